@@ -1,0 +1,26 @@
+//! What every part of `dgtr` must agree on before the first frame: the mission file, presets, geodesy and
+//! the fixed memory plan. Depends on nothing else of the project.
+//!
+//! Without the `std` feature only [`geodesy`] remains; the `no_std` core of `hal` uses it.
+#![cfg_attr(not(feature = "std"), no_std)]
+
+#[cfg(feature = "std")]
+pub mod faults;
+pub mod geodesy;
+
+#[cfg(feature = "std")]
+pub mod ground;
+#[cfg(feature = "std")]
+pub mod init;
+#[cfg(feature = "std")]
+pub mod link;
+#[cfg(feature = "std")]
+pub mod mission;
+#[cfg(feature = "std")]
+pub mod plan;
+#[cfg(feature = "std")]
+pub mod refine;
+#[cfg(feature = "std")]
+pub mod training;
+#[cfg(feature = "std")]
+pub mod upload;

@@ -1,0 +1,265 @@
+//! The fixed memory plan of the device: one number of MiB in, every capacity and every byte out.
+//!
+//! This file is the only place that knows how large a section is; the arena allocates exactly these sections, so what
+//! `dgtr plan` prints is what the device holds, to the byte.
+
+use serde::Serialize;
+
+/// Lanes that sort and emit; each owns one histogram (specialised into the shaders).
+///
+/// Enough to keep the cores of a small board evenly busy: shares differ, as near Gaussians touch more tiles.
+pub const SORT_BLOCKS: u64 = 128;
+/// Lanes of the passes that loop over the visible Gaussians; each leaves one partial sum.
+pub const LOOP_LANES: u64 = 1024;
+/// Every binding stays below this (lavapipe's and older V3DV's `maxStorageBufferRange`).
+pub const BINDING_LIMIT: u64 = 128 << 20;
+/// Sections start at multiples of this, the largest `minStorageBufferOffsetAlignment` Vulkan allows.
+pub const SECTION_ALIGNMENT: u64 = 256;
+/// The whole is a multiple of this, so that no driver rounds it up.
+pub const TOTAL_ALIGNMENT: u64 = 64 << 10;
+/// Pixels along the side of a tile.
+pub const TILE_SIDE: u64 = 4;
+
+/// What the job will ask of the device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PlanRequest {
+    /// Device memory that may be used, MiB.
+    pub device_mib: u32,
+    /// Width of the largest training picture, pixels.
+    pub width: u32,
+    /// Height of the largest training picture, pixels.
+    pub height: u32,
+    /// Training views kept on the device.
+    pub views: u32,
+    /// Highest SH degree, 0…3.
+    pub sh_degree: u8,
+    /// Upper bound on Gaussians; `None` takes what the memory allows.
+    pub max_gaussians: Option<usize>,
+}
+
+/// Capacities and the size of every section.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Plan {
+    /// N, Gaussians.
+    pub gaussians: usize,
+    /// M, Gaussian–tile instances held at once; more are rendered in several bands.
+    pub instances: usize,
+    /// P, pixels rendered at once; larger renderings are done in several windows.
+    pub pixels: usize,
+    /// Tiles rendered at once.
+    pub tiles: usize,
+    /// Training views.
+    pub views: usize,
+    /// Highest SH degree.
+    pub sh_degree: u8,
+    /// Name and bytes of every section, in the order in which they lie in memory.
+    pub sections: Vec<(&'static str, u64)>,
+    /// Bytes of the one device allocation.
+    pub total_bytes: u64,
+}
+
+/// Why no plan could be made.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PlanError {
+    /// Pictures and views alone exceed the budget.
+    #[error(
+        "memory plan: {device_mib} MiB of device memory are too few for {views} views of {width}x{height}; \
+         at least {needed_mib} MiB are needed (raise memory.device_mib, or use fewer or smaller views)"
+    )]
+    TooSmall {
+        /// What was allowed.
+        device_mib: u32,
+        /// Views asked for.
+        views: u32,
+        /// Picture width.
+        width: u32,
+        /// Picture height.
+        height: u32,
+        /// What the smallest plan takes.
+        needed_mib: u64,
+    },
+    /// A number that makes no sense.
+    #[error("memory plan: {what} = {value} is outside {low}…{high}")]
+    OutOfRange {
+        /// Which number.
+        what: &'static str,
+        /// Its value.
+        value: u64,
+        /// Least allowed.
+        low: u64,
+        /// Greatest allowed.
+        high: u64,
+    },
+}
+
+/// vec4 columns that one Gaussian's SH coefficients fill.
+pub const fn sh_columns(degree: u8) -> u64 {
+    let d = (degree as u64 + 1) * (degree as u64 + 1);
+    (3 * d).div_ceil(4)
+}
+
+/// Bytes of one resident view: RGBA8 (alpha is the depth prior's confidence) and a 16-bit depth prior, aligned so that
+/// every view can be bound on its own.
+pub const fn view_bytes(pixels: u64) -> u64 {
+    (4 * pixels + 4 * pixels.div_ceil(2)).next_multiple_of(SECTION_ALIGNMENT)
+}
+
+fn within(what: &'static str, value: u64, low: u64, high: u64) -> Result<(), PlanError> {
+    if (low..=high).contains(&value) { Ok(()) } else { Err(PlanError::OutOfRange { what, value, low, high }) }
+}
+
+impl Plan {
+    /// The least number of Gaussians a plan is worth making for.
+    pub const LEAST_GAUSSIANS: usize = 256;
+
+    /// As many Gaussians and instances as the budget holds.
+    ///
+    /// # Errors
+    /// [`PlanError::TooSmall`] with the MiB that would do; [`PlanError::OutOfRange`].
+    pub fn new(request: &PlanRequest) -> Result<Self, PlanError> {
+        let r = request;
+        within("width", r.width.into(), 1, 1 << 15)?;
+        within("height", r.height.into(), 1, 1 << 15)?;
+        within("pixels", u64::from(r.width) * u64::from(r.height), 1, BINDING_LIMIT / 48)?;
+        within("views", r.views.into(), 0, 1 << 20)?;
+        within("sh_degree", r.sh_degree.into(), 0, 3)?;
+        within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, u64::from(u32::MAX) >> 4)?;
+        let budget = u64::from(r.device_mib) << 20;
+        // Widest column set in one binding: three vec4 of Adam state per geometry column, or all SH columns.
+        let widest = 144.max(16 * sh_columns(r.sh_degree));
+        let most = (BINDING_LIMIT / widest) as usize;
+        let most = r.max_gaussians.unwrap_or(most).min(most);
+        let least = most.min(Self::LEAST_GAUSSIANS);
+        let pixels = r.width as usize * r.height as usize;
+        // A picture of ordinary content needs about 4 instances per pixel of 4 × 4 tiles (measured on fox).
+        let made = |n: usize, per_pixel: usize| Self::laid_out(r, n, n + per_pixel * pixels);
+        let smallest = made(least, 2);
+        if smallest.total_bytes > budget {
+            return Err(PlanError::TooSmall {
+                device_mib: r.device_mib,
+                views: r.views,
+                width: r.width,
+                height: r.height,
+                needed_mib: smallest.total_bytes.div_ceil(1 << 20),
+            });
+        }
+        let (mut low, mut high) = (least, most);
+        while low < high {
+            let middle = low + (high - low).div_ceil(2);
+            if made(middle, 4).total_bytes <= budget { low = middle } else { high = middle - 1 }
+        }
+        let fits = |per_pixel: &usize| made(low, *per_pixel).total_bytes <= budget;
+        // What is left goes to instances, so that few frames need bands.
+        let per_pixel = [16, 12, 8, 6, 4, 3].into_iter().find(fits).unwrap_or(2);
+        Ok(made(low, per_pixel))
+    }
+
+    /// A plan with given capacities instead of a budget (tests, benchmarks). `instances` is raised to `gaussians`, so
+    /// that one tile always fits.
+    pub fn with_capacities(request: &PlanRequest, gaussians: usize, instances: usize) -> Self {
+        Self::laid_out(request, gaussians.max(1), instances)
+    }
+
+    fn laid_out(r: &PlanRequest, gaussians: usize, instances: usize) -> Self {
+        let most_instances = (BINDING_LIMIT / 48) as usize;
+        let instances = instances.clamp(gaussians.min(most_instances), most_instances);
+        let (n, m) = (gaussians as u64, instances as u64);
+        // Pictures of the same area in another shape (portrait, cropped) need a few more tiles and padding.
+        let p = (u64::from(r.width) * u64::from(r.height)).next_multiple_of(64);
+        let (across, down) = (u64::from(r.width).div_ceil(TILE_SIDE), u64::from(r.height).div_ceil(TILE_SIDE));
+        let tiles = across * down + across.max(down) + 64;
+        let sh = 16 * sh_columns(r.sh_degree) * n;
+        let sections: Vec<(&'static str, u64)> = [
+            ("frame", 16 << 10), // uniforms and the table of deferred moments
+            ("status", 8 << 10), // counters read back after every step, cursors of the sorting lanes
+            ("partials", 32 * (LOOP_LANES + p.div_ceil(8) + u64::from(r.width) + u64::from(r.height) + 64)),
+            ("geometry", 144 * n), // mean+opacity, log scale+state, rotation; each with two Adam moments
+            ("sh", sh),
+            ("sh_first_moment", sh),
+            ("sh_second_moment", sh),
+            ("projected", 48 * n), // centre, conic, span data
+            ("shaded", 48 * n),    // the visible ones in depth order, with colour
+            ("keys", 4 * n),       // depths of all, and of the visible ones while sorting
+            ("rows", 4 * n),       // the visible ones in depth order
+            ("keys_other", 4 * n),
+            ("rows_other", 4 * n),
+            ("digits", 4 * 256 * SORT_BLOCKS), // per sorting lane: digits of the sort's present pass
+            ("reduced", 48 * n),               // summed gradient slots
+            ("slot_ranges", 8 * n),            // first slot and number of slots
+            ("tiles", 4 * tiles * SORT_BLOCKS), // per sorting lane and tile: instances
+            ("tile_starts", 8 * tiles + 16),   // first instance; Gaussians blended (work counter)
+            ("instances", 8 * m),              // Gaussian and slot
+            ("slots", (48 * m).max(96 * p)),   // gradient slots; SSIM's intermediate maps before those are needed
+            ("image", 16 * p),                 // RGB, depth
+            ("transmittance", 4 * p),
+            ("image_gradient", 16 * p),
+            ("target", 8 * p), // the step's picture (RGBA8) and depth prior at working size
+            ("views", view_bytes(p) * u64::from(r.views)),
+        ]
+        .into_iter()
+        .map(|(name, bytes): (&'static str, u64)| (name, bytes.max(16).next_multiple_of(SECTION_ALIGNMENT)))
+        .collect();
+        let total: u64 = sections.iter().map(|s| s.1).sum();
+        Self {
+            gaussians,
+            instances,
+            pixels: p as usize,
+            tiles: tiles as usize,
+            views: r.views as usize,
+            sh_degree: r.sh_degree,
+            sections,
+            total_bytes: total.next_multiple_of(TOTAL_ALIGNMENT),
+        }
+    }
+
+    /// Bytes of the section `name`; 0 when there is none.
+    pub fn bytes(&self, name: &str) -> u64 {
+        self.sections.iter().find(|s| s.0 == name).map_or(0, |s| s.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn request(device_mib: u32) -> PlanRequest {
+        PlanRequest { device_mib, width: 640, height: 480, views: 50, sh_degree: 3, max_gaussians: None }
+    }
+
+    #[test]
+    fn a_larger_budget_never_holds_fewer_gaussians_and_is_never_exceeded() {
+        let mut last = 0;
+        for mib in [200, 256, 384, 512, 1024, 4096] {
+            let p = Plan::new(&request(mib)).unwrap();
+            assert!(p.total_bytes <= u64::from(mib) << 20);
+            assert!(p.gaussians >= last, "{mib}: {} < {last}", p.gaussians);
+            assert!(p.instances >= p.gaussians);
+            last = p.gaussians;
+        }
+    }
+
+    #[test]
+    fn the_total_is_the_sum_of_the_sections_rounded_once() {
+        let p = Plan::new(&request(512)).unwrap();
+        let sum: u64 = p.sections.iter().map(|s| s.1).sum();
+        assert_eq!(p.total_bytes, sum.next_multiple_of(TOTAL_ALIGNMENT));
+        for (name, bytes) in &p.sections {
+            assert!(*name == "views" || *bytes <= BINDING_LIMIT + (1 << 20), "{name}: {bytes}");
+        }
+    }
+
+    #[test]
+    fn too_small_a_budget_says_how_much_would_do() {
+        let error = Plan::new(&request(16)).unwrap_err();
+        let PlanError::TooSmall { needed_mib, .. } = error else { panic!("{error}") };
+        assert!(Plan::new(&request(needed_mib as u32)).is_ok());
+        assert!(Plan::new(&request(needed_mib as u32 - 1)).is_err());
+    }
+
+    #[test]
+    fn sizes_out_of_range_are_refused() {
+        assert!(Plan::new(&PlanRequest { width: 0, ..request(512) }).is_err());
+        assert!(Plan::new(&PlanRequest { sh_degree: 4, ..request(512) }).is_err());
+        assert!(Plan::new(&PlanRequest { width: 1 << 15, height: 1 << 15, ..request(512) }).is_err());
+    }
+}

@@ -1,0 +1,258 @@
+//! What autopilots really send, message by message.
+
+use config::geodesy::{EnuFrame, Geodetic};
+use glam::{DQuat, DVec3};
+
+use super::*;
+use crate::frames::euler_to_ned;
+use crate::mavlink::dialect::{GimbalDeviceFlags, GpsFixType, MavBool, MavFrame};
+use crate::mavlink::{Encoder, Framer};
+use crate::trigger::TriggerKind;
+
+const S: u64 = 1_000_000_000;
+const HOME: Geodetic = Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 200.0 };
+
+/// An autopilot heard through real frames, one per call.
+struct Wire {
+    autopilot: Autopilot,
+    encoder: Encoder,
+    now_ns: u64,
+}
+
+impl Wire {
+    fn new() -> Self {
+        let ids = Ids { system: 1, autopilot: 1, own_component: 100 };
+        Self { autopilot: Autopilot::new(ids), encoder: Encoder::new(1, 1), now_ns: 500 * S }
+    }
+
+    fn hear<D: MessageData>(&mut self, message: &D) -> Heard {
+        let mut framer = Framer::new();
+        framer.push(self.encoder.encode(message, None));
+        self.autopilot.hear(&framer.next_frame().expect("a frame"), self.now_ns)
+    }
+
+    /// Level flight east at 10 m/s from boot time `from_ms`, 25 attitudes and 10 positions a second.
+    fn fly(&mut self, from_ms: u32, to_ms: u32) {
+        for time_boot_ms in (from_ms..to_ms).step_by(20) {
+            self.now_ns += 20_000_000;
+            if time_boot_ms % 40 == 0 {
+                self.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms, q1: 1.0, ..Default::default() });
+            }
+            if time_boot_ms % 100 == 0 {
+                self.position(time_boot_ms, 0.0);
+            }
+        }
+    }
+
+    fn position(&mut self, time_boot_ms: u32, off_m: f64) -> Heard {
+        let east = f64::from(time_boot_ms) * 0.01;
+        let at = EnuFrame::new(HOME).to_geodetic(DVec3::new(east, off_m, 0.0));
+        self.hear(&GLOBAL_POSITION_INT_DATA {
+            time_boot_ms,
+            lat: (at.lat_deg * 1e7) as i32,
+            lon: (at.lon_deg * 1e7) as i32,
+            alt: (at.alt_m * 1e3) as i32,
+            vy: 1000,
+            ..Default::default()
+        })
+    }
+
+    fn counters(&self) -> HalCounters {
+        self.autopilot.counters()
+    }
+}
+
+#[test]
+fn feedback_is_placed_from_unix_time_and_from_wrapping_boot_time() {
+    let mut h = Wire::new();
+    h.fly(10_000, 12_000);
+    let boot_us = (1u64 << 32) - 500_000;
+    h.hear(&SYSTEM_TIME_DATA { time_unix_usec: 1_795_248_400_000_000, time_boot_ms: 12_000 });
+    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 1_795_248_399_500_000, img_idx: 1, ..Default::default() });
+    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 11_900_000, img_idx: 3, ..Default::default() });
+    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 11_900_000, img_idx: 3, ..Default::default() });
+    // Not a time of this flight: taken at its arrival.
+    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: boot_us, img_idx: 4, ..Default::default() });
+    let times: std::vec::Vec<_> =
+        core::iter::from_fn(|| h.autopilot.next_trigger()).map(|t| (t.sequence, t.boot_ns / 1_000_000)).collect();
+    assert_eq!(times[..2], [(1, 11_500), (3, 11_900)]);
+    assert!(times.len() == 3 && times[2].1.abs_diff(12_000) < 60, "{times:?}");
+    let c = h.counters();
+    assert_eq!((c.triggers, c.trigger_gaps, c.trigger_duplicates, c.trigger_times_mended), (3, 1, 1, 1));
+}
+
+#[test]
+fn px4s_second_announcement_of_an_exposure_is_a_duplicate() {
+    let mut h = Wire::new();
+    h.fly(10_000, 11_000);
+    for seq in 5..8u32 {
+        h.fly(11_000 + seq * 1000, 12_000 + seq * 1000);
+        let boot_ms = 11_900 + seq * 1000;
+        h.hear(&CAMERA_TRIGGER_DATA { time_usec: u64::from(boot_ms) * 1000, seq });
+        let captured = CAMERA_IMAGE_CAPTURED_DATA {
+            time_boot_ms: boot_ms,
+            image_index: seq as i32,
+            capture_result: MavBool::MAV_BOOL_TRUE,
+            ..Default::default()
+        };
+        h.hear(&captured);
+    }
+    let kinds: std::vec::Vec<_> = core::iter::from_fn(|| h.autopilot.next_trigger()).map(|t| t.kind).collect();
+    assert_eq!(kinds, [TriggerKind::CameraTrigger; 3]);
+    assert_eq!(h.counters().trigger_duplicates, 3);
+}
+
+#[test]
+fn our_own_exposure_gives_way_to_the_autopilots_announcement() {
+    let mut h = Wire::new();
+    h.fly(10_000, 11_000);
+    h.autopilot.announce_own(1, h.now_ns);
+    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 10_950_000, img_idx: 1, ..Default::default() });
+    h.autopilot.settle_own(h.now_ns + S);
+    assert_eq!(h.autopilot.next_trigger().map(|t| t.kind), Some(TriggerKind::Feedback));
+    assert_eq!(h.autopilot.next_trigger(), None);
+    // Without one it counts, at the time it was made.
+    h.now_ns += 20 * S;
+    h.fly(31_000, 32_000);
+    h.autopilot.announce_own(2, h.now_ns);
+    h.autopilot.settle_own(h.now_ns + S);
+    let trigger = h.autopilot.next_trigger().expect("announced");
+    assert!(trigger.kind == TriggerKind::Command && trigger.boot_ns.abs_diff(32 * S) < S / 10, "{trigger:?}");
+}
+
+#[test]
+fn odometry_is_placed_by_the_origin_and_only_in_frames_tied_to_north() {
+    let mut h = Wire::new();
+    h.hear(&SYSTEM_TIME_DATA { time_unix_usec: 0, time_boot_ms: 5_000 });
+    let odometry = ODOMETRY_DATA {
+        time_usec: 5_000_000,
+        x: 30.0,
+        y: 40.0,
+        z: -50.0,
+        q: [1.0, 0.0, 0.0, 0.0],
+        vx: 2.0,
+        frame_id: MavFrame::MAV_FRAME_LOCAL_NED,
+        child_frame_id: MavFrame::MAV_FRAME_BODY_FRD,
+        pose_covariance: [f32::NAN; 21],
+        ..Default::default()
+    };
+    assert_eq!(h.hear(&odometry), Heard::Other, "no origin yet");
+    h.hear(&GPS_GLOBAL_ORIGIN_DATA {
+        latitude: (HOME.lat_deg * 1e7) as i32,
+        longitude: (HOME.lon_deg * 1e7) as i32,
+        altitude: 200_000,
+        ..Default::default()
+    });
+    let next = ODOMETRY_DATA { time_usec: 5_100_000, ..odometry.clone() };
+    assert_eq!(h.hear(&next), Heard::Position);
+    let pose = h.autopilot.pose_at(5_100_000_000).expect("a pose");
+    let enu = EnuFrame::new(HOME).to_enu(pose.position);
+    assert!((enu - DVec3::new(40.0, 30.0, 50.0)).length() < 0.02, "{enu}");
+    assert!((pose.velocity - DVec3::new(0.0, 2.0, 0.0)).length() < 1e-6 && pose.position_sigma_m.is_finite());
+    let adrift = ODOMETRY_DATA { time_usec: 5_200_000, frame_id: MavFrame::MAV_FRAME_LOCAL_FRD, ..odometry.clone() };
+    assert_eq!(h.hear(&adrift), Heard::Other);
+    h.hear(&ODOMETRY_DATA { time_usec: 5_300_000, x: f32::NAN, ..odometry.clone() });
+    h.hear(&ODOMETRY_DATA { time_usec: 5_400_000, reset_counter: 1, ..odometry });
+    assert_eq!((h.counters().impossible, h.counters().position_steps), (1, 1));
+}
+
+#[test]
+fn gimbal_yaw_obeys_its_frame_flags() {
+    let east = core::f64::consts::FRAC_PI_2;
+    let flag = |f| GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_PITCH_LOCK | f;
+    for (flags, vehicle_frame) in [
+        (flag(GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME), true),
+        (flag(GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME), false),
+        (flag(GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_YAW_LOCK), false),
+        (GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_PITCH_LOCK, true),
+    ] {
+        let mut h = Wire::new();
+        let wire = |q: DQuat| [q.w as f32, q.x as f32, q.y as f32, q.z as f32];
+        let [q1, q2, q3, q4] = wire(euler_to_ned(0.1, 0.0, east));
+        let q = wire(euler_to_ned(0.0, -0.5, 0.0));
+        for time_boot_ms in [8_000, 8_100] {
+            h.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms, q1, q2, q3, q4, ..Default::default() });
+            h.position(time_boot_ms, 0.0);
+            h.hear(&GIMBAL_DEVICE_ATTITUDE_STATUS_DATA {
+                time_boot_ms,
+                q,
+                flags,
+                delta_yaw: f32::NAN,
+                ..Default::default()
+            });
+        }
+        let forward = h.autopilot.pose_at(8_050_000_000).expect("a pose").gimbal.expect("reported") * DVec3::X;
+        let heading = if vehicle_frame { DVec3::X } else { DVec3::Y };
+        let expected = heading * 0.5f64.cos() - DVec3::Z * 0.5f64.sin();
+        assert!((forward - expected).length() < 1e-6, "{flags:?}: {forward}");
+    }
+}
+
+#[test]
+fn a_spike_is_left_out_and_a_lasting_jump_is_followed_with_its_size_as_uncertainty() {
+    let mut h = Wire::new();
+    h.fly(10_000, 12_000);
+    assert_eq!(h.position(12_000, 60.0), Heard::Other);
+    h.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_000, q2: 1.0, ..Default::default() });
+    h.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_010, q1: f32::NAN, ..Default::default() });
+    h.fly(12_100, 13_000);
+    assert_eq!((h.counters().spikes, h.counters().impossible, h.counters().position_steps), (2, 1, 0));
+    let heard: std::vec::Vec<_> = (0..6).map(|i| h.position(13_000 + i * 100, 60.0)).collect();
+    assert_eq!(heard, [Heard::Other, Heard::Other, Heard::Other, Heard::Other, Heard::Position, Heard::Position]);
+    assert_eq!(h.counters().position_steps, 1);
+    let newest = h.autopilot.track().newest_position().expect("one");
+    assert!(newest.sigma_m.min_element() > 50.0, "{}", newest.sigma_m);
+}
+
+#[test]
+fn gps_accuracy_reaches_the_pose_and_its_loss_shows() {
+    let mut h = Wire::new();
+    let gps = |fix_type, h_acc, eph| GPS_RAW_INT_DATA {
+        fix_type,
+        h_acc,
+        v_acc: 900,
+        eph,
+        epv: u16::MAX,
+        ..Default::default()
+    };
+    for (message, east) in [
+        (gps(GpsFixType::GPS_FIX_TYPE_RTK_FIXED, 14, 100), 0.0099),
+        (gps(GpsFixType::GPS_FIX_TYPE_3D_FIX, 0, 80), 0.8485),
+        (gps(GpsFixType::GPS_FIX_TYPE_NO_FIX, 0, u16::MAX), 100.0),
+    ] {
+        h.hear(&message);
+        let next = h.autopilot.track().newest_position().map_or(9_000, |p| (p.boot_ns / 1_000_000) as u32 + 100);
+        h.position(next, 0.0);
+        let sigma = h.autopilot.track().newest_position().expect("one").sigma_m;
+        assert!((sigma.x - east).abs() < 1e-3 * east.max(1.0), "{sigma}");
+    }
+    assert_eq!(h.autopilot.state().gps_fix, Some(1));
+}
+
+#[test]
+fn a_restarted_autopilot_starts_a_new_track() {
+    let mut h = Wire::new();
+    h.fly(600_000, 602_000);
+    h.fly(3_000, 5_000);
+    assert_eq!(h.counters().clock_restarts, 1);
+    assert_eq!(h.autopilot.pose_at(601 * S), Err(PoseError::NotYet));
+    assert!(h.autopilot.pose_at(4 * S).is_ok());
+    let mapped = h.autopilot.clock().to_companion_ns(4_900_000_000).expect("mapped");
+    assert!(mapped.abs_diff(h.now_ns) < S / 5);
+}
+
+#[test]
+fn other_systems_and_our_own_echo_are_ignored_and_a_timesync_is_answered() {
+    let mut h = Wire::new();
+    h.encoder = Encoder::new(2, 1);
+    assert_eq!(h.position(9_000, 0.0), Heard::Foreign);
+    h.encoder = Encoder::new(1, 100);
+    assert_eq!(h.position(9_000, 0.0), Heard::Foreign);
+    assert_eq!(h.counters().foreign, 2);
+    h.encoder = Encoder::new(1, 1);
+    h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() });
+    let answer = h.autopilot.next_answer().expect("an answer");
+    assert_eq!((answer.ts1, answer.tc1), (77, h.now_ns as i64));
+    h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 78, target_system: 1, target_component: 50, ..Default::default() });
+    assert_eq!(h.autopilot.next_answer(), None);
+}

@@ -1,0 +1,193 @@
+//! Where a JPEG ends: needed to know that a file is complete, and to cut a stream of them (MJPEG) into pictures. Walks the
+//! segments instead of searching for end markers, because EXIF thumbnails contain some.
+
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// Largest picture of a stream; more without an end is garbage.
+const MAX_PICTURE: usize = 32 << 20;
+
+/// True when the file at `path` ends as a JPEG or PNG does. Half-written files do not.
+pub fn is_complete(path: &Path) -> std::io::Result<bool> {
+    let mut file = File::open(path)?;
+    let len = file.seek(SeekFrom::End(0))?;
+    let mut head = [0; 2];
+    file.seek(SeekFrom::Start(0))?;
+    if len < 64 {
+        return Ok(false);
+    }
+    file.read_exact(&mut head)?;
+    let mut tail = [0; 32];
+    file.seek(SeekFrom::Start(len - 32))?;
+    file.read_exact(&mut tail)?;
+    Ok(match head {
+        // Some cameras pad after the end marker.
+        [0xFF, 0xD8] => {
+            let end = tail.iter().rposition(|b| *b != 0).unwrap_or(0);
+            tail[..=end].ends_with(&[0xFF, 0xD9])
+        }
+        [0x89, b'P'] => tail[20..].starts_with(&[0, 0, 0, 0]) && tail[24..28] == *b"IEND",
+        _ => false,
+    })
+}
+
+/// What the splitter expects next.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum State {
+    /// Before a picture.
+    Between,
+    /// At a marker, inside a picture.
+    Marker,
+    /// Entropy-coded data up to the next marker.
+    Scan,
+}
+
+/// Cuts a byte stream into JPEGs.
+pub struct JpegSplitter {
+    buffer: Vec<u8>,
+    position: usize,
+    state: State,
+    skipped: u64,
+}
+
+impl Default for JpegSplitter {
+    fn default() -> Self {
+        Self { buffer: Vec::new(), position: 0, state: State::Between, skipped: 0 }
+    }
+}
+
+impl JpegSplitter {
+    /// Adds bytes of the stream.
+    pub fn push(&mut self, bytes: &[u8]) {
+        self.buffer.extend_from_slice(bytes);
+    }
+
+    /// Bytes that belonged to no picture.
+    pub fn skipped(&self) -> u64 {
+        self.skipped
+    }
+
+    /// The next complete picture.
+    pub fn next_jpeg(&mut self) -> Option<Vec<u8>> {
+        loop {
+            let rest = &self.buffer[self.position..];
+            match self.state {
+                State::Between => {
+                    let start = rest.windows(3).position(|w| w == [0xFF, 0xD8, 0xFF]);
+                    let drop = start.unwrap_or(rest.len().saturating_sub(2));
+                    self.skip(drop);
+                    start?;
+                    self.position = 2;
+                    self.state = State::Marker;
+                }
+                State::Marker => match *rest {
+                    [0xFF, 0xFF, ..] => self.position += 1,
+                    [0xFF, 0xD9, ..] => {
+                        let tail = self.buffer.split_off(self.position + 2);
+                        self.position = 0;
+                        self.state = State::Between;
+                        return Some(std::mem::replace(&mut self.buffer, tail));
+                    }
+                    [0xFF, 0xD8, ..] => self.give_up(), // a start inside: the first one was none
+                    [0xFF, 0x01 | 0xD0..=0xD7, ..] => self.position += 2,
+                    [0xFF, marker, high, low, ..] if u16::from_be_bytes([high, low]) >= 2 => {
+                        let len = 2 + usize::from(u16::from_be_bytes([high, low]));
+                        if rest.len() < len {
+                            return self.wait();
+                        }
+                        self.position += len;
+                        self.state = if marker == 0xDA { State::Scan } else { State::Marker };
+                    }
+                    [0xFF, _, _, _, ..] => self.give_up(),
+                    [0xFF, ..] | [] => return self.wait(),
+                    _ => self.give_up(),
+                },
+                State::Scan => match rest.windows(2).position(|w| w[0] == 0xFF && !matches!(w[1], 0 | 0xD0..=0xD7)) {
+                    Some(marker) => {
+                        self.position += marker;
+                        self.state = State::Marker;
+                    }
+                    None => {
+                        self.position += rest.len().saturating_sub(1);
+                        return self.wait();
+                    }
+                },
+            }
+        }
+    }
+
+    /// Waits for more bytes, unless the picture is already larger than any can be.
+    fn wait(&mut self) -> Option<Vec<u8>> {
+        if self.buffer.len() > MAX_PICTURE {
+            self.skip(self.buffer.len());
+        }
+        None
+    }
+
+    /// Not a JPEG after all: look for the next start after this one.
+    fn give_up(&mut self) {
+        self.skip(2);
+    }
+
+    fn skip(&mut self, bytes: usize) {
+        self.buffer.drain(..bytes);
+        self.skipped += bytes as u64;
+        self.position = 0;
+        self.state = State::Between;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn jpeg(shade: u8) -> Vec<u8> {
+        let image = image::RgbImage::from_fn(40, 30, |x, y| image::Rgb([shade, (x * 6) as u8, (y * 8) as u8]));
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        image.write_to(&mut bytes, image::ImageFormat::Jpeg).expect("encodes");
+        bytes.into_inner()
+    }
+
+    #[test]
+    fn a_stream_with_garbage_between_is_cut_into_its_pictures() {
+        let pictures = [jpeg(10), jpeg(200), jpeg(90)];
+        let mut stream = b"garbage\xFF\xD8".to_vec();
+        for picture in &pictures {
+            stream.extend_from_slice(picture);
+            stream.extend_from_slice(b"--boundary\r\n");
+        }
+        let mut splitter = JpegSplitter::default();
+        let mut found = Vec::new();
+        for chunk in stream.chunks(7) {
+            splitter.push(chunk);
+            found.extend(std::iter::from_fn(|| splitter.next_jpeg()));
+        }
+        assert!(found == pictures, "{} pictures", found.len());
+        assert!(splitter.skipped() > 20);
+    }
+
+    #[test]
+    fn a_thumbnail_inside_does_not_end_the_picture() {
+        let (outer, thumbnail) = (jpeg(1), jpeg(2));
+        let mut picture = outer[..2].to_vec();
+        picture.extend_from_slice(&[0xFF, 0xE1]);
+        picture.extend_from_slice(&u16::try_from(thumbnail.len() + 2).expect("small").to_be_bytes());
+        picture.extend_from_slice(&thumbnail);
+        picture.extend_from_slice(&outer[2..]);
+        let mut splitter = JpegSplitter::default();
+        splitter.push(&picture);
+        assert_eq!(splitter.next_jpeg(), Some(picture));
+    }
+
+    #[test]
+    fn half_a_file_is_not_complete_at_any_length() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.jpg");
+        let whole = jpeg(5);
+        for len in (0..=whole.len()).step_by(13).chain([whole.len()]) {
+            std::fs::write(&path, &whole[..len]).expect("written");
+            assert_eq!(is_complete(&path).expect("read"), len == whole.len(), "{len}");
+        }
+    }
+}

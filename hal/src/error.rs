@@ -1,0 +1,115 @@
+//! Errors in embedded-hal's manner: every error says its [`ErrorKind`], so that generic code can decide (wait, reopen,
+//! give up) without knowing who is behind the trait. The one concrete error of the std parts is [`HalError`].
+
+/// What generic code may need to know about an error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// The other end is gone or the recording is at its end; reopening may help.
+    Closed,
+    /// Could not be done right now; the same call may succeed later.
+    Busy,
+    /// A setting, address or file that will never work as given.
+    Invalid,
+    /// The device or driver refused for another reason.
+    Device,
+}
+
+/// An error that knows its kind.
+pub trait Error: core::fmt::Debug + core::fmt::Display {
+    /// The kind of this error.
+    fn kind(&self) -> ErrorKind;
+}
+
+impl Error for core::convert::Infallible {
+    fn kind(&self) -> ErrorKind {
+        match *self {}
+    }
+}
+
+#[cfg(feature = "std")]
+pub use with_std::HalError;
+
+#[cfg(feature = "std")]
+mod with_std {
+    use super::{Error, ErrorKind};
+    use std::path::PathBuf;
+
+    /// What can go wrong with links, cameras and settings. One line each: what, where, how to mend.
+    #[derive(Debug, thiserror::Error)]
+    pub enum HalError {
+        /// A link address that does not follow the syntax.
+        #[error(
+            "link address '{text}': {why}; use serial:PATH:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcpin:HOST:PORT, tcpout:HOST:PORT, file:LOG.tlog or pty:"
+        )]
+        Address {
+            /// As given.
+            text: String,
+            /// What is wrong with it.
+            why: &'static str,
+        },
+        /// A link that could not be opened.
+        #[error("cannot open link {address}: {source}")]
+        Open {
+            /// The address.
+            address: String,
+            /// The system's reason.
+            source: std::io::Error,
+        },
+        /// The other end of a link is gone, or a recording is at its end.
+        #[error("link {address} is closed")]
+        Closed {
+            /// The address.
+            address: String,
+        },
+        /// A link cannot take a frame right now (nobody reads at the other end).
+        #[error("link {address} does not take data")]
+        Full {
+            /// The address.
+            address: String,
+        },
+        /// Reading or writing an open link failed.
+        #[error("link {address}: {source}")]
+        Link {
+            /// The address.
+            address: String,
+            /// The system's reason.
+            source: std::io::Error,
+        },
+        /// The key or time-stamp file of MAVLink signing.
+        #[error("signing: {}: {why}", path.display())]
+        Signing {
+            /// The file.
+            path: PathBuf,
+            /// What is wrong with it and what would be right.
+            why: String,
+        },
+        /// A camera folder or program that does not work.
+        #[error("camera {what}: {why}")]
+        Camera {
+            /// The folder or command.
+            what: String,
+            /// What is wrong with it and how to mend it.
+            why: String,
+        },
+        /// One picture that could not be used.
+        #[error("picture {}: {why}", path.display())]
+        Picture {
+            /// The file.
+            path: PathBuf,
+            /// What is wrong with it.
+            why: String,
+        },
+    }
+
+    impl Error for HalError {
+        fn kind(&self) -> ErrorKind {
+            match self {
+                Self::Address { .. } | Self::Signing { .. } => ErrorKind::Invalid,
+                Self::Closed { .. } => ErrorKind::Closed,
+                Self::Full { .. } => ErrorKind::Busy,
+                Self::Open { .. } | Self::Link { .. } | Self::Camera { .. } | Self::Picture { .. } => ErrorKind::Device,
+            }
+        }
+    }
+}

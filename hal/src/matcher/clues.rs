@@ -1,0 +1,143 @@
+//! What is learnt about a camera from certain matches: its latency, how its numbers follow the exposures, and the offset
+//! of its clock; and the choice of an exposure for a picture from all three.
+
+use heapless::Deque;
+
+use crate::traits::PictureClues;
+use crate::trigger::Trigger;
+
+/// A relation that held this often in a row is believed.
+const BELIEVED: u8 = 3;
+/// Exposures may be announced this much after the picture (clock mapping and link delay).
+const EARLY_NS: i64 = 300_000_000;
+/// Least spread of latencies assumed, before and after learning.
+const FIRST_SPREAD_NS: f64 = 1e9;
+const LEAST_SPREAD_NS: f64 = 0.1e9;
+/// Weight of the newest latency.
+const BLEND: f64 = 0.2;
+
+/// The relations learnt so far.
+pub(super) struct Learnt {
+    latency_ns: f64,
+    spread_ns: f64,
+    matches: u32,
+    last: Option<(PictureClues, Trigger)>,
+    /// number = stride · sequence + constant.
+    stride: u64,
+    number_held: u8,
+    /// camera clock − boot clock, ns.
+    camera_offset_ns: i128,
+    camera_held: u8,
+}
+
+impl Learnt {
+    pub(super) fn new(latency_ns: u64) -> Self {
+        Self {
+            latency_ns: latency_ns as f64,
+            spread_ns: FIRST_SPREAD_NS,
+            matches: 0,
+            last: None,
+            stride: 0,
+            number_held: 0,
+            camera_offset_ns: 0,
+            camera_held: 0,
+        }
+    }
+
+    /// The exposure's index, and whether it is certain enough not to wait for more.
+    pub(super) fn choose<const N: usize>(
+        &self,
+        clues: &PictureClues,
+        triggers: &Deque<Trigger, N>,
+        patience_ns: u64,
+    ) -> Option<(usize, bool)> {
+        let latency = |t: &Trigger| clues.arrived_ns as i64 - t.time_ns as i64;
+        let possible = |t: &Trigger| (-EARLY_NS..=patience_ns as i64).contains(&latency(t));
+        let off = |t: &Trigger| (latency(t) as f64 - self.latency_ns).abs();
+        let by_time = triggers
+            .iter()
+            .enumerate()
+            .filter(|(_, t)| possible(t))
+            .min_by(|(_, a), (_, b)| off(a).total_cmp(&off(b)))
+            .map(|(i, t)| (i, off(t), latency(t)));
+
+        // The camera's own clock, once its offset is known, is decisive: it was read at the exposure.
+        if let (Some(camera_ns), true) = (clues.camera_ns, self.camera_held >= BELIEVED) {
+            let resolution = clues.camera_resolution_ns.max(50_000_000) as i128;
+            let error = |t: &Trigger| (i128::from(camera_ns) - i128::from(t.boot_ns) - self.camera_offset_ns).abs();
+            let mut fitting = triggers.iter().enumerate().filter(|(_, t)| possible(t) && error(t) <= resolution);
+            if let (Some((index, _)), None) = (fitting.next(), fitting.next()) {
+                return Some((index, true));
+            }
+        }
+        // A number out of order belongs to a late picture: its time says nothing, its number does.
+        if let Some((sequence, behind)) = self.sequence_of(clues) {
+            let found = triggers.iter().position(|t| u64::from(t.sequence) == sequence && possible(t));
+            if behind {
+                return found.map(|index| (index, true));
+            }
+            if let (Some(index), Some((timed, ..))) = (found, by_time)
+                && index == timed
+            {
+                return Some((index, true));
+            }
+        }
+        let (index, off, latency) = by_time?;
+        let certain = self.matches > 2 && off < 3.0 * self.spread_ns && latency >= 0;
+        Some((index, certain))
+    }
+
+    /// The sequence that the picture's number stands for, and whether it lies behind the last one matched.
+    fn sequence_of(&self, clues: &PictureClues) -> Option<(u64, bool)> {
+        let (last, trigger) = self.last.as_ref()?;
+        let (number, last) = (clues.number?, last.number?);
+        if self.number_held < BELIEVED || self.stride == 0 || number.abs_diff(last) % self.stride != 0 {
+            return None;
+        }
+        let steps = number.abs_diff(last) / self.stride;
+        let sequence = u64::from(trigger.sequence);
+        if number < last { Some((sequence.checked_sub(steps)?, true)) } else { Some((sequence + steps, false)) }
+    }
+
+    pub(super) fn learn(&mut self, clues: &PictureClues, trigger: &Trigger, late: bool) {
+        if late {
+            return; // its latency is no measure, its number is behind
+        }
+        let latency = clues.arrived_ns as f64 - trigger.time_ns as f64;
+        self.matches += 1;
+        let blend = if self.matches == 1 { 1.0 } else { BLEND };
+        let error = latency - self.latency_ns;
+        self.latency_ns += blend * error;
+        let spread = if self.matches == 1 { FIRST_SPREAD_NS / 2.0 } else { error.abs() };
+        self.spread_ns = (self.spread_ns + blend * (spread - self.spread_ns)).max(LEAST_SPREAD_NS);
+
+        if let (Some(a), Some((last, b))) = (clues.number, &self.last)
+            && let Some(last) = last.number
+        {
+            let (steps, sequences) = (a.saturating_sub(last), u64::from(trigger.sequence.saturating_sub(b.sequence)));
+            let stride = if sequences > 0 && steps % sequences == 0 { steps / sequences } else { 0 };
+            let holds = stride > 0 && (stride == self.stride || self.number_held == 0);
+            self.number_held =
+                if holds { (self.number_held + 1).min(BELIEVED + 2) } else { self.number_held.saturating_sub(2) };
+            if self.number_held <= 1 {
+                self.stride = stride;
+            }
+        }
+        if let Some(camera_ns) = clues.camera_ns {
+            let offset = i128::from(camera_ns) - i128::from(trigger.boot_ns);
+            let resolution = clues.camera_resolution_ns.max(50_000_000) as i128;
+            let error = offset - self.camera_offset_ns;
+            if self.camera_held > 0 && error.abs() <= resolution {
+                self.camera_held = (self.camera_held + 1).min(BELIEVED + 2);
+                // A clock cut to whole seconds is on average half of one behind.
+                self.camera_offset_ns += error / 8;
+            } else if self.camera_held <= 1 {
+                self.camera_offset_ns = offset;
+                self.camera_held = 1;
+            } else {
+                self.camera_held -= 1;
+            }
+        }
+        self.last = Some((*clues, *trigger));
+    }
+}

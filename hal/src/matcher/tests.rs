@@ -1,0 +1,124 @@
+//! The matcher's promises, on exposures every two seconds with pictures 0.4 s later.
+
+use std::vec::Vec;
+
+use super::*;
+use crate::trigger::TriggerKind;
+
+const S: u64 = 1_000_000_000;
+const MS: u64 = 1_000_000;
+
+fn trigger(i: u32) -> Trigger {
+    let boot_ns = (100 + 2 * u64::from(i)) * S;
+    Trigger { sequence: i, boot_ns, time_ns: boot_ns - 90 * S, sigma_ns: MS, kind: TriggerKind::Feedback }
+}
+
+/// One picture: of which exposure, at which delay, with which number.
+#[derive(Clone, Copy)]
+struct Shot {
+    of: u32,
+    delay_ms: u64,
+    number: Option<u64>,
+    camera: bool,
+}
+
+fn shots(n: u32) -> Vec<Shot> {
+    (1..=n).map(|of| Shot { of, delay_ms: 400, number: Some(1000 + 2 * u64::from(of)), camera: false }).collect()
+}
+
+/// Plays exposures (except `unannounced`) and shots in order of time; returns what was matched and what stayed alone.
+fn play(n: u32, shots: &[Shot], unannounced: &[u32]) -> (Vec<(u32, u32)>, Vec<Reason>) {
+    let mut matcher = Matcher::new(MatcherSettings::default());
+    let (mut matched, mut alone) = (Vec::new(), Vec::new());
+    let mut take = |outcome| match outcome {
+        Outcome::Matched { trigger, picture, .. } => matched.push((trigger.sequence, picture)),
+        Outcome::Picture { reason, .. } | Outcome::Trigger { reason, .. } => alone.push(reason),
+    };
+    for now in (0..(2 * u64::from(n) + 40) * 10).map(|tick| 10 * S + tick * 100 * MS) {
+        for t in (1..=n).map(trigger).filter(|t| t.time_ns / (100 * MS) == now / (100 * MS)) {
+            if !unannounced.contains(&t.sequence) {
+                matcher.push_trigger(t).map(&mut take);
+            }
+        }
+        for shot in shots {
+            let arrived_ns = trigger(shot.of).time_ns + shot.delay_ms * MS;
+            if arrived_ns / (100 * MS) == now / (100 * MS) {
+                let camera_ns = shot.camera.then(|| (trigger(shot.of).boot_ns + 7777 * S) / S * S);
+                let clues = PictureClues { arrived_ns, number: shot.number, camera_ns, camera_resolution_ns: S };
+                matcher.push_picture(clues, shot.of).map(&mut take);
+            }
+        }
+        while let Some(outcome) = matcher.poll(now) {
+            take(outcome);
+        }
+    }
+    while let Some(outcome) = matcher.flush() {
+        take(outcome);
+    }
+    (matched, alone)
+}
+
+fn all_right(matched: &[(u32, u32)]) -> bool {
+    matched.iter().all(|(exposure, picture)| exposure == picture)
+}
+
+#[test]
+fn every_picture_finds_its_exposure() {
+    let (matched, alone) = play(40, &shots(40), &[]);
+    assert!(matched.len() == 40 && all_right(&matched) && alone.is_empty(), "{matched:?} {alone:?}");
+}
+
+#[test]
+fn a_skipped_exposure_does_not_shift_the_following_pictures() {
+    // The camera did not fire for 9 and 20; its numbers go on without a gap.
+    let mut shots = shots(40);
+    shots.retain(|s| s.of != 9 && s.of != 20);
+    for (i, shot) in shots.iter_mut().enumerate() {
+        shot.number = Some(500 + i as u64);
+    }
+    let (matched, alone) = play(40, &shots, &[]);
+    assert!(matched.len() == 38 && all_right(&matched), "{matched:?}");
+    assert_eq!(alone, [Reason::NoPicture; 2]);
+}
+
+#[test]
+fn a_late_picture_is_found_by_its_number() {
+    let mut shots = shots(40);
+    shots[11].delay_ms = 6_900;
+    shots[25].delay_ms = 4_500;
+    let (matched, alone) = play(40, &shots, &[]);
+    assert!(matched.len() == 40 && all_right(&matched) && alone.is_empty(), "{matched:?} {alone:?}");
+}
+
+#[test]
+fn a_late_picture_without_a_number_is_found_by_the_cameras_clock() {
+    let mut shots = shots(40);
+    shots[11].delay_ms = 6_900;
+    shots.iter_mut().for_each(|s| (s.number, s.camera) = (None, true));
+    let (matched, _) = play(40, &shots, &[]);
+    assert!(matched.len() == 40 && all_right(&matched), "{matched:?}");
+}
+
+#[test]
+fn a_duplicate_is_known_and_a_lost_announcement_costs_its_picture_only() {
+    let mut shots = shots(30);
+    shots.push(Shot { delay_ms: 900, ..shots[14] });
+    let (matched, alone) = play(30, &shots, &[20]);
+    assert!(matched.len() == 29 && all_right(&matched), "{matched:?}");
+    assert_eq!(alone, [Reason::Duplicate, Reason::NoTrigger]);
+}
+
+#[test]
+fn a_flood_is_bounded_and_every_piece_accounted_for() {
+    let mut matcher = Matcher::new(MatcherSettings::default());
+    let mut out = 0;
+    for i in 0..1000 {
+        out += usize::from(matcher.push_trigger(trigger(i)).is_some());
+        let clues = PictureClues { arrived_ns: 900_000 * S, ..PictureClues::default() };
+        out += usize::from(matcher.push_picture(clues, i).is_some());
+    }
+    while matcher.flush().is_some() {
+        out += 1;
+    }
+    assert_eq!(out, 2000);
+}

@@ -1,0 +1,185 @@
+//! Frames over a link: what a simulator, a test or the vehicle driver needs to talk MAVLink, signing included.
+
+use std::time::Duration;
+
+use super::{Encoder, Frame, FrameCounters, Framer, MessageData, Refusal, Signer};
+use crate::error::{Error, ErrorKind};
+use crate::traits::Link;
+
+/// What happened on a channel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ChannelCounters {
+    /// What the framer met.
+    pub frames: FrameCounters,
+    /// Frames sent.
+    pub sent: u64,
+    /// Frames the link would not take.
+    pub send_failed: u64,
+    /// Unsigned frames refused.
+    pub unsigned: u64,
+    /// Frames with a wrong signature.
+    pub wrong_key: u64,
+    /// Frames whose signing time stamp did not grow.
+    pub replayed: u64,
+}
+
+/// MAVLink over one link.
+pub struct Channel<L: Link> {
+    link: L,
+    framer: Framer,
+    encoder: Encoder,
+    signer: Signer,
+    received_ns: Option<u64>,
+    counters: ChannelCounters,
+}
+
+impl<L: Link> Channel<L> {
+    /// A channel that sends as `system`, `component`.
+    pub fn new(link: L, system: u8, component: u8, signer: Signer) -> Self {
+        Self {
+            link,
+            framer: Framer::new(),
+            encoder: Encoder::new(system, component),
+            signer,
+            received_ns: None,
+            counters: ChannelCounters::default(),
+        }
+    }
+
+    /// The link below.
+    pub fn link(&self) -> &L {
+        &self.link
+    }
+
+    /// The link below, e.g. to write damaged bytes on purpose.
+    pub fn link_mut(&mut self) -> &mut L {
+        &mut self.link
+    }
+
+    /// Sends with these ids from now on.
+    pub fn set_ids(&mut self, system: u8, component: u8) {
+        if self.encoder.ids() != (system, component) {
+            self.encoder = Encoder::new(system, component);
+        }
+    }
+
+    /// Says that no more bytes will come; a last call of [`Channel::next_frame`] finds what half a frame was hiding.
+    pub fn end(&mut self) {
+        self.framer.end();
+    }
+
+    /// Forgets half a frame, for a link that was reopened.
+    pub fn resynchronise(&mut self) {
+        self.framer.reset();
+    }
+
+    /// The signing state.
+    pub fn signer_mut(&mut self) -> &mut Signer {
+        &mut self.signer
+    }
+
+    /// What happened so far.
+    pub fn counters(&self) -> ChannelCounters {
+        ChannelCounters { frames: self.framer.counters(), ..self.counters }
+    }
+
+    /// When the frame returned last was received, for recordings; `None` on live links.
+    pub fn received_ns(&self) -> Option<u64> {
+        self.received_ns
+    }
+
+    /// Reads what the link has, waiting `timeout` at most; true when something came. Then call [`Channel::next_frame`]
+    /// until it returns `None`.
+    ///
+    /// # Errors
+    /// The link's.
+    pub fn fill(&mut self, timeout: Duration) -> Result<bool, L::Error> {
+        let received = self.link.read(self.framer.space(), timeout)?;
+        self.framer.filled(received.bytes);
+        self.received_ns = received.time_ns;
+        Ok(received.bytes > 0)
+    }
+
+    /// The next good frame of what was read; refused ones are counted and passed over.
+    pub fn next_frame(&mut self) -> Option<Frame<'_>> {
+        // Two steps because a frame borrows the framer: first whether it is acceptable, then its bytes.
+        loop {
+            let verdict = self.signer.check(&self.framer.next_frame()?);
+            match verdict {
+                Ok(()) => return self.framer.last_frame(),
+                Err(Refusal::Unsigned) => self.counters.unsigned += 1,
+                Err(Refusal::WrongKey | Refusal::TooManyStreams) => self.counters.wrong_key += 1,
+                Err(Refusal::Replayed) => self.counters.replayed += 1,
+            }
+        }
+    }
+
+    /// Sends `message`. A link that is full drops the frame, counted; a lost one is the error.
+    ///
+    /// # Errors
+    /// The link's, except `ErrorKind::Busy`.
+    pub fn send<D: MessageData>(&mut self, message: &D) -> Result<(), L::Error> {
+        let frame = self.encoder.encode(message, Some(&mut self.signer));
+        match self.link.write(frame) {
+            Ok(()) => {
+                self.counters.sent += 1;
+                Ok(())
+            }
+            Err(e) => {
+                self.counters.send_failed += 1;
+                if e.kind() == ErrorKind::Busy { Ok(()) } else { Err(e) }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::link::{PtyLink, SerialLink};
+    use crate::mavlink::SigningMode;
+    use crate::mavlink::dialect::SYSTEM_TIME_DATA;
+
+    fn pair(near: Signer, far: Signer) -> (Channel<PtyLink>, Channel<SerialLink>) {
+        let pty = PtyLink::create(None).expect("a pty");
+        let serial = SerialLink::open(pty.path(), 921_600).expect("its far end");
+        (Channel::new(pty, 1, 1, near), Channel::new(serial, 1, 191, far))
+    }
+
+    fn count(channel: &mut Channel<impl Link>) -> usize {
+        let mut n = 0;
+        while channel.fill(Duration::from_millis(50)).is_ok_and(|some| some) {
+            while let Some(frame) = channel.next_frame() {
+                n += usize::from(frame.message::<SYSTEM_TIME_DATA>().is_some());
+            }
+        }
+        n
+    }
+
+    #[test]
+    fn a_pty_carries_frames_both_ways() {
+        let (mut near, mut far) = pair(Signer::off(), Signer::off());
+        for _ in 0..20 {
+            near.send(&SYSTEM_TIME_DATA::default()).expect("sent");
+            far.send(&SYSTEM_TIME_DATA::default()).expect("sent");
+        }
+        assert_eq!((count(&mut near), count(&mut far)), (20, 20));
+    }
+
+    #[test]
+    fn frames_signed_with_another_key_do_not_pass() {
+        let sign = |key| Signer::new(SigningMode::Require, [key; 32], 0, 5);
+        let (mut near, mut far) = pair(sign(1), sign(2));
+        near.send(&SYSTEM_TIME_DATA::default()).expect("sent");
+        assert_eq!((count(&mut far), far.counters().wrong_key), (0, 1));
+    }
+
+    #[test]
+    fn a_line_nobody_reads_drops_frames_instead_of_blocking() {
+        let (mut near, _far) = pair(Signer::off(), Signer::off());
+        for _ in 0..10_000 {
+            near.send(&SYSTEM_TIME_DATA::default()).expect("dropped, not failed");
+        }
+        assert!(near.counters().send_failed > 0);
+    }
+}

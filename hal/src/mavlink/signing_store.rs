@@ -1,0 +1,126 @@
+//! The signing key from its file, and the time stamp kept beside it: signing time stamps must never go back, also over a
+//! restart on a computer without a battery-backed clock.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use config::link::{LinkSettings, Signing};
+
+use super::signing::{Signer, SigningMode, timestamp_of_unix_us};
+use crate::error::HalError;
+
+/// The stored time stamp is this far ahead of the one in use, so that it is written once a minute and still never
+/// reused after a crash. 10 µs ticks.
+const RESERVE: u64 = 60 * 100_000;
+
+/// Keeps the time stamp.
+pub struct SigningStore {
+    path: PathBuf,
+    stored: u64,
+}
+
+/// The signer that the settings ask for, and the keeper of its time stamp.
+///
+/// # Errors
+/// [`HalError::Signing`] when signing is asked for and the key is missing or not a key.
+pub fn open(settings: &LinkSettings) -> Result<(Signer, Option<SigningStore>), HalError> {
+    let mode = match settings.signing {
+        Signing::Off => return Ok((Signer::off(), None)),
+        Signing::Accept => SigningMode::Accept,
+        Signing::Require => SigningMode::Require,
+    };
+    let Some(path) = &settings.signing_key else {
+        let why = "link.signing is on but link.signing_key names no key file".into();
+        return Err(HalError::Signing { path: "link.signing_key".into(), why });
+    };
+    let key = read_key(path)?;
+    let mut name = path.clone().into_os_string();
+    name.push(".timestamp");
+    let mut store = SigningStore { path: name.into(), stored: 0 };
+    store.stored = store.read()?;
+    let now_us = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_micros() as u64);
+    let start = store.stored.max(timestamp_of_unix_us(now_us));
+    let mut signer = Signer::new(mode, key, settings.own_component, start);
+    store.keep(&mut signer)?;
+    Ok((signer, Some(store)))
+}
+
+fn read_key(path: &Path) -> Result<[u8; 32], HalError> {
+    let wrong = |why: String| HalError::Signing { path: path.into(), why };
+    let bytes = std::fs::read(path).map_err(|e| wrong(e.to_string()))?;
+    if let Ok(key) = <[u8; 32]>::try_from(bytes.as_slice()) {
+        return Ok(key);
+    }
+    let digits: Vec<u32> = bytes.trim_ascii().iter().map_while(|b| char::from(*b).to_digit(16)).collect();
+    let pairs: Vec<u8> = digits.chunks_exact(2).map(|d| (d[0] * 16 + d[1]) as u8).collect();
+    match <[u8; 32]>::try_from(pairs) {
+        Ok(key) if bytes.trim_ascii().len() == 64 => Ok(key),
+        _ => Err(wrong(format!("{} bytes; a key is 32 bytes or 64 hexadecimal digits", bytes.len()))),
+    }
+}
+
+impl SigningStore {
+    fn read(&self) -> Result<u64, HalError> {
+        let wrong = |why: String| HalError::Signing { path: self.path.clone(), why };
+        match std::fs::read_to_string(&self.path) {
+            Ok(text) => text.trim().parse().map_err(|_| wrong("not a time stamp; delete it to start afresh".into())),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(0),
+            Err(e) => Err(wrong(e.to_string())),
+        }
+    }
+
+    /// Writes the time stamp when the reserve is used up.
+    ///
+    /// # Errors
+    /// [`HalError::Signing`] when it cannot be written.
+    pub fn keep(&mut self, signer: &mut Signer) -> Result<(), HalError> {
+        if signer.timestamp() < self.stored {
+            return Ok(());
+        }
+        let stamp = signer.timestamp() + RESERVE;
+        let folder = self.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let write = || -> std::io::Result<()> {
+            let mut file = tempfile::NamedTempFile::new_in(folder)?;
+            writeln!(file, "{stamp}")?;
+            file.as_file().sync_all()?;
+            file.persist(&self.path)?;
+            Ok(())
+        };
+        write().map_err(|e| HalError::Signing { path: self.path.clone(), why: e.to_string() })?;
+        self.stored = stamp;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(key: &Path) -> LinkSettings {
+        LinkSettings { signing: Signing::Require, signing_key: Some(key.into()), ..LinkSettings::default() }
+    }
+
+    #[test]
+    fn the_time_stamp_never_goes_back_over_a_restart() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let key = folder.path().join("key");
+        std::fs::write(&key, [7; 32]).expect("written");
+        let (first, _) = open(&settings(&key)).expect("opens");
+        let (second, _) = open(&settings(&key)).expect("opens");
+        assert!(second.timestamp() >= first.timestamp() + RESERVE);
+    }
+
+    #[test]
+    fn keys_are_read_raw_or_in_hexadecimal_and_nothing_else() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let key = folder.path().join("key");
+        std::fs::write(&key, "0a".repeat(32) + "\n").expect("written");
+        assert_eq!(read_key(&key).expect("a key"), [10; 32]);
+        std::fs::write(&key, "secret").expect("written");
+        let error = open(&settings(&key)).err().expect("refused").to_string();
+        assert!(error.contains("64 hexadecimal digits"), "{error}");
+        let error = open(&settings(&folder.path().join("none"))).err().expect("refused").to_string();
+        assert!(error.contains("none"), "{error}");
+    }
+}

@@ -1,0 +1,155 @@
+//! What stands in for reality: a ray-cast world, an aircraft that flies over it and speaks MAVLink, and the faults
+//! of both. Everything follows from a seed.
+
+pub mod aircraft;
+pub mod autopilot;
+pub mod axes;
+mod dice;
+mod error;
+pub mod faulty_link;
+mod messages;
+pub mod photographer;
+pub mod reference;
+pub mod session;
+pub mod survey;
+pub mod track;
+pub mod world;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use config::geodesy::Geodetic;
+use glam::DVec2;
+
+pub use error::SimError;
+pub(crate) use messages::heartbeat;
+pub use session::{SessionReport, SessionSettings};
+
+use crate::link::LinkAddress;
+use aircraft::{Flight, Imperfections};
+use autopilot::{Autopilot, AutopilotSettings};
+use photographer::{Photographer, to_jpeg, write_whole};
+use reference::{Lens, flown_views};
+use survey::SurveySettings;
+use world::{World, WorldSettings};
+
+/// One simulated aircraft over one world.
+#[derive(Clone, Debug)]
+pub struct SimSettings {
+    /// Seed of the world; aircraft of one mission share it.
+    pub world_seed: u64,
+    /// Seed of the flight and of the faults.
+    pub seed: u64,
+    /// Size and contents of the world.
+    pub world: WorldSettings,
+    /// Origin of the ENU frame.
+    pub origin: Geodetic,
+    /// The lens.
+    pub lens: Lens,
+    /// Corners of the region to fly, metres east and north.
+    pub region: Vec<[f64; 2]>,
+    /// How it is flown.
+    pub survey: SurveySettings,
+    /// What is not as it should be.
+    pub imperfections: Imperfections,
+    /// Ids, clocks, signing and faults; its seed and clock drift are taken from here.
+    pub autopilot: AutopilotSettings,
+    /// Speed and waiting.
+    pub session: SessionSettings,
+    /// Start of the pictures' names.
+    pub prefix: String,
+}
+
+impl SimSettings {
+    /// The flight these settings lead to.
+    ///
+    /// # Errors
+    /// [`SimError::Settings`] when region, survey or lens allow none.
+    pub fn flight(&self) -> Result<Flight, SimError> {
+        let wrong = |what, why: String| Err(SimError::Settings { what, why });
+        let (lens, survey) = (&self.lens, &self.survey);
+        if lens.width == 0 || lens.height == 0 || !(lens.fx > 0.0 && lens.fy > 0.0) {
+            return wrong("lens", "width, height, fx and fy must be positive".into());
+        }
+        if !(survey.height_m > 0.0 && survey.height_m < 10_000.0 && survey.speed_ms > 0.1 && survey.speed_ms < 100.0) {
+            return wrong("survey", "height must be 0..10000 m and speed 0.1..100 m/s".into());
+        }
+        if !(0.0..1.0).contains(&survey.forward_overlap) || !(0.0..1.0).contains(&survey.side_overlap) {
+            return wrong("survey", "overlaps must be at least 0 and below 1".into());
+        }
+        let region: Vec<DVec2> = self.region.iter().map(|c| DVec2::from(*c)).collect();
+        let footprint = DVec2::new(f64::from(lens.width) / lens.fx, f64::from(lens.height) / lens.fy) * survey.height_m;
+        aircraft::fly(self.origin, &region, footprint, survey, &self.imperfections, &self.prefix, self.seed).ok_or_else(
+            || SimError::Settings { what: "region", why: "needs at least three corners around an area".into() },
+        )
+    }
+}
+
+/// Simulates one flight on `address`: MAVLink there, pictures into `camera_dir` at their time, and, with
+/// `reference_dir`, the truth as a data set with held-out views.
+///
+/// `on_ready` is told the path of the pseudo-terminal for `pty:` (else `None`) before anything is sent; `stop` ends
+/// the simulation early and cleanly.
+///
+/// # Errors
+/// Settings without a flight, a link or folder that cannot be used.
+pub fn run(
+    settings: &SimSettings,
+    address: &LinkAddress,
+    camera_dir: &Path,
+    reference_dir: Option<&Path>,
+    stop: &AtomicBool,
+    on_ready: &mut dyn FnMut(Option<&Path>),
+) -> Result<SessionReport, SimError> {
+    settings.session.check()?;
+    let flight = settings.flight()?;
+    let link = session::open(address, settings.seed, on_ready)?;
+    let world = Arc::new(World::new(settings.world_seed, &settings.world));
+    let camera = camera_over(world, &flight, &settings.lens, camera_dir, reference_dir, settings.seed)?;
+    let autopilot = AutopilotSettings {
+        seed: settings.seed,
+        clock_drift_ppm: settings.imperfections.clock_drift_ppm,
+        ..settings.autopilot.clone()
+    };
+    session::fly(Autopilot::new(link, flight, autopilot), Some(camera), &settings.session, stop)
+}
+
+/// A camera that renders a flight's true views of `world`.
+pub(crate) fn camera_over(
+    world: Arc<World>,
+    flight: &Flight,
+    lens: &Lens,
+    camera_dir: &Path,
+    reference_dir: Option<&Path>,
+    seed: u64,
+) -> Result<Photographer, SimError> {
+    let views = flown_views(flight, lens);
+    let names: Vec<String> = flight.exposures.iter().map(|e| e.name.clone()).collect();
+    let origin = flight.origin;
+    let images = reference_dir.map(|d| d.join("images"));
+    if let Some(folder) = &images {
+        std::fs::create_dir_all(folder).map_err(|source| SimError::Folder { path: folder.clone(), source })?;
+    }
+    let reference = reference_dir.map(Path::to_path_buf);
+    let (later_world, later_views, later_names) = (Arc::clone(&world), views.clone(), names.clone());
+    let picture = move |index: usize| {
+        let bytes = to_jpeg(&world.render(&views[index]).0)?;
+        if let Some(folder) = &images {
+            write_whole(&folder.join(&names[index]), &bytes)?;
+        }
+        Ok(bytes)
+    };
+    let afterwards = move |quit: &AtomicBool| match reference {
+        Some(folder) => reference::complete(&folder, &later_world, origin, &later_names, &later_views, quit),
+        None => Ok(()),
+    };
+    Photographer::new(camera_dir, flight.exposures.clone(), seed, picture, afterwards)
+}
+
+#[cfg(test)]
+mod fault_table;
+#[cfg(test)]
+pub(crate) mod listener;
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,270 @@
+//! A multirotor flying a survey, computed before take-off: what really happened (truth) and what its sensors make
+//! of it (reported). Wind, gimbal, GPS and shutter are wrong in the ways real ones are; all of it follows from the seed.
+
+use config::geodesy::Geodetic;
+use glam::{DQuat, DVec2, DVec3};
+use rand::{Rng, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use super::survey::{SurveySettings, lines};
+use super::track::{Sample, Track};
+use crate::frames::{euler_to_ned, ned_to_enu};
+
+/// Time step of the simulation, seconds.
+const STEP: f64 = 0.02;
+/// Standing still at both ends of the flight, seconds.
+const HOVER: f64 = 3.0;
+/// Acceleration along the path, m/s² (ArduCopter's WPNAV_ACCEL is 2.5).
+const ACCELERATION: f64 = 2.5;
+/// Longest flight simulated, seconds.
+const LONGEST: f64 = 3600.0;
+/// Acceleration by gravity, m/s².
+const GRAVITY: f64 = 9.81;
+
+/// One standard deviation of everything that is not as it should be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Imperfections {
+    /// Mean wind towards east and north, m/s.
+    pub wind_ms: [f64; 2],
+    /// Gusts, m/s.
+    pub gust_ms: f64,
+    /// Slowly wandering GPS error, horizontal, metres (vertical is 1.5 times as much).
+    pub gps_bias_m: f64,
+    /// Fast position noise after the autopilot's filter, metres.
+    pub gps_noise_m: f64,
+    /// Attitude estimate, roll and pitch, degrees.
+    pub attitude_noise_deg: f64,
+    /// Constant error of the compass heading, degrees.
+    pub yaw_bias_deg: f64,
+    /// How far the gimbal strays from its set angle (reported truly), degrees.
+    pub gimbal_stray_deg: f64,
+    /// Autopilot's clock against the companion's, parts per million.
+    pub clock_drift_ppm: f64,
+    /// From the trigger to the middle of the exposure, milliseconds.
+    pub shutter_delay_ms: f64,
+    /// Its scatter, milliseconds.
+    pub shutter_jitter_ms: f64,
+    /// From the exposure to the finished file, milliseconds.
+    pub transfer_ms: f64,
+}
+
+impl Default for Imperfections {
+    fn default() -> Self {
+        Self {
+            wind_ms: [2.0, 1.0],
+            gust_ms: 1.0,
+            gps_bias_m: 0.5,
+            gps_noise_m: 0.05,
+            attitude_noise_deg: 0.4,
+            yaw_bias_deg: 1.0,
+            gimbal_stray_deg: 0.3,
+            clock_drift_ppm: 20.0,
+            shutter_delay_ms: 60.0,
+            shutter_jitter_ms: 3.0,
+            transfer_ms: 250.0,
+        }
+    }
+}
+
+impl Imperfections {
+    /// An aircraft that measures everything exactly.
+    pub fn none() -> Self {
+        Self {
+            wind_ms: [0.0; 2],
+            gust_ms: 0.0,
+            gps_bias_m: 0.0,
+            gps_noise_m: 0.0,
+            attitude_noise_deg: 0.0,
+            yaw_bias_deg: 0.0,
+            gimbal_stray_deg: 0.0,
+            clock_drift_ppm: 0.0,
+            shutter_delay_ms: 0.0,
+            shutter_jitter_ms: 0.0,
+            transfer_ms: 50.0,
+        }
+    }
+}
+
+/// One picture to be taken.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Exposure {
+    /// When the autopilot triggers, seconds of flight.
+    pub trigger_s: f64,
+    /// Middle of the exposure, seconds of flight.
+    pub middle_s: f64,
+    /// When the file is complete, seconds of flight.
+    pub ready_s: f64,
+    /// File name.
+    pub name: String,
+}
+
+/// A whole flight.
+#[derive(Clone, Debug)]
+pub struct Flight {
+    /// Origin of the ENU frame of both tracks; the aircraft's home.
+    pub origin: Geodetic,
+    /// What happened.
+    pub truth: Track,
+    /// What the autopilot believes.
+    pub reported: Track,
+    /// Pictures in order.
+    pub exposures: Vec<Exposure>,
+}
+
+/// Noise that forgets with a time constant (Ornstein–Uhlenbeck), on three axes.
+struct Wander {
+    value: DVec3,
+    sigma: f64,
+    keep: f64,
+}
+
+impl Wander {
+    fn new(sigma: f64, time_constant_s: f64, random: &mut Pcg64Mcg) -> Self {
+        Self { value: normal3(random) * sigma, sigma, keep: (-STEP / time_constant_s).exp() }
+    }
+
+    fn step(&mut self, random: &mut Pcg64Mcg) -> DVec3 {
+        self.value = self.value * self.keep + normal3(random) * (self.sigma * (1.0 - self.keep * self.keep).sqrt());
+        self.value
+    }
+}
+
+/// A standard normal number (Box–Muller).
+fn normal(random: &mut Pcg64Mcg) -> f64 {
+    let (a, b): (f64, f64) = (random.random(), random.random());
+    (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+}
+
+fn normal3(random: &mut Pcg64Mcg) -> DVec3 {
+    DVec3::new(normal(random), normal(random), normal(random))
+}
+
+/// Flies a survey of `region` (corners in metres east and north of `origin`); `None` when it has no area.
+///
+/// `footprint`: see [`lines`]. Pictures are called `{prefix}0001.jpg` and so on.
+pub fn fly(
+    origin: Geodetic,
+    region: &[DVec2],
+    footprint: DVec2,
+    survey: &SurveySettings,
+    wrong: &Imperfections,
+    prefix: &str,
+    seed: u64,
+) -> Option<Flight> {
+    let lines = lines(region, footprint, survey);
+    let first = lines.first()?;
+    let random = &mut Pcg64Mcg::seed_from_u64(seed);
+    let mut gust = Wander::new(wrong.gust_ms, 2.0, random);
+    let mut bias = Wander::new(wrong.gps_bias_m, 150.0, random);
+    let mut noise = Wander::new(wrong.gps_noise_m, 1.0, random);
+    let mut tilt_error = Wander::new(wrong.attitude_noise_deg.to_radians(), 8.0, random);
+    let mut stray = Wander::new(wrong.gimbal_stray_deg.to_radians(), 0.8, random);
+    let yaw_bias = wrong.yaw_bias_deg.to_radians() * normal(random);
+    let mean_wind = DVec3::new(wrong.wind_ms[0], wrong.wind_ms[1], 0.0);
+    let height = survey.height_m;
+    let pitch = survey.gimbal_pitch_deg.to_radians();
+
+    // The legs alternate: a line with pictures, then the way to the next one.
+    let mut legs: Vec<(DVec2, DVec2, &[f64])> = Vec::new();
+    for (k, line) in lines.iter().enumerate() {
+        if k > 0 {
+            legs.push((lines[k - 1].to, line.from, &[]));
+        }
+        legs.push((line.from, line.to, &line.exposures));
+    }
+    let toward = |a: DVec2, b: DVec2| if (b - a).length() > 1e-6 { Some((b - a).normalize()) } else { None };
+    let mut yaw = toward(first.from, first.to).map_or(0.0, |d| d.x.atan2(d.y));
+
+    let (mut truth, mut reported, mut exposures) = (Vec::new(), Vec::new(), Vec::new());
+    let mut position = first.from.extend(height);
+    let mut velocity = DVec3::ZERO;
+    let (mut leg, mut progress, mut pace, mut shot) = (0, 0.0, 0.0, 0);
+    let mut after = 0.0;
+    for k in 0.. {
+        let time_s = k as f64 * STEP;
+        // The point the autopilot follows, slowing down before each corner.
+        let (from, to, shots) = legs.get(leg).copied().unwrap_or((legs[legs.len() - 1].0, legs[legs.len() - 1].1, &[]));
+        let length = (to - from).length();
+        let direction = toward(from, to).unwrap_or(DVec2::Y);
+        if leg < legs.len() && time_s > HOVER {
+            let limit = (2.0 * ACCELERATION * (length - progress).max(0.0)).sqrt() + 0.3;
+            pace = (pace + ACCELERATION * STEP).min(survey.speed_ms).min(limit);
+            progress += pace * STEP;
+        } else {
+            pace = 0.0;
+        }
+        let aim = (from + direction * progress.min(length)).extend(height);
+        let aim_velocity = (direction * pace).extend(0.0);
+        // Position controller (critically damped at 1.6 rad/s) against drag from wind and gusts.
+        let wind = mean_wind + gust.step(random);
+        let drag = 0.12 * (wind - velocity);
+        let wanted = (aim - position) * 2.56 + (aim_velocity - velocity) * 3.2;
+        let control = wanted.clamp_length_max(6.0) - 0.12 * (mean_wind - aim_velocity);
+        let acceleration = control + drag;
+        velocity += acceleration * STEP;
+        position += velocity * STEP;
+        // A multirotor leans the way its thrust must point; yaw follows the leg at 60°/s at most.
+        let heading = direction.x.atan2(direction.y);
+        let turn = (heading - yaw + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
+        yaw += turn.clamp(-1.05 * STEP, 1.05 * STEP);
+        let attitude = lean(control + DVec3::Z * GRAVITY, yaw);
+        let s = stray.step(random);
+        let gimbal = euler_to_ned(s.z, pitch + s.y, yaw + s.x);
+        truth.push(Sample { time_s, position, velocity, attitude, gimbal });
+
+        let e = tilt_error.step(random);
+        let error = DQuat::from_scaled_axis(DVec3::new(e.x, e.y, yaw_bias + 0.5 * e.z));
+        let (b, n) = (bias.step(random), noise.step(random));
+        let gps = DVec3::new(b.x + n.x, b.y + n.y, 1.5 * (b.z + n.z));
+        reported.push(Sample {
+            time_s,
+            position: position + gps,
+            velocity: velocity + 0.05 * n,
+            attitude: (error * attitude).normalize(),
+            gimbal: (error * gimbal).normalize(),
+        });
+
+        // Triggered by distance along the line, as CAM_TRIGG_DIST does.
+        while shot < shots.len() && (position.truncate() - from).dot(direction) >= shots[shot] {
+            let middle_s =
+                time_s + (wrong.shutter_delay_ms + wrong.shutter_jitter_ms * normal(random)).max(0.0) / 1000.0;
+            let name = format!("{prefix}{:04}.jpg", exposures.len() + 1);
+            exposures.push(Exposure {
+                trigger_s: time_s,
+                middle_s,
+                ready_s: middle_s + wrong.transfer_ms / 1000.0,
+                name,
+            });
+            shot += 1;
+        }
+        // The vehicle lags its aim: a leg ends when its last picture is taken.
+        if leg < legs.len() && progress >= length && (shot == shots.len() || (aim - position).length() < 0.05) {
+            (leg, progress, shot) = (leg + 1, 0.0, 0);
+        }
+        if leg >= legs.len() {
+            (leg, progress) = (legs.len(), length);
+            after += STEP;
+        }
+        if after > HOVER || time_s > LONGEST {
+            break;
+        }
+    }
+    Some(Flight { origin, truth: Track::new(truth)?, reported: Track::new(reported)?, exposures })
+}
+
+/// FRD → NED of a multirotor that pushes along `thrust` (ENU) with its nose towards `yaw`.
+fn lean(thrust: DVec3, yaw: f64) -> DQuat {
+    let down = -ned_to_enu(thrust).normalize();
+    let (sin, cos) = yaw.sin_cos();
+    // In the frame turned by yaw: down = (sin p cos r, −sin r, cos p cos r).
+    let (fx, fy, fz) = (cos * down.x + sin * down.y, -sin * down.x + cos * down.y, down.z);
+    euler_to_ned(-fy.clamp(-1.0, 1.0).asin(), fx.atan2(fz), yaw)
+}
+
+/// Angle between two attitudes, radians.
+pub fn angle_between(a: DQuat, b: DQuat) -> f64 {
+    2.0 * (a.conjugate() * b).xyz().length().min(1.0).asin()
+}
+
+#[cfg(test)]
+mod tests;

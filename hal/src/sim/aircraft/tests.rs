@@ -1,0 +1,67 @@
+//! Promises of the simulated flight.
+
+use super::*;
+
+fn pitch_roll(q: DQuat) -> (f64, f64) {
+    let (_, pitch, roll) = q.to_euler(glam::EulerRot::ZYX);
+    (pitch, roll)
+}
+
+const ORIGIN: Geodetic = Geodetic { lat_deg: 47.0, lon_deg: 8.0, alt_m: 400.0 };
+
+fn flight(wrong: &Imperfections, seed: u64) -> Flight {
+    let region = [DVec2::new(-30.0, -30.0), DVec2::new(30.0, -30.0), DVec2::new(30.0, 30.0), DVec2::new(-30.0, 30.0)];
+    fly(ORIGIN, &region, DVec2::new(50.0, 40.0), &SurveySettings::default(), wrong, "IMG_", seed).expect("a flight")
+}
+
+#[test]
+fn a_seed_fixes_the_flight_and_another_changes_it() {
+    let wrong = Imperfections::default();
+    let print = |f: &Flight| format!("{:?} {:?}", f.exposures, f.reported.at(33.3));
+    assert_eq!(print(&flight(&wrong, 1)), print(&flight(&wrong, 1)));
+    assert_ne!(print(&flight(&wrong, 1)), print(&flight(&wrong, 2)));
+}
+
+#[test]
+fn every_planned_picture_is_taken_on_its_line_at_height() {
+    let flight = flight(&Imperfections::default(), 5);
+    assert_eq!(flight.exposures.len(), 21);
+    for e in &flight.exposures {
+        let at = flight.truth.at(e.middle_s);
+        assert!((at.position.z - 40.0).abs() < 1.0 && at.position.truncate().abs().max_element() < 33.0, "{at:?}");
+        let across = at.position.x.min(at.position.y).abs();
+        assert!(across < 35.0 && e.middle_s > e.trigger_s && e.ready_s > e.middle_s);
+    }
+}
+
+#[test]
+fn a_perfect_aircraft_reports_the_truth_and_a_real_one_is_wrong_as_told() {
+    let perfect = flight(&Imperfections::none(), 1);
+    for k in 0..50 {
+        let (a, b) = (perfect.truth.at(f64::from(k)), perfect.reported.at(f64::from(k)));
+        assert!((a.position - b.position).length() < 1e-9 && angle_between(a.gimbal, b.gimbal) < 1e-7);
+    }
+    let wrong = Imperfections { gps_bias_m: 1.0, yaw_bias_deg: 2.0, ..Imperfections::default() };
+    let mut errors = Vec::new();
+    for seed in 0..20 {
+        let f = flight(&wrong, seed);
+        let (a, b) = (f.truth.at(30.0), f.reported.at(30.0));
+        errors
+            .push(((a.position - b.position).truncate().length(), angle_between(a.attitude, b.attitude).to_degrees()));
+    }
+    let mean = errors.iter().fold((0.0, 0.0), |s, e| (s.0 + e.0 / 20.0, s.1 + e.1 / 20.0));
+    assert!((0.5..2.5).contains(&mean.0) && (0.7..4.0).contains(&mean.1), "{mean:?}");
+}
+
+#[test]
+fn it_leans_into_the_wind_and_into_acceleration() {
+    let calm = flight(&Imperfections::none(), 1);
+    // Hovering in no wind is level; gaining speed lowers the nose.
+    let (pitch, roll) = pitch_roll(calm.truth.at(1.0).attitude);
+    assert!(pitch.abs() < 1e-6 && roll.abs() < 1e-6);
+    let (pitch, _) = pitch_roll(calm.truth.at(HOVER + 1.0).attitude);
+    assert!(pitch < -0.05, "{pitch}");
+    let windy = flight(&Imperfections { wind_ms: [0.0, 8.0], ..Imperfections::none() }, 1);
+    let thrust = windy.truth.at(1.0).attitude * DVec3::NEG_Z; // NED
+    assert!(thrust.x < -0.05, "wind towards north is met by leaning south: {thrust}");
+}

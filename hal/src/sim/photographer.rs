@@ -1,0 +1,237 @@
+//! The simulated camera: makes pictures ahead of time on a thread of its own and lets each file appear in the camera
+//! folder when it is due, whole (written under another name, then renamed), or spoiled as told.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::thread::JoinHandle;
+
+use config::faults::FaultSettings;
+use image::codecs::jpeg::JpegEncoder;
+use image::{ExtendedColorType, RgbImage};
+
+use super::aircraft::Exposure;
+use super::dice::{About, strikes};
+use super::error::SimError;
+
+/// Pictures made ahead of their time.
+const AHEAD: usize = 3;
+/// A picture this much after its time was made too slowly for the chosen speed, seconds of flight.
+const TARDY_S: f64 = 0.5;
+
+/// What was done with the pictures.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PictureCounters {
+    /// Files that appeared in the folder.
+    pub delivered: u64,
+    /// Not delivered.
+    pub lost: u64,
+    /// Delivered a second time.
+    pub twice: u64,
+    /// Held back.
+    pub late: u64,
+    /// Black or overexposed.
+    pub spoiled: u64,
+    /// Truncated.
+    pub cut: u64,
+    /// Made later than they were due, because this machine is too slow for the chosen speed.
+    pub tardy: u64,
+}
+
+struct Delivery {
+    due_s: f64,
+    name: String,
+    bytes: Vec<u8>,
+}
+
+/// A camera with its folder.
+pub struct Photographer {
+    folder: PathBuf,
+    exposures: Vec<Exposure>,
+    next: usize,
+    made: Receiver<Result<Vec<u8>, SimError>>,
+    held: Vec<Delivery>,
+    seed: u64,
+    counters: PictureCounters,
+    quit: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Photographer {
+    /// A camera that puts the pictures of `exposures` into `folder` (made if absent). `picture` makes the file of an
+    /// exposure by its index; it runs on a thread. `afterwards` runs there when all were taken, unless stopped before.
+    ///
+    /// # Errors
+    /// [`SimError::Folder`].
+    pub fn new(
+        folder: &Path,
+        exposures: Vec<Exposure>,
+        seed: u64,
+        mut picture: impl FnMut(usize) -> Result<Vec<u8>, SimError> + Send + 'static,
+        afterwards: impl FnOnce(&AtomicBool) -> Result<(), SimError> + Send + 'static,
+    ) -> Result<Self, SimError> {
+        std::fs::create_dir_all(folder).map_err(|source| SimError::Folder { path: folder.into(), source })?;
+        let (sender, made) = sync_channel(AHEAD);
+        let quit = Arc::new(AtomicBool::new(false));
+        let (count, quitting) = (exposures.len(), Arc::clone(&quit));
+        let thread = std::thread::spawn(move || {
+            for index in 0..count {
+                if quitting.load(Ordering::Relaxed) || sender.send(picture(index)).is_err() {
+                    return;
+                }
+            }
+            if let Err(e) = afterwards(&quitting) {
+                // The receiver may be gone already: then nobody wants to know.
+                let _ = sender.send(Err(e));
+            }
+        });
+        Ok(Self {
+            folder: folder.into(),
+            exposures,
+            next: 0,
+            made,
+            held: Vec::new(),
+            seed,
+            counters: PictureCounters::default(),
+            quit,
+            thread: Some(thread),
+        })
+    }
+
+    /// What was done so far.
+    pub fn counters(&self) -> PictureCounters {
+        self.counters
+    }
+
+    /// True when every picture was delivered, or was never meant to be.
+    pub fn done(&self) -> bool {
+        self.next == self.exposures.len() && self.held.is_empty()
+    }
+
+    /// Delivers what is due after `flight_s` seconds of flight.
+    ///
+    /// # Errors
+    /// A picture that could not be made or written.
+    pub fn deliver(&mut self, flight_s: f64, acting: &FaultSettings) -> Result<(), SimError> {
+        while let Some(exposure) = self.exposures.get(self.next).filter(|e| e.ready_s <= flight_s) {
+            let bytes = match self.made.try_recv() {
+                Ok(made) => made?,
+                Err(TryRecvError::Empty) => break,
+                Err(TryRecvError::Disconnected) => return Err(SimError::CameraStopped { made: self.next }),
+            };
+            let name = exposure.name.clone();
+            self.counters.tardy += u64::from(flight_s > exposure.ready_s + TARDY_S);
+            self.next += 1;
+            self.take(flight_s, name, bytes, acting)?;
+        }
+        let mut k = 0;
+        while k < self.held.len() {
+            if self.held[k].due_s <= flight_s {
+                let delivery = self.held.swap_remove(k);
+                self.write(&delivery.name, &delivery.bytes)?;
+            } else {
+                k += 1;
+            }
+        }
+        Ok(())
+    }
+
+    /// One picture, with what befalls it.
+    fn take(
+        &mut self,
+        flight_s: f64,
+        name: String,
+        mut bytes: Vec<u8>,
+        acting: &FaultSettings,
+    ) -> Result<(), SimError> {
+        let n = self.next as u64;
+        let seed = self.seed;
+        let befalls = |percent, about| strikes(percent, seed, about, 0, n);
+        if befalls(acting.picture_loss_pct, About::PictureLoss) {
+            self.counters.lost += 1;
+            return Ok(());
+        }
+        let black = befalls(acting.picture_black_pct, About::PictureBlack);
+        if black || befalls(acting.picture_over_pct, About::PictureOver) {
+            bytes = expose(&bytes, if black { 0.02 } else { 8.0 }, &name)?;
+            self.counters.spoiled += 1;
+        }
+        if befalls(acting.picture_cut_pct, About::PictureCut) {
+            bytes.truncate(bytes.len() / 2);
+            self.counters.cut += 1;
+        }
+        if befalls(acting.picture_twice_pct, About::PictureTwice) {
+            self.write(&copy_name(&name), &bytes)?;
+            self.counters.twice += 1;
+        }
+        if befalls(acting.picture_late_pct, About::PictureLate) {
+            self.held.push(Delivery { due_s: flight_s + f64::from(acting.picture_late_s), name, bytes });
+            self.counters.late += 1;
+            return Ok(());
+        }
+        self.write(&name, &bytes)
+    }
+
+    fn write(&mut self, name: &str, bytes: &[u8]) -> Result<(), SimError> {
+        write_whole(&self.folder.join(name), bytes)?;
+        self.counters.delivered += 1;
+        Ok(())
+    }
+
+    /// Waits for the thread; with `stop` it ends after the picture it is at.
+    ///
+    /// # Errors
+    /// What went wrong in the work after the last picture.
+    pub fn finish(mut self, stop: bool) -> Result<PictureCounters, SimError> {
+        self.quit.store(stop, Ordering::Relaxed);
+        // Empty the channel so that a thread waiting to send comes on.
+        let mut failed = None;
+        while let Ok(made) = self.made.recv() {
+            failed = failed.or(made.err());
+        }
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+        failed.map_or(Ok(self.counters), Err)
+    }
+}
+
+/// Name of a second delivery of a picture.
+fn copy_name(name: &str) -> String {
+    match name.rsplit_once('.') {
+        Some((stem, extension)) => format!("{stem}_copy.{extension}"),
+        None => format!("{name}_copy"),
+    }
+}
+
+/// Writes a file so that a reader of its folder sees it whole or not at all.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SimError> {
+    let failed = |source| SimError::Folder { path: path.into(), source };
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let mut file = tempfile::Builder::new().prefix(".").suffix(".part").tempfile_in(folder).map_err(failed)?;
+    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(failed)?;
+    file.persist(path).map_err(|e| failed(e.error))?;
+    Ok(())
+}
+
+/// A picture as a JPEG file of good quality.
+pub fn to_jpeg(picture: &RgbImage) -> Result<Vec<u8>, SimError> {
+    let mut bytes = Vec::new();
+    JpegEncoder::new_with_quality(&mut bytes, 93)
+        .encode(picture.as_raw(), picture.width(), picture.height(), ExtendedColorType::Rgb8)
+        .map_err(|e| SimError::Picture { name: "rendered picture".into(), why: e.to_string() })?;
+    Ok(bytes)
+}
+
+/// The same picture with its light multiplied.
+fn expose(bytes: &[u8], gain: f32, name: &str) -> Result<Vec<u8>, SimError> {
+    let mut picture = image::load_from_memory(bytes)
+        .map_err(|e| SimError::Picture { name: name.into(), why: e.to_string() })?
+        .to_rgb8();
+    for p in picture.iter_mut() {
+        *p = (f32::from(*p) * gain).min(255.0) as u8;
+    }
+    to_jpeg(&picture)
+}

@@ -1,0 +1,301 @@
+//! One aircraft as the runtime sees it: the generic driver over link, camera and clock. [`Vehicle::poll`] gives poses,
+//! exposures and posed pictures in order, on the companion's clock, in East-North-Up metres; everything lost on the way is
+//! counted and named.
+
+mod event;
+mod exposures;
+mod mount;
+mod service;
+mod settings;
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use config::geodesy::EnuFrame;
+use heapless::Deque;
+
+pub use event::{CameraPose, Event, Frame, PoseReport, Unmatched, UnmatchedReason};
+pub use settings::VehicleSettings;
+
+use crate::autopilot::{Autopilot, AutopilotState, Heard, Ids};
+use crate::camera::{AnyCamera, Picture};
+use crate::counters::HalCounters;
+use crate::error::HalError;
+use crate::failsafe::Flags;
+use crate::link::Reconnecting;
+use crate::matcher::{Matcher, MatcherSettings};
+use crate::mavlink::channel::Channel;
+use crate::time::MonotonicClock;
+use crate::traits::{Camera, Clock, Link, LinkState, TriggerSource};
+use exposures::{Exposures, PendingFrame};
+use mount::Mount;
+use service::Service;
+
+/// Events kept for a runtime that is busy; beyond it the oldest is dropped, counted.
+const EVENTS: usize = 256;
+/// Matched pictures waiting for their pose.
+const PENDING: usize = 32;
+/// The link is read in slices of this, so that pictures and timers are served while it is silent.
+const SLICE: Duration = Duration::from_millis(20);
+
+/// A position worse than this does not place a picture, m; that many exposures in a row without a picture mean a silent
+/// camera; and ArduPilot's customary low battery, percent.
+const POOR_SIGMA_M: f64 = 20.0;
+const SILENT_CAMERA: u32 = 3;
+const LOW_BATTERY: u8 = 20;
+
+/// The driver. `Vehicle` alone means the real thing: any link, any camera, the monotonic clock.
+pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
+    channel: Channel<L>,
+    camera: C,
+    clock: K,
+    recorded_ns: Option<u64>,
+    autopilot: Autopilot,
+    matcher: Matcher<Picture>,
+    exposures: Exposures,
+    pending: Deque<PendingFrame, PENDING>,
+    mount: Mount,
+    service: Service,
+    settings: VehicleSettings,
+    events: VecDeque<Event>,
+    lost: bool,
+    link_losses: u64,
+    texts: u16,
+    /// Exposures in a row without a picture.
+    pictureless: u32,
+    finished: bool,
+    counters: HalCounters,
+}
+
+impl Vehicle {
+    /// Opens the link and the camera. A serial port that is not there yet is waited for; an address or camera that can
+    /// never work is an error.
+    ///
+    /// # Errors
+    /// One line on the link, the camera or the signing key.
+    pub fn open(settings: &VehicleSettings) -> Result<Self, HalError> {
+        let link = Reconnecting::open(settings.address.clone(), settings.patient)?;
+        let camera = match &settings.camera {
+            Some(source) => AnyCamera::open(source, &settings.lens)?,
+            None => AnyCamera::None,
+        };
+        Self::new(link, camera, MonotonicClock::default(), settings)
+    }
+
+    /// The link's address and state, for messages.
+    pub fn link(&self) -> &Reconnecting {
+        self.channel.link()
+    }
+}
+
+impl<L, C, K> Vehicle<L, C, K>
+where
+    L: Link<Error = HalError>,
+    C: Camera<Picture = Picture, Error = HalError>,
+    K: Clock,
+{
+    /// A vehicle over these parts.
+    ///
+    /// # Errors
+    /// A signing key that cannot be read.
+    pub fn new(link: L, camera: C, clock: K, settings: &VehicleSettings) -> Result<Self, HalError> {
+        let ids = Ids { system: settings.system_id, autopilot: 1, own_component: settings.link.own_component };
+        let ns = |seconds: f32| (f64::from(seconds.max(0.0)) * 1e9) as u64;
+        let matching = MatcherSettings {
+            latency_ns: ns(settings.link.picture_latency_ms * 1e-3),
+            patience_ns: ns(settings.link.patience_s),
+            ..MatcherSettings::default()
+        };
+        let (service, signer) = Service::new(settings)?;
+        Ok(Self {
+            channel: Channel::new(link, ids.system, ids.own_component, signer),
+            camera,
+            clock,
+            recorded_ns: None,
+            autopilot: Autopilot::new(ids),
+            matcher: Matcher::new(matching),
+            exposures: Exposures::default(),
+            pending: Deque::new(),
+            mount: Mount::new(&settings.mount, EnuFrame::new(settings.origin)),
+            service,
+            settings: settings.clone(),
+            events: VecDeque::with_capacity(EVENTS),
+            lost: false,
+            link_losses: 0,
+            texts: 0,
+            pictureless: 0,
+            finished: false,
+            counters: HalCounters::default(),
+        })
+    }
+
+    /// The next event, waiting `timeout` at most for one.
+    ///
+    /// # Errors
+    /// Those of a link that does not reconnect by itself.
+    pub fn poll(&mut self, timeout: Duration) -> Result<Option<Event>, HalError> {
+        let deadline = Instant::now() + timeout;
+        loop {
+            if let Some(event) = self.events.pop_front() {
+                return Ok(Some(event));
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            self.receive(left.min(SLICE))?;
+            self.look_at_link();
+            let now_ns = self.now_ns();
+            self.serve(now_ns);
+            self.take_pictures(now_ns);
+            self.settle(now_ns);
+            if self.events.is_empty() && (left.is_zero() || self.finished) {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// The companion's clock as this vehicle sees it: a recording brings its own.
+    pub fn now_ns(&self) -> u64 {
+        self.recorded_ns.unwrap_or_else(|| self.clock.now_ns())
+    }
+
+    /// True once a recording is at its end and every picture and exposure is accounted for.
+    pub fn is_finished(&self) -> bool {
+        self.finished && self.events.is_empty()
+    }
+
+    /// True while the autopilot is silent or the link closed.
+    pub fn is_link_lost(&self) -> bool {
+        self.lost
+    }
+
+    /// What this side knows for the failsafe ladder: link, position, camera, battery. The runtime adds its own.
+    pub fn flags(&self) -> Flags {
+        let state = self.autopilot.state();
+        let sigma = self.autopilot.track().newest_position().map(|p| p.sigma_m.max_element());
+        Flags {
+            link_lost: self.lost && state.heartbeat_ns.is_some(),
+            position_poor: state.gps_fix.is_some_and(|fix| fix < 3) || sigma.is_some_and(|s| s > POOR_SIGMA_M),
+            camera_silent: self.pictureless >= SILENT_CAMERA,
+            battery_low: state.battery_percent.is_some_and(|p| p <= LOW_BATTERY),
+            ..Flags::default()
+        }
+    }
+
+    /// Pictures are posed by their own time: video, or an intervalometer that nobody announces.
+    fn is_free_running(&self) -> bool {
+        self.settings.link.free_running || self.camera.is_continuous()
+    }
+
+    /// What the autopilot says about itself.
+    pub fn autopilot(&self) -> AutopilotState {
+        self.autopilot.state()
+    }
+
+    /// Undistorted pixels of a frame.
+    ///
+    /// # Errors
+    /// [`HalError::Picture`] when it cannot be decoded or has the wrong size.
+    pub fn load(&self, frame: &Frame) -> Result<image::RgbImage, HalError> {
+        frame.picture.load(&self.settings.lens)
+    }
+
+    /// Everything counted so far.
+    pub fn counters(&self) -> HalCounters {
+        let (heard, wire) = (self.autopilot.counters(), self.channel.counters());
+        let own = self.counters;
+        HalCounters {
+            frames: wire.frames.frames,
+            damaged: wire.frames.damaged,
+            skipped_bytes: wire.frames.skipped_bytes,
+            unknown: wire.frames.unknown + wire.frames.unsupported,
+            unsigned: wire.unsigned,
+            wrong_key: wire.wrong_key,
+            replayed: wire.replayed,
+            sent: wire.sent,
+            send_failed: wire.send_failed,
+            triggers_unmatched: heard.triggers_unmatched + own.triggers_unmatched,
+            pictures: own.pictures,
+            pictures_broken: own.pictures_broken,
+            picture_duplicates: own.picture_duplicates,
+            pictures_unmatched: own.pictures_unmatched,
+            pictures_late: own.pictures_late,
+            poseless: own.poseless,
+            posed_frames: own.posed_frames,
+            exif_poses: own.exif_poses,
+            link_losses: self.link_losses,
+            events_dropped: own.events_dropped,
+            ..heard
+        }
+    }
+
+    fn receive(&mut self, wait: Duration) -> Result<(), HalError> {
+        self.channel.fill(wait)?;
+        self.recorded_ns = self.channel.received_ns().or(self.recorded_ns);
+        if self.channel.link().state() == LinkState::Ended {
+            self.channel.end();
+        }
+        self.hear();
+        Ok(())
+    }
+
+    fn hear(&mut self) {
+        let now_ns = self.now_ns();
+        while let Some(frame) = self.channel.next_frame() {
+            self.service.component.hear(&frame, self.autopilot.ids().system, now_ns);
+            if self.autopilot.hear(&frame, now_ns) == Heard::Position {
+                let report = self.mount.report(&self.autopilot, now_ns);
+                self.counters.events_dropped += push(&mut self.events, report.map(Event::Pose));
+            }
+        }
+    }
+
+    fn look_at_link(&mut self) {
+        let state = self.channel.link().state();
+        let silent = self.autopilot.state().heartbeat_ns.is_some_and(|t| {
+            let limit_ns = (f64::from(self.settings.link.heartbeat_timeout_s) * 1e9) as u64;
+            self.now_ns().saturating_sub(t) > limit_ns
+        });
+        let lost = silent || state != LinkState::Up;
+        if lost && !self.lost {
+            self.link_losses += u64::from(state != LinkState::Ended);
+            self.channel.resynchronise();
+            self.emit(Event::LinkLost);
+        } else if !lost && self.lost {
+            self.emit(Event::LinkBack);
+        }
+        self.lost = lost;
+        if state == LinkState::Ended && !self.finished {
+            self.finish();
+        }
+    }
+
+    fn emit(&mut self, event: Event) {
+        self.counters.events_dropped += push(&mut self.events, Some(event));
+    }
+
+    /// Announced exposures into the matcher and the list of poses to find.
+    fn take_triggers(&mut self, now_ns: u64) {
+        while let Some(trigger) = self.autopilot.next_trigger() {
+            let delay_ns = (f64::from(self.settings.lens.exposure_delay_ms) * 1e6) as i64;
+            self.exposures.push(trigger, trigger.boot_ns.saturating_add_signed(delay_ns), now_ns);
+            self.emit(Event::Trigger(trigger));
+            if self.is_free_running() {
+                self.service.hurry();
+            } else if let Some(outcome) = self.matcher.push_trigger(trigger) {
+                self.take_outcome(outcome, now_ns);
+            }
+        }
+    }
+}
+
+/// Adds an event, dropping the oldest when nobody fetches them; returns how many were dropped.
+fn push(events: &mut VecDeque<Event>, event: Option<Event>) -> u64 {
+    let Some(event) = event else { return 0 };
+    let full = events.len() >= EVENTS;
+    if full {
+        // Poses are the first to go: the next one says more.
+        let oldest_pose = events.iter().position(|e| matches!(e, Event::Pose(_))).unwrap_or(0);
+        events.remove(oldest_pose);
+    }
+    events.push_back(event);
+    u64::from(full)
+}

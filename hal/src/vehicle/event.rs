@@ -1,0 +1,116 @@
+//! What a vehicle reports.
+
+use std::path::PathBuf;
+
+use glam::{DQuat, DVec3};
+
+use crate::camera::Picture;
+use crate::matcher::Reason;
+use crate::pose::PoseError;
+use crate::trigger::Trigger;
+
+/// Something the runtime should know.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Event {
+    /// Where the aircraft is; about 10 a second.
+    Pose(PoseReport),
+    /// An exposure was announced.
+    Trigger(Trigger),
+    /// A picture with its pose.
+    Frame(Frame),
+    /// A picture or an exposure that will not become a frame.
+    Unmatched(Unmatched),
+    /// The autopilot is silent, or the link is closed; it is being reopened.
+    LinkLost,
+    /// The autopilot is heard again.
+    LinkBack,
+}
+
+/// Where the aircraft is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseReport {
+    /// Companion's clock, ns.
+    pub time_ns: u64,
+    /// East, north, up of the mission's origin, metres.
+    pub position: DVec3,
+    /// East, north, up, m/s.
+    pub velocity: DVec3,
+    /// Body (forward-left-up) → ENU.
+    pub rotation: DQuat,
+    /// One standard deviation east, north, up, metres.
+    pub position_sigma_m: [f32; 3],
+}
+
+/// Where the camera was at mid-exposure.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CameraPose {
+    /// Camera centre, east, north, up of the mission's origin, metres.
+    pub position: DVec3,
+    /// Camera (OpenCV axes) → ENU.
+    pub rotation: DQuat,
+    /// One standard deviation east, north, up, metres.
+    pub position_sigma_m: [f32; 3],
+    /// One standard deviation of rotation about the camera's x, y, z axes, radians.
+    pub rotation_sigma_rad: [f32; 3],
+}
+
+/// A picture with its pose.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Counter of the exposure's announcement.
+    pub sequence: u32,
+    /// Mid-exposure on the companion's clock, ns.
+    pub time_ns: u64,
+    /// Where the camera was.
+    pub pose: CameraPose,
+    /// Speed at the exposure, m/s.
+    pub speed_m_s: f32,
+    /// The picture, as it came; see [`Picture::load`] for undistorted pixels.
+    pub picture: Picture,
+}
+
+/// Why something did not become a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum UnmatchedReason {
+    /// Picture and exposure did not find each other.
+    Matching(Reason),
+    /// The track holds no usable pose for the exposure.
+    Pose(PoseError),
+    /// The mission's mount needs the gimbal's attitude and the autopilot does not report it.
+    NoGimbal,
+    /// More matched pictures waited for their pose than there is room for.
+    Overflow,
+}
+
+/// A picture or an exposure that will not become a frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Unmatched {
+    /// The exposure's counter, when there is one.
+    pub sequence: Option<u32>,
+    /// The picture's file, when there is one.
+    pub picture: Option<PathBuf>,
+    /// Why.
+    pub reason: UnmatchedReason,
+}
+
+impl std::fmt::Display for Unmatched {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match (&self.sequence, &self.picture) {
+            (Some(sequence), Some(picture)) => write!(f, "exposure {sequence} with {}", picture.display())?,
+            (Some(sequence), None) => write!(f, "exposure {sequence}")?,
+            (None, Some(picture)) => write!(f, "picture {}", picture.display())?,
+            (None, None) => write!(f, "picture")?,
+        }
+        f.write_str(match self.reason {
+            UnmatchedReason::Matching(Reason::NoTrigger) => ": no announced exposure",
+            UnmatchedReason::Matching(Reason::NoPicture) => ": no picture came",
+            UnmatchedReason::Matching(Reason::Duplicate) => ": the same picture again",
+            UnmatchedReason::Matching(Reason::Overflow) | UnmatchedReason::Overflow => ": too many waiting",
+            UnmatchedReason::Pose(PoseError::Empty) => ": no pose received yet",
+            UnmatchedReason::Pose(PoseError::NotYet) => ": the pose messages stopped before it",
+            UnmatchedReason::Pose(PoseError::TooOld) => ": older than the poses kept",
+            UnmatchedReason::Pose(PoseError::Gap) => ": pose messages too far apart",
+            UnmatchedReason::NoGimbal => ": no gimbal attitude (mount.attitude = \"fixed\" if there is no gimbal)",
+        })
+    }
+}

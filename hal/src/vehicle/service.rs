@@ -1,0 +1,174 @@
+//! What a vehicle does besides listening: heartbeats, TIMESYNC, STATUSTEXT, the MAVLink camera's answers, and the signing
+//! time stamp.
+
+use config::geodesy::{EnuFrame, Geodetic};
+
+use super::{CameraPose, Vehicle, VehicleSettings};
+use crate::camera::Picture;
+use crate::component::{CameraComponent, CameraInfo, Reply, Request};
+use crate::error::HalError;
+use crate::mavlink::channel::Channel;
+use crate::mavlink::dialect::{CAMERA_IMAGE_CAPTURED_DATA, MavBool, MavSeverity, MavType, STATUSTEXT_DATA};
+use crate::mavlink::signing_store::{self, SigningStore};
+use crate::mavlink::{MessageData, Signer};
+use crate::traits::{Camera, Clock, Link};
+
+/// Heartbeats at 1 Hz, as the protocol asks.
+const HEARTBEAT_NS: u64 = 1_000_000_000;
+/// TIMESYNC requests: fast until the mapping has settled, then at 1 Hz.
+const FAST_TIMESYNC_NS: u64 = 250_000_000;
+const SLOW_TIMESYNC_NS: u64 = 1_000_000_000;
+const FAST_REQUESTS: u32 = 16;
+/// The same complaint is logged this often at most.
+const COMPLAIN_EVERY_NS: u64 = 5_000_000_000;
+
+/// Timers and answers.
+pub(super) struct Service {
+    pub(super) component: CameraComponent,
+    store: Option<SigningStore>,
+    announces: bool,
+    next_heartbeat_ns: u64,
+    next_timesync_ns: u64,
+    requests: u32,
+    next_complaint_ns: u64,
+    last_free_ns: Option<u64>,
+}
+
+impl Service {
+    pub(super) fn new(settings: &VehicleSettings) -> Result<(Self, Signer), HalError> {
+        let (signer, store) = signing_store::open(&settings.link)?;
+        let info = CameraInfo { width: settings.lens.width, height: settings.lens.height };
+        let service = Self {
+            component: CameraComponent::new(info, settings.link.own_component),
+            store,
+            announces: settings.link.act_as_camera,
+            next_heartbeat_ns: 0,
+            next_timesync_ns: 0,
+            requests: 0,
+            next_complaint_ns: 0,
+            last_free_ns: None,
+        };
+        Ok((service, signer))
+    }
+
+    /// Says in the log that a picture or the camera failed, not more often than is useful.
+    pub(super) fn complain(&mut self, error: &HalError, now_ns: u64) {
+        if now_ns >= self.next_complaint_ns {
+            self.next_complaint_ns = now_ns + COMPLAIN_EVERY_NS;
+            tracing::warn!("{error}");
+        }
+    }
+
+    /// An exposure was announced or asked for: the next free-running picture is due whatever its time.
+    pub(super) fn hurry(&mut self) {
+        self.last_free_ns = None;
+    }
+
+    /// Whether a free-running picture at `time_ns` is far enough from the last one.
+    pub(super) fn is_due(&mut self, time_ns: u64, interval_ns: u64) -> bool {
+        let due = self.last_free_ns.is_none_or(|last| time_ns >= last.saturating_add(interval_ns));
+        if due {
+            self.last_free_ns = Some(time_ns);
+        }
+        due
+    }
+
+    /// A frame was posed: ground stations are told with CAMERA_IMAGE_CAPTURED.
+    pub(super) fn captured(&mut self, sequence: u32, mid_boot_ns: u64, pose: &CameraPose, origin: Geodetic) {
+        let at = EnuFrame::new(origin).to_geodetic(pose.position);
+        let nan = f32::NAN; // attitude unknown in the message's frame
+        self.component.captured(CAMERA_IMAGE_CAPTURED_DATA {
+            time_boot_ms: (mid_boot_ns / 1_000_000) as u32,
+            lat: (at.lat_deg * 1e7) as i32,
+            lon: (at.lon_deg * 1e7) as i32,
+            alt: (at.alt_m * 1e3) as i32,
+            relative_alt: (pose.position.z * 1e3) as i32,
+            q: [nan; 4],
+            image_index: sequence as i32,
+            capture_result: MavBool::MAV_BOOL_TRUE,
+            ..CAMERA_IMAGE_CAPTURED_DATA::default()
+        });
+    }
+}
+
+impl<L, C, K> Vehicle<L, C, K>
+where
+    L: Link<Error = HalError>,
+    C: Camera<Picture = Picture, Error = HalError>,
+    K: Clock,
+{
+    /// Tells the ground control station; long texts are sent in several chunks of 50 bytes.
+    pub fn status_text(&mut self, severity: MavSeverity, text: &str) {
+        let bytes = text.as_bytes();
+        let chunks = bytes.chunks(50).take(usize::from(u8::MAX));
+        // Chunks of one text share an id; 0 means that there is only one.
+        self.texts = if bytes.len() > 50 { self.texts.wrapping_add(1).max(1) } else { self.texts };
+        let id = if bytes.len() > 50 { self.texts } else { 0 };
+        for (chunk_seq, chunk) in chunks.enumerate() {
+            let mut padded = [0; 50];
+            padded[..chunk.len()].copy_from_slice(chunk);
+            let text = padded.into();
+            send(&mut self.channel, &STATUSTEXT_DATA { severity, text, id, chunk_seq: chunk_seq as u8 });
+        }
+    }
+
+    /// Timers and answers that are due.
+    pub(super) fn serve(&mut self, now_ns: u64) {
+        let system = self.autopilot.ids().system;
+        if system == 0 {
+            return; // nobody to talk to yet
+        }
+        self.channel.set_ids(system, self.settings.link.own_component);
+        while let Some(answer) = self.autopilot.next_answer() {
+            send(&mut self.channel, &answer);
+        }
+        if now_ns >= self.service.next_timesync_ns {
+            let every = if self.service.requests < FAST_REQUESTS { FAST_TIMESYNC_NS } else { SLOW_TIMESYNC_NS };
+            self.service.requests = self.service.requests.saturating_add(1);
+            self.service.next_timesync_ns = now_ns + every;
+            let request = self.autopilot.ask_time(now_ns);
+            send(&mut self.channel, &request);
+        }
+        if let Some(store) = &mut self.service.store
+            && let Err(e) = store.keep(self.channel.signer_mut())
+        {
+            self.service.complain(&e, now_ns);
+        }
+        if now_ns >= self.service.next_heartbeat_ns {
+            self.service.next_heartbeat_ns = now_ns + HEARTBEAT_NS;
+            let mut heartbeat = self.service.component.heartbeat();
+            if !self.service.announces {
+                heartbeat.mavtype = MavType::MAV_TYPE_ONBOARD_CONTROLLER;
+            }
+            send(&mut self.channel, &heartbeat);
+        }
+        if self.service.announces {
+            self.serve_camera(now_ns);
+        }
+    }
+
+    fn serve_camera(&mut self, now_ns: u64) {
+        while let Some(request) = self.service.component.next_request(now_ns) {
+            match request {
+                Request::Capture(sequence) => self.autopilot.announce_own(sequence, now_ns),
+            }
+        }
+        self.autopilot.settle_own(now_ns);
+        let boot_ms = self.autopilot.clock().to_boot_ns(now_ns).unwrap_or(now_ns) / 1_000_000;
+        while let Some(reply) = self.service.component.next_reply(boot_ms as u32, now_ns) {
+            match &reply {
+                Reply::Ack(m) => send(&mut self.channel, m),
+                Reply::Information(m) => send(&mut self.channel, m),
+                Reply::Settings(m) => send(&mut self.channel, m),
+                Reply::Storage(m) => send(&mut self.channel, m),
+                Reply::Status(m) => send(&mut self.channel, m),
+                Reply::Captured(m) => send(&mut self.channel, m),
+            }
+        }
+    }
+}
+
+/// Sends, or counts in the channel that it could not: a link that takes nothing is reported by its silence.
+fn send<L: Link, D: MessageData>(channel: &mut Channel<L>, message: &D) {
+    let _ = channel.send(message);
+}

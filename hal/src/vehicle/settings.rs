@@ -1,0 +1,48 @@
+//! What a vehicle needs of the mission.
+
+use config::geodesy::Geodetic;
+use config::link::LinkSettings;
+use config::mission::{Aircraft, CameraSettings, CameraSource, Mission, MountSettings};
+
+use crate::error::HalError;
+use crate::link::LinkAddress;
+
+/// One aircraft's part of the mission, as the HAL needs it.
+#[derive(Clone, Debug)]
+pub struct VehicleSettings {
+    /// Where the autopilot is.
+    pub address: LinkAddress,
+    /// Wait for a link that cannot be opened yet (a cable not plugged in) instead of refusing to start.
+    pub patient: bool,
+    /// Its MAVLink system id; 0 takes the first autopilot heard.
+    pub system_id: u8,
+    /// Link, signing and matching.
+    pub link: LinkSettings,
+    /// Where pictures come from; `None` = poses and triggers only.
+    pub camera: Option<CameraSource>,
+    /// The lens.
+    pub lens: CameraSettings,
+    /// How the camera sits on the airframe.
+    pub mount: MountSettings,
+    /// Origin of the ENU frame.
+    pub origin: Geodetic,
+}
+
+impl VehicleSettings {
+    /// The settings of one aircraft of a mission.
+    ///
+    /// # Errors
+    /// [`HalError::Address`] when its link cannot be understood.
+    pub fn from_mission(mission: &Mission, aircraft: &Aircraft) -> Result<Self, HalError> {
+        Ok(Self {
+            address: aircraft.link.parse()?,
+            patient: false,
+            system_id: aircraft.system_id,
+            link: mission.link.clone(),
+            camera: Some(aircraft.camera.clone()),
+            lens: mission.camera,
+            mount: mission.mount,
+            origin: mission.origin,
+        })
+    }
+}

@@ -1,0 +1,173 @@
+//! What a picture of the scene costs nothing to guess: the nearest training picture laid onto flat ground, and one
+//! colour everywhere. A model that does not clearly beat both has learnt nothing.
+
+use glam::{DQuat, DVec3};
+use image::RgbImage;
+use rayon::prelude::*;
+
+use crate::camera::{PosedImage, View};
+
+/// Mean colour of pictures, 0…1: accumulate with [`MeanColor::add`].
+#[derive(Clone, Copy, Debug, Default)]
+pub struct MeanColor {
+    sum: [u64; 3],
+    pixels: u64,
+}
+
+impl MeanColor {
+    /// Takes a picture in.
+    pub fn add(&mut self, image: &RgbImage) {
+        for p in image.pixels() {
+            for (sum, v) in self.sum.iter_mut().zip(p.0) {
+                *sum += u64::from(v);
+            }
+        }
+        self.pixels += u64::from(image.width()) * u64::from(image.height());
+    }
+
+    /// The mean; mid grey before any picture.
+    pub fn get(&self) -> [f32; 3] {
+        match self.pixels {
+            0 => [0.5; 3],
+            n => self.sum.map(|s| (s as f64 / n as f64 / 255.0) as f32),
+        }
+    }
+
+    /// A picture of `pixels` pixels of this colour, interleaved.
+    pub fn picture(&self, pixels: usize) -> Vec<f32> {
+        self.get().repeat(pixels)
+    }
+}
+
+/// Number of the view whose camera is nearest to `target`'s; the first one of equals. `None` without views.
+pub fn nearest_view(target: &View, views: &[View]) -> Option<usize> {
+    let distance = |v: &View| v.pose.center.distance_squared(target.pose.center);
+    (0..views.len()).min_by(|&a, &b| distance(&views[a]).total_cmp(&distance(&views[b])))
+}
+
+/// What `target` would see if the world were the plane z = 0 painted with `source`: interleaved RGB, 0…1. Pixels that
+/// see the sky, or ground outside the source picture, are `elsewhere`.
+pub fn warp_over_ground(source: &PosedImage, target: &View, elsewhere: [f32; 3]) -> Vec<f32> {
+    let (width, height) = (target.intrinsics.width as usize, target.intrinsics.height as usize);
+    let mut out = vec![0.0; 3 * width * height];
+    let ray = Ray::of(target);
+    let to_source = source.view.pose.rotation.conjugate();
+    out.par_chunks_mut(3 * width.max(1)).enumerate().for_each(|(y, row)| {
+        for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
+            let ground = ray.at_ground(x as f64 + 0.5, y as f64 + 0.5);
+            let color = ground.and_then(|p| sample(source, to_source * (p - source.view.pose.center)));
+            pixel.copy_from_slice(&color.unwrap_or(elsewhere));
+        }
+    });
+    out
+}
+
+struct Ray {
+    rotation: DQuat,
+    center: DVec3,
+    focal: (f64, f64),
+    principal: (f64, f64),
+}
+
+impl Ray {
+    fn of(view: &View) -> Self {
+        let k = &view.intrinsics;
+        Self {
+            rotation: view.pose.rotation,
+            center: view.pose.center,
+            focal: (k.fx.into(), k.fy.into()),
+            principal: (k.cx.into(), k.cy.into()),
+        }
+    }
+
+    fn at_ground(&self, u: f64, v: f64) -> Option<DVec3> {
+        let camera = DVec3::new((u - self.principal.0) / self.focal.0, (v - self.principal.1) / self.focal.1, 1.0);
+        let direction = self.rotation * camera;
+        let t = -self.center.z / direction.z;
+        // Level rays give an infinite t, rays away from the ground a negative one.
+        (t > 0.0 && t.is_finite()).then(|| self.center + direction * t)
+    }
+}
+
+/// Bilinear colour of the source at a point in its camera's frame.
+fn sample(source: &PosedImage, p: DVec3) -> Option<[f32; 3]> {
+    let k = &source.view.intrinsics;
+    if p.z <= 0.0 {
+        return None;
+    }
+    let u = f64::from(k.fx) * p.x / p.z + f64::from(k.cx);
+    let v = f64::from(k.fy) * p.y / p.z + f64::from(k.cy);
+    let inside = u >= 0.0 && v >= 0.0 && u <= f64::from(k.width) && v <= f64::from(k.height);
+    inside.then(|| crate::undistort::sample_bilinear(&source.image, u as f32, v as f32).0.map(|c| f32::from(c) / 255.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Intrinsics, Pose, PoseSigma};
+    use image::Rgb;
+
+    fn nadir(east: f64, north: f64, yaw: f64) -> View {
+        let down = DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0);
+        View {
+            intrinsics: Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0 },
+            pose: Pose { rotation: DQuat::from_rotation_z(yaw) * down, center: DVec3::new(east, north, 35.0) },
+        }
+    }
+
+    /// Flat ground with a colour ramp of 4 per metre: at 35 m one pixel sees one metre.
+    fn ground(view: View) -> PosedImage {
+        let ray = Ray::of(&view);
+        let image = RgbImage::from_fn(40, 30, |x, y| {
+            let p = ray.at_ground(f64::from(x) + 0.5, f64::from(y) + 0.5).unwrap();
+            Rgb([(100.0 + 2.0 * p.x).round() as u8, (100.0 + 2.0 * p.y).round() as u8, 50])
+        });
+        let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
+        PosedImage { name: "s".into(), time_ns: 0, image, view, sigma }
+    }
+
+    #[test]
+    fn flat_ground_is_predicted_exactly_where_the_source_saw_it() {
+        let source = ground(nadir(0.0, 0.0, 0.0));
+        for target in [nadir(4.0, 3.0, 0.0), nadir(-3.0, 2.0, 0.7)] {
+            let truth = ground(target);
+            let warped = warp_over_ground(&source, &target, [-1.0; 3]);
+            let (mut seen, mut worst) = (0, 0.0f32);
+            for (w, t) in warped.chunks_exact(3).zip(truth.image.pixels()) {
+                if w[0] >= 0.0 {
+                    seen += 1;
+                    worst = worst.max((0..3).map(|i| (w[i] * 255.0 - f32::from(t[i])).abs()).fold(0.0, f32::max));
+                }
+            }
+            assert!(seen > 700 && seen < 1200 && worst <= 2.0, "{seen} {worst}");
+        }
+    }
+
+    #[test]
+    fn the_sky_and_unseen_ground_take_the_given_colour() {
+        let source = ground(nadir(0.0, 0.0, 0.0));
+        let mut up = nadir(0.0, 0.0, 0.0);
+        up.pose.rotation = DQuat::IDENTITY;
+        let far = nadir(1e4, 0.0, 0.0);
+        for view in [up, far] {
+            assert!(warp_over_ground(&source, &view, [0.25; 3]).iter().all(|v| *v == 0.25));
+        }
+    }
+
+    #[test]
+    fn the_mean_colour_is_the_mean_over_all_pixels() {
+        let mut mean = MeanColor::default();
+        assert_eq!(mean.get(), [0.5; 3]);
+        mean.add(&RgbImage::from_pixel(1, 1, Rgb([255, 0, 0])));
+        mean.add(&RgbImage::from_pixel(3, 1, Rgb([0, 0, 255])));
+        assert_eq!(mean.get(), [0.25, 0.0, 0.75]);
+        assert_eq!(mean.picture(2), [0.25, 0.0, 0.75, 0.25, 0.0, 0.75]);
+    }
+
+    #[test]
+    fn the_nearest_view_is_the_one_with_the_nearest_camera() {
+        let views = [nadir(9.0, 0.0, 0.0), nadir(1.0, 0.0, 0.0)];
+        assert_eq!(nearest_view(&nadir(0.0, 0.0, 0.0), &views), Some(1));
+        assert_eq!(nearest_view(&nadir(0.0, 0.0, 0.0), &[]), None);
+    }
+}

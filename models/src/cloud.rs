@@ -1,0 +1,177 @@
+//! The Gaussian cloud as columns: the one type that initialisation fills, the trainer loads and reads back,
+//! files store and the ground merges.
+//!
+//! Parameters are stored as they are optimised: log scales, logit opacities, SH coefficients around
+//! `colour = 0.5 + C0·sh₀ + …` (3DGS's convention), unnormalised quaternions in **w, x, y, z** order (as in a
+//! 3DGS PLY).
+
+use serde::{Deserialize, Serialize};
+
+/// Number of SH coefficients per colour channel for a degree 0…3.
+pub const fn sh_coefficients(degree: u8) -> usize {
+    (degree as usize + 1) * (degree as usize + 1)
+}
+
+/// Y₀₀, the constant SH basis function.
+pub const SH_C0: f32 = 0.282_094_79;
+
+/// N Gaussians, column by column; every column has the same N.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct GaussianCloud {
+    /// Highest SH degree stored, 0…3.
+    pub sh_degree: u8,
+    /// World positions, metres ENU.
+    pub means: Vec<[f32; 3]>,
+    /// Natural logarithm of the standard deviations along the Gaussian's own axes, metres.
+    pub log_scales: Vec<[f32; 3]>,
+    /// Own axes → world, **w x y z**, normalised when used, not when stored.
+    pub rotations: Vec<[f32; 4]>,
+    /// logit(opacity).
+    pub opacity_logits: Vec<f32>,
+    /// N × D × 3 floats, D = [`sh_coefficients`]: for each Gaussian D coefficients, each r, g, b.
+    pub sh: Vec<f32>,
+}
+
+impl GaussianCloud {
+    /// An empty cloud with room for `capacity` Gaussians.
+    pub fn with_capacity(sh_degree: u8, capacity: usize) -> Self {
+        Self {
+            sh_degree,
+            means: Vec::with_capacity(capacity),
+            log_scales: Vec::with_capacity(capacity),
+            rotations: Vec::with_capacity(capacity),
+            opacity_logits: Vec::with_capacity(capacity),
+            sh: Vec::with_capacity(capacity * sh_coefficients(sh_degree) * 3),
+        }
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    /// True when there is none.
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+
+    /// Floats per Gaussian in `sh`.
+    pub fn sh_stride(&self) -> usize {
+        sh_coefficients(self.sh_degree) * 3
+    }
+
+    /// Appends one Gaussian; `sh` has [`Self::sh_stride`] floats.
+    pub fn push(&mut self, mean: [f32; 3], log_scale: [f32; 3], rotation: [f32; 4], opacity_logit: f32, sh: &[f32]) {
+        debug_assert_eq!(sh.len(), self.sh_stride());
+        self.means.push(mean);
+        self.log_scales.push(log_scale);
+        self.rotations.push(rotation);
+        self.opacity_logits.push(opacity_logit);
+        self.sh.extend_from_slice(sh);
+    }
+
+    /// Whether row `i` holds only finite numbers and a quaternion that can be normalised.
+    pub fn row_is_sound(&self, i: usize) -> bool {
+        let stride = self.sh_stride();
+        let q = self.rotations[i];
+        let q2: f32 = q.iter().map(|v| v * v).sum();
+        self.means[i].iter().chain(&self.log_scales[i]).all(|v| v.is_finite())
+            && q2.is_finite()
+            && q2 > 1e-20
+            && self.opacity_logits[i].is_finite()
+            && self.sh[i * stride..(i + 1) * stride].iter().all(|v| v.is_finite())
+    }
+
+    /// Keeps the rows for which `keep(index)` holds, in order; returns how many were removed.
+    pub fn retain(&mut self, mut keep: impl FnMut(usize) -> bool) -> usize {
+        let (n, stride) = (self.len(), self.sh_stride());
+        let mut to = 0;
+        for from in 0..n {
+            if keep(from) {
+                self.means[to] = self.means[from];
+                self.log_scales[to] = self.log_scales[from];
+                self.rotations[to] = self.rotations[from];
+                self.opacity_logits[to] = self.opacity_logits[from];
+                self.sh.copy_within(from * stride..(from + 1) * stride, to * stride);
+                to += 1;
+            }
+        }
+        self.means.truncate(to);
+        self.log_scales.truncate(to);
+        self.rotations.truncate(to);
+        self.opacity_logits.truncate(to);
+        self.sh.truncate(to * stride);
+        n - to
+    }
+
+    /// Drops every row that is not [sound](Self::row_is_sound); returns how many.
+    pub fn drop_unsound(&mut self) -> usize {
+        let sound: Vec<bool> = (0..self.len()).map(|i| self.row_is_sound(i)).collect();
+        self.retain(|i| sound[i])
+    }
+
+    /// Appends another cloud; the lower SH degree is padded with zeros.
+    pub fn extend(&mut self, other: &Self) {
+        if other.sh_degree > self.sh_degree {
+            self.raise_sh_degree(other.sh_degree);
+        }
+        self.means.extend_from_slice(&other.means);
+        self.log_scales.extend_from_slice(&other.log_scales);
+        self.rotations.extend_from_slice(&other.rotations);
+        self.opacity_logits.extend_from_slice(&other.opacity_logits);
+        let (from, to) = (other.sh_stride(), self.sh_stride());
+        for row in other.sh.chunks_exact(from) {
+            self.sh.extend_from_slice(row);
+            self.sh.resize(self.sh.len() + to - from, 0.0);
+        }
+    }
+
+    /// Raises the stored SH degree; new coefficients are zero.
+    pub fn raise_sh_degree(&mut self, degree: u8) {
+        if degree <= self.sh_degree {
+            return;
+        }
+        let from = self.sh_stride();
+        self.sh_degree = degree;
+        let to = self.sh_stride();
+        let mut sh = Vec::with_capacity(self.len() * to);
+        for row in self.sh.chunks_exact(from) {
+            sh.extend_from_slice(row);
+            sh.resize(sh.len() + to - from, 0.0);
+        }
+        self.sh = sh;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn one(v: f32, degree: u8) -> GaussianCloud {
+        let mut c = GaussianCloud::with_capacity(degree, 1);
+        let sh = vec![v; c.sh_stride()];
+        c.push([v; 3], [v; 3], [1.0, 0.0, 0.0, 0.0], v, &sh);
+        c
+    }
+
+    #[test]
+    fn extending_with_a_higher_degree_pads_with_zeros() {
+        let mut a = one(1.0, 0);
+        a.extend(&one(2.0, 1));
+        assert_eq!(a.sh_degree, 1);
+        assert_eq!(a.len(), 2);
+        assert_eq!(&a.sh[..12], &[1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(&a.sh[12..], &[2.0; 12]);
+    }
+
+    #[test]
+    fn rows_with_nan_or_zero_quaternion_are_dropped_and_counted() {
+        let mut a = one(1.0, 0);
+        a.extend(&one(f32::NAN, 0));
+        a.extend(&one(2.0, 0));
+        a.rotations[2] = [0.0; 4];
+        a.extend(&one(3.0, 0));
+        assert_eq!(a.drop_unsound(), 2);
+        assert_eq!(a.means, vec![[1.0; 3], [3.0; 3]]);
+    }
+}

@@ -1,0 +1,232 @@
+//! The `.dgtr` model file: checkpoint on board, what is sent to the ground, and the global model.
+//!
+//! ```text
+//! magic "dgtr\r\n\x1a\n" (8) · version u32 · header bytes u32 · Gaussians u64 · SH degree u32
+//! header (postcard) · means 3N f32 · log scales 3N · rotations 4N (w x y z) · opacity logits N · sh N·D·3
+//! BLAKE3 of everything before (32)
+//! ```
+//!
+//! All little-endian. The magic's line ends betray a transfer as text, the length follows from the fixed part
+//! before anything is allocated, and the hash covers every byte.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Write};
+use std::path::Path;
+
+use config::geodesy::Geodetic;
+use serde::{Deserialize, Serialize};
+
+use super::{FormatError, write_atomic};
+use crate::camera::View;
+use crate::cloud::{GaussianCloud, sh_coefficients};
+
+const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
+const VERSION: u32 = 1;
+const FIXED: u64 = 28;
+const HASH: u64 = 32;
+/// A header holds 100 bytes per view; this is room for 100,000 of them and long names.
+const MAX_HEADER: u64 = 64 << 20;
+/// Floats moved at a time.
+const CHUNK: usize = 16 << 10;
+
+/// What a model file says about itself besides its Gaussians.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ModelHeader {
+    /// Name of the mission; empty when trained from a data set by hand.
+    pub mission: String,
+    /// Who trained it; the ground writes `global`.
+    pub aircraft: String,
+    /// WGS-84 origin of the ENU frame the Gaussians live in; `None` when the frame is not georeferenced.
+    pub origin: Option<Geodetic>,
+    /// Polygon of the area this model answers for, ENU metres; empty = everything.
+    pub region: Vec<[f64; 2]>,
+    /// Training views by picture name, with their (refined) poses.
+    pub views: Vec<(String, View)>,
+    /// Optimiser steps taken so far, over all continuations.
+    pub steps: u64,
+    /// Seconds of training so far, over all continuations.
+    pub train_seconds: f64,
+    /// Seed of the random choices.
+    pub seed: u64,
+    /// Whether the job that writes this file had reached its goal; false in checkpoints.
+    pub finished: bool,
+}
+
+/// Writes a model, atomically.
+pub fn write(path: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result<(), FormatError> {
+    let n = cloud.len();
+    let columns_fit = cloud.log_scales.len() == n
+        && cloud.rotations.len() == n
+        && cloud.opacity_logits.len() == n
+        && cloud.sh_degree <= 3
+        && cloud.sh.len() == n * cloud.sh_stride();
+    if !columns_fit {
+        return Err(FormatError::invalid(path, "not written: the cloud's columns differ in length"));
+    }
+    let head = postcard::to_allocvec(header)
+        .map_err(|e| FormatError::invalid(path, format!("not written: its header cannot be encoded ({e})")))?;
+    if head.len() as u64 > MAX_HEADER {
+        let (size, limit) = (head.len() as u64, MAX_HEADER);
+        return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size, limit });
+    }
+    write_atomic(path, |file| {
+        let mut out = Hashing { inner: file, hasher: blake3::Hasher::new() };
+        out.write_all(&MAGIC)?;
+        out.write_all(&VERSION.to_le_bytes())?;
+        out.write_all(&(head.len() as u32).to_le_bytes())?;
+        out.write_all(&(n as u64).to_le_bytes())?;
+        out.write_all(&u32::from(cloud.sh_degree).to_le_bytes())?;
+        out.write_all(&head)?;
+        write_floats(&mut out, cloud.means.as_flattened())?;
+        write_floats(&mut out, cloud.log_scales.as_flattened())?;
+        write_floats(&mut out, cloud.rotations.as_flattened())?;
+        write_floats(&mut out, &cloud.opacity_logits)?;
+        write_floats(&mut out, &cloud.sh)?;
+        let hash = out.hasher.finalize();
+        out.inner.write_all(hash.as_bytes())
+    })
+}
+
+/// Reads and verifies a model. Gaussians that hold a number that is not finite are dropped and their number logged.
+pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
+    let mut opened = open(path)?;
+    let header = read_header_of(path, &mut opened)?;
+    let Opened { mut input, count, sh_degree, .. } = opened;
+    let mut cloud = GaussianCloud { sh_degree, ..Default::default() };
+    let mut column = |floats: usize| read_floats(&mut input, floats).map_err(|e| FormatError::io(path, "reading", e));
+    cloud.means = triples(column(3 * count)?);
+    cloud.log_scales = triples(column(3 * count)?);
+    cloud.rotations = column(4 * count)?.as_chunks().0.to_vec();
+    cloud.opacity_logits = column(count)?;
+    cloud.sh = column(count * cloud.sh_stride())?;
+    let expected = input.hasher.finalize();
+    let mut hash = [0; HASH as usize];
+    input.inner.read_exact(&mut hash).map_err(|e| FormatError::io(path, "reading", e))?;
+    if expected != blake3::Hash::from_bytes(hash) {
+        return Err(FormatError::Damaged { path: path.to_owned() });
+    }
+    let header = decode_header(path, &header)?;
+    let dropped = cloud.drop_unsound();
+    if dropped > 0 {
+        tracing::warn!("{}: {dropped} Gaussians hold numbers that are not finite and were left out", path.display());
+    }
+    Ok((header, cloud))
+}
+
+/// The header and the number of Gaussians alone, without the time to verify the columns: enough to list models.
+pub fn read_header(path: &Path) -> Result<(ModelHeader, usize), FormatError> {
+    let mut opened = open(path)?;
+    let header = read_header_of(path, &mut opened)?;
+    Ok((decode_header(path, &header)?, opened.count))
+}
+
+struct Opened {
+    input: Hashing<BufReader<File>>,
+    count: usize,
+    sh_degree: u8,
+    header_len: usize,
+}
+
+fn open(path: &Path) -> Result<Opened, FormatError> {
+    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
+    let mut input = Hashing { inner: BufReader::with_capacity(1 << 16, file), hasher: blake3::Hasher::new() };
+    let truncated = |what| FormatError::Truncated { path: path.to_owned(), at: size, what };
+    if size < FIXED {
+        return Err(truncated("its first 28 bytes"));
+    }
+    let mut fixed = [0; FIXED as usize];
+    input.read_exact(&mut fixed).map_err(|e| FormatError::io(path, "reading", e))?;
+    if fixed[..8] != MAGIC {
+        return Err(FormatError::invalid(path, "is not a dgtr model (its first bytes differ); give a .dgtr file"));
+    }
+    let word = |at: usize| u32::from_le_bytes([fixed[at], fixed[at + 1], fixed[at + 2], fixed[at + 3]]);
+    let version = word(8);
+    if version != VERSION {
+        let what =
+            format!("model file version {version}; this dgtr reads version {VERSION}: use the dgtr that wrote it");
+        return Err(FormatError::invalid(path, what));
+    }
+    let header_len = u64::from(word(12));
+    let count = u64::from(word(16)) | u64::from(word(20)) << 32;
+    let degree = word(24);
+    if degree > 3 {
+        return Err(FormatError::invalid(path, format!("SH degree {degree}; 0 to 3 is possible (damaged file?)")));
+    }
+    if header_len > MAX_HEADER {
+        let limit = MAX_HEADER;
+        return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size: header_len, limit });
+    }
+    let each = 4 * (11 + 3 * sh_coefficients(degree as u8) as u64);
+    let expected = count.checked_mul(each).and_then(|c| c.checked_add(FIXED + header_len + HASH));
+    match expected {
+        Some(expected) if expected == size => {}
+        Some(expected) if expected < size => {
+            let what = format!("is {} bytes longer than its {count} Gaussians; copy it again", size - expected);
+            return Err(FormatError::invalid(path, what));
+        }
+        _ => return Err(truncated("its Gaussians")),
+    }
+    Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len: header_len as usize })
+}
+
+fn read_header_of(path: &Path, opened: &mut Opened) -> Result<Vec<u8>, FormatError> {
+    let mut bytes = vec![0; opened.header_len];
+    opened.input.read_exact(&mut bytes).map_err(|e| FormatError::io(path, "reading", e))?;
+    Ok(bytes)
+}
+
+fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
+    postcard::from_bytes(bytes).map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))
+}
+
+fn triples(flat: Vec<f32>) -> Vec<[f32; 3]> {
+    flat.as_chunks().0.to_vec()
+}
+
+fn write_floats(out: &mut impl Write, values: &[f32]) -> std::io::Result<()> {
+    let mut buffer = Vec::with_capacity(4 * CHUNK.min(values.len()));
+    for chunk in values.chunks(CHUNK) {
+        buffer.clear();
+        buffer.extend(chunk.iter().flat_map(|v| v.to_le_bytes()));
+        out.write_all(&buffer)?;
+    }
+    Ok(())
+}
+
+fn read_floats(input: &mut impl Read, n: usize) -> std::io::Result<Vec<f32>> {
+    let mut values = Vec::with_capacity(n);
+    let mut buffer = vec![0; 4 * CHUNK.min(n)];
+    while values.len() < n {
+        let bytes = &mut buffer[..4 * CHUNK.min(n - values.len())];
+        input.read_exact(bytes)?;
+        values.extend(bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)));
+    }
+    Ok(values)
+}
+
+/// Hashes what passes through.
+struct Hashing<T> {
+    inner: T,
+    hasher: blake3::Hasher,
+}
+
+impl<T: Write> Write for Hashing<T> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let n = self.inner.write(bytes)?;
+        self.hasher.update(&bytes[..n]);
+        Ok(n)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.inner.flush()
+    }
+}
+
+impl<T: Read> Read for Hashing<T> {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        let n = self.inner.read(bytes)?;
+        self.hasher.update(&bytes[..n]);
+        Ok(n)
+    }
+}

@@ -1,0 +1,87 @@
+//! From a handful of posed pictures to a dense Gaussian cloud in seconds, without SfM: pair selection, a feed-forward
+//! network, alignment, scales and a budgeted merge; and the two baselines it is compared with.
+
+mod baselines;
+mod consistency;
+mod fill;
+mod finish;
+mod frame;
+mod initialiser;
+mod merge;
+mod pairs;
+mod posed;
+mod range;
+mod report;
+mod samples;
+#[cfg(test)]
+mod tests;
+mod unposed;
+
+pub use baselines::{from_sfm, random};
+pub use initialiser::Initialiser;
+pub use pairs::SkippedPairs;
+pub use range::mutual_matches;
+pub use report::{InitReport, Initialisation};
+
+use crate::onnx::OnnxError;
+use crate::onnx::manifest::Manifest;
+
+/// Why there is no initial cloud.
+#[derive(Debug, thiserror::Error)]
+pub enum InitError {
+    /// Nothing to start from.
+    #[error("initialisation: none of {given} points is usable; give finite points, views and a depth range")]
+    NoPoints {
+        /// Points handed in.
+        given: usize,
+    },
+    /// A setting is out of range.
+    #[error("[init] {field} {reason}")]
+    Setting {
+        /// The field in the mission file.
+        field: &'static str,
+        /// What it must be.
+        reason: &'static str,
+    },
+    /// The plan is for fewer pictures.
+    #[error("initialisation: more than {limit} pictures; raise [init] max_pictures")]
+    TooMany {
+        /// `max_pictures`.
+        limit: usize,
+    },
+    /// A picture cannot be used.
+    #[error("picture {name}: {reason}")]
+    Picture {
+        /// Its name.
+        name: String,
+        /// Why.
+        reason: &'static str,
+    },
+    /// Nothing bounds the depths.
+    #[error(
+        "initialisation: only {points} points could be triangulated to bound the depths; give [init] depth_m = [nearest, farthest]"
+    )]
+    NoRange {
+        /// Points found.
+        points: usize,
+    },
+    /// No picture has a partner.
+    #[error(
+        "initialisation: none of {pictures} pictures has a partner with baseline and overlap ({skipped} pairs skipped); fly further apart, or check the poses"
+    )]
+    NoDepth {
+        /// Pictures.
+        pictures: usize,
+        /// Pairs refused.
+        skipped: usize,
+    },
+    /// The network or ONNX Runtime.
+    #[error(transparent)]
+    Network(#[from] OnnxError),
+}
+
+/// The network that ships inside the binary: a posed plane sweep without learned weights.
+fn embedded() -> Result<(Manifest, posed::NetworkBytes), OnnxError> {
+    let manifest = Manifest::parse(include_str!("../networks/plane_sweep.toml"), "plane-sweep (embedded)")?;
+    Ok((manifest, posed::NetworkBytes::Embedded(include_bytes!("../networks/plane_sweep.onnx"))))
+}

@@ -1,0 +1,382 @@
+//! The order of work for posed pictures: keep them at the network's size, bound the depth, choose partners, run the
+//! network, resolve conflicts, merge into the budget. Works while flying: pictures come one by one, poses may be
+//! refined afterwards, and only depths whose geometry really changed are made again.
+
+use std::path::Path;
+use std::time::Instant;
+
+use config::init::InitSettings;
+
+use crate::camera::{Pose, PosedImage, View};
+use crate::onnx::features::{FeatureNetwork, Features};
+use crate::onnx::manifest::{Manifest, Poses};
+use crate::onnx::picture::{center_crop, resized};
+
+use super::InitError;
+use super::frame::{DepthGrid, Frame, Projector, unproject};
+use super::merge::VoxelMerge;
+use super::pairs::{Relation, SkippedPairs, partners, relate};
+use super::posed::{NetworkBytes, PosedNetwork};
+use super::range::DepthRange;
+use super::report::{InitReport, Initialisation};
+use super::unposed::{Appearance, Heads, PairNetwork, align_frames, appearance, keep_better};
+
+mod assemble;
+
+/// Features per picture for the depth range.
+const RANGE_FEATURES: usize = 600;
+/// Every how many pictures the depth range is measured again.
+const RANGE_EVERY: usize = 8;
+/// A depth is made again when its pictures' refined poses move it by more than this, pixels.
+const STALE_PX: f32 = 0.7;
+/// Finest voxels per Gaussian of the budget.
+const VOXELS_PER_GAUSSIAN: usize = 4;
+
+/// Whether the network is told the poses.
+#[derive(Debug)]
+enum Network {
+    Posed(PosedNetwork),
+    Unposed(PairNetwork),
+}
+
+impl Network {
+    fn manifest(&self) -> &Manifest {
+        match self {
+            Self::Posed(n) => n.manifest(),
+            Self::Unposed(n) => n.manifest(),
+        }
+    }
+
+    fn sources(&self) -> usize {
+        match self {
+            Self::Posed(n) => n.sources(),
+            Self::Unposed(_) => 1,
+        }
+    }
+
+    fn close(&mut self) {
+        match self {
+            Self::Posed(n) => n.close(),
+            Self::Unposed(n) => n.close(),
+        }
+    }
+}
+
+/// Posed pictures in, Gaussians out.
+#[derive(Debug)]
+pub struct Initialiser {
+    settings: InitSettings,
+    network: Network,
+    features: Option<FeatureNetwork>,
+    last_features: Option<(usize, Features)>,
+    frames: Vec<Frame>,
+    range: DepthRange,
+    /// What an unposed network says about each picture's Gaussians.
+    appearance: Vec<Option<Appearance>>,
+    report: InitReport,
+}
+
+impl Initialiser {
+    /// With the embedded network, or the user's own (a manifest of contract `pair`).
+    ///
+    /// # Errors
+    /// A setting, the manifest, the network's file or ONNX Runtime is bad.
+    pub fn open(settings: &InitSettings, manifest: Option<&Path>) -> Result<Self, InitError> {
+        settings.check().map_err(|(field, reason)| InitError::Setting { field, reason })?;
+        let (manifest, bytes) = match manifest {
+            Some(path) => {
+                let manifest = Manifest::read(path)?;
+                let bytes = manifest.read_network()?;
+                (manifest, NetworkBytes::Read(bytes))
+            }
+            None => super::embedded()?,
+        };
+        let network = match manifest.pair.clone() {
+            Some(pair) if pair.poses == Poses::None => {
+                Network::Unposed(PairNetwork::new(manifest, pair, bytes, settings.threads))
+            }
+            _ => Network::Posed(PosedNetwork::new(manifest, bytes, settings.threads)?),
+        };
+        crate::onnx::session::find_library()?;
+        let features = match settings.depth_m {
+            Some(_) => None,
+            None => Some(FeatureNetwork::open(None, settings.threads)?),
+        };
+        let report = InitReport { network: network.manifest().name.clone(), ..InitReport::default() };
+        Ok(Self {
+            settings: settings.clone(),
+            network,
+            features,
+            last_features: None,
+            frames: Vec::new(),
+            range: DepthRange::default(),
+            appearance: Vec::new(),
+            report,
+        })
+    }
+
+    /// Other settings for the next [`Self::build`]; depths made so far are kept (they depend on `stride`, `depth_m` and the
+    /// pairing only). For ablations and for retries with a smaller budget.
+    ///
+    /// # Errors
+    /// A setting is out of range, or `stride` differs after depths were made.
+    pub fn reconfigure(&mut self, settings: &InitSettings) -> Result<(), InitError> {
+        settings.check().map_err(|(field, reason)| InitError::Setting { field, reason })?;
+        if settings.stride != self.settings.stride && self.frames.iter().any(|f| f.depth.is_some()) {
+            return Err(InitError::Setting { field: "stride", reason: "cannot change after depths were made" });
+        }
+        self.settings = settings.clone();
+        Ok(())
+    }
+
+    /// Takes a picture in; its pixels are copied at the network's size.
+    ///
+    /// # Errors
+    /// More pictures than planned, a picture whose size is not its camera's, or features failing.
+    pub fn add(&mut self, picture: &PosedImage) -> Result<(), InitError> {
+        let started = Instant::now();
+        if self.frames.len() >= self.settings.max_pictures {
+            return Err(InitError::TooMany { limit: self.settings.max_pictures });
+        }
+        let k = &picture.view.intrinsics;
+        if (k.width, k.height) != picture.image.dimensions() || k.width < 8 || k.height < 8 {
+            return Err(InitError::Picture {
+                name: picture.name.clone(),
+                reason: "its size is not its camera's, or below 8 pixels",
+            });
+        }
+        let p = &picture.view.pose;
+        if !(p.center.is_finite() && p.rotation.is_finite() && p.rotation.length_squared() > 1e-12) {
+            return Err(InitError::Picture { name: picture.name.clone(), reason: "its pose is not finite" });
+        }
+        let shrink = (f64::from(self.settings.max_side) / f64::from(k.width.max(k.height))).min(1.0);
+        let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
+        let (w, h) = self.network.manifest().input_size(fit(k.width), fit(k.height));
+        let (image, intrinsics) = match &self.network {
+            Network::Posed(_) => (resized(&picture.image, w, h), k.resized(w, h)),
+            // What knows no intrinsics was trained on square pixels: crop to its shape, never stretch.
+            Network::Unposed(_) => center_crop(&picture.image, k, w, h),
+        };
+        self.frames.push(Frame {
+            name: picture.name.clone(),
+            image,
+            view: View { intrinsics, pose: picture.view.pose },
+            depth: None,
+            made_with: Vec::new(),
+            made_as: None,
+        });
+        self.report.pictures = self.frames.len();
+        self.measure_range()?;
+        self.report.add_ms += started.elapsed().as_secs_f64() * 1e3;
+        Ok(())
+    }
+
+    /// Replaces the pose of a picture after refinement; unknown names are ignored (their picture was no key frame).
+    pub fn update_pose(&mut self, name: &str, pose: &Pose) {
+        if let Some(frame) = self.frames.iter_mut().find(|f| f.name == name) {
+            frame.view.pose = *pose;
+        }
+    }
+
+    /// Adds points of the scene known from elsewhere (refinement's tracks) to bound the depths.
+    pub fn hint_points(&mut self, points: impl IntoIterator<Item = [f32; 3]>) {
+        points.into_iter().for_each(|p| self.range.push(p.into()));
+    }
+
+    /// Host bytes planned for a number of pictures and Gaussians: pictures and depths at the network's size, the
+    /// merge, the network's tensors (measured: about 60 floats per pixel of one picture).
+    pub fn planned_bytes(&self, pictures: usize, max_gaussians: usize) -> u64 {
+        let pixels = self.frames.first().map_or(640 * 480, |f| f.view.intrinsics.pixels()) as u64;
+        let grid = pixels / u64::from(self.settings.stride).pow(2) * 8;
+        let network = pixels * 60 * 4;
+        pictures as u64 * (3 * pixels + 2 * grid)
+            + network
+            + VoxelMerge::planned_bytes(max_gaussians * VOXELS_PER_GAUSSIAN)
+    }
+
+    /// While flying: makes the depth of one picture that has neighbours on both sides; false when there was none to do.
+    ///
+    /// # Errors
+    /// The network fails.
+    pub fn advance(&mut self) -> Result<bool, InitError> {
+        if matches!(self.network, Network::Unposed(_)) {
+            return Ok(false);
+        }
+        let ready = (0..self.frames.len().saturating_sub(1)).find(|&i| self.frames[i].made_as.is_none());
+        match ready {
+            Some(i) if self.depth_range(i).is_some() => self.make_depth(i).map(|_| true),
+            _ => Ok(false),
+        }
+    }
+
+    /// All pictures so far into at most `max_gaussians` Gaussians. May be called again after more pictures.
+    ///
+    /// # Errors
+    /// The network fails; no depth range can be found; no picture has a partner.
+    pub fn build(&mut self, max_gaussians: usize) -> Result<Initialisation, InitError> {
+        let started = Instant::now();
+        self.report.skipped = SkippedPairs::default();
+        let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
+        for i in 0..views.len() {
+            if let Some(depth) = self.typical_depth(i) {
+                partners(i, &views, depth, &self.settings, &mut self.report.skipped);
+            }
+        }
+        match self.network {
+            Network::Posed(_) => {
+                for i in 0..self.frames.len() {
+                    if self.is_stale(i) {
+                        self.make_depth(i)?;
+                    }
+                }
+            }
+            Network::Unposed(_) => self.align_pairs(&views)?,
+        }
+        self.network.close();
+        self.report.depth_ms += started.elapsed().as_secs_f64() * 1e3;
+        if self.frames.iter().all(|f| f.depth.is_none()) {
+            return Err(InitError::NoDepth { pictures: self.frames.len(), skipped: self.report.skipped.total() });
+        }
+        self.assemble(max_gaussians)
+    }
+
+    fn measure_range(&mut self) -> Result<(), InitError> {
+        let i = self.frames.len() - 1;
+        let Some(network) = &mut self.features else { return Ok(()) };
+        // Two pictures in a row out of every few; all until there are enough.
+        let wanted = self.range.of(&self.frames[i].view).is_none() || i % RANGE_EVERY < 2;
+        if !wanted {
+            return Ok(());
+        }
+        let found = network.extract(&self.frames[i].image, RANGE_FEATURES)?;
+        if let Some((j, previous)) = &self.last_features
+            && j + 1 == i
+        {
+            self.range.measure((&self.frames[*j].view, previous), (&self.frames[i].view, &found));
+        }
+        self.last_features = Some((i, found));
+        Ok(())
+    }
+
+    fn depth_range(&self, i: usize) -> Option<[f32; 2]> {
+        self.settings.depth_m.or_else(|| self.range.of(&self.frames[i].view))
+    }
+
+    fn typical_depth(&self, i: usize) -> Option<f64> {
+        // The harmonic mean: what half-way means in disparity.
+        self.depth_range(i).map(|[n, f]| 2.0 / (1.0 / f64::from(n) + 1.0 / f64::from(f)))
+    }
+
+    fn sources_of(&self, i: usize, depth: f64) -> Vec<(usize, f64)> {
+        let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
+        let mut best = partners(i, &views, depth, &self.settings, &mut SkippedPairs::default());
+        best.truncate(self.network.sources());
+        best
+    }
+
+    fn is_stale(&self, i: usize) -> bool {
+        let frame = &self.frames[i];
+        let (Some(as_view), Some(depth)) = (&frame.made_as, self.typical_depth(i)) else { return true };
+        let moved = frame
+            .made_with
+            .iter()
+            .any(|(s, old)| shift(&frame.view, &self.frames[*s].view, as_view, old, depth as f32) > STALE_PX);
+        let quality = |list: &mut dyn Iterator<Item = View>| -> f64 {
+            list.map(|v| match relate(&frame.view, &v, depth, &self.settings) {
+                Relation::Good(score) => score,
+                Relation::Bad(_) => 0.0,
+            })
+            .sum()
+        };
+        let now = quality(&mut frame.made_with.iter().map(|(s, _)| self.frames[*s].view));
+        let best: f64 = self.sources_of(i, depth).iter().map(|s| s.1).sum();
+        moved || best > 1.5 * now
+    }
+
+    fn make_depth(&mut self, i: usize) -> Result<(), InitError> {
+        let started = Instant::now();
+        let (Some(range), Some(depth)) = (self.depth_range(i), self.typical_depth(i)) else {
+            return Err(InitError::NoRange { points: self.range.len() });
+        };
+        let sources = self.sources_of(i, depth);
+        let made_with: Vec<(usize, View)> = sources.iter().map(|s| (s.0, self.frames[s.0].view)).collect();
+        let view = self.frames[i].view;
+        let grid = if sources.is_empty() {
+            None
+        } else {
+            let partners: Vec<&Frame> = sources.iter().map(|s| &self.frames[s.0]).collect();
+            let Network::Posed(network) = &mut self.network else { return Ok(()) };
+            let (depth, conf) = network.run(&self.frames[i], &partners, range)?;
+            let (w, h) = (view.intrinsics.width as usize, view.intrinsics.height as usize);
+            let (grid, unsound) = DepthGrid::sampled(w, h, self.settings.stride as usize, &depth.data, &conf.data);
+            self.report.unsound_depths += unsound;
+            self.report.runs += 1;
+            self.report.run_ms += started.elapsed().as_secs_f64() * 1e3;
+            Some(grid)
+        };
+        let frame = &mut self.frames[i];
+        frame.depth = grid;
+        frame.made_with = made_with;
+        frame.made_as = Some(view);
+        self.report.depth_m = range;
+        Ok(())
+    }
+
+    /// All pairs through an unposed network, then the global alignment.
+    fn align_pairs(&mut self, views: &[View]) -> Result<(), InitError> {
+        let mut pairs: Vec<[usize; 2]> = Vec::new();
+        for i in 0..views.len() {
+            let Some(depth) = self.typical_depth(i) else {
+                return Err(InitError::NoRange { points: self.range.len() });
+            };
+            let good = partners(i, views, depth, &self.settings, &mut SkippedPairs::default());
+            pairs.extend(good.into_iter().map(|(j, _)| [i.min(j), i.max(j)]));
+        }
+        pairs.sort_unstable();
+        pairs.dedup();
+        let Network::Unposed(network) = &mut self.network else { return Ok(()) };
+        let mut edges = Vec::with_capacity(pairs.len());
+        let mut heads: Vec<Option<Heads>> = vec![None; views.len()];
+        for (e, pair) in pairs.into_iter().enumerate() {
+            let started = Instant::now();
+            let (edge, [first, second]) = network.run(&self.frames, pair, self.settings.stride as usize, e)?;
+            keep_better(&mut heads[pair[0]], first);
+            keep_better(&mut heads[pair[1]], second);
+            edges.push(edge);
+            self.report.runs += 1;
+            self.report.run_ms += started.elapsed().as_secs_f64() * 1e3;
+        }
+        let residual = network.pair().sh_residual;
+        let alignment = align_frames(&mut self.frames, &edges, &self.settings);
+        self.report.edges = edges.len();
+        self.report.edges_without_scale = alignment.sigma.iter().filter(|s| s.is_none()).count();
+        self.report.components = crate::align::graph::components(views.len(), &edges).1;
+        self.report.align_steps = alignment.steps;
+        self.report.align_residual_m = alignment.mean_residual;
+        self.appearance = (0..views.len())
+            .map(|v| {
+                let heads = heads[v].as_ref()?;
+                let first = &views[edges[heads.edge].first];
+                appearance(heads, &self.frames[v], first, &alignment, &self.settings, residual)
+            })
+            .collect();
+        Ok(())
+    }
+}
+
+/// Largest shift, in pixels, of the reference's corners and centre in the source between two pairs of poses.
+fn shift(reference: &View, source: &View, old_reference: &View, old_source: &View, depth: f32) -> f32 {
+    let (w, h) = (reference.intrinsics.width as f32, reference.intrinsics.height as f32);
+    let (new, old) = (Projector::new(source), Projector::new(old_source));
+    [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h), (w / 2.0, h / 2.0)]
+        .into_iter()
+        .map(|(x, y)| {
+            let a = new.project(unproject(reference, x, y, depth));
+            let b = old.project(unproject(old_reference, x, y, depth));
+            match (a, b) {
+                (Some(a), Some(b)) => (a.0 - b.0).hypot(a.1 - b.1),
+                _ => f32::INFINITY,
+            }
+        })
+        .fold(0.0, f32::max)
+}

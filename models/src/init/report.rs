@@ -1,0 +1,76 @@
+//! What an initialisation did, for `run.json` and the tables.
+
+use serde::Serialize;
+
+use crate::camera::DepthPrior;
+use crate::cloud::GaussianCloud;
+
+use super::pairs::SkippedPairs;
+
+/// The result.
+#[derive(Clone, Debug)]
+pub struct Initialisation {
+    /// The Gaussians, SH degree 0.
+    pub cloud: GaussianCloud,
+    /// D_est of each picture that has a depth (depth × confidence of the same network pass), at the grid's resolution.
+    pub depth_priors: Vec<(String, DepthPrior)>,
+    /// What happened.
+    pub report: InitReport,
+}
+
+/// Counts and times; milliseconds are wall time.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct InitReport {
+    /// Name of the network.
+    pub network: String,
+    /// Pictures taken in.
+    pub pictures: usize,
+    /// Runs of the network.
+    pub runs: usize,
+    /// Pairs of the sliding window that were not sent to the network.
+    pub skipped: SkippedPairs,
+    /// Unposed networks: pairs in the connectivity graph.
+    pub edges: usize,
+    /// Unposed networks: pairs whose scale σ is not determined (no baseline, no confidence); left out.
+    pub edges_without_scale: usize,
+    /// Unposed networks: connected components of the graph, each anchored by its own baselines.
+    pub components: usize,
+    /// Unposed networks: steps of the global alignment.
+    pub align_steps: usize,
+    /// Unposed networks: mean distance between χ and the pairs' points, metres.
+    pub align_residual_m: f64,
+    /// Depth range of the last run, metres.
+    pub depth_m: [f32; 2],
+    /// Depths claimed by the network that were not positive finite numbers.
+    pub unsound_depths: usize,
+    /// Samples another view agrees with.
+    pub supported: usize,
+    /// Samples no other view confirms or denies.
+    pub alone: usize,
+    /// Samples removed because other views see through them.
+    pub removed: usize,
+    /// Samples continued from their surroundings where no picture has a depth.
+    pub filled: usize,
+    /// Samples merged.
+    pub samples: usize,
+    /// Samples dropped as not finite or absurdly far.
+    pub dropped_samples: usize,
+    /// Finest voxels used.
+    pub voxels: usize,
+    /// Their edge, metres.
+    pub voxel_m: f32,
+    /// Gaussians removed for abnormal extent.
+    pub abnormal: usize,
+    /// Gaussians in the cloud.
+    pub gaussians: usize,
+    /// Taking pictures in, depth range included.
+    pub add_ms: f64,
+    /// Network runs alone.
+    pub run_ms: f64,
+    /// Choosing partners and making depths in `build`, network runs included.
+    pub depth_ms: f64,
+    /// Consistency, samples, merge.
+    pub merge_ms: f64,
+    /// Host bytes planned.
+    pub planned_bytes: u64,
+}

@@ -1,0 +1,124 @@
+//! The whole way from pictures to Gaussians over a textured plane, with the embedded network and with a randomly
+//! initialised network of Splatt3R's signature.
+
+use super::*;
+use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use config::init::InitSettings;
+use glam::{DQuat, DVec3};
+use image::{Rgb, RgbImage};
+
+fn texture(x: f64, y: f64) -> u8 {
+    let cell = |s: f64| {
+        let (i, j) = ((x / s).floor() as i64 as u64, (y / s).floor() as i64 as u64);
+        (i.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ j.wrapping_mul(0xC2B2_AE3D_27D4_EB4F))
+            .wrapping_mul(0x1656_67B1_9E37_79F9)
+            >> 57
+    };
+    (cell(1.7) + cell(4.1)) as u8
+}
+
+/// A nadir picture of the plane z = 0 from 50 m.
+fn picture(i: usize, x: f64, y: f64) -> PosedImage {
+    let intrinsics = Intrinsics { width: 192, height: 144, fx: 144.0, fy: 144.0, cx: 96.0, cy: 72.0 };
+    let pose = Pose { rotation: DQuat::from_rotation_x(std::f64::consts::PI), center: DVec3::new(x, y, 50.0) };
+    let image = RgbImage::from_fn(192, 144, |u, v| {
+        let ray =
+            pose.rotation * DVec3::new((f64::from(u) + 0.5 - 96.0) / 144.0, (f64::from(v) + 0.5 - 72.0) / 144.0, 1.0);
+        let p = pose.center + ray * (50.0 / -ray.z);
+        Rgb([texture(p.x, p.y), texture(p.y + 100.0, p.x), 90])
+    });
+    let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
+    PosedImage { name: format!("{i}"), time_ns: 0, image, view: View { intrinsics, pose }, sigma }
+}
+
+fn no_runtime() -> bool {
+    let missing = crate::onnx::session::find_library().is_err();
+    if missing {
+        println!("skipped: no ONNX Runtime");
+    }
+    missing
+}
+
+fn settings() -> InitSettings {
+    InitSettings { threads: 1, ..InitSettings::default() }
+}
+
+#[test]
+fn a_plane_comes_out_flat_within_the_budget_and_the_same_every_time() {
+    if no_runtime() {
+        return;
+    }
+    let run = || {
+        let mut init = Initialiser::open(&settings(), None).unwrap();
+        for i in 0..5 {
+            init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
+            init.advance().unwrap();
+        }
+        init.build(5000).unwrap()
+    };
+    let a = run();
+    assert!(a.cloud.len() <= 5000 && a.cloud.len() > 2000, "{:?}", a.report);
+    // 3 % of the height is a third of a pixel of the coarse level at this size.
+    let near = a.cloud.means.iter().filter(|m| m[2].abs() < 1.5).count();
+    assert!(near as f64 > 0.8 * a.cloud.len() as f64, "{near} of {} within 1.5 m", a.cloud.len());
+    assert_eq!(a.depth_priors.len(), 5);
+    assert_eq!(a.cloud, run().cloud);
+}
+
+#[test]
+fn only_depths_whose_poses_moved_are_made_again() {
+    if no_runtime() {
+        return;
+    }
+    let mut init = Initialiser::open(&settings(), None).unwrap();
+    for i in 0..4 {
+        init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
+    }
+    assert_eq!(init.build(3000).unwrap().report.runs, 4);
+    assert_eq!(init.build(1000).unwrap().report.runs, 4);
+    let mut moved = picture(3, 36.0, 0.0).view.pose;
+    moved.center.x += 2.0;
+    init.update_pose("3", &moved);
+    let runs = init.build(1000).unwrap().report.runs;
+    assert!(runs > 4 && runs < 8, "{runs}");
+}
+
+#[test]
+fn hovering_alone_and_too_many_pictures_are_one_clear_line() {
+    if no_runtime() {
+        return;
+    }
+    let known = InitSettings { depth_m: Some([40.0, 60.0]), max_pictures: 3, ..settings() };
+    let mut init = Initialiser::open(&known, None).unwrap();
+    for i in 0..3 {
+        init.add(&picture(i, 0.0, 0.0)).unwrap();
+    }
+    assert!(init.add(&picture(3, 9.0, 0.0)).unwrap_err().to_string().contains("max_pictures"));
+    let e = init.build(100).unwrap_err().to_string();
+    assert!(e.contains("none of 3 pictures has a partner"), "{e}");
+    let mut blind = Initialiser::open(&settings(), None).unwrap();
+    blind.add(&picture(0, 0.0, 0.0)).unwrap();
+    assert!(blind.build(100).unwrap_err().to_string().contains("depth_m"));
+}
+
+#[test]
+fn an_unposed_network_runs_the_whole_way_and_its_plane_is_put_at_its_height() {
+    if no_runtime() {
+        return;
+    }
+    // The network claims a plane at unit distance and a baseline of 0.24: with 12 m flown, σ is 50 and the plane z = 0.
+    let manifest = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("networks/random_pair.toml");
+    let known = InitSettings { depth_m: Some([40.0, 60.0]), stride: 1, window: 1, covisible: 0, ..settings() };
+    let mut init = Initialiser::open(&known, Some(&manifest)).unwrap();
+    for i in 0..4 {
+        init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
+    }
+    let out = init.build(4000).unwrap();
+    assert!(out.cloud.len() > 500 && out.cloud.len() <= 4000, "{:?}", out.report);
+    assert_eq!((out.report.components, out.report.edges_without_scale), (1, 0), "{:?}", out.report);
+    let mut heights: Vec<f32> = out.cloud.means.iter().map(|m| m[2]).collect();
+    heights.sort_by(f32::total_cmp);
+    println!("median height {} of {} Gaussians, {:?}", heights[heights.len() / 2], heights.len(), out.report);
+    assert!(heights[heights.len() / 2].abs() < 1.0);
+    assert!(out.cloud.log_scales.iter().flatten().all(|s| s.is_finite()));
+}

@@ -1,0 +1,266 @@
+//! Networks that know no poses (Splatt3R's signature): every pair gives two pointmaps and Gaussian heads in the first
+//! camera's frame, at a scale of its own. Global alignment turns them into one χ per picture in the aircraft's frame;
+//! of the heads, each picture keeps those of its most confident pair, so that memory does not grow with the pairs.
+
+use glam::{Mat3, Quat, Vec3};
+
+use config::init::InitSettings;
+
+use crate::align::graph::{Edge, PointMap};
+use crate::align::icp::{Metric, icp};
+use crate::align::solve::{Alignment, align};
+use crate::camera::View;
+use crate::cloud::SH_C0;
+use crate::onnx::manifest::{Manifest, OpacityUnit, PairSettings, QuaternionOrder, ScaleUnit};
+use crate::onnx::picture::push_planes;
+use crate::onnx::session::{NetworkSession, Tensor};
+use crate::onnx::{OnnxError, network};
+
+use super::frame::{DepthGrid, Frame};
+use super::posed::NetworkBytes;
+
+/// Points that ICP compares, at most.
+const ICP_POINTS: usize = 1500;
+/// sˡ outside these bounds is noise at depth edges.
+const LOCAL: [f32; 2] = [0.1, 10.0];
+
+/// Gaussian heads of one picture on the depth grid, in the frame of their pair's first camera.
+#[derive(Clone, Debug)]
+pub struct Heads {
+    /// Which edge they come from.
+    pub edge: usize,
+    points: Vec<Vec3>,
+    scales: Vec<Vec3>,
+    rotations: Vec<Quat>,
+    /// Colour the network adds to (residual) or puts in place of the picture's.
+    colors: Vec<Vec3>,
+    opacities: Vec<f32>,
+    /// Sum of confidence.
+    trust: f64,
+}
+
+/// Covariance, colour and opacity that a network gave a sample, ready for the merge.
+#[derive(Clone, Debug)]
+pub struct Appearance {
+    /// World, m².
+    pub covariances: Vec<Mat3>,
+    /// Linear colour, or the difference to the picture's.
+    pub colors: Vec<Vec3>,
+    /// Whether `colors` are differences.
+    pub residual: bool,
+    /// 0…1.
+    pub opacities: Vec<f32>,
+}
+
+/// An unposed pair network.
+#[derive(Debug)]
+pub struct PairNetwork {
+    manifest: Manifest,
+    pair: PairSettings,
+    bytes: NetworkBytes,
+    threads: usize,
+    session: Option<((u32, u32), NetworkSession)>,
+}
+
+impl PairNetwork {
+    /// Of a manifest with `poses = "none"`.
+    pub fn new(manifest: Manifest, pair: PairSettings, bytes: NetworkBytes, threads: usize) -> Self {
+        Self { manifest, pair, bytes, threads, session: None }
+    }
+
+    /// Its manifest.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// Its conventions.
+    pub fn pair(&self) -> &PairSettings {
+        &self.pair
+    }
+
+    /// Gives the session's memory back.
+    pub fn close(&mut self) {
+        self.session = None;
+    }
+
+    /// Looks at a pair; `stride` thins the outputs to the depth grid. Returns the edge and both pictures' heads.
+    ///
+    /// # Errors
+    /// ONNX Runtime or the contract fails.
+    pub fn run(
+        &mut self,
+        frames: &[Frame],
+        pair: [usize; 2],
+        stride: usize,
+        edge: usize,
+    ) -> Result<(Edge, [Heads; 2]), OnnxError> {
+        let [first, second] = pair.map(|i| &frames[i]);
+        let (w, h) = first.image.dimensions();
+        let session = match &mut self.session {
+            Some((size, session)) if *size == (w, h) => session,
+            slot => {
+                &mut slot.insert(((w, h), network::open(&self.manifest, self.bytes.get(), (w, h), self.threads)?)).1
+            }
+        };
+        let mut planes = [Vec::new(), Vec::new()];
+        push_planes(&first.image, w, h, &self.manifest.input, &mut planes[0]);
+        push_planes(&second.image, w, h, &self.manifest.input, &mut planes[1]);
+        let shape = [1, 3, h as usize, w as usize];
+        let names = ["pts3d", "conf", "scales", "rotations", "sh", "opacities"];
+        let wanted: Vec<String> = ["1", "2"].iter().flat_map(|v| names.map(|n| format!("{n}_{v}"))).collect();
+        let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
+        let out = session.run(&[("img1", &shape, &planes[0]), ("img2", &shape, &planes[1])], &wanted)?;
+        let size = (w as usize, h as usize);
+        let (map1, heads1) = self.thin(&out[..6], size, stride, edge, None);
+        // A network whose second pointmap is in the second camera's own frame is moved by the known poses.
+        let own_frame = (!self.pair.first_camera_frame).then(|| {
+            let r = first.view.pose.rotation.conjugate() * second.view.pose.rotation;
+            r.as_quat()
+        });
+        let (map2, heads2) = self.thin(&out[6..], size, stride, edge, own_frame);
+        Ok((Edge { first: pair[0], second: pair[1], maps: [map1, map2] }, [heads1, heads2]))
+    }
+
+    fn thin(
+        &self,
+        out: &[Tensor],
+        (w, h): (usize, usize),
+        stride: usize,
+        edge: usize,
+        turn: Option<Quat>,
+    ) -> (PointMap, Heads) {
+        let (gw, gh) = ((w / stride).max(1), (h / stride).max(1));
+        let n = gw * gh;
+        let mut map =
+            PointMap { width: gw, height: gh, points: Vec::with_capacity(n), confidence: Vec::with_capacity(n) };
+        let mut heads = Heads {
+            edge,
+            points: Vec::new(),
+            scales: Vec::with_capacity(n),
+            rotations: Vec::with_capacity(n),
+            colors: Vec::with_capacity(n),
+            opacities: Vec::with_capacity(n),
+            trust: 0.0,
+        };
+        let d = usize::from(self.pair.sh_degree + 1).pow(2);
+        let turn = turn.unwrap_or(Quat::IDENTITY);
+        for k in 0..n {
+            let (i, j) = ((k % gw * stride + stride / 2).min(w - 1), (k / gw * stride + stride / 2).min(h - 1));
+            let at = j * w + i;
+            let three = |t: &Tensor| Vec3::from_slice(&t.data[3 * at..3 * at + 3]);
+            map.points.push(turn * three(&out[0]));
+            map.confidence.push((out[1].data[at] - self.pair.confidence_offset).max(0.0));
+            let scale = three(&out[2]);
+            heads.scales.push(if self.pair.scales == ScaleUnit::Log { scale.exp() } else { scale });
+            let q: [f32; 4] = [0, 1, 2, 3].map(|c| out[3].data[4 * at + c]);
+            let q = match self.pair.quaternion {
+                QuaternionOrder::Xyzw => Quat::from_array(q),
+                QuaternionOrder::Wxyz => Quat::from_xyzw(q[1], q[2], q[3], q[0]),
+            };
+            heads.rotations.push(turn * if q.length_squared() > 1e-12 { q.normalize() } else { Quat::IDENTITY });
+            let dc = Vec3::new(out[4].data[at * 3 * d], out[4].data[at * 3 * d + d], out[4].data[at * 3 * d + 2 * d]);
+            heads.colors.push(dc * SH_C0 + if self.pair.sh_residual { 0.0 } else { 0.5 });
+            let o = out[5].data[at];
+            heads.opacities.push(if self.pair.opacity == OpacityUnit::Logit { 1.0 / (1.0 + (-o).exp()) } else { o });
+        }
+        heads.points.clone_from(&map.points);
+        heads.trust = map.confidence.iter().filter(|c| c.is_finite()).map(|c| f64::from(*c)).sum();
+        (map, heads)
+    }
+}
+
+/// Keeps the more trusted heads of a picture.
+pub fn keep_better(slot: &mut Option<Heads>, new: Heads) {
+    if slot.as_ref().is_none_or(|old| new.trust > old.trust) {
+        *slot = Some(new);
+    }
+}
+
+/// The camera of a depth grid: one pixel per sample.
+pub fn grid_view(view: &View, stride: usize) -> View {
+    let k = view.intrinsics;
+    let s = stride as f32;
+    let center = |c: f32| (c - (stride / 2) as f32 - 0.5) / s + 0.5;
+    let intrinsics = crate::camera::Intrinsics {
+        width: (k.width / stride as u32).max(1),
+        height: (k.height / stride as u32).max(1),
+        fx: k.fx / s,
+        fy: k.fy / s,
+        cx: center(k.cx),
+        cy: center(k.cy),
+    };
+    View { intrinsics, pose: view.pose }
+}
+
+/// Aligns all edges and writes χ into the frames' depth grids; returns the alignment.
+pub fn align_frames(frames: &mut [Frame], edges: &[Edge], settings: &InitSettings) -> Alignment {
+    let stride = settings.stride as usize;
+    let views: Vec<View> = frames.iter().map(|f| grid_view(&f.view, stride)).collect();
+    let alignment = align(&views, edges, settings.align_steps);
+    for (frame, map) in frames.iter_mut().zip(&alignment.maps) {
+        frame.depth = map.as_ref().map(|m| DepthGrid {
+            width: m.width,
+            height: m.height,
+            stride,
+            depth: m.depth.clone(),
+            // From 0…∞ to 0…1.
+            confidence: m.confidence.iter().map(|c| c / (1.0 + c)).collect(),
+        });
+    }
+    alignment
+}
+
+/// Σ of a picture's heads in the world: sᵍ from ICP between the original and the aligned points, sˡ from the distance to the
+/// neighbours before and after. `first` is the camera of [`Heads::edge`]'s first picture.
+pub fn appearance(
+    heads: &Heads,
+    frame: &Frame,
+    first: &View,
+    alignment: &Alignment,
+    settings: &InitSettings,
+    residual: bool,
+) -> Option<Appearance> {
+    let (grid, view) = (frame.depth.as_ref()?, &frame.view);
+    let sigma = alignment.sigma.get(heads.edge).copied().flatten()? as f32;
+    let turn = first.pose.rotation.normalize().as_quat();
+    let unproject = super::frame::Unprojector::new(view);
+    let aligned: Vec<Vec3> = (0..grid.depth.len())
+        .map(|at| {
+            let (x, y) = grid.pixel(at % grid.width, at / grid.width);
+            if grid.confidence[at] > 0.0 { unproject.at(x, y, grid.depth[at]) } else { Vec3::NAN }
+        })
+        .collect();
+    let original: Vec<Vec3> = heads.points.iter().map(|p| turn * *p).collect();
+    let global = if settings.global_scale { icp_scale(&original, &aligned).unwrap_or(sigma) } else { 1.0 };
+    let covariances = (0..aligned.len())
+        .map(|at| {
+            let local = if settings.local_scale {
+                let (before, after) = (spacing(&original, grid, at), spacing(&aligned, grid, at));
+                let ratio = after / (before * global);
+                if ratio.is_finite() { ratio.clamp(LOCAL[0], LOCAL[1]) } else { 1.0 }
+            } else {
+                1.0
+            };
+            let r = Mat3::from_quat(turn * heads.rotations[at]);
+            let s = heads.scales[at] * (global * local);
+            r * Mat3::from_diagonal(s * s) * r.transpose()
+        })
+        .collect();
+    Some(Appearance { covariances, colors: heads.colors.clone(), residual, opacities: heads.opacities.clone() })
+}
+
+/// sᵍ.
+fn icp_scale(original: &[Vec3], aligned: &[Vec3]) -> Option<f32> {
+    let step = original.len().div_ceil(ICP_POINTS).max(1);
+    let chosen: Vec<usize> = (0..original.len()).step_by(step).filter(|&i| aligned[i].is_finite()).collect();
+    let pick = |from: &[Vec3]| chosen.iter().map(|&i| from[i]).collect::<Vec<_>>();
+    icp(&pick(original), &pick(aligned), Metric::PointToPoint, None).ok().map(|r| r.similarity.scale as f32)
+}
+
+/// Mean distance to the right and lower (else left and upper) neighbours.
+fn spacing(points: &[Vec3], grid: &DepthGrid, at: usize) -> f32 {
+    let (i, j) = (at % grid.width, at / grid.width);
+    let across = if i + 1 < grid.width { at + 1 } else { at.saturating_sub(1) };
+    let down = if j + 1 < grid.height { at + grid.width } else { at.saturating_sub(grid.width) };
+    0.5 * (points[at].distance(points[across]) + points[at].distance(points[down]))
+}

@@ -1,0 +1,17 @@
+//! Gaussian cloud, cameras and file formats; ONNX sessions, pose refinement, global alignment and the
+//! initialisation that turns posed pictures into Gaussians.
+//!
+//! World frame: local ENU metres around a WGS-84 origin. Cameras: OpenCV axes (x right, y down, z forward).
+//! Pixel convention: the centre of the top-left pixel is (0.5, 0.5), as COLMAP's.
+
+pub mod align;
+pub mod baselines;
+pub mod camera;
+pub mod cloud;
+pub mod dataset;
+pub mod formats;
+pub mod init;
+pub mod metrics;
+pub mod onnx;
+pub mod refine;
+pub mod undistort;

@@ -1,0 +1,79 @@
+//! ONNX networks: where the runtime library is found, what a network promises (its manifest), and the features
+//! network that pose refinement and pair selection share.
+//!
+//! A session is opened when it is needed and dropped when it is not; nothing here is global except the runtime
+//! library itself, which ONNX Runtime allows only once per process.
+
+pub mod features;
+pub mod manifest;
+pub mod network;
+pub mod picture;
+pub mod session;
+
+use std::path::PathBuf;
+
+/// What can be wrong with a network, in one line each.
+#[derive(Debug, thiserror::Error)]
+pub enum OnnxError {
+    /// libonnxruntime.so is nowhere.
+    #[error(
+        "ONNX Runtime not found (looked at {searched}); put libonnxruntime.so (1.22 or newer, e.g. from the PyPI wheel `onnxruntime`) in ~/.local/share/dgtr/lib or point ORT_DYLIB_PATH at it"
+    )]
+    LibraryMissing {
+        /// The places tried.
+        searched: String,
+    },
+    /// The library is there but cannot be used.
+    #[error("ONNX Runtime at {path} cannot be used: {reason}")]
+    Library {
+        /// The library.
+        path: String,
+        /// The loader's words.
+        reason: String,
+    },
+    /// A file cannot be read.
+    #[error("{}: {reason}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        reason: String,
+    },
+    /// The manifest contradicts itself or the network's bytes.
+    #[error("network manifest {manifest}: {field}: {reason}")]
+    Manifest {
+        /// Where it came from.
+        manifest: String,
+        /// The offending field.
+        field: &'static str,
+        /// What is wrong, and what would be right.
+        reason: String,
+    },
+    /// The network's inputs or outputs are not what the manifest's contract promises.
+    #[error("network {network}: {tensor} is {found}, contract `{contract}` wants {expected}")]
+    Contract {
+        /// Name of the network.
+        network: String,
+        /// The contract in the manifest.
+        contract: &'static str,
+        /// The input or output.
+        tensor: String,
+        /// What was expected.
+        expected: String,
+        /// What the file says.
+        found: String,
+    },
+    /// ONNX Runtime failed while loading or running.
+    #[error("network {network}: {reason}")]
+    Runtime {
+        /// Name of the network.
+        network: String,
+        /// ONNX Runtime's words, one line.
+        reason: String,
+    },
+}
+
+/// ONNX Runtime's messages span lines; ours do not.
+fn one_line(error: impl std::fmt::Display) -> String {
+    error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,192 @@
+//! One ONNX Runtime session with bounded memory: the arena and spinning threads are off (a companion computer
+//! shares its cores), memory is planned from fixed shapes, and one or two threads work.
+//!
+//! The library is loaded at run time, so that the binary starts on a board without it and says what is missing.
+
+use std::path::PathBuf;
+use std::sync::OnceLock;
+
+use ort::environment::Environment;
+use ort::session::Session;
+use ort::session::builder::GraphOptimizationLevel;
+use ort::value::{TensorElementType, TensorRef, ValueType};
+
+use super::{OnnxError, one_line};
+
+/// Networks larger than this are refused before they are read: nothing a companion computer can run is larger.
+pub const MAX_NETWORK_BYTES: u64 = 4 << 30;
+
+/// Name, element type and shape of an input or output as the file declares it; −1 where the file leaves it open.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TensorSpec {
+    /// Name in the graph.
+    pub name: String,
+    /// True for 32-bit floats, the only type the contracts use.
+    pub is_f32: bool,
+    /// Dimensions, −1 = any.
+    pub shape: Vec<i64>,
+}
+
+/// A dense f32 tensor that came out of a network.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tensor {
+    /// Dimensions.
+    pub shape: Vec<usize>,
+    /// Row-major values.
+    pub data: Vec<f32>,
+}
+
+/// An input: name, dimensions, row-major values.
+pub type Input<'a> = (&'a str, &'a [usize], &'a [f32]);
+
+/// An opened network.
+#[derive(Debug)]
+pub struct NetworkSession {
+    name: String,
+    session: Session,
+    inputs: Vec<TensorSpec>,
+    outputs: Vec<TensorSpec>,
+}
+
+impl NetworkSession {
+    /// Opens a network from its bytes. `dimensions` pins symbolic dimensions (`("h", 480)`) so that the runtime can
+    /// plan its memory; unknown names are ignored by the runtime.
+    ///
+    /// # Errors
+    /// The library is missing or unusable, or the bytes are no network it can run.
+    pub fn open(name: &str, bytes: &[u8], threads: usize, dimensions: &[(&str, usize)]) -> Result<Self, OnnxError> {
+        let environment = environment()?;
+        let fail = |e: String| OnnxError::Runtime { network: name.to_owned(), reason: e };
+        let build = || -> ort::Result<Session> {
+            let mut b = Session::builder(environment)?
+                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(false).build()])?
+                .with_memory_pattern(true)?
+                .with_intra_op_spinning(false)?
+                .with_inter_op_spinning(false)?
+                .with_intra_threads(threads.clamp(1, 64))?
+                .with_inter_threads(1)?
+                .with_optimization_level(GraphOptimizationLevel::All)?;
+            for (symbol, size) in dimensions {
+                b = b.with_dimension_override(symbol, *size as i64)?;
+            }
+            b.commit_from_memory(bytes)
+        };
+        let session = build().map_err(|e| fail(one_line(e)))?;
+        let specs = |outlets: &[ort::value::Outlet]| outlets.iter().map(spec).collect::<Vec<_>>();
+        let (inputs, outputs) = (specs(session.inputs()), specs(session.outputs()));
+        Ok(Self { name: name.to_owned(), session, inputs, outputs })
+    }
+
+    /// What the network was called when it was opened.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Declared inputs.
+    pub fn inputs(&self) -> &[TensorSpec] {
+        &self.inputs
+    }
+
+    /// Declared outputs.
+    pub fn outputs(&self) -> &[TensorSpec] {
+        &self.outputs
+    }
+
+    /// Runs once and copies out the outputs in `wanted`, in that order.
+    ///
+    /// # Errors
+    /// ONNX Runtime refused the inputs or failed; an output in `wanted` is missing or not f32.
+    pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str]) -> Result<Vec<Tensor>, OnnxError> {
+        let network = self.name.clone();
+        let fail = |reason: String| OnnxError::Runtime { network: network.clone(), reason };
+        let mut values = Vec::with_capacity(inputs.len());
+        for &(name, shape, data) in inputs {
+            let tensor = TensorRef::from_array_view((shape.to_vec(), data))
+                .map_err(|e| fail(format!("input {name}: {}", one_line(e))))?;
+            values.push((name, tensor));
+        }
+        let results = self.session.run(values).map_err(|e| fail(one_line(e)))?;
+        wanted
+            .iter()
+            .map(|&name| {
+                let value = results.get(name).ok_or_else(|| fail(format!("has no output `{name}`")))?;
+                let (shape, data) =
+                    value.try_extract_tensor::<f32>().map_err(|e| fail(format!("output {name}: {}", one_line(e))))?;
+                Ok(Tensor { shape: shape.iter().map(|&d| d as usize).collect(), data: data.to_vec() })
+            })
+            .collect()
+    }
+}
+
+fn spec(outlet: &ort::value::Outlet) -> TensorSpec {
+    let (is_f32, shape) = match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => (*ty == TensorElementType::Float32, shape.iter().copied().collect()),
+        _ => (false, Vec::new()),
+    };
+    TensorSpec { name: outlet.name().to_owned(), is_f32, shape }
+}
+
+/// The places where the runtime library may be, in order.
+fn library_candidates() -> Vec<PathBuf> {
+    if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|p| !p.is_empty()) {
+        // The user has said which; another one found by luck would only confuse.
+        return vec![PathBuf::from(path)];
+    }
+    const FILE: &str = "libonnxruntime.so";
+    let mut places = Vec::new();
+    if let Some(home) = std::env::var_os("HOME") {
+        places.push(PathBuf::from(home).join(".local/share/dgtr/lib").join(FILE));
+    }
+    if let Some(folder) = std::env::current_exe().ok().and_then(|p| p.parent().map(PathBuf::from)) {
+        places.push(folder.join(FILE));
+        places.push(folder.join("../lib").join(FILE));
+    }
+    for folder in ["/usr/local/lib", "/usr/lib", "/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/lib"] {
+        places.push(PathBuf::from(folder).join(FILE));
+    }
+    places
+}
+
+/// The runtime library that would be used, if any.
+///
+/// # Errors
+/// [`OnnxError::LibraryMissing`] with the places tried.
+pub fn find_library() -> Result<PathBuf, OnnxError> {
+    let places = library_candidates();
+    places.iter().find(|p| p.is_file()).cloned().ok_or_else(|| OnnxError::LibraryMissing {
+        searched: places.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", "),
+    })
+}
+
+/// Loads the runtime library unless it is loaded, and says where it came from; for `dgtr doctor`.
+///
+/// # Errors
+/// As [`NetworkSession::open`].
+pub fn check_library() -> Result<PathBuf, OnnxError> {
+    let path = find_library()?;
+    environment()?;
+    Ok(path)
+}
+
+/// The one environment of the process; a failure is not remembered, so that a library installed meanwhile is found.
+fn environment() -> Result<&'static Environment, OnnxError> {
+    static ENVIRONMENT: OnceLock<Environment> = OnceLock::new();
+    static OPENING: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    if let Some(environment) = ENVIRONMENT.get() {
+        return Ok(environment);
+    }
+    let _one_at_a_time = OPENING.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    if let Some(environment) = ENVIRONMENT.get() {
+        return Ok(environment);
+    }
+    let path = find_library()?;
+    let unusable = |e: String| OnnxError::Library { path: path.display().to_string(), reason: e };
+    let environment = ort::init_from(&path)
+        .map_err(|e| unusable(one_line(e)))?
+        .with_name("dgtr")
+        .with_telemetry(false)
+        .build()
+        .map_err(|e| unusable(one_line(e)))?;
+    environment.set_log_level(ort::logging::LogLevel::Error);
+    Ok(ENVIRONMENT.get_or_init(|| environment))
+}

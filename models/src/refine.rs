@@ -1,0 +1,396 @@
+//! Pose refinement: telemetry says where a camera was to within metres and degrees, the pictures say it to within
+//! centimetres. XFeat matches between co-visible key frames, verified relative poses, tracks, and a bundle
+//! adjustment in which telemetry is the prior that fixes the gauge.
+//!
+//! Key frames are added one at a time while flying ([`Refiner::add`] extracts, matches and verifies) and
+//! [`Refiner::solve`] may be called whenever there is time; it starts from what the last one found. Everything held
+//! is bounded by [`RefineSettings`]; of pictures only grey values are kept. What telemetry gets wrong for all frames alike
+//! (camera mount, delay of positions, focal length) is estimated when the pictures can tell it and left alone
+//! when not.
+
+mod adjust;
+mod frames;
+mod gauge;
+mod linking;
+mod matching;
+mod motion;
+mod overlap;
+mod polish;
+mod problem;
+mod reduced;
+mod report;
+mod resect;
+mod schur;
+mod so3;
+mod solving;
+mod tracks;
+mod triangulate;
+mod twoview;
+mod upright;
+
+pub use report::{AddReport, RefineReport, RefinedPoint, SharedEstimate};
+
+use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use crate::onnx::OnnxError;
+use crate::onnx::features::{FeatureNetwork, Features};
+use config::refine::{RefineSettings, RefineSettingsError};
+use frames::{Camera, DESCRIPTOR, Frame, quantise, spread};
+use glam::DVec3;
+use image::RgbImage;
+use linking::Pair;
+use polish::Grey;
+use problem::Shared;
+use std::collections::HashMap;
+use std::time::Instant;
+use thiserror::Error;
+use tracks::Union;
+
+/// Why a key frame was not taken, or the refiner not opened.
+#[derive(Debug, Error)]
+pub enum RefineError {
+    /// A setting is out of range.
+    #[error(transparent)]
+    Settings(#[from] RefineSettingsError),
+    /// The feature network cannot be opened or run.
+    #[error(transparent)]
+    Network(#[from] OnnxError),
+    /// A picture was given to a refiner without a network.
+    #[error("this refiner was opened without a feature network; give it features instead of pictures")]
+    NoNetwork,
+    /// The cap on key frames is reached.
+    #[error("key frame {name} is beyond the {max} that [refine] max_keyframes allows; it keeps its telemetry pose")]
+    Full {
+        /// The key frame.
+        name: String,
+        /// The cap.
+        max: usize,
+    },
+    /// A name was used before.
+    #[error("key frame {0} was added before; names must be unique")]
+    Duplicate(String),
+    /// NaN, an infinite number or a zero quaternion in a pose; a sigma that is not positive.
+    #[error("key frame {name}: its {what}; it was left out")]
+    Invalid {
+        /// The key frame.
+        name: String,
+        /// What is wrong.
+        what: &'static str,
+    },
+}
+
+/// Refines the poses of key frames; see the module's text.
+pub struct Refiner {
+    settings: RefineSettings,
+    /// One for pictures as they are, one for pictures on their side: a session is tied to one size.
+    networks: Option<[FeatureNetwork; 2]>,
+    frames: Vec<Frame>,
+    by_name: HashMap<String, u32>,
+    union: Union,
+    pairs: Vec<Pair>,
+    shared: Shared,
+    /// Height of the ground, world metres, overall and under each frame.
+    ground: Option<f64>,
+    grounds: Vec<Option<f64>>,
+    pair_grounds: Vec<f64>,
+    points: Vec<RefinedPoint>,
+    solves: u32,
+    totals: RefineReport,
+}
+
+impl Refiner {
+    /// Opens the feature network (the embedded one) and reserves for the caps of `settings`.
+    ///
+    /// # Errors
+    /// A setting is out of range, or ONNX Runtime is missing.
+    pub fn open(settings: &RefineSettings) -> Result<Self, RefineError> {
+        let mut refiner = Self::without_network(settings)?;
+        let open = || FeatureNetwork::open(None, settings.threads);
+        refiner.networks = Some([open()?, open()?]);
+        Ok(refiner)
+    }
+
+    /// A refiner that is given features ([`Refiner::add_features`]) rather than pictures.
+    ///
+    /// # Errors
+    /// A setting is out of range.
+    pub fn without_network(settings: &RefineSettings) -> Result<Self, RefineError> {
+        settings.check()?;
+        Ok(Self {
+            settings: settings.clone(),
+            networks: None,
+            frames: Vec::with_capacity(settings.max_keyframes),
+            by_name: HashMap::with_capacity(settings.max_keyframes),
+            union: Union::with_capacity(settings.max_keyframes * settings.max_features),
+            pairs: Vec::new(),
+            shared: Shared::default(),
+            ground: None,
+            grounds: Vec::with_capacity(settings.max_keyframes),
+            pair_grounds: Vec::new(),
+            points: Vec::new(),
+            solves: 0,
+            totals: RefineReport::default(),
+        })
+    }
+
+    /// Takes a key frame: extracts features and links it to the frames before it. Of the picture only the grey
+    /// values are kept, at the size the network saw.
+    ///
+    /// # Errors
+    /// The pose or sigma is not usable, the name is taken, the cap is reached, or the network failed. The refiner
+    /// is as before then.
+    pub fn add(&mut self, image: &PosedImage) -> Result<AddReport, RefineError> {
+        self.check(&image.name, &image.view, &image.sigma)?;
+        let lens = image.view.intrinsics;
+        if (image.image.width(), image.image.height()) != (lens.width, lens.height) {
+            return Err(invalid(&image.name, "picture and intrinsics differ in size"));
+        }
+        let camera = Camera::new(self.expect(&image.view.pose), &lens, self.shared.log_focal.exp());
+        let candidates = self.candidates(&camera, &lens);
+        let turns = candidates.first().map_or(0, |a| {
+            let frame = &self.frames[*a as usize];
+            upright::turns_like(&self.camera_of(frame), frame.turns, &camera, &lens, self.ground_at(*a as usize))
+        });
+        let mut report = AddReport::default();
+        let features = self.extract(&image.image, turns, &mut report)?;
+        self.insert(&image.name, image.time_ns, &image.view, &image.sigma);
+        self.set_features(features, turns, Some(&image.image), &mut report);
+        self.link(&candidates, &mut report);
+        // A heading that is wrong by a quarter or half turn: descriptors do not match unless the picture is
+        // turned accordingly. Only for frames that should overlap and do not.
+        for more in [2, 1, 3] {
+            if report.pairs_verified > 0 || candidates.is_empty() || report.features == 0 {
+                break;
+            }
+            let turns = (turns + more) % 4;
+            let features = self.extract(&image.image, turns, &mut report)?;
+            self.set_features(features, turns, Some(&image.image), &mut report);
+            let clock = Instant::now();
+            self.link_wide(&candidates[..candidates.len().min(2)], &mut report);
+            report.match_seconds += clock.elapsed().as_secs_f64();
+        }
+        self.finish(report)
+    }
+
+    /// As [`Refiner::add`], with features found elsewhere (64 floats per descriptor, best first).
+    ///
+    /// # Errors
+    /// As [`Refiner::add`]; the lengths of `features` do not agree.
+    pub fn add_features(
+        &mut self,
+        name: &str,
+        time_ns: u64,
+        view: &View,
+        sigma: &PoseSigma,
+        features: Features,
+    ) -> Result<AddReport, RefineError> {
+        self.check(name, view, sigma)?;
+        if features.descriptors.len() != features.keypoints.len() * DESCRIPTOR {
+            return Err(invalid(name, "features do not hold 64 values per key point"));
+        }
+        let camera = Camera::new(self.expect(&view.pose), &view.intrinsics, self.shared.log_focal.exp());
+        let candidates = self.candidates(&camera, &view.intrinsics);
+        let mut report = AddReport::default();
+        self.insert(name, time_ns, view, sigma);
+        self.set_features(features, 0, None, &mut report);
+        self.link(&candidates, &mut report);
+        self.finish(report)
+    }
+
+    /// Optimises all poses from where they are, within the time that the settings allow.
+    ///
+    /// # Errors
+    /// None at present beyond those of the type; a problem without enough links returns telemetry's poses.
+    pub fn solve(&mut self) -> Result<RefineReport, RefineError> {
+        self.solve_all()
+    }
+
+    /// Best pose of a key frame so far: telemetry's (with the shared errors taken out) until it is linked.
+    pub fn pose(&self, name: &str) -> Option<Pose> {
+        self.by_name.get(name).map(|i| self.frames[*i as usize].pose)
+    }
+
+    /// True when pictures, not only telemetry, hold the key frame in place.
+    pub fn is_tied(&self, name: &str) -> bool {
+        self.by_name.get(name).is_some_and(|i| self.frames[*i as usize].tied)
+    }
+
+    /// The key frame's lens with the estimated focal length.
+    pub fn intrinsics(&self, name: &str) -> Option<Intrinsics> {
+        let k = self.frames[*self.by_name.get(name)? as usize].intrinsics;
+        let scale = self.shared.log_focal.exp() as f32;
+        Some(Intrinsics { fx: k.fx * scale, fy: k.fy * scale, ..k })
+    }
+
+    /// Depths between which 98 % of the key frame's points lie, widened by 15 %, metres along the optical axis;
+    /// `None` with too few points.
+    pub fn depth_range(&self, name: &str) -> Option<(f32, f32)> {
+        let (near, far) = self.frames[*self.by_name.get(name)? as usize].depths?;
+        Some((near / 1.15, far * 1.15))
+    }
+
+    /// Points of the last [`Refiner::solve`].
+    pub fn sparse_points(&self) -> &[RefinedPoint] {
+        &self.points
+    }
+
+    /// Telemetry pose of any other picture of the same flight, with the shared errors taken out; `velocity` in
+    /// m/s, zero when unknown.
+    pub fn correct(&self, telemetry: &Pose, velocity: DVec3) -> Pose {
+        solving::corrected(telemetry, velocity, &self.shared)
+    }
+
+    /// Bytes held for key frames, tracks and points.
+    pub fn bytes(&self) -> usize {
+        let frames: usize = self
+            .frames
+            .iter()
+            .map(|f| f.descriptors.len() + f.keypoints.len() * 12 + f.grey.as_ref().map_or(0, Grey::bytes))
+            .sum();
+        frames
+            + self.union.bytes()
+            + std::mem::size_of_val(self.points.as_slice())
+            + std::mem::size_of_val(self.pairs.as_slice())
+    }
+
+    fn expect(&self, telemetry: &Pose) -> Pose {
+        self.correct(telemetry, DVec3::ZERO)
+    }
+
+    fn counts(&self) -> RefineReport {
+        let linked = self.frames.iter().filter(|f| f.pairs > 0).count();
+        RefineReport { frames: self.frames.len(), frames_linked: linked, ..self.totals.clone() }
+    }
+
+    fn check(&mut self, name: &str, view: &View, sigma: &PoseSigma) -> Result<(), RefineError> {
+        let k = &view.intrinsics;
+        let q = view.pose.rotation;
+        let what = if !(view.pose.center.is_finite() && q.is_finite()) {
+            "pose is not a number"
+        } else if (q.length() - 1.0).abs() > 1e-3 {
+            "rotation is not a unit quaternion"
+        } else if !sigma.position_m.iter().chain(&sigma.rotation_rad).all(|s| *s > 0.0) {
+            "sigma is not positive"
+        } else if !(k.fx > 0.0
+            && k.fy > 0.0
+            && k.fx.is_finite()
+            && k.fy.is_finite()
+            && k.cx.is_finite()
+            && k.cy.is_finite())
+        {
+            "lens is not a number"
+        } else {
+            ""
+        };
+        if !what.is_empty() {
+            self.totals.frames_invalid += 1;
+            return Err(invalid(name, what));
+        }
+        if self.by_name.contains_key(name) {
+            return Err(RefineError::Duplicate(name.to_owned()));
+        }
+        if self.frames.len() >= self.settings.max_keyframes {
+            self.totals.frames_over_cap += 1;
+            return Err(RefineError::Full { name: name.to_owned(), max: self.settings.max_keyframes });
+        }
+        Ok(())
+    }
+
+    fn extract(&mut self, image: &RgbImage, turns: u8, report: &mut AddReport) -> Result<Features, RefineError> {
+        let clock = Instant::now();
+        let [level, sideways] = self.networks.as_mut().ok_or(RefineError::NoNetwork)?;
+        let network = if turns.is_multiple_of(2) { level } else { sideways };
+        let seen = upright::prepare(image, self.settings.feature_side, turns);
+        let mut features = network.extract(&seen, 2 * self.settings.max_features)?;
+        for p in &mut features.keypoints {
+            *p = upright::restore(*p, seen.width(), seen.height(), turns, image.dimensions());
+        }
+        report.extractions += 1;
+        report.extract_seconds += clock.elapsed().as_secs_f64();
+        Ok(features)
+    }
+
+    fn insert(&mut self, name: &str, time_ns: u64, view: &View, sigma: &PoseSigma) {
+        let prior = Pose { rotation: view.pose.rotation.normalize(), ..view.pose };
+        let largest = |v: [f32; 3], cap: f64| f64::from(v.iter().fold(0.0f32, |a, b| a.max(*b))).min(cap);
+        self.by_name.insert(name.to_owned(), self.frames.len() as u32);
+        self.grounds.push(None);
+        self.frames.push(Frame {
+            name: name.to_owned(),
+            time_ns,
+            intrinsics: view.intrinsics,
+            prior,
+            sigma: *sigma,
+            pose: self.expect(&prior),
+            // Beyond these, guided search is no guide any more.
+            rotation_sigma: largest(sigma.rotation_rad, 0.5),
+            position_sigma: largest(sigma.position_m, 30.0),
+            rotation_refused: false,
+            adjusted: false,
+            tied: false,
+            turns: 0,
+            pairs: 0,
+            depths: None,
+            keypoints: Vec::new(),
+            colors: Vec::new(),
+            polished: Vec::new(),
+            grey: None,
+            descriptors: Vec::new(),
+            first_node: self.union.grow(0, 0),
+        });
+    }
+
+    /// Gives the newest frame its features (again, when a turn of the picture did not match).
+    fn set_features(&mut self, features: Features, turns: u8, image: Option<&RgbImage>, report: &mut AddReport) {
+        let newest = self.frames.len().saturating_sub(1) as u32;
+        let Some(frame) = self.frames.last_mut() else { return };
+        let features = spread(features, self.settings.max_features);
+        let count = features.keypoints.len();
+        let first = frame.first_node;
+        report.features = count;
+        frame.turns = turns;
+        frame.descriptors = quantise(&features.descriptors);
+        frame.keypoints = features.keypoints;
+        frame.colors = frame
+            .keypoints
+            .iter()
+            .map(|p| match image {
+                Some(image) => {
+                    image.get_pixel((p[0] as u32).min(image.width() - 1), (p[1] as u32).min(image.height() - 1)).0
+                }
+                None => [128; 3],
+            })
+            .collect();
+        frame.polished = vec![false; count];
+        frame.grey = image.map(|image| Grey::new(image, self.settings.feature_side));
+        self.union.shrink(first);
+        self.union.grow(newest, count);
+    }
+
+    fn link(&mut self, candidates: &[u32], report: &mut AddReport) {
+        let clock = Instant::now();
+        self.link_guided(candidates, report);
+        if report.pairs_verified == 0 && self.frames.len() > 1 {
+            // No overlap predicted may be a wrong prediction: the frames just before are worth a look.
+            let newest = self.frames.len() as u32 - 1;
+            let recent: Vec<u32> = (0..newest).rev().take(2).collect();
+            self.link_wide(if candidates.is_empty() { &recent } else { candidates }, report);
+        }
+        report.match_seconds += clock.elapsed().as_secs_f64();
+    }
+
+    fn finish(&mut self, report: AddReport) -> Result<AddReport, RefineError> {
+        if report.contradicted {
+            // Whose heading is wrong is settled at once, so that the next frame is guided by the majority.
+            self.vote();
+        }
+        self.totals.absorb(&report);
+        if let Some(f) = self.frames.last() {
+            tracing::debug!(frame = %f.name, features = report.features, pairs = report.pairs_verified, "key frame linked");
+        }
+        Ok(report)
+    }
+}
+
+fn invalid(name: &str, what: &'static str) -> RefineError {
+    RefineError::Invalid { name: name.to_owned(), what }
+}

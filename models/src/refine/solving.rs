@@ -1,0 +1,300 @@
+//! One optimisation over everything held: tracks, triangulation, bundle adjustment in stages of growing trust,
+//! shared parameters where the pictures can tell them, and the points and depth ranges that come out.
+
+use super::adjust::{Limits, adjust, shared_sigma};
+use super::frames::Camera;
+use super::linking::{ADJUSTED_SIGMA, median};
+use super::motion::velocities;
+use super::problem::{Loss, Observation, PosePrior, Problem, SHARED};
+use super::resect::resect;
+use super::tracks::{Sighting, Tracks};
+use super::triangulate::{Triangulated, triangulate};
+use super::{RefineError, RefineReport, RefinedPoint, Refiner, SharedEstimate};
+use crate::camera::Pose;
+use glam::DVec3;
+use std::time::{Duration, Instant};
+
+/// Reprojection errors (pixels) a triangulation may have while poses are telemetry's, and after a first
+/// adjustment; sightings beyond are left out until poses are better.
+const COARSE_PX: f64 = 60.0;
+const FINE_PX: f64 = 12.0;
+/// Sightings that tie a frame to the map; with fewer, its pose is mostly telemetry's.
+const TIED: usize = 12;
+
+impl Refiner {
+    pub(super) fn solve_all(&mut self) -> Result<RefineReport, RefineError> {
+        let start = Instant::now();
+        let deadline = start + Duration::from_secs_f64(self.settings.solve_seconds);
+        let mut report = self.counts();
+        self.place_new_frames();
+        self.vote();
+        let tracks = Tracks::build(&mut self.union, &self.frames, self.settings.max_observations);
+        report.tracks = tracks.len();
+        report.observations_over_cap = tracks.over_cap;
+        let chosen = tracks.select(self.frames.len(), self.settings.max_tracks);
+        report.adjusted_tracks = chosen.len();
+        // Frames never adjusted are still metres off: a convex loss first, and frames that most points disagree
+        // with (a GPS position that jumped) are placed from the points alone.
+        if self.frames.iter().any(|f| !f.adjusted) {
+            let mut problem = self.problem(&tracks, &chosen, COARSE_PX);
+            let limits = Limits { loss: Loss::Huber(3.0), max_steps: 12, deadline };
+            report.steps += adjust(&mut problem, limits).steps;
+            self.take(&problem);
+            report.replaced_frames = self.replace_strays(&problem, &tracks, &chosen);
+        }
+        let mut problem = self.problem(&tracks, &chosen, FINE_PX);
+        let limits = Limits { loss: Loss::Cauchy(2.0), max_steps: 12, deadline };
+        report.steps += adjust(&mut problem, limits).steps;
+        self.take(&problem);
+        let mut problem = self.problem(&tracks, &chosen, self.settings.outlier_px);
+        problem.free = [false; SHARED];
+        let sigma = shared_sigma(&mut problem, limits.loss);
+        problem.free = self.observable(&sigma);
+        let last = adjust(&mut problem, Limits { max_steps: 25, ..limits });
+        report.steps += last.steps;
+        report.converged = last.converged;
+        self.take(&problem);
+        report.shared = self.shared_estimate(&problem, &sigma);
+        self.harvest(&tracks, &mut report);
+        for frame in &mut self.frames {
+            frame.adjusted = frame.pairs > 0;
+            if frame.adjusted {
+                frame.rotation_sigma = ADJUSTED_SIGMA;
+                frame.position_sigma = frame.position_sigma.min(0.3);
+            }
+        }
+        self.solves += 1;
+        report.solve_seconds = start.elapsed().as_secs_f64();
+        Ok(report)
+    }
+
+    /// Unlinked frames, and the positions of frames not yet adjusted, follow telemetry and what is known about
+    /// its shared errors.
+    fn place_new_frames(&mut self) {
+        let velocity = self.velocities();
+        for (frame, v) in self.frames.iter_mut().zip(velocity) {
+            if !frame.adjusted {
+                frame.pose.center = frame.prior.center + v * self.shared.delay;
+            }
+            if frame.pairs == 0 {
+                frame.pose.rotation = (frame.prior.rotation * self.shared.mount).normalize();
+            }
+        }
+    }
+
+    fn velocities(&self) -> Vec<DVec3> {
+        let path: Vec<_> = self.frames.iter().map(|f| (f.time_ns, f.prior.center)).collect();
+        velocities(&path)
+    }
+
+    /// The adjustment's problem at the present poses: chosen tracks that triangulate to below `max_px`.
+    fn problem(&self, tracks: &Tracks, chosen: &[u32], max_px: f64) -> Problem {
+        let s = &self.settings;
+        let weight = |sigma: f64| if sigma > 0.0 { 1.0 / sigma } else { 0.0 };
+        let priors = self.frames.iter().zip(self.velocities()).map(|(f, velocity)| {
+            let per = |v: [f32; 3]| DVec3::from_array(v.map(|x| 1.0 / f64::from(x)));
+            let rotation_weight = if f.rotation_refused { DVec3::ZERO } else { per(f.sigma.rotation_rad) };
+            PosePrior { pose: f.prior, velocity, position_weight: per(f.sigma.position_m), rotation_weight }
+        });
+        let mount = weight(s.mount_sigma_deg.to_radians());
+        let mut problem = Problem {
+            intrinsics: self.frames.iter().map(|f| f.intrinsics).collect(),
+            poses: self.frames.iter().map(|f| f.pose).collect(),
+            priors: priors.collect(),
+            points: Vec::with_capacity(chosen.len()),
+            starts: vec![0],
+            observations: Vec::new(),
+            shared: self.shared,
+            shared_weight: [mount, mount, mount, weight(s.delay_sigma_s), weight(s.focal_sigma)],
+            free: [false; SHARED],
+            pixel_sigma: s.pixel_sigma,
+        };
+        let cameras = self.cameras();
+        let mut views = Vec::new();
+        for t in chosen {
+            let mut seen = tracks.get(*t as usize).to_vec();
+            if let Some(point) = self.robust_point(&cameras, &mut seen, max_px, &mut views) {
+                problem.points.push(point.world);
+                problem.observations.extend(seen.iter().map(|s| Observation {
+                    camera: s.frame,
+                    pixel: self.frames[s.frame as usize].keypoints[s.feature as usize],
+                }));
+                problem.starts.push(problem.observations.len() as u32);
+            }
+        }
+        problem
+    }
+
+    fn cameras(&self) -> Vec<Camera> {
+        self.frames.iter().map(|f| self.camera_of(f)).collect()
+    }
+
+    /// Triangulates a track; while it does not fit, the sighting furthest off is left out, down to two.
+    fn robust_point(
+        &self,
+        cameras: &[Camera],
+        seen: &mut Vec<Sighting>,
+        max_px: f64,
+        views: &mut Vec<(Camera, [f32; 2])>,
+    ) -> Option<Triangulated> {
+        let min_angle = self.settings.min_angle_deg.to_radians();
+        loop {
+            views.clear();
+            views.extend(seen.iter().map(|s| {
+                let frame = s.frame as usize;
+                (cameras[frame], self.frames[frame].keypoints[s.feature as usize])
+            }));
+            let found = triangulate(views, min_angle)?;
+            let error = |v: &(Camera, [f32; 2])| match v.0.project(found.world) {
+                Some(q) => (q - glam::DVec2::new(v.1[0].into(), v.1[1].into())).length(),
+                None => f64::INFINITY,
+            };
+            let worst = views.iter().map(error).enumerate().max_by(|a, b| a.1.total_cmp(&b.1))?;
+            if worst.1 <= max_px {
+                return Some(found);
+            }
+            // Two rays always nearly meet somewhere; a third must agree before one of three is dropped.
+            if seen.len() <= 3 {
+                return None;
+            }
+            seen.remove(worst.0);
+        }
+    }
+
+    /// Writes adjusted poses and shared parameters back.
+    fn take(&mut self, problem: &Problem) {
+        for (frame, pose) in self.frames.iter_mut().zip(&problem.poses) {
+            if pose.center.is_finite() && pose.rotation.is_finite() {
+                frame.pose = *pose;
+            }
+        }
+        self.shared = problem.shared;
+    }
+
+    /// Frames that hold few of the sightings they should have had are placed from the points around them.
+    fn replace_strays(&mut self, problem: &Problem, tracks: &Tracks, chosen: &[u32]) -> usize {
+        let mut wanted = vec![0usize; self.frames.len()];
+        let mut held = vec![0usize; self.frames.len()];
+        chosen.iter().flat_map(|t| tracks.get(*t as usize)).for_each(|s| wanted[s.frame as usize] += 1);
+        problem.observations.iter().for_each(|o| held[o.camera as usize] += 1);
+        let strays: Vec<usize> =
+            (0..self.frames.len()).filter(|i| wanted[*i] >= TIED && held[*i] * 2 < wanted[*i]).collect();
+        if strays.is_empty() || strays.len() * 2 > self.frames.len() {
+            return 0;
+        }
+        let cameras = self.cameras();
+        let mut seen_by = vec![Vec::new(); self.frames.len()];
+        let mut views = Vec::new();
+        for t in chosen {
+            let (own, mut others): (Vec<Sighting>, Vec<Sighting>) =
+                tracks.get(*t as usize).iter().partition(|s| strays.contains(&(s.frame as usize)));
+            if own.is_empty() {
+                continue;
+            }
+            if let Some(p) = self.robust_point(&cameras, &mut others, FINE_PX, &mut views) {
+                for s in own {
+                    seen_by[s.frame as usize]
+                        .push((p.world, self.frames[s.frame as usize].keypoints[s.feature as usize]));
+                }
+            }
+        }
+        let mut replaced = 0;
+        for i in strays {
+            if seen_by[i].len() >= TIED
+                && let Some(pose) = resect(cameras[i], &seen_by[i], self.settings.outlier_px * 3.0)
+            {
+                self.frames[i].pose = pose;
+                replaced += 1;
+            }
+        }
+        replaced
+    }
+
+    /// Shared parameters whose sigma the pictures cut below the wanted fraction of its prior.
+    fn observable(&self, sigma: &[f64; SHARED]) -> [bool; SHARED] {
+        let s = &self.settings;
+        let mount = s.mount_sigma_deg.to_radians();
+        let prior = [mount, mount, mount, s.delay_sigma_s, s.focal_sigma];
+        let tied = self.frames.iter().filter(|f| f.pairs > 0).count();
+        // Fewer frames than shared parameters cannot tell them from their own errors, whatever the formula says.
+        std::array::from_fn(|k| tied > SHARED && prior[k] > 0.0 && sigma[k] < s.observable_ratio * prior[k])
+    }
+
+    fn shared_estimate(&self, problem: &Problem, sigma: &[f64; SHARED]) -> SharedEstimate {
+        let m = super::so3::log(problem.shared.mount);
+        SharedEstimate {
+            mount_deg: [m.x, m.y, m.z].map(f64::to_degrees),
+            mount_sigma_deg: [sigma[0], sigma[1], sigma[2]].map(f64::to_degrees),
+            mount_estimated: [problem.free[0], problem.free[1], problem.free[2]],
+            delay_s: problem.shared.delay,
+            delay_sigma_s: sigma[3],
+            delay_estimated: problem.free[3],
+            focal_scale: problem.shared.log_focal.exp(),
+            focal_sigma: sigma[4],
+            focal_estimated: problem.free[4],
+        }
+    }
+
+    /// All tracks at the final poses: points, depth ranges, ground heights and the errors that remain.
+    fn harvest(&mut self, tracks: &Tracks, report: &mut RefineReport) {
+        let cameras = self.cameras();
+        let mut depths: Vec<Vec<f32>> = vec![Vec::new(); self.frames.len()];
+        let mut heights: Vec<Vec<f64>> = vec![Vec::new(); self.frames.len()];
+        let mut errors = Vec::new();
+        self.points.clear();
+        let mut views = Vec::new();
+        for t in 0..tracks.len() {
+            let mut seen = tracks.get(t).to_vec();
+            let all = seen.len();
+            let Some(p) = self.robust_point(&cameras, &mut seen, self.settings.outlier_px, &mut views) else {
+                report.outlier_observations += all;
+                continue;
+            };
+            report.outlier_observations += all - seen.len();
+            let mut color = [0u32; 3];
+            for (s, (camera, pixel)) in seen.iter().zip(&views) {
+                let frame = s.frame as usize;
+                depths[frame].push(camera.local(p.world).z as f32);
+                heights[frame].push(p.world.z);
+                let c = self.frames[frame].colors[s.feature as usize];
+                (0..3).for_each(|k| color[k] += u32::from(c[k]));
+                if let Some(q) = camera.project(p.world) {
+                    errors.push((q - glam::DVec2::new(pixel[0].into(), pixel[1].into())).length());
+                }
+            }
+            self.points.push(RefinedPoint {
+                position: p.world.to_array(),
+                color: color.map(|c| (c / seen.len() as u32) as u8),
+                views: seen.len() as u32,
+                error_px: p.rms_px as f32,
+                angle_deg: p.angle.to_degrees() as f32,
+            });
+        }
+        report.points = self.points.len();
+        report.observations = errors.len();
+        report.reprojection_rms_px = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len().max(1) as f64).sqrt();
+        report.reprojection_median_px = median(&mut errors);
+        for (i, frame) in self.frames.iter_mut().enumerate() {
+            frame.tied = depths[i].len() >= TIED;
+            frame.depths = frame.tied.then(|| (quantile(&mut depths[i], 0.01), quantile(&mut depths[i], 0.99)));
+            self.grounds[i] = frame.tied.then(|| median(&mut heights[i]));
+        }
+        let mut grounds: Vec<f64> = self.grounds.iter().flatten().copied().collect();
+        if !grounds.is_empty() {
+            self.ground = Some(median(&mut grounds));
+        }
+        report.frames_tied = self.frames.iter().filter(|f| f.tied).count();
+        report.rotations_refused = self.frames.iter().filter(|f| f.rotation_refused).count();
+        report.ground_m = self.ground;
+    }
+}
+
+fn quantile(values: &mut [f32], q: f64) -> f32 {
+    let k = ((values.len() - 1) as f64 * q).round() as usize;
+    *values.select_nth_unstable_by(k, f32::total_cmp).1
+}
+
+/// Telemetry pose with the shared errors taken out.
+pub(super) fn corrected(pose: &Pose, velocity: DVec3, shared: &super::problem::Shared) -> Pose {
+    Pose { rotation: (pose.rotation * shared.mount).normalize(), center: pose.center + velocity * shared.delay }
+}

@@ -1,0 +1,61 @@
+#!/bin/sh
+# Installs what dgtr needs beside git, a C compiler and Rust, and only what is missing:
+#   - the Vulkan loader and, where no GPU driver is installed, Mesa's software driver (Debian/Ubuntu packages, needs root);
+#   - ONNX Runtime's shared library, out of its published Python package, into ~/.local/share/dgtr/lib.
+# Ends with 0 when everything is there, with 3 and one line that says what to install when it cannot be.
+# `setup.sh --tests` also brings what only the tests need (a C++ compiler for the shader check).
+set -eu
+
+lib="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/lib"
+
+say() { echo "dgtr setup: $*" >&2; }
+give_up() { say "$*"; exit 3; }
+
+# apt PACKAGE...: installs as root, or with a sudo that asks nothing; otherwise says which command to run.
+apt() {
+    command -v apt-get >/dev/null || give_up "no apt-get here; install the equivalents of: $*"
+    if [ "$(id -u)" = 0 ]; then as=; elif sudo -n true 2>/dev/null; then as="sudo -n"; else
+        give_up "not root; run: sudo apt-get install $*"
+    fi
+    say "installing $*"
+    $as apt-get update -qq >&2 || say "apt-get update failed; trying with the package lists there are"
+    $as env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null ||
+        give_up "apt-get could not install: $*"
+}
+
+have_library() { { ldconfig -p 2>/dev/null || /sbin/ldconfig -p; } | grep -q "$1"; }
+
+have_vulkan_driver() {
+    [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ] && return 0
+    for dir in /usr/share /usr/local/share /etc "${XDG_DATA_HOME:-$HOME/.local/share}"; do
+        for file in "$dir"/vulkan/icd.d/*.json; do [ -e "$file" ] && return 0; done
+    done
+    return 1
+}
+
+have_library libvulkan.so.1 || apt libvulkan1
+have_vulkan_driver || apt mesa-vulkan-drivers
+
+if [ -z "${ORT_DYLIB_PATH:-}" ] && [ ! -e "$lib/libonnxruntime.so" ] && ! have_library libonnxruntime.so; then
+    command -v python3 >/dev/null && python3 -m pip --version >/dev/null 2>&1 || apt python3 python3-pip
+    say "fetching ONNX Runtime into $lib"
+    wheel=$(mktemp -d)
+    trap 'rm -rf "$wheel"' EXIT
+    python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --dest "$wheel" onnxruntime ||
+        give_up "pip could not fetch the package onnxruntime; or set ORT_DYLIB_PATH to a libonnxruntime.so of 1.22 or later"
+    mkdir -p "$lib"
+    python3 - "$wheel" "$lib" <<'PY'
+import glob, os, sys, zipfile
+wheel = zipfile.ZipFile(glob.glob(sys.argv[1] + "/onnxruntime-*.whl")[0])
+name = next(n for n in wheel.namelist() if "/capi/libonnxruntime.so" in n)
+for member, target in ((name, "libonnxruntime.so"), ("onnxruntime/LICENSE", "LICENSE.onnxruntime")):
+    path = os.path.join(sys.argv[2], target)
+    with open(path + ".part", "wb") as out:
+        out.write(wheel.read(member))
+    os.replace(path + ".part", path)
+PY
+fi
+
+if [ "${1:-}" = --tests ]; then
+    command -v c++ >/dev/null || apt g++
+fi

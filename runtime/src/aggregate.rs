@@ -1,0 +1,186 @@
+//! The ground's work: local models in, one global model out (the paper's §Model Aggregation).
+//!
+//! Bring every model into one frame → keep of each what its aircraft answers for → unite → let every aircraft's own
+//! model teach the union how its own training views look, where regions meet. Pictures are never needed.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use config::geodesy::Geodetic;
+use config::ground::GroundSettings;
+use models::cloud::GaussianCloud;
+use models::formats::model::{self, ModelHeader};
+use vulkan::trainer::TrainError;
+
+pub mod compare;
+pub mod distil;
+pub mod frame;
+pub mod merge;
+pub mod region;
+pub mod register;
+pub mod seam;
+pub mod summary;
+
+/// One aircraft's model as it arrived.
+#[derive(Clone, Debug)]
+pub struct LocalModel {
+    /// Where it was read from.
+    pub path: PathBuf,
+    /// What it says about itself.
+    pub header: ModelHeader,
+    /// Its Gaussians.
+    pub cloud: GaussianCloud,
+}
+
+impl LocalModel {
+    /// Reads and verifies a model file.
+    ///
+    /// # Errors
+    /// Unreadable, damaged, or not a model.
+    pub fn read(path: &Path) -> Result<Self, AggregateError> {
+        let (header, cloud) = model::read(path)?;
+        Ok(Self { path: path.into(), header, cloud })
+    }
+
+    /// The aircraft's name, or the file's when it has none.
+    pub fn name(&self) -> &str {
+        match self.header.aircraft.as_str() {
+            "" => self.path.file_stem().and_then(|s| s.to_str()).unwrap_or("?"),
+            name => name,
+        }
+    }
+}
+
+/// Why no global model could be made.
+#[derive(Debug, thiserror::Error)]
+pub enum AggregateError {
+    /// A model file cannot be read or written.
+    #[error(transparent)]
+    Format(#[from] models::formats::FormatError),
+    /// Nothing to merge.
+    #[error("no models to merge; give at least one .dgtr file")]
+    NoModels,
+    /// Some models are georeferenced and this one is not.
+    #[error("{0}: has no (valid) WGS-84 origin while other models have one; all or none must")]
+    NoOrigin(String),
+    /// Models of different places.
+    #[error("{name}: its origin lies {km:.1} km from the others'; are these models of one mission?")]
+    TooFar {
+        /// Whose.
+        name: String,
+        /// How far.
+        km: f64,
+    },
+    /// Distillation does not fit into `ground.device_mib`.
+    #[error("ground: {0}")]
+    Plan(#[from] config::plan::PlanError),
+    /// The device or the trainer.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+}
+
+impl AggregateError {
+    /// Whether a device or driver is missing (exit code 3).
+    pub fn is_device(&self) -> bool {
+        matches!(self, Self::Train(TrainError::Gpu(_)))
+    }
+}
+
+/// What the aggregation came to; everything the report shows.
+#[derive(Debug, Default)]
+pub struct Outcome {
+    /// The global model's file.
+    pub path: PathBuf,
+    /// Its header.
+    pub header: ModelHeader,
+    /// Its Gaussians.
+    pub gaussians: usize,
+    /// Per model, in the order given: name and header (in the common frame).
+    pub models: Vec<(String, ModelHeader)>,
+    /// Per model: what became of its Gaussians.
+    pub kept: Vec<merge::Kept>,
+    /// Models that were moved onto their neighbours.
+    pub registered: Vec<register::Registration>,
+    /// Why none could be; the models were then merged where their GPS put them.
+    pub not_registered: Option<String>,
+    /// Regions in use, declared or derived.
+    pub regions: Vec<Option<region::Region>>,
+    /// Distillation, when it ran or found nothing to do.
+    pub distilled: Option<distil::Distilled>,
+    /// Why it did not run; the merged model was written all the same.
+    pub not_distilled: Option<AggregateError>,
+    /// Seconds by stage: read, merge, distil, write.
+    pub seconds: Vec<(&'static str, f64)>,
+    /// Asked to stop before the end.
+    pub interrupted: bool,
+}
+
+/// Merges and distils models, and writes `out/global.dgtr`: first as merged, then as distilled, so that an
+/// interruption or a missing device still leaves a global model.
+///
+/// `origin` is the common origin wanted; None takes the first model's.
+///
+/// # Errors
+/// Models that do not belong together or cannot be written. A failing distillation is in [`Outcome::not_distilled`].
+pub fn run(
+    mut models: Vec<LocalModel>,
+    settings: &GroundSettings,
+    origin: Option<Geodetic>,
+    out: &Path,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Outcome, AggregateError> {
+    if models.is_empty() {
+        return Err(AggregateError::NoModels);
+    }
+    let mut outcome = Outcome { path: out.join("global.dgtr"), ..Default::default() };
+    let start = Instant::now();
+    let origin = frame::unify(&mut models, origin)?;
+    outcome.seconds.push(("unify", start.elapsed().as_secs_f64()));
+    let start = Instant::now();
+    if settings.register {
+        match register::register(&mut models, settings.device.as_deref()) {
+            Ok(done) => outcome.registered = done,
+            Err(e) => outcome.not_registered = Some(e),
+        }
+    }
+    outcome.seconds.push(("register", start.elapsed().as_secs_f64()));
+    let start = Instant::now();
+    let partition = region::Partition::new(&models);
+    let mut merged = merge::merge(&models, &partition, settings.max_gaussians.unwrap_or(usize::MAX));
+    outcome.seconds.push(("merge", start.elapsed().as_secs_f64()));
+    outcome.header = ModelHeader {
+        mission: models[0].header.mission.clone(),
+        aircraft: "global".into(),
+        origin,
+        views: models.iter().flat_map(|m| m.header.views.clone()).collect(),
+        seed: settings.seed,
+        ..Default::default()
+    };
+    outcome.models = models.iter().map(|m| (m.name().to_owned(), m.header.clone())).collect();
+    outcome.regions = partition.regions;
+    model::write(&outcome.path, &outcome.header, &merged.cloud)?;
+
+    let start = Instant::now();
+    match distil::distil(&models, &mut merged, settings, go_on) {
+        Ok(distilled) => {
+            outcome.header.steps = u64::from(distilled.steps);
+            outcome.header.train_seconds = distilled.seconds.iter().sum();
+            outcome.distilled = Some(distilled);
+        }
+        Err(e) => outcome.not_distilled = Some(e),
+    }
+    outcome.seconds.push(("distil", start.elapsed().as_secs_f64()));
+    outcome.interrupted = !go_on();
+    outcome.header.finished = outcome.not_distilled.is_none() && !outcome.interrupted;
+    outcome.gaussians = merged.cloud.len();
+    outcome.kept = merged.kept;
+    let start = Instant::now();
+    model::write(&outcome.path, &outcome.header, &merged.cloud)?;
+    outcome.seconds.push(("write", start.elapsed().as_secs_f64()));
+    Ok(outcome)
+}
+
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,157 @@
+//! Local and global models against held-out photographs, where the ground has them (after landing, in tests, in the
+//! demo): the global model should not be worse than a local one on that one's own ground.
+
+use std::path::{Path, PathBuf};
+
+use image::RgbImage;
+use models::camera::View;
+use models::dataset::Dataset;
+use models::formats::model;
+use models::metrics::to_rgb8;
+use vulkan::trainer::{Rendering, Trainer};
+
+use crate::cli::CliError;
+use crate::evaluate::{Scores, evaluate, stem};
+use crate::renderer;
+use crate::report::{Comparison, ReportData};
+use crate::transfer::PoseTransfer;
+
+/// A global model this much worse than a local one on its own ground is worth a warning, dB.
+const WORTH_A_WARNING_DB: f64 = 0.3;
+
+/// One aircraft's held-out pictures: its own model's figures and the global one's on the same pictures.
+#[derive(Clone, Debug)]
+pub struct Held {
+    /// Name of the aircraft.
+    pub name: String,
+    /// Its own model.
+    pub local: Scores,
+    /// The global model on the same pictures.
+    pub global: Scores,
+    /// One picture: photograph, local, global.
+    pub pictures: Option<(String, [RgbImage; 3])>,
+}
+
+struct Opened {
+    trainer: Trainer,
+    transfer: PoseTransfer,
+}
+
+impl Opened {
+    fn new(path: &Path, set: &Dataset, size: (u32, u32), device: Option<&str>) -> Result<Self, CliError> {
+        let (header, cloud) = model::read(path)?;
+        let trainer = renderer::open(device, &cloud, size.0, size.1)?;
+        Ok(Self { trainer, transfer: PoseTransfer::between(set, &header.views) })
+    }
+
+    fn picture(&mut self, view: &View) -> Result<RgbImage, CliError> {
+        let mut into = Rendering::default();
+        let view = View { intrinsics: view.intrinsics, pose: self.transfer.apply(&view.pose) };
+        self.trainer.render(&view, &mut into)?;
+        Ok(to_rgb8(&into.rgb, into.width, into.height).unwrap_or_default())
+    }
+}
+
+/// Measures all models on the pictures of `split`; a picture counts for the model with the nearest training view.
+/// `locals` are names and files.
+///
+/// # Errors
+/// The data set or a model cannot be read; the device fails.
+pub fn compare(
+    set: &Dataset,
+    split: &str,
+    scale: f64,
+    locals: &[(String, PathBuf)],
+    global: &Path,
+    device: Option<&str>,
+) -> Result<Vec<Held>, CliError> {
+    let frames = set.select(split, None)?;
+    let Some(first) = frames.first() else { return Ok(Vec::new()) };
+    let size = set.load(*first, scale)?.image.dimensions();
+    let owned = by_nearest_training_view(set, &frames, locals)?;
+    let mut held = Vec::new();
+    for ((name, path), mine) in locals.iter().zip(&owned).filter(|(_, mine)| !mine.is_empty()) {
+        let mut own = Opened::new(path, set, size, device)?;
+        let local = evaluate(&mut own.trainer, set, mine, scale, &own.transfer, None)?;
+        let photograph = set.load(mine[mine.len() / 2], scale)?;
+        let shown = own.picture(&photograph.view)?;
+        drop(own);
+        let mut all = Opened::new(global, set, size, device)?;
+        let scores = evaluate(&mut all.trainer, set, mine, scale, &all.transfer, None)?;
+        let pictures = [photograph.image.clone(), shown, all.picture(&photograph.view)?];
+        held.push(Held { name: name.clone(), local, global: scores, pictures: Some((photograph.name, pictures)) });
+    }
+    Ok(held)
+}
+
+fn by_nearest_training_view(
+    set: &Dataset,
+    frames: &[usize],
+    locals: &[(String, PathBuf)],
+) -> Result<Vec<Vec<usize>>, CliError> {
+    let mut centers = Vec::new();
+    for (m, (_, path)) in locals.iter().enumerate() {
+        let names: Vec<String> = model::read_header(path)?.0.views.iter().map(|(n, _)| stem(n)).collect();
+        let trained = set.frames.iter().filter(|f| names.contains(&stem(&f.name)));
+        centers.extend(trained.map(|f| (m, f.view.pose.center)));
+    }
+    let mut owned = vec![Vec::new(); locals.len()];
+    for &i in frames {
+        let at = set.frames[i].view.pose.center;
+        let nearest = centers.iter().min_by(|a, b| a.1.distance(at).total_cmp(&b.1.distance(at)));
+        if let Some((m, _)) = nearest {
+            owned[*m].push(i);
+        }
+    }
+    Ok(owned)
+}
+
+/// Puts the figures into the report's table and the pictures before the others.
+pub fn add_to(data: &mut ReportData, held: Vec<Held>) {
+    let views = |s: &Scores| s.views.len() as f64;
+    let total: f64 = held.iter().map(|h| views(&h.global)).sum();
+    if total <= 0.0 {
+        return;
+    }
+    let mean = |of: &dyn Fn(&Scores) -> f64| held.iter().map(|h| of(&h.global) * views(&h.global)).sum::<f64>() / total;
+    let (psnr, ssim) = (mean(&|s| s.psnr), mean(&|s| s.ssim));
+    data.headline.push(("held-out PSNR".into(), format!("{psnr:.2} dB")));
+    for row in &mut data.models {
+        let own = held.iter().find(|h| h.name == row.name).map(|h| (h.local.psnr, h.local.ssim));
+        let figures = if row.name == "global" { Some((psnr, ssim)) } else { own };
+        (row.psnr, row.ssim) = (figures.map(|f| f.0), figures.map(|f| f.1));
+    }
+    let mut comparisons = Vec::new();
+    for h in held {
+        let lost = h.local.psnr - h.global.psnr;
+        if lost > WORTH_A_WARNING_DB {
+            data.warnings.push(format!(
+                "On {}'s own held-out pictures the global model is {lost:.2} dB worse than the local one.",
+                h.name
+            ));
+        }
+        let row = [h.local.psnr, h.global.psnr].map(|v| format!("{v:.2}"));
+        let row = [vec![h.name.clone(), h.local.views.len().to_string()], row.to_vec()].concat();
+        match data.tables.iter_mut().find(|t| t.title == TABLE) {
+            Some(table) => table.rows.push(row),
+            None => data.tables.insert(
+                0,
+                crate::report::Table {
+                    title: TABLE.into(),
+                    note: "Each picture counts for the aircraft with the nearest training view.".into(),
+                    head: ["", "pictures", "own model, dB", "global model, dB"].map(String::from).to_vec(),
+                    rows: vec![row],
+                },
+            ),
+        }
+        if let Some((title, pictures)) = h.pictures {
+            let labels = ["photograph, held out", "the aircraft's own model", "global model"];
+            let panels = labels.map(String::from).into_iter().zip(pictures).collect();
+            comparisons.push(Comparison { title, note: h.name, panels });
+        }
+    }
+    comparisons.append(&mut data.comparisons);
+    data.comparisons = comparisons;
+}
+
+const TABLE: &str = "Held-out pictures";

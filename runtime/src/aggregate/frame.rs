@@ -1,0 +1,152 @@
+//! One East-North-Up frame for models that were made around different origins.
+//!
+//! The change of frame is a rigid motion (ENU → ECEF → ENU), computed in f64 and rounded to f32 once. Spherical
+//! harmonics are left as they are: frames whose origins lie `d` apart are turned by d / 6371 km, 0.2° at the distance
+//! of [`MAX_APART_M`], far below what degree 3 can resolve.
+
+use glam::{DMat3, DQuat, DVec3};
+
+use config::geodesy::{EnuFrame, Geodetic};
+use models::cloud::GaussianCloud;
+
+use super::{AggregateError, LocalModel};
+
+/// Models whose origins lie farther apart than this do not belong to one mission (and f32 metres would lose millimetres).
+pub const MAX_APART_M: f64 = 20_000.0;
+
+/// A rigid motion from one ENU frame to another.
+#[derive(Clone, Copy, Debug)]
+pub struct Motion {
+    rotation: DQuat,
+    translation: DVec3,
+}
+
+impl Motion {
+    /// From coordinates around `from` to coordinates around `to`.
+    pub fn between(from: Geodetic, to: Geodetic) -> Self {
+        let (from, to) = (EnuFrame::new(from), EnuFrame::new(to));
+        let place = |p: DVec3| to.to_enu(from.to_geodetic(p));
+        let translation = place(DVec3::ZERO);
+        // A long lever keeps the nanometres of the geodetic round trip out of the rotation.
+        let lever = 1e5;
+        let axis = |a: DVec3| (place(a * lever) - translation) / lever;
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(axis(DVec3::X), axis(DVec3::Y), axis(DVec3::Z)));
+        Self { rotation: rotation.normalize(), translation }
+    }
+
+    /// Turns about the origin, then shifts.
+    pub fn rigid(rotation: DQuat, translation: DVec3) -> Self {
+        Self { rotation: rotation.normalize(), translation }
+    }
+
+    /// Angle of its rotation, radians.
+    pub fn angle(&self) -> f64 {
+        2.0 * self.rotation.w.abs().min(1.0).acos()
+    }
+
+    /// Moves a point.
+    pub fn point(&self, p: DVec3) -> DVec3 {
+        self.rotation * p + self.translation
+    }
+
+    /// Moves positions and orientations of a cloud.
+    pub fn cloud(&self, cloud: &mut GaussianCloud) {
+        for mean in &mut cloud.means {
+            *mean = self.point(glam::Vec3::from(*mean).as_dvec3()).as_vec3().to_array();
+        }
+        for [w, x, y, z] in &mut cloud.rotations {
+            let q = DQuat::from_xyzw(f64::from(*x), f64::from(*y), f64::from(*z), f64::from(*w));
+            let r = (self.rotation * q).as_quat();
+            [*w, *x, *y, *z] = [r.w, r.x, r.y, r.z];
+        }
+    }
+
+    /// Moves everything a model says about places.
+    pub fn model(&self, model: &mut LocalModel) {
+        self.cloud(&mut model.cloud);
+        for (_, view) in &mut model.header.views {
+            view.pose.center = self.point(view.pose.center);
+            view.pose.rotation = (self.rotation * view.pose.rotation).normalize();
+        }
+        self.corners(&mut model.header.region);
+    }
+
+    /// Moves the corners of a region, which is drawn on the ground plane.
+    pub fn corners(&self, region: &mut [[f64; 2]]) {
+        for corner in region {
+            let p = self.point(DVec3::new(corner[0], corner[1], 0.0));
+            *corner = [p.x, p.y];
+        }
+    }
+}
+
+/// Brings all models around `origin`, or around the first one's when None. Returns the common origin.
+///
+/// # Errors
+/// Some models have an origin and others have none; or two lie too far apart.
+pub fn unify(models: &mut [LocalModel], origin: Option<Geodetic>) -> Result<Option<Geodetic>, AggregateError> {
+    let Some(common) = origin.or_else(|| models.iter().find_map(|m| m.header.origin)) else { return Ok(None) };
+    for model in models.iter_mut() {
+        let Some(own) = model.header.origin else {
+            return Err(AggregateError::NoOrigin(model.name().into()));
+        };
+        if own == common {
+            continue;
+        }
+        if !own.is_valid() {
+            return Err(AggregateError::NoOrigin(model.name().into()));
+        }
+        let motion = Motion::between(own, common);
+        if motion.translation.length() > MAX_APART_M {
+            return Err(AggregateError::TooFar { name: model.name().into(), km: motion.translation.length() / 1e3 });
+        }
+        motion.model(model);
+        model.header.origin = Some(common);
+    }
+    Ok(Some(common))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const A: Geodetic = Geodetic { lat_deg: 28.0394, lon_deg: -82.6979, alt_m: -69.75 };
+
+    #[test]
+    fn a_change_of_origin_is_exact_to_a_tenth_of_a_millimetre() {
+        let frame = EnuFrame::new(A);
+        for far in [10.0, 300.0, 5_000.0] {
+            let b = frame.to_geodetic(DVec3::new(far, -0.7 * far, 12.0));
+            let motion = Motion::between(A, b);
+            let other = EnuFrame::new(b);
+            for p in [DVec3::ZERO, DVec3::new(150.0, -90.0, 64.0), DVec3::new(-120.5, 200.25, -3.0)] {
+                let truth = other.to_enu(frame.to_geodetic(p));
+                assert!((motion.point(p) - truth).length() < 1e-6);
+                // Through f32, as in a cloud whose own extent is some hundred metres.
+                let mut cloud = GaussianCloud::with_capacity(0, 1);
+                cloud.push(p.as_vec3().to_array(), [0.0; 3], [1.0, 0.0, 0.0, 0.0], 0.0, &[0.0; 3]);
+                motion.cloud(&mut cloud);
+                let back = Motion::between(b, A);
+                let there = glam::Vec3::from(cloud.means[0]).as_dvec3();
+                assert!((there - truth).length() < 1e-4 * (far / 300.0).max(1.0), "{far} {p}");
+                assert!((back.point(motion.point(p)) - p).length() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
+    fn orientation_and_views_turn_with_the_frame() {
+        let b = Geodetic { lat_deg: A.lat_deg, lon_deg: A.lon_deg + 0.1, alt_m: 0.0 };
+        let motion = Motion::between(A, b);
+        let q = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -1.0, 2.0);
+        let mut cloud = GaussianCloud::with_capacity(0, 1);
+        let f = q.as_quat();
+        cloud.push([0.0; 3], [0.0; 3], [f.w, f.x, f.y, f.z], 0.0, &[0.0; 3]);
+        motion.cloud(&mut cloud);
+        let [w, x, y, z] = cloud.rotations[0].map(f64::from);
+        // A direction given in the Gaussian's own axes ends where moving two points would have put it.
+        let moved = DQuat::from_xyzw(x, y, z, w) * DVec3::X;
+        let truth = motion.point(q * DVec3::X) - motion.point(DVec3::ZERO);
+        assert!((moved - truth).length() < 1e-6);
+    }
+}

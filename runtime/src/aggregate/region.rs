@@ -1,0 +1,234 @@
+//! Who answers for which piece of ground.
+//!
+//! Inside a region its aircraft does. Beyond all regions the nearest one does, so that the border of the scene, which
+//! the outer aircraft see beyond their own polygons, belongs to somebody. A model without a region gets the hull of
+//! the points its cameras look at.
+
+use glam::{DVec2, DVec3};
+
+use super::LocalModel;
+
+/// Distances closer than this count as equal, metres: corners that two polygons share differ by rounding.
+const TIE_M: f64 = 1e-6;
+
+/// The part of the ground one aircraft answers for.
+#[derive(Clone, Debug)]
+pub struct Region {
+    /// Corners in order, metres east and north; 1 or 2 are allowed (a point, a line).
+    pub corners: Vec<DVec2>,
+    /// Given by the mission, not derived from the views.
+    pub declared: bool,
+    /// Camera centres, metres east and north; they decide between derived regions that overlap.
+    cameras: Vec<DVec2>,
+}
+
+impl Region {
+    /// The declared region of a model, or the hull of what its cameras look at. None when there is neither.
+    pub fn of(model: &LocalModel) -> Option<Self> {
+        let cameras = model.header.views.iter().map(|(_, v)| v.pose.center.truncate()).collect();
+        if model.header.region.len() >= 3 {
+            let corners = model.header.region.iter().map(|c| DVec2::from(*c)).collect();
+            return Some(Self { corners, declared: true, cameras });
+        }
+        let ground = median_height(model);
+        let looked_at = model.header.views.iter().map(|(_, v)| look_at(v.pose.center, v.pose.forward(), ground));
+        let corners = hull(looked_at.collect());
+        (!corners.is_empty()).then_some(Self { corners, declared: false, cameras })
+    }
+
+    /// Whether the point lies inside or on the border (even-odd rule, so concave polygons work).
+    pub fn contains(&self, p: DVec2) -> bool {
+        self.distance(p) <= TIE_M
+    }
+
+    /// Metres to the region; 0 inside.
+    pub fn distance(&self, p: DVec2) -> f64 {
+        let mut inside = false;
+        let mut nearest = f64::INFINITY;
+        for (i, &a) in self.corners.iter().enumerate() {
+            let b = self.corners[(i + 1) % self.corners.len()];
+            let (edge, to) = (b - a, p - a);
+            let along =
+                if edge.length_squared() > 0.0 { (to.dot(edge) / edge.length_squared()).clamp(0.0, 1.0) } else { 0.0 };
+            nearest = nearest.min((to - edge * along).length());
+            if (a.y > p.y) != (b.y > p.y) && p.x < a.x + (p.y - a.y) / (b.y - a.y) * (b.x - a.x) {
+                inside = !inside;
+            }
+        }
+        if inside { 0.0 } else { nearest }
+    }
+
+    fn to_camera(&self, p: DVec2) -> f64 {
+        self.cameras.iter().map(|c| c.distance(p)).fold(f64::INFINITY, f64::min)
+    }
+}
+
+/// Every piece of ground has exactly one owner.
+#[derive(Clone, Debug)]
+pub struct Partition {
+    /// In the order of the models.
+    pub regions: Vec<Option<Region>>,
+}
+
+impl Partition {
+    /// The partition of these models' regions.
+    pub fn new(models: &[LocalModel]) -> Self {
+        Self { regions: models.iter().map(Region::of).collect() }
+    }
+
+    /// Index of the model that answers for a point; 0 when no model has a region.
+    pub fn owner(&self, p: DVec2) -> usize {
+        let mut best: Option<(usize, f64, &Region)> = None;
+        for (i, region) in self.regions.iter().enumerate() {
+            let Some(region) = region else { continue };
+            let distance = region.distance(p);
+            let wins = match best {
+                None => true,
+                Some((_, least, _)) if distance < least - TIE_M => true,
+                Some((_, least, _)) if distance > least + TIE_M => false,
+                // On a common border, or where regions overlap: what the mission says before what we derived, then
+                // the nearer camera, then the earlier model.
+                Some((_, _, other)) if region.declared != other.declared => region.declared,
+                Some((_, _, other)) => !region.declared && region.to_camera(p) < other.to_camera(p),
+            };
+            if wins {
+                best = Some((i, distance, region));
+            }
+        }
+        best.map_or(0, |b| b.0)
+    }
+}
+
+fn median_height(model: &LocalModel) -> f64 {
+    let stride = model.cloud.len().div_ceil(4096).max(1);
+    let mut z: Vec<f32> = model.cloud.means.iter().step_by(stride).map(|m| m[2]).filter(|z| z.is_finite()).collect();
+    if z.is_empty() {
+        return 0.0;
+    }
+    let middle = z.len() / 2;
+    f64::from(*z.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+/// Where the optical axis meets the ground, no farther off than three times the height; below the camera when it looks up.
+fn look_at(center: DVec3, forward: DVec3, ground: f64) -> DVec2 {
+    let height = center.z - ground;
+    let reach = if forward.z < -1e-6 && height > 0.0 { height / -forward.z } else { 0.0 };
+    let offset = forward.truncate() * reach;
+    center.truncate() + offset.clamp_length_max(3.0 * height.max(0.0))
+}
+
+/// Convex hull (Andrew's monotone chain), counter-clockwise.
+fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
+    points.retain(|p| p.is_finite());
+    points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
+    points.dedup();
+    if points.len() < 3 {
+        return points;
+    }
+    let mut hull: Vec<DVec2> = Vec::with_capacity(2 * points.len());
+    let chain = |hull: &mut Vec<DVec2>, points: &mut dyn Iterator<Item = &DVec2>| {
+        let start = hull.len();
+        for &p in points {
+            while hull.len() >= start + 2 {
+                let (a, b) = (hull[hull.len() - 2], hull[hull.len() - 1]);
+                if (b - a).perp_dot(p - b) > 0.0 {
+                    break;
+                }
+                hull.pop();
+            }
+            hull.push(p);
+        }
+        hull.pop();
+    };
+    chain(&mut hull, &mut points.iter());
+    chain(&mut hull, &mut points.iter().rev());
+    hull
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn region(corners: &[[f64; 2]], declared: bool) -> Region {
+        Region { corners: corners.iter().map(|c| DVec2::from(*c)).collect(), declared, cameras: vec![] }
+    }
+
+    fn partition(regions: Vec<Option<Region>>) -> Partition {
+        Partition { regions }
+    }
+
+    #[test]
+    fn a_concave_region_does_not_own_its_notch() {
+        // An L: the square 0..2 without its upper right quarter.
+        let l = region(&[[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 2.0], [0.0, 2.0]], true);
+        assert!(l.contains(DVec2::new(0.5, 1.5)) && l.contains(DVec2::new(1.5, 0.5)));
+        assert!(!l.contains(DVec2::new(1.5, 1.5)));
+        assert!((l.distance(DVec2::new(1.5, 1.5)) - 0.5).abs() < 1e-12);
+        // Either direction of travel describes the same region.
+        let mut reversed = l.clone();
+        reversed.corners.reverse();
+        for p in [[0.5, 1.5], [1.5, 1.5], [-1.0, 3.0]] {
+            assert_eq!(l.distance(p.into()), reversed.distance(p.into()));
+        }
+    }
+
+    #[test]
+    fn a_point_on_the_common_border_has_exactly_one_owner() {
+        let west = region(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], true);
+        let east = region(&[[1.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0]], true);
+        let p = partition(vec![Some(west), Some(east)]);
+        for y in [0.0, 0.5, 1.0, 7.0] {
+            assert_eq!(p.owner(DVec2::new(1.0, y)), 0);
+        }
+        assert_eq!(p.owner(DVec2::new(0.999, 0.5)), 0);
+        assert_eq!(p.owner(DVec2::new(1.001, 0.5)), 1);
+    }
+
+    #[test]
+    fn ground_beyond_all_regions_belongs_to_the_nearest() {
+        let west = region(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], true);
+        let east = region(&[[3.0, 0.0], [4.0, 0.0], [4.0, 1.0], [3.0, 1.0]], true);
+        let p = partition(vec![Some(west), Some(east)]);
+        assert_eq!(p.owner(DVec2::new(-100.0, 0.5)), 0);
+        assert_eq!(p.owner(DVec2::new(100.0, 0.5)), 1);
+        assert_eq!(p.owner(DVec2::new(1.9, 0.5)), 0);
+        assert_eq!(p.owner(DVec2::new(2.1, 0.5)), 1);
+    }
+
+    #[test]
+    fn declared_regions_come_before_derived_ones_and_none_owns_nothing() {
+        let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+        let p = partition(vec![None, Some(region(&square, false)), Some(region(&square, true))]);
+        assert_eq!(p.owner(DVec2::new(0.5, 0.5)), 2);
+        assert_eq!(partition(vec![None, None]).owner(DVec2::ZERO), 0);
+    }
+
+    #[test]
+    fn overlapping_derived_regions_are_split_by_the_nearer_camera() {
+        let mut a = region(&[[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [0.0, 1.0]], false);
+        let mut b = region(&[[1.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0]], false);
+        a.cameras.push(DVec2::new(1.0, 0.5));
+        b.cameras.push(DVec2::new(3.0, 0.5));
+        let p = partition(vec![Some(a), Some(b)]);
+        assert_eq!(p.owner(DVec2::new(1.9, 0.5)), 0);
+        assert_eq!(p.owner(DVec2::new(2.1, 0.5)), 1);
+    }
+
+    #[test]
+    fn hulls_of_few_or_equal_points_are_points_and_lines() {
+        let p = DVec2::new(1.0, 2.0);
+        assert_eq!(hull(vec![p, p, p]), vec![p]);
+        let line = hull(vec![p, DVec2::new(3.0, 2.0), DVec2::new(2.0, 2.0), DVec2::new(f64::NAN, 0.0)]);
+        assert_eq!(line.len(), 2);
+        let square = hull([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0], [0.4, 0.6]].map(DVec2::from).to_vec());
+        assert_eq!(square.len(), 4);
+        assert!(region(&[[1.0, 2.0]], false).distance(DVec2::new(1.0, 5.0)) == 3.0);
+    }
+
+    #[test]
+    fn a_camera_that_looks_at_the_horizon_does_not_claim_it() {
+        let far = look_at(DVec3::new(0.0, 0.0, 50.0), DVec3::new(1.0, 0.0, -1e-4), 0.0);
+        assert_eq!(far, DVec2::new(150.0, 0.0));
+        assert_eq!(look_at(DVec3::new(5.0, 5.0, 50.0), DVec3::Z, 0.0), DVec2::new(5.0, 5.0));
+    }
+}

@@ -1,0 +1,154 @@
+//! Which pictures become key frames.
+//!
+//! The paper's rule (after NeuralRecon): a picture becomes a key frame when the camera moved more than `t_min` or
+//! turned more than `r_max` since the last key frame. On top of it, a picture from where an earlier key frame already
+//! stood sees nothing new and is skipped, so that a second pass over a covered line costs nothing.
+
+use config::mission::KeyframeSettings;
+use models::camera::Pose;
+use serde::Serialize;
+
+/// What became of a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Decision {
+    /// It is a key frame.
+    Key,
+    /// It moved and turned too little since the last key frame.
+    TooClose,
+    /// An earlier key frame was taken from there.
+    Covered,
+    /// Its pose is not finite.
+    BadPose,
+    /// There are as many key frames as were planned for.
+    Full,
+}
+
+/// How many pictures met which fate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct KeyframeCounters {
+    /// Became key frames.
+    pub key: u32,
+    /// Moved and turned too little.
+    pub too_close: u32,
+    /// Seen from there before.
+    pub covered: u32,
+    /// Pose not finite.
+    pub bad_pose: u32,
+    /// Beyond the planned number.
+    pub full: u32,
+}
+
+/// Chooses key frames; its memory is planned from [`KeyframeSettings::max`].
+#[derive(Debug)]
+pub struct KeyframeSelector {
+    settings: KeyframeSettings,
+    chosen: Vec<Pose>,
+    counters: KeyframeCounters,
+}
+
+impl KeyframeSelector {
+    /// A selector that has chosen nothing yet.
+    pub fn new(settings: KeyframeSettings) -> Self {
+        Self { settings, chosen: Vec::with_capacity(settings.max as usize), counters: KeyframeCounters::default() }
+    }
+
+    /// Takes a key frame of an earlier run as chosen.
+    pub fn restore(&mut self, pose: Pose) {
+        if self.chosen.len() < self.settings.max as usize {
+            self.chosen.push(pose);
+        }
+    }
+
+    /// Decides on the next picture, in the order of capture.
+    pub fn consider(&mut self, pose: &Pose) -> Decision {
+        let decision = self.decide(pose);
+        let counter = match decision {
+            Decision::Key => &mut self.counters.key,
+            Decision::TooClose => &mut self.counters.too_close,
+            Decision::Covered => &mut self.counters.covered,
+            Decision::BadPose => &mut self.counters.bad_pose,
+            Decision::Full => &mut self.counters.full,
+        };
+        *counter += 1;
+        if decision == Decision::Key {
+            self.chosen.push(*pose);
+        }
+        decision
+    }
+
+    /// What has been counted so far.
+    pub fn counters(&self) -> KeyframeCounters {
+        self.counters
+    }
+
+    fn decide(&self, pose: &Pose) -> Decision {
+        if !pose.center.is_finite() || !pose.rotation.is_finite() || pose.rotation.length_squared() < 1e-12 {
+            return Decision::BadPose;
+        }
+        let Some(last) = self.chosen.last() else { return Decision::Key };
+        let t_min = f64::from(self.settings.t_min_m);
+        let r_max = f64::from(self.settings.r_max_deg).to_radians();
+        let near = |other: &Pose, distance: f64| {
+            other.center.distance(pose.center) <= distance && turned(&other.rotation, &pose.rotation) <= r_max
+        };
+        if near(last, t_min) {
+            Decision::TooClose
+        } else if self.chosen.iter().any(|k| near(k, 0.5 * t_min)) {
+            Decision::Covered
+        } else if self.chosen.len() >= self.settings.max as usize {
+            Decision::Full
+        } else {
+            Decision::Key
+        }
+    }
+}
+
+/// Angle between two attitudes, radians, 0…π.
+fn turned(a: &glam::DQuat, b: &glam::DQuat) -> f64 {
+    2.0 * a.normalize().dot(b.normalize()).abs().min(1.0).acos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+
+    fn at(x: f64, yaw_deg: f64) -> Pose {
+        Pose { rotation: DQuat::from_rotation_z(yaw_deg.to_radians()), center: DVec3::new(x, 0.0, 40.0) }
+    }
+
+    fn selector(max: u32) -> KeyframeSelector {
+        KeyframeSelector::new(KeyframeSettings { t_min_m: 5.0, r_max_deg: 15.0, max })
+    }
+
+    #[test]
+    fn a_picture_is_a_key_frame_when_it_moved_or_turned_enough() {
+        let mut s = selector(10);
+        let fates: Vec<_> = [at(0.0, 0.0), at(4.9, 0.0), at(5.1, 0.0), at(5.2, 14.0), at(5.2, 16.0)]
+            .iter()
+            .map(|p| s.consider(p))
+            .collect();
+        use Decision::{Key, TooClose};
+        assert_eq!(fates, [Key, TooClose, Key, TooClose, Key]);
+    }
+
+    #[test]
+    fn a_second_pass_over_a_covered_line_is_skipped_unless_it_looks_elsewhere() {
+        let mut s = selector(10);
+        for x in [0.0, 6.0, 12.0] {
+            assert_eq!(s.consider(&at(x, 0.0)), Decision::Key);
+        }
+        assert_eq!(s.consider(&at(1.0, 5.0)), Decision::Covered);
+        assert_eq!(s.consider(&at(1.0, 180.0)), Decision::Key);
+    }
+
+    #[test]
+    fn poses_that_are_not_finite_and_pictures_beyond_the_plan_are_counted() {
+        let mut s = selector(2);
+        assert_eq!(s.consider(&at(f64::NAN, 0.0)), Decision::BadPose);
+        assert_eq!(s.consider(&at(0.0, 0.0)), Decision::Key);
+        assert_eq!(s.consider(&at(9.0, 0.0)), Decision::Key);
+        assert_eq!(s.consider(&at(18.0, 0.0)), Decision::Full);
+        assert_eq!(s.counters(), KeyframeCounters { key: 2, bad_pose: 1, full: 1, ..Default::default() });
+    }
+}

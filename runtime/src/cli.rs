@@ -1,0 +1,125 @@
+//! The command line: one file per command, one error type, and the exit codes that scripts may rely on.
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use clap::error::ErrorKind;
+use clap::{Parser, Subcommand};
+
+use crate::console;
+
+mod aggregate;
+mod demo;
+mod doctor;
+mod error;
+mod eval;
+mod export;
+mod fly;
+mod import;
+mod plan;
+mod render;
+mod replay;
+mod serve;
+mod sim;
+mod train;
+
+pub use error::CliError;
+
+/// Posed aerial pictures to 3D Gaussian Splatting on board, merged on the ground.
+#[derive(Debug, Parser)]
+#[command(
+    name = "dgtr",
+    version,
+    about = "Posed aerial pictures to 3D Gaussian Splatting on board, merged on the ground"
+)]
+#[command(subcommand_required = true, arg_required_else_help = true)]
+#[command(
+    after_help = "Exit codes: 0 done, 1 failed, 2 usage or bad input, 3 device or driver missing, 4 interrupted with a \
+                  valid checkpoint."
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// More log lines: -v what each stage does, -vv everything. RUST_LOG overrides.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    verbose: u8,
+    /// Bound on the memory this process may write to, MiB (RLIMIT_DATA).
+    #[arg(long, global = true, value_name = "MIB")]
+    limit_mib: Option<u64>,
+    /// Warnings and errors only, no progress.
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    quiet: bool,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Trains a model from a folder of posed pictures.
+    Train(Box<train::Args>),
+    /// Scores a model on held-out pictures.
+    Eval(eval::Args),
+    /// Renders colour and depth of given cameras.
+    Render(render::Args),
+    /// Merges local models into a global one.
+    Aggregate(aggregate::Args),
+    /// Receives the models of all aircraft of a mission and merges them.
+    Serve(serve::Args),
+    /// The onboard job: from MAVLink and pictures to a model, while flying.
+    Fly(fly::Args),
+    /// The whole system with nothing attached.
+    Demo(demo::Args),
+    /// Recorded pictures or a recorded log as a living aircraft.
+    Replay(replay::Args),
+    /// A simulated aircraft over a ray-cast world.
+    Sim(sim::Args),
+    /// Writes a model in a format that other programs read.
+    Export(export::Args),
+    /// Makes a model of another program's file.
+    Import(import::Args),
+    /// Prints what a memory budget holds, section by section.
+    Plan(plan::Args),
+    /// Checks device, driver, ONNX Runtime, ports: what is there, what is missing, how to mend it.
+    Doctor(doctor::Args),
+}
+
+/// Parses `arguments` (the first is the program's name), runs the command and says how it went: results on standard
+/// output, everything else on standard error.
+pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let cli = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli,
+        Err(e) => {
+            // A closed pipe is no reason to fail.
+            let _ = e.print();
+            let asked = matches!(e.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+            return if asked { ExitCode::SUCCESS } else { ExitCode::from(2) };
+        }
+    };
+    console::install(cli.verbose, cli.quiet);
+    if let Some(mib) = cli.limit_mib
+        && let Err(e) = crate::resources::limit_data(mib)
+    {
+        console::error(&format!("--limit-mib {mib}: {e}"));
+        return ExitCode::from(2);
+    }
+    let result = match cli.command {
+        Command::Train(args) => train::run(*args),
+        Command::Eval(args) => eval::run(args),
+        Command::Render(args) => render::run(args),
+        Command::Aggregate(args) => aggregate::run(args),
+        Command::Serve(args) => serve::run(args),
+        Command::Fly(args) => fly::run(args),
+        Command::Sim(args) => sim::run(args),
+        Command::Replay(args) => replay::run(args),
+        Command::Demo(args) => demo::run(args),
+        Command::Export(args) => export::run(args),
+        Command::Import(args) => import::run(args),
+        Command::Plan(args) => plan::run(args),
+        Command::Doctor(args) => doctor::run(args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => {
+            console::error(&e.to_string());
+            e.exit_code()
+        }
+    }
+}

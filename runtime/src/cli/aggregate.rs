@@ -1,0 +1,158 @@
+//! `dgtr aggregate MODEL… --out DIR`: merges local models without a mission.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use config::ground::GroundSettings;
+use models::dataset::Dataset;
+
+use crate::aggregate::compare::{add_to, compare};
+use crate::aggregate::{self, AggregateError, LocalModel, Outcome, summary};
+use crate::interrupt::Interrupt;
+use crate::report::ReportData;
+use crate::run_json::RunReport;
+
+use super::CliError;
+
+/// Arguments of `dgtr aggregate`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The aircraft's .dgtr models.
+    #[arg(required = true)]
+    pub models: Vec<PathBuf>,
+    /// Folder for global.dgtr, run.json and report.html.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// How to merge.
+    #[command(flatten)]
+    pub settings: Settings,
+}
+
+/// What `aggregate` and `serve` let one change on the command line.
+#[derive(Debug, clap::Args)]
+pub struct Settings {
+    /// Device memory, MiB.
+    #[arg(long)]
+    pub budget_mib: Option<u32>,
+    /// Upper bound of the global model.
+    #[arg(long)]
+    pub max_gaussians: Option<usize>,
+    /// Passes over the views that see a seam; 0 merges only.
+    #[arg(long)]
+    pub epochs: Option<u32>,
+    /// Seconds for distillation at most.
+    #[arg(long)]
+    pub seconds: Option<f64>,
+    /// Size of the distillation pictures relative to the training pictures.
+    #[arg(long)]
+    pub scale: Option<f32>,
+    /// Learning rates relative to training.
+    #[arg(long)]
+    pub rate: Option<f32>,
+    /// Distil on every view, not only where regions meet.
+    #[arg(long)]
+    pub all_views: bool,
+    /// Vulkan device by (part of) its name.
+    #[arg(long)]
+    pub device: Option<String>,
+    /// Seed of the order of views.
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Data set with held-out pictures (split `test`), to measure the models and to show them side by side.
+    #[arg(long, value_name = "DATASET")]
+    pub compare: Option<PathBuf>,
+    /// Size at which they are compared, above 0 and at most 1.
+    #[arg(long, default_value_t = 1.0)]
+    pub compare_scale: f64,
+}
+
+impl Settings {
+    /// Overrides what was given.
+    pub fn apply(&self, to: &mut GroundSettings) -> Result<(), CliError> {
+        to.device_mib = self.budget_mib.unwrap_or(to.device_mib);
+        to.max_gaussians = self.max_gaussians.or(to.max_gaussians);
+        to.epochs = self.epochs.unwrap_or(to.epochs);
+        to.seconds = self.seconds.or(to.seconds);
+        to.scale = self.scale.unwrap_or(to.scale);
+        to.rate = self.rate.unwrap_or(to.rate);
+        to.all_views |= self.all_views;
+        to.device = self.device.clone().or(to.device.take());
+        to.seed = self.seed.unwrap_or(to.seed);
+        to.validate().map_err(CliError::input)
+    }
+
+    /// Measures the models on the held-out pictures of `--compare`, when given.
+    pub(super) fn compare(
+        &self,
+        locals: &[(String, PathBuf)],
+        outcome: &Outcome,
+        (run, data): (&mut RunReport, &mut ReportData),
+    ) -> Result<(), CliError> {
+        let Some(root) = &self.compare else { return Ok(()) };
+        let start = Instant::now();
+        let set = Dataset::open(root)?;
+        let held = compare(&set, "test", self.compare_scale, locals, &outcome.path, self.device.as_deref())?;
+        let figures =
+            held.iter().map(|h| (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global })));
+        run.more.insert("held_out".into(), figures.collect::<serde_json::Map<_, _>>().into());
+        add_to(data, held);
+        let global = data.models.iter().find(|r| r.name == "global");
+        (run.psnr, run.ssim) = (global.and_then(|r| r.psnr), global.and_then(|r| r.ssim));
+        run.stage("compare", start);
+        Ok(())
+    }
+}
+
+impl From<AggregateError> for CliError {
+    fn from(e: AggregateError) -> Self {
+        match e {
+            e if e.is_device() => Self::device(e),
+            AggregateError::Train(e) => Self::failed(e),
+            e => Self::input(e),
+        }
+    }
+}
+
+/// Runs `dgtr aggregate`.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let mut settings = GroundSettings::default();
+    args.settings.apply(&mut settings)?;
+    let stop = Interrupt::install().map_err(CliError::failed)?;
+    let models = args.models.iter().map(|p| LocalModel::read(p)).collect::<Result<Vec<_>, _>>()?;
+    let outcome = aggregate::run(models, &settings, None, &args.out, &|| !stop.requested())?;
+    let mut run = summary::run_report("aggregate", &outcome, settings.seed);
+    let mut data = summary::report(&outcome);
+    let names = outcome.models.iter().map(|m| m.0.clone());
+    let locals: Vec<_> = names.zip(args.models.iter().cloned()).collect();
+    args.settings.compare(&locals, &outcome, (&mut run, &mut data))?;
+    for (row, path) in data.models.iter_mut().zip(&args.models) {
+        row.uploaded = std::fs::metadata(path).ok().map(|m| m.len());
+    }
+    finish(&args.out, run, data, outcome)
+}
+
+/// Writes `run.json` and `report.html`, prints the result, and says how it went.
+pub(super) fn finish(
+    out: &std::path::Path,
+    mut run: RunReport,
+    mut data: ReportData,
+    outcome: Outcome,
+) -> Result<(), CliError> {
+    let page = out.join("report.html");
+    data.files.push(("figures".into(), run.write(out)?));
+    data.write(&page).map_err(CliError::failed)?;
+    for warning in &data.warnings {
+        tracing::warn!("{warning}");
+    }
+    println!("{}: {} Gaussians out of {} models", outcome.path.display(), outcome.gaussians, outcome.models.len());
+    println!("{}", page.display());
+    if let Some(e) = outcome.not_distilled {
+        let device = e.is_device();
+        let what = format!("{} is merged but not distilled: {e}", outcome.path.display());
+        return Err(if device { CliError::device(what) } else { CliError::failed(what) });
+    }
+    if outcome.interrupted {
+        return Err(CliError::interrupted(format!("stopped on request; {} is valid", outcome.path.display())));
+    }
+    Ok(())
+}

@@ -1,0 +1,46 @@
+//! `dgtr demo`: the whole system with nothing attached.
+
+use std::path::PathBuf;
+
+use super::CliError;
+use crate::demo::{DemoError, DemoOptions, run as run_demo};
+use crate::interrupt::Interrupt;
+
+/// Two simulated aircraft and a ground station, each a process of its own, from MAVLink and pictures to one merged model.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Output folder.
+    #[arg(long, value_name = "DIR", default_value = "dgtr-demo")]
+    out: PathBuf,
+    /// Seconds of training per aircraft after landing.
+    #[arg(long, value_name = "S", default_value_t = 60.0)]
+    seconds: f64,
+    /// Seed of world, flights and training.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Bound on the memory each process may write to, MiB.
+    #[arg(long, value_name = "MIB", default_value_t = 768)]
+    process_mib: u64,
+    /// Seconds of flight per second of wall clock.
+    #[arg(long, value_name = "X", default_value_t = 4.0)]
+    speed: f64,
+}
+
+/// Runs the command.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let Args { out, seconds, seed, process_mib: limit_mib, speed } = args;
+    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+    let summary = run_demo(&DemoOptions { out, seconds, seed, limit_mib, speed }, &interrupt)?;
+    print!("{summary}");
+    Ok(())
+}
+
+impl From<DemoError> for CliError {
+    fn from(e: DemoError) -> Self {
+        match e {
+            DemoError::Device(_) => Self::device(e),
+            DemoError::Interrupted(_) => Self::interrupted(e),
+            _ => Self::failed(e),
+        }
+    }
+}

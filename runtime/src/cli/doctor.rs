@@ -1,0 +1,126 @@
+//! `dgtr doctor`: what this machine has and lacks, one line each, with how to mend it.
+
+use std::path::{Path, PathBuf};
+
+use models::onnx::{features::FeatureNetwork, session};
+use vulkan::gpu::Gpu;
+
+use super::CliError;
+use crate::resources;
+
+/// Arguments of `dgtr doctor`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Also check this network manifest (may be given more than once).
+    #[arg(long, value_name = "FILE")]
+    pub model: Vec<PathBuf>,
+}
+
+/// How a check came out.
+enum Finding {
+    Ok(String),
+    /// Some jobs run without it.
+    Note(String),
+    /// Jobs fail without it.
+    Missing(String),
+}
+
+/// Runs `dgtr doctor`; fails with exit code 3 when something is missing.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let mut missing = 0;
+    let mut tell = |what: &str, finding: Finding| {
+        let (state, text) = match finding {
+            Finding::Ok(t) => ("ok", t),
+            Finding::Note(t) => ("note", t),
+            Finding::Missing(t) => {
+                missing += 1;
+                ("missing", t)
+            }
+        };
+        println!("{state:<8} {what:<16} {}", text.split_whitespace().collect::<Vec<_>>().join(" "));
+    };
+    match Gpu::list() {
+        Err(e) => tell("vulkan", Finding::Missing(e.to_string())),
+        Ok(devices) => {
+            for d in devices {
+                let kind = if d.is_cpu { "software" } else { "hardware" };
+                let mib = d.heap_bytes >> 20;
+                let (major, minor) = d.version;
+                let text =
+                    format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
+                tell("vulkan", Finding::Ok(text));
+            }
+        }
+    }
+    match session::find_library() {
+        Ok(library) => {
+            tell("onnx runtime", Finding::Ok(library.display().to_string()));
+            match FeatureNetwork::open(None, 1) {
+                Ok(_) => tell("features", Finding::Ok("embedded XFeat opens".to_owned())),
+                Err(e) => tell("features", Finding::Missing(e.to_string())),
+            }
+        }
+        Err(e) => tell("onnx runtime", Finding::Missing(e.to_string())),
+    }
+    for path in &args.model {
+        let read = models::onnx::manifest::Manifest::read(path).and_then(|m| m.read_network().map(|b| (m, b)));
+        match read {
+            Ok((m, bytes)) => {
+                tell("network", Finding::Ok(format!("{} ({} bytes, hash as stated)", m.name, bytes.len())))
+            }
+            Err(e) => tell("network", Finding::Missing(e.to_string())),
+        }
+    }
+    for finding in serial_ports() {
+        tell("serial port", finding);
+    }
+    tell(
+        "pseudo terminal",
+        match std::fs::OpenOptions::new().read(true).write(true).open("/dev/ptmx") {
+            Ok(_) => Finding::Ok("/dev/ptmx opens (demo, sim and replay)".to_owned()),
+            Err(e) => Finding::Missing(format!("/dev/ptmx: {e}; mount devpts, or use udp: and tcp: links")),
+        },
+    );
+    tell(
+        "memory",
+        match resources::available_bytes() {
+            Some(bytes) if bytes < 512 << 20 => {
+                Finding::Note(format!("{} MiB available; lower memory.device_mib", bytes >> 20))
+            }
+            Some(bytes) => Finding::Ok(format!("{} MiB available", bytes >> 20)),
+            None => Finding::Note("not known on this system".to_owned()),
+        },
+    );
+    match missing {
+        0 => Ok(()),
+        n => Err(CliError::device(format!("{n} of the checks above failed; each line says how to mend it"))),
+    }
+}
+
+/// Ports an autopilot may hang on, and whether this user may open them.
+fn serial_ports() -> Vec<Finding> {
+    const PREFIXES: [&str; 5] = ["ttyACM", "ttyUSB", "ttyAMA", "ttyTHS", "serial"];
+    let mut ports: Vec<PathBuf> = std::fs::read_dir("/dev")
+        .map(|entries| entries.flatten().map(|e| e.path()).filter(|p| is_port(p, &PREFIXES)).collect())
+        .unwrap_or_default();
+    ports.sort();
+    if ports.is_empty() {
+        let text = "none found; connect the autopilot (needed by `dgtr fly` on serial: links only)";
+        return vec![Finding::Note(text.to_owned())];
+    }
+    ports
+        .into_iter()
+        .map(|p| match rustix::fs::access(&p, rustix::fs::Access::READ_OK | rustix::fs::Access::WRITE_OK) {
+            Ok(()) => Finding::Ok(p.display().to_string()),
+            Err(e) => {
+                Finding::Missing(format!("{}: {e}; sudo usermod -aG dialout $USER and log in again", p.display()))
+            }
+        })
+        .collect()
+}
+
+fn is_port(path: &Path, prefixes: &[&str]) -> bool {
+    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
+    !path.is_dir()
+        && prefixes.iter().any(|p| name.strip_prefix(p).is_some_and(|n| n.starts_with(|c: char| c.is_ascii_digit())))
+}

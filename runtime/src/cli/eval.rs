@@ -1,0 +1,112 @@
+//! `dgtr eval MODEL DATASET --split test`: PSNR and SSIM on pictures the model has not seen.
+
+use std::collections::HashSet;
+use std::path::PathBuf;
+
+use models::dataset::Dataset;
+use models::formats::model::{self, ModelHeader};
+use serde::Serialize;
+
+use super::CliError;
+use super::plan::largest;
+use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, stem};
+use crate::renderer;
+use crate::transfer::PoseTransfer;
+
+/// Arguments of `dgtr eval`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The .dgtr model.
+    pub model: PathBuf,
+    /// Folder of posed pictures.
+    pub dataset: PathBuf,
+    /// Which pictures (a list of split.json; without that file every 8th is `test`; `all` always works).
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Only the pictures of this region.
+    #[arg(long)]
+    pub region: Option<String>,
+    /// Image scale, above 0 and at most 1.
+    #[arg(long, default_value_t = 1.0)]
+    pub scale: f64,
+    /// One JSON object on standard output.
+    #[arg(long)]
+    pub json: bool,
+    /// Save each rendering as DIR/<image stem>.png.
+    #[arg(long, value_name = "DIR")]
+    pub save: Option<PathBuf>,
+    /// Also score the two naive guesses: nearest training picture over flat ground, mean colour.
+    #[arg(long)]
+    pub baselines: bool,
+    /// Vulkan device whose name contains this.
+    #[arg(long)]
+    pub device: Option<String>,
+}
+
+#[derive(Serialize)]
+struct Answer<'a> {
+    #[serde(flatten)]
+    scores: &'a Scores,
+    gaussians: usize,
+    steps: u64,
+    split: &'a str,
+    region: Option<&'a str>,
+    /// Held-out poses were carried into the model's own frame (it was trained with other poses).
+    poses_transferred: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    baselines: Option<&'a BaselineScores>,
+}
+
+/// Runs `dgtr eval`.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let set = Dataset::open(&args.dataset)?;
+    let frames = set.select(&args.split, args.region.as_deref())?;
+    if frames.is_empty() {
+        return Err(CliError::input(format!("{}: split {:?} holds no pictures", args.dataset.display(), args.split)));
+    }
+    let (header, cloud) = model::read(&args.model)?;
+    let (width, height) = largest(&set, &frames, args.scale)?;
+    let mut trainer = renderer::open(args.device.as_deref(), &cloud, width, height)?;
+    let transfer = PoseTransfer::between(&set, &header.views);
+    let scores = evaluate(&mut trainer, &set, &frames, args.scale, &transfer, args.save.as_deref())?;
+    let naive = match args.baselines {
+        true => Some(baselines(&set, &training_frames(&set, &header, &frames)?, &frames, args.scale)?),
+        false => None,
+    };
+    if args.json {
+        let answer = Answer {
+            scores: &scores,
+            gaussians: cloud.len(),
+            steps: header.steps,
+            split: &args.split,
+            region: args.region.as_deref(),
+            poses_transferred: !transfer.is_identity(),
+            baselines: naive.as_ref(),
+        };
+        println!("{}", serde_json::to_string(&answer).map_err(CliError::failed)?);
+        return Ok(());
+    }
+    for v in &scores.views {
+        println!("{:<28} {:>7.3} dB  SSIM {:.4}", v.name, v.psnr, v.ssim);
+    }
+    let row = |what: &str, s: &Scores| println!("{what:<28} {:>7.3} dB  SSIM {:.4}", s.psnr, s.ssim);
+    row(&format!("mean of {} views", scores.views.len()), &scores);
+    if let Some(naive) = &naive {
+        row("ground-plane warp", &naive.ground_warp);
+        row("mean colour", &naive.mean_color);
+    }
+    println!("{} Gaussians after {} steps", cloud.len(), header.steps);
+    Ok(())
+}
+
+/// What a naive guess may use: the pictures the model was trained on, where this data set has them, else the split
+/// `train`; never an evaluated one.
+fn training_frames(set: &Dataset, header: &ModelHeader, held_out: &[usize]) -> Result<Vec<usize>, CliError> {
+    let used: HashSet<String> = header.views.iter().map(|(name, _)| stem(name)).collect();
+    let mut frames: Vec<usize> = (0..set.frames.len()).filter(|&i| used.contains(&stem(&set.frames[i].name))).collect();
+    if frames.is_empty() {
+        frames = set.select("train", None)?;
+    }
+    frames.retain(|i| !held_out.contains(i));
+    Ok(frames)
+}

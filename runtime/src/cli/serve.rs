@@ -1,0 +1,123 @@
+//! `dgtr serve --mission FILE --out DIR`: receives the models of all aircraft, merges them, writes the report.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use config::mission::Mission;
+
+use crate::aggregate::summary;
+use crate::console::Progress;
+use crate::interrupt::Interrupt;
+use crate::report::{ReportData, Timing, bytes};
+use crate::serve::{self, Reception, ServeError};
+
+use super::CliError;
+use super::aggregate::{Settings, finish};
+
+/// Arguments of `dgtr serve`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The mission file.
+    #[arg(long)]
+    pub mission: PathBuf,
+    /// Folder for what is received, global.dgtr, run.json and report.html.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Seconds to wait for the aircraft; then what has arrived is merged. Without it: until all are in, or Ctrl-C.
+    #[arg(long, value_name = "SECONDS")]
+    pub timeout: Option<f64>,
+    /// How to merge, over `[ground]` of the mission.
+    #[command(flatten)]
+    pub settings: Settings,
+}
+
+impl From<ServeError> for CliError {
+    fn from(e: ServeError) -> Self {
+        match e {
+            ServeError::Aggregate(e) => e.into(),
+            ServeError::Upload(e) => Self::input(e),
+            ServeError::Nothing(_) => Self::interrupted(e),
+        }
+    }
+}
+
+/// Runs `dgtr serve`.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let mut mission = Mission::read(&args.mission).map_err(CliError::input)?;
+    args.settings.apply(&mut mission.ground)?;
+    let timeout = match args.timeout {
+        Some(s) => Some(Duration::try_from_secs_f64(s).map_err(|e| CliError::input(format!("--timeout {s}: {e}")))?),
+        None => None,
+    };
+    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+    let stop = AtomicBool::new(false);
+    let mut bar = Progress::new("receive", mission.aircraft.len() as u64);
+    let reception = serve::receive(&mission, &args.out, timeout, &stop, &mut |p| {
+        stop.store(interrupt.requested(), Ordering::Relaxed);
+        bar.set(p.finished as u64, || {
+            let under_way: Vec<String> = p.transfers.iter().map(|(id, n, of)| format!("{id} {n}/{of}")).collect();
+            format!("{} received {}", bytes(p.bytes), under_way.join(", "))
+        });
+    })
+    .map_err(ServeError::from)?;
+    bar.finish(&format!(
+        "{} of {} final models",
+        mission.aircraft.len() - reception.missing.len(),
+        mission.aircraft.len()
+    ));
+    // A first Ctrl-C ends the reception; what is here is merged all the same, and a second one ends at once.
+    let (outcome, unreadable) = serve::merge(&mission, &reception, &args.out, &|| true)?;
+    let mut run = summary::run_report("serve", &outcome, mission.ground.seed);
+    run.wall_s += reception.seconds;
+    run.stage_ms.insert("receive".into(), reception.seconds * 1e3);
+    let counters = serde_json::to_value(reception.counters).unwrap_or_default();
+    run.more.insert("received".into(), counters);
+    run.more.insert("missing".into(), reception.missing.clone().into());
+    let mut data = summary::report(&outcome);
+    add_reception(&mut data, &reception);
+    let readable = reception.received.iter().filter(|r| unreadable.iter().all(|u| u.0 != r.path));
+    let locals: Vec<_> = readable.map(|r| (r.aircraft.clone(), r.path.clone())).collect();
+    args.settings.compare(&locals, &outcome, (&mut run, &mut data))?;
+    for (path, why) in unreadable {
+        data.warnings.push(format!("{} was received but cannot be used: {why}", path.display()));
+    }
+    let missing = reception.missing;
+    if !missing.is_empty() {
+        run.outcome = "interrupted".into();
+    }
+    finish(&args.out, run, data, outcome)?;
+    match missing.is_empty() {
+        true => Ok(()),
+        false => Err(CliError::interrupted(format!(
+            "merged without the final model of {}; run the same command again to continue receiving",
+            missing.join(", ")
+        ))),
+    }
+}
+
+fn add_reception(data: &mut ReportData, reception: &Reception) {
+    for row in &mut data.models {
+        row.uploaded = reception.received.iter().find(|r| r.aircraft == row.name).map(|r| r.size);
+    }
+    let total: u64 = reception.received.iter().map(|r| r.size).sum();
+    data.headline.push(("received".into(), bytes(total)));
+    data.timings.insert(0, Timing { name: "receive".into(), of: String::new(), seconds: reception.seconds });
+    for aircraft in &reception.missing {
+        data.warnings.push(format!("The final model of {aircraft} has not arrived."));
+    }
+    let c = &reception.counters;
+    for (what, n) in [
+        ("corrupt chunks, fetched again", c.corrupt),
+        ("failed attempts, repeated", c.retries),
+        ("chunks that were here already", c.chunks_reused),
+        ("offers of other missions", c.foreign),
+        ("offers from unknown aircraft", c.unknown),
+        ("offers above max_model_mib", c.oversize),
+        ("unreadable offers", c.damaged),
+    ] {
+        if n > 0 {
+            data.skipped.push((what.into(), n));
+        }
+    }
+}

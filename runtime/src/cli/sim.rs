@@ -1,0 +1,146 @@
+//! `dgtr sim`: an aircraft that is not there, for tests without an autopilot.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use config::mission::{CameraSource, Mission};
+use hal::sim::aircraft::Imperfections;
+use hal::sim::autopilot::AutopilotSettings;
+use hal::sim::reference::Lens;
+use hal::sim::survey::SurveySettings;
+use hal::sim::world::WorldSettings;
+use hal::sim::{SessionSettings, SimSettings};
+
+use super::CliError;
+use crate::interrupt::Interrupt;
+
+/// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
+/// the camera folder.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Mission file: origin, camera, region, seed and [faults].
+    #[arg(long, value_name = "FILE")]
+    mission: PathBuf,
+    /// Which aircraft to simulate; not needed when there is only one.
+    #[arg(long, value_name = "ID")]
+    aircraft: Option<String>,
+    /// Where to speak: `pty` (its path is printed), `pty:/path/of/a/link`, `udpout:HOST:PORT`, `tcpin:HOST:PORT`.
+    #[arg(long, value_name = "ADDRESS", default_value = "pty")]
+    link: String,
+    /// Camera folder; the mission's when left out.
+    #[arg(long, value_name = "DIR")]
+    camera_dir: Option<PathBuf>,
+    /// Also write the truth here, as a data set with held-out views.
+    #[arg(long, value_name = "DIR")]
+    reference: Option<PathBuf>,
+    /// Seconds of flight per second of wall clock.
+    #[arg(long, value_name = "X", default_value_t = 1.0)]
+    speed: f64,
+    /// Height of the flight, metres.
+    #[arg(long, value_name = "M", default_value_t = 40.0)]
+    height: f64,
+    /// Share of a picture seen again by the next one on the line.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.75)]
+    forward_overlap: f64,
+    /// Share of a picture seen again from the next line.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
+    side_overlap: f64,
+    /// Pitch of the camera, degrees; −90 looks straight down.
+    #[arg(long, value_name = "DEG", default_value_t = -90.0, allow_hyphen_values = true)]
+    pitch: f64,
+    /// Fly a second set of lines across the first.
+    #[arg(long)]
+    cross: bool,
+    /// Without wind, noise and bias.
+    #[arg(long)]
+    perfect: bool,
+    /// Seconds to go on speaking after the flight.
+    #[arg(long, value_name = "S", default_value_t = 5.0)]
+    linger: f64,
+}
+
+/// Runs the command.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let mission = Mission::read(&args.mission).map_err(CliError::input)?;
+    let aircraft = mission.aircraft(args.aircraft.as_deref()).map_err(CliError::input)?;
+    let camera_dir = camera_dir(args.camera_dir.clone(), &aircraft.camera)?;
+    let address = args.link.parse().map_err(CliError::input)?;
+    let number = mission.aircraft.iter().position(|a| a.id == aircraft.id).unwrap_or(0) as u64;
+    let c = &mission.camera;
+    let settings = SimSettings {
+        world_seed: mission.seed,
+        seed: mission.seed.wrapping_mul(1000).wrapping_add(number),
+        world: WorldSettings::default(),
+        origin: mission.origin,
+        lens: Lens {
+            width: c.width,
+            height: c.height,
+            fx: c.fx.into(),
+            fy: c.fy.into(),
+            cx: c.cx.into(),
+            cy: c.cy.into(),
+        },
+        region: mission.region(aircraft),
+        survey: SurveySettings {
+            height_m: args.height,
+            forward_overlap: args.forward_overlap,
+            side_overlap: args.side_overlap,
+            gimbal_pitch_deg: args.pitch,
+            cross: args.cross,
+            ..SurveySettings::default()
+        },
+        imperfections: if args.perfect { Imperfections::none() } else { Imperfections::default() },
+        autopilot: AutopilotSettings {
+            system_id: aircraft.system_id,
+            faults: mission.faults,
+            ..AutopilotSettings::default()
+        },
+        session: SessionSettings { speed: args.speed, linger_s: args.linger, ..SessionSettings::default() },
+        prefix: format!("{}_", aircraft.id),
+    };
+    let stop = stop_flag()?;
+    let report = hal::sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut |pty| {
+        if let Some(path) = pty {
+            println!("{}", path.display());
+        }
+    })
+    .map_err(CliError::input)?;
+    tracing::info!(
+        "{} exposures, {} pictures, {:.0} s of flight",
+        report.triggers,
+        report.pictures.delivered,
+        report.flight_s
+    );
+    if report.completed { Ok(()) } else { Err(CliError::interrupted("the flight was ended early")) }
+}
+
+/// A flag that Ctrl-C sets.
+pub fn stop_flag() -> Result<Arc<AtomicBool>, CliError> {
+    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&stop);
+    std::thread::Builder::new()
+        .name("interrupt".into())
+        .spawn(move || {
+            while !interrupt.requested() {
+                std::thread::sleep(std::time::Duration::from_millis(50));
+            }
+            flag.store(true, Ordering::Relaxed);
+        })
+        .map_err(CliError::failed)?;
+    Ok(stop)
+}
+
+/// The camera folder: the one asked for, else the mission's.
+pub fn camera_dir(asked: Option<PathBuf>, camera: &CameraSource) -> Result<PathBuf, CliError> {
+    let folder = match (asked, camera) {
+        (Some(folder), _) => folder,
+        (None, CameraSource::Folder(folder)) => folder.clone(),
+        (None, _) => {
+            return Err(CliError::input("the mission's camera is a program; say where pictures go with --camera-dir"));
+        }
+    };
+    std::fs::create_dir_all(&folder).map_err(|e| CliError::input(format!("{}: {e}", folder.display())))?;
+    Ok(folder)
+}

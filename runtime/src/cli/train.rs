@@ -1,0 +1,177 @@
+//! `dgtr train DATASET --out DIR`: the onboard training, fed from a folder instead of an aircraft.
+
+use std::path::PathBuf;
+
+use clap::ValueEnum;
+use config::init::InitSettings;
+use config::refine::RefineSettings;
+use config::training::TrainSettings;
+use models::dataset::PoseSource;
+use models::formats::{FormatError, read_bounded};
+use serde::Deserialize;
+
+use super::CliError;
+use crate::train_job::{InitKind, TrainJob};
+
+/// A settings file has a few KiB.
+const SETTINGS_LIMIT: u64 = 1 << 20;
+
+/// Where the first Gaussians come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Init {
+    /// The feed-forward network on pairs of pictures.
+    FeedForward,
+    /// The sparse points that came with the data set (only those at least two training pictures saw).
+    Sfm,
+    /// Points at random in what the cameras see.
+    Random,
+}
+
+/// Where camera poses come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Poses {
+    /// The reconstruction that came with the data set.
+    Dataset,
+    /// GPS and gimbal angles of gps.csv, refined from the pictures.
+    Telemetry,
+}
+
+/// Arguments of `dgtr train`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Folder of posed pictures: nerfstudio transforms.json, or a COLMAP model in sparse/0 beside images/.
+    pub dataset: PathBuf,
+    /// Where the model (model.dgtr) and run.json go; an unfinished model there is continued.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Which pictures (a list of split.json; without that file every 8th is held out).
+    #[arg(long, default_value = "train")]
+    split: String,
+    /// Only the pictures of this region.
+    #[arg(long)]
+    region: Option<String>,
+    /// Where the first Gaussians come from.
+    #[arg(long, value_enum, default_value = "feed-forward")]
+    init: Init,
+    /// Where camera poses come from.
+    #[arg(long, value_enum, default_value = "dataset")]
+    poses: Poses,
+    /// Take telemetry poses as they are.
+    #[arg(long)]
+    no_refine: bool,
+    /// Optimiser steps; with neither --steps nor --seconds the recipe's own number.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
+    steps: Option<u32>,
+    /// Seconds of training; with --steps, whichever comes first.
+    #[arg(long)]
+    seconds: Option<f64>,
+    /// Device memory, MiB, allocated once.
+    #[arg(long, default_value_t = 512)]
+    budget_mib: u32,
+    /// Most Gaussians; default: what the budget holds.
+    #[arg(long)]
+    max_gaussians: Option<usize>,
+    /// Image scale, above 0 and at most 1.
+    #[arg(long, default_value_t = 1.0)]
+    scale: f64,
+    /// Seed of everything random; same seed and device, same model.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Vulkan device whose name contains this.
+    #[arg(long)]
+    device: Option<String>,
+    /// Manifest of your own feed-forward network.
+    #[arg(long = "model", value_name = "FILE")]
+    network: Option<PathBuf>,
+    /// TOML file with any of the mission file's tables [training], [init], [refine].
+    #[arg(long, value_name = "FILE")]
+    settings: Option<PathBuf>,
+    /// Seconds between two checkpoints.
+    #[arg(long, default_value_t = 30.0)]
+    checkpoint_seconds: f64,
+    /// Forget a model that is already in --out.
+    #[arg(long)]
+    fresh: bool,
+    /// Do not score the split `test` at the end.
+    #[arg(long)]
+    no_eval: bool,
+}
+
+/// The recipe tables of a mission file.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    training: TrainSettings,
+    init: InitSettings,
+    refine: RefineSettings,
+}
+
+/// Runs `dgtr train`.
+pub fn run(args: Args) -> Result<(), CliError> {
+    for (name, value) in [("--seconds", args.seconds), ("--checkpoint-seconds", Some(args.checkpoint_seconds))] {
+        if value.is_some_and(|v| !(v > 0.0 && v.is_finite())) {
+            return Err(CliError::input(format!("{name} must be a positive number of seconds")));
+        }
+    }
+    let mut settings = match &args.settings {
+        None => Settings::default(),
+        Some(path) => {
+            let bad = |what: String| CliError::from(FormatError::Invalid { path: path.clone(), what });
+            let bytes = read_bounded(path, SETTINGS_LIMIT)?;
+            let text = String::from_utf8(bytes).map_err(|_| bad("not UTF-8 text".to_owned()))?;
+            toml::from_str(&text).map_err(|e| bad(e.to_string()))?
+        }
+    };
+    if let Some(seed) = args.seed {
+        settings.training.seed = seed;
+        settings.init.seed = seed;
+    }
+    let job = TrainJob {
+        dataset: args.dataset,
+        out: args.out,
+        split: args.split,
+        region: args.region,
+        init: match args.init {
+            Init::FeedForward => InitKind::FeedForward,
+            Init::Sfm => InitKind::SparsePoints,
+            Init::Random => InitKind::Random,
+        },
+        poses: match args.poses {
+            Poses::Dataset => PoseSource::Dataset,
+            Poses::Telemetry => PoseSource::Telemetry,
+        },
+        refine: !args.no_refine,
+        steps: args.steps,
+        seconds: args.seconds,
+        budget_mib: args.budget_mib,
+        max_gaussians: args.max_gaussians,
+        scale: args.scale,
+        device: args.device,
+        network: args.network,
+        checkpoint_seconds: args.checkpoint_seconds,
+        fresh: args.fresh,
+        evaluate: !args.no_eval,
+        training: settings.training,
+        init_settings: settings.init,
+        refine_settings: settings.refine,
+    };
+    let ended = job.run()?;
+    let model = job.model_path();
+    if !ended.finished {
+        return Err(CliError::interrupted(format!(
+            "interrupted after {} steps; {} is valid, the same command continues it",
+            ended.steps,
+            model.display()
+        )));
+    }
+    let report = ended.report;
+    let quality = report.psnr.map_or(String::new(), |p| format!(", held-out PSNR {p:.2} dB"));
+    println!(
+        "{}: {} Gaussians after {} steps, {:.1} s{quality}",
+        model.display(),
+        report.gaussians,
+        ended.steps,
+        report.wall_s
+    );
+    Ok(())
+}

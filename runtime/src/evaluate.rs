@@ -1,0 +1,139 @@
+//! Held-out quality of a model: renders the pictures of a split and compares, next to the two naive baselines.
+
+use std::io::Write;
+use std::path::Path;
+
+use models::baselines::{MeanColor, nearest_view, warp_over_ground};
+use models::camera::{PosedImage, View};
+use models::dataset::Dataset;
+use models::formats::write_atomic;
+use models::metrics::{psnr, ssim, to_f32, to_rgb8};
+use serde::Serialize;
+use vulkan::trainer::{Rendering, Trainer};
+
+use crate::cli::CliError;
+use crate::transfer::PoseTransfer;
+
+/// PSNR of equal pictures; JSON has no infinity.
+const PSNR_CAP: f64 = 100.0;
+
+/// One view's figures.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ViewScore {
+    /// Name of the picture.
+    pub name: String,
+    /// dB, at most 100.
+    pub psnr: f64,
+    /// −1…1.
+    pub ssim: f64,
+}
+
+/// Figures over several views: means of the views' figures.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Scores {
+    /// Mean PSNR, dB.
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+    /// Each view.
+    pub views: Vec<ViewScore>,
+}
+
+impl Scores {
+    fn of(views: Vec<ViewScore>) -> Self {
+        let n = views.len().max(1) as f64;
+        let mean = |f: fn(&ViewScore) -> f64| views.iter().map(f).sum::<f64>() / n;
+        Self { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), views }
+    }
+}
+
+/// The two naive guesses.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BaselineScores {
+    /// Nearest training picture warped over the plane z = 0.
+    pub ground_warp: Scores,
+    /// Mean colour of the training pictures.
+    pub mean_color: Scores,
+}
+
+/// Renders and scores `frames` of `set`.
+///
+/// Poses are the data set's, carried into the model's frame by `transfer`. The rendering is rounded to 8 bits first, so
+/// that the figures are those of the pictures that `save` receives (`<stem>.png`).
+///
+/// # Errors
+/// A picture cannot be read, the device fails, or `save` cannot be written to.
+pub fn evaluate(
+    trainer: &mut Trainer,
+    set: &Dataset,
+    frames: &[usize],
+    scale: f64,
+    transfer: &PoseTransfer,
+    save: Option<&Path>,
+) -> Result<Scores, CliError> {
+    let mut rendering = Rendering::default();
+    let mut scores = Vec::with_capacity(frames.len());
+    for &i in frames {
+        let truth = set.load(i, scale)?;
+        let view = View { intrinsics: truth.view.intrinsics, pose: transfer.apply(&truth.view.pose) };
+        trainer.render(&view, &mut rendering)?;
+        let Some(picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
+            return Err(CliError::failed(format!("{}: the rendering has another size than its camera", truth.name)));
+        };
+        if let Some(dir) = save {
+            save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
+        }
+        scores.push(score(&truth, &to_f32(&picture)));
+    }
+    Ok(Scores::of(scores))
+}
+
+/// Scores both baselines on the same pictures. `training` are the frames that a guess may use.
+///
+/// # Errors
+/// A picture cannot be read.
+pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64) -> Result<BaselineScores, CliError> {
+    let mut mean = MeanColor::default();
+    for &i in training {
+        mean.add(&set.load(i, scale)?.image);
+    }
+    let views: Vec<View> = training.iter().map(|&i| set.frames[i].view).collect();
+    let (mut warped, mut flat) = (Vec::new(), Vec::new());
+    for &i in frames {
+        let truth = set.load(i, scale)?;
+        let guess = match nearest_view(&truth.view, &views) {
+            Some(n) => warp_over_ground(&set.load(training[n], scale)?, &truth.view, mean.get()),
+            None => mean.picture(truth.view.intrinsics.pixels()),
+        };
+        warped.push(score(&truth, &guess));
+        flat.push(score(&truth, &mean.picture(truth.view.intrinsics.pixels())));
+    }
+    Ok(BaselineScores { ground_warp: Scores::of(warped), mean_color: Scores::of(flat) })
+}
+
+fn score(truth: &PosedImage, rgb: &[f32]) -> ViewScore {
+    let k = &truth.view.intrinsics;
+    let target = to_f32(&truth.image);
+    ViewScore {
+        name: truth.name.clone(),
+        psnr: psnr(rgb, &target).min(PSNR_CAP),
+        ssim: ssim(rgb, &target, k.width as usize, k.height as usize),
+    }
+}
+
+/// File name without folder and extension.
+pub fn stem(name: &str) -> String {
+    Path::new(name).file_stem().map_or_else(|| name.to_owned(), |s| s.to_string_lossy().into_owned())
+}
+
+/// Writes an 8-bit RGB PNG, atomically.
+///
+/// # Errors
+/// The folder cannot be written to.
+pub fn save_png(picture: &image::RgbImage, path: &Path) -> Result<(), CliError> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .map_err(|e| CliError::failed(format!("{}: cannot be encoded: {e}", path.display())))?;
+    Ok(write_atomic(path, |out| out.write_all(bytes.get_ref()))?)
+}

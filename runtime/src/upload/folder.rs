@@ -1,0 +1,155 @@
+//! The folder transport: a USB stick carried over after landing, or a directory both ends mount.
+//!
+//! `<folder>/<mission>/<aircraft>/offer` and `…/chunk/<blake3>`, the same names as the keys on the network. Every
+//! file is written aside, synced and renamed; chunks come before the offer that names them, so a reader never sees
+//! an offer whose chunks were not yet complete when it was written.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::offer::{Hash, Offer, OfferedModel, hex, is_safe_name};
+use super::transport::{Inlet, Outlet, TransportError};
+
+/// Most aircraft folders looked at; more than any mission has.
+const MAX_ENTRIES: usize = 1024;
+
+/// Writes a file so that it is either absent, old, or complete.
+pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let dir = path.parent().unwrap_or(Path::new("."));
+    let mut file = tempfile::Builder::new().prefix(".tmp-").tempfile_in(dir)?;
+    file.write_all(bytes)?;
+    file.as_file().sync_all()?;
+    file.persist(path).map_err(|e| e.error)?;
+    // The name must survive a pulled stick, too.
+    File::open(dir)?.sync_all()
+}
+
+/// Reads a file of at most `limit` bytes.
+pub(super) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, TransportError> {
+    let file = File::open(path).map_err(TransportError::io(path))?;
+    let mut bytes = Vec::new();
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(TransportError::io(path))?;
+    if bytes.len() as u64 > limit {
+        return Err(TransportError::TooLong { what: path.display().to_string(), bytes: bytes.len() as u64, limit });
+    }
+    Ok(bytes)
+}
+
+/// The aircraft's end.
+pub struct FolderOutlet {
+    root: PathBuf,
+    dir: PathBuf,
+    /// Chunks of the offer before the current one, kept for a ground station that is just reading them.
+    previous: Vec<Hash>,
+    current: Option<(Hash, Vec<Hash>)>,
+}
+
+impl FolderOutlet {
+    /// Offers below `root`; nothing is touched before the first offer.
+    pub fn new(root: &Path, mission: &str, aircraft: &str) -> Self {
+        Self { root: root.into(), dir: root.join(mission).join(aircraft), previous: Vec::new(), current: None }
+    }
+
+    fn drop_stale_chunks(&self, offer: &Offer) {
+        let Ok(entries) = std::fs::read_dir(self.dir.join("chunk")) else { return };
+        let keep: std::collections::HashSet<String> = offer.chunks.iter().chain(&self.previous).map(hex).collect();
+        for entry in entries.flatten() {
+            if !entry.file_name().to_str().is_some_and(|name| keep.contains(name)) {
+                // Left-overs cost room, nothing else; the next offer tries again.
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+impl Outlet for FolderOutlet {
+    fn name(&self) -> String {
+        format!("folder {}", self.root.display())
+    }
+
+    fn offer(&mut self, model: &Arc<OfferedModel>) -> Result<(), TransportError> {
+        // A stick that is not plugged in must fail, not fill the disk below its mount point.
+        let parent = self.root.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        std::fs::metadata(parent).map_err(TransportError::io(parent))?;
+        let chunks = self.dir.join("chunk");
+        std::fs::create_dir_all(&chunks).map_err(TransportError::io(&chunks))?;
+        for (index, hash) in model.offer.chunks.iter().enumerate() {
+            let path = chunks.join(hex(hash));
+            let whole = std::fs::metadata(&path).is_ok_and(|m| m.len() == model.offer.chunk_len(index));
+            if !whole {
+                let bytes = model.chunk(index).map_err(TransportError::io(&path))?;
+                write_whole(&path, &bytes).map_err(TransportError::io(&path))?;
+            }
+        }
+        let path = self.dir.join("offer");
+        write_whole(&path, &model.offer.encode()).map_err(TransportError::io(&path))?;
+        if let Some((_, chunks)) = self.current.replace((model.offer.model, model.offer.chunks.clone())) {
+            self.previous = chunks;
+        }
+        self.drop_stale_chunks(&model.offer);
+        Ok(())
+    }
+
+    fn is_delivered(&self, model: &Hash) -> bool {
+        self.current.as_ref().is_some_and(|c| c.0 == *model)
+    }
+}
+
+/// The ground's end.
+pub struct FolderInlet {
+    dir: PathBuf,
+    max_offer: u64,
+}
+
+impl FolderInlet {
+    /// Reads offers of `mission` below `root`.
+    pub fn new(root: &Path, mission: &str, max_offer: u64) -> Self {
+        Self { dir: root.join(mission), max_offer }
+    }
+}
+
+impl Inlet for FolderInlet {
+    fn name(&self) -> String {
+        format!("folder {}", self.dir.display())
+    }
+
+    fn offers(&self) -> Result<Vec<Vec<u8>>, TransportError> {
+        let entries = match std::fs::read_dir(&self.dir) {
+            Ok(entries) => entries,
+            // Nobody has offered anything yet, or the stick is not plugged in yet.
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+            Err(e) => return Err(TransportError::io(&self.dir)(e)),
+        };
+        let mut offers = Vec::new();
+        for entry in entries.flatten().take(MAX_ENTRIES) {
+            if entry.file_name().to_str().is_some_and(is_safe_name) {
+                match read_bounded(&entry.path().join("offer"), self.max_offer) {
+                    Ok(bytes) => offers.push(bytes),
+                    Err(TransportError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
+                    // One bad offer must not hide the others; an empty one is counted as damaged.
+                    Err(TransportError::TooLong { .. }) => offers.push(Vec::new()),
+                    Err(e) => return Err(e),
+                }
+            }
+        }
+        Ok(offers)
+    }
+
+    fn chunk(&self, offer: &Offer, index: usize) -> Result<Vec<u8>, TransportError> {
+        let hash = offer.chunks[index];
+        let path = self.dir.join(&offer.aircraft).join("chunk").join(hex(&hash));
+        match read_bounded(&path, offer.chunk_len(index)) {
+            Err(TransportError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
+                Err(TransportError::NotHeld(hash))
+            }
+            other => other,
+        }
+    }
+
+    /// Nothing to tell: for the aircraft a model on the stick is delivered, and the stick may be read-only.
+    fn confirm(&self, _: &Offer) -> Result<(), TransportError> {
+        Ok(())
+    }
+}

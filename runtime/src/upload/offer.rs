@@ -1,0 +1,284 @@
+//! What an aircraft says about a model it holds, and the model file cut into content-hashed chunks.
+//!
+//! The offer is the only thing the ground has to believe before it can check everything else, so each field is
+//! bounded when it arrives, and the chunk list must add up to the stated size.
+
+use std::fs::File;
+use std::io::Read;
+use std::os::unix::fs::FileExt;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use config::upload::UploadSettings;
+
+/// Version of the wire format; another one is refused, not guessed at.
+const VERSION: u8 = 1;
+/// Longest mission or aircraft name on the wire (the mission file allows 32).
+const MAX_NAME: usize = 64;
+
+/// blake3 of a chunk or a whole model.
+pub type Hash = [u8; 32];
+
+/// Lower-case hexadecimal, as used in keys and file names.
+pub fn hex(hash: &Hash) -> String {
+    blake3::Hash::from_bytes(*hash).to_hex().to_string()
+}
+
+/// One model on offer.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Offer {
+    version: u8,
+    /// Mission the model belongs to.
+    pub mission: String,
+    /// Aircraft that made it.
+    pub aircraft: String,
+    /// Larger = newer, per aircraft; Unix milliseconds unless the clock went back.
+    pub sequence: u64,
+    /// No further model of this flight will follow.
+    pub finished: bool,
+    /// Bytes of the model file.
+    pub size: u64,
+    /// Bytes of every chunk but the last.
+    pub chunk_bytes: u32,
+    /// blake3 of the whole file.
+    pub model: Hash,
+    /// blake3 of each chunk, in file order.
+    pub chunks: Vec<Hash>,
+}
+
+/// Why an offer was not accepted.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum OfferError {
+    /// Cut short, garbled, or longer than any valid offer.
+    #[error("offer is damaged: {0}")]
+    Damaged(String),
+    /// Made by a different version of this program.
+    #[error("offer has format {0}, this program reads {VERSION}; update the older side")]
+    Version(u8),
+    /// Another mission on the same link.
+    #[error("offer belongs to mission {0:?}")]
+    ForeignMission(String),
+    /// Not one of the mission's aircraft.
+    #[error("offer is from aircraft {0:?}, which the mission does not know")]
+    UnknownAircraft(String),
+    /// Above `upload.max_model_mib`.
+    #[error("model of {size} bytes is above the limit of {limit} (upload.max_model_mib)")]
+    Oversize {
+        /// Stated size.
+        size: u64,
+        /// Accepted size.
+        limit: u64,
+    },
+}
+
+/// Whether a name is safe as a path component and as a part of a zenoh key.
+pub fn is_safe_name(name: &str) -> bool {
+    !name.is_empty()
+        && name.len() <= MAX_NAME
+        && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_')
+}
+
+impl Offer {
+    /// Most bytes an encoded offer can have under these settings.
+    pub fn max_encoded(settings: &UploadSettings) -> u64 {
+        256 + 2 * MAX_NAME as u64 + 32 * settings.max_chunks()
+    }
+
+    /// Wire bytes.
+    pub fn encode(&self) -> Vec<u8> {
+        // Plain integers, strings and byte arrays: serialising into a growing vector has no way to fail.
+        postcard::to_allocvec(self).unwrap_or_default()
+    }
+
+    /// Wire bytes → an offer whose every field is within bounds. Whether it concerns us is [`Offer::check`]'s job.
+    pub fn decode(bytes: &[u8], settings: &UploadSettings) -> Result<Self, OfferError> {
+        let damaged = |what: &str| Err(OfferError::Damaged(what.into()));
+        if bytes.len() as u64 > Self::max_encoded(settings) {
+            return damaged("longer than any valid one");
+        }
+        match bytes.first() {
+            Some(&VERSION) => {}
+            Some(&other) => return Err(OfferError::Version(other)),
+            None => return damaged("empty"),
+        }
+        let (offer, rest): (Self, _) =
+            postcard::take_from_bytes(bytes).map_err(|e| OfferError::Damaged(e.to_string()))?;
+        if !rest.is_empty() {
+            return damaged("bytes after its end");
+        }
+        if !is_safe_name(&offer.mission) || !is_safe_name(&offer.aircraft) {
+            return damaged("mission or aircraft name");
+        }
+        let limit = settings.max_model_bytes();
+        if offer.size > limit {
+            return Err(OfferError::Oversize { size: offer.size, limit });
+        }
+        let kib = config::upload::CHUNK_KIB;
+        if offer.size == 0 || !(kib.start() * 1024..=kib.end() * 1024).contains(&offer.chunk_bytes) {
+            return damaged("size of model or chunk");
+        }
+        if offer.chunks.len() as u64 != offer.size.div_ceil(u64::from(offer.chunk_bytes)) {
+            return damaged("number of chunks does not match the size");
+        }
+        Ok(offer)
+    }
+
+    /// Whether the offer concerns this mission and one of its aircraft.
+    pub fn check(&self, mission: &str, aircraft: &[String]) -> Result<(), OfferError> {
+        if self.mission != mission {
+            return Err(OfferError::ForeignMission(self.mission.clone()));
+        }
+        if !aircraft.contains(&self.aircraft) {
+            return Err(OfferError::UnknownAircraft(self.aircraft.clone()));
+        }
+        Ok(())
+    }
+
+    /// Bytes of chunk `index`.
+    pub fn chunk_len(&self, index: usize) -> u64 {
+        let chunk = u64::from(self.chunk_bytes);
+        self.size.saturating_sub(index as u64 * chunk).min(chunk)
+    }
+}
+
+/// A model file held open for the ground to fetch. Model files are replaced by renaming, so the open file keeps
+/// the very bytes that were hashed even while training writes newer ones.
+#[derive(Debug)]
+pub struct OfferedModel {
+    /// What is said about it.
+    pub offer: Offer,
+    file: File,
+}
+
+impl OfferedModel {
+    /// Opens and hashes a model file. Reads it once, with one chunk in memory.
+    ///
+    /// # Errors
+    /// The file cannot be read, is empty, or is larger than `max_model_mib`.
+    pub fn open(
+        path: &Path,
+        settings: &UploadSettings,
+        (mission, aircraft): (&str, &str),
+        sequence: u64,
+        finished: bool,
+    ) -> std::io::Result<Self> {
+        let mut file = File::open(path)?;
+        let size = file.metadata()?.len();
+        if size == 0 || size > settings.max_model_bytes() {
+            return Err(std::io::Error::other(format!(
+                "{} has {size} bytes; a model has 1 to {} (upload.max_model_mib)",
+                path.display(),
+                settings.max_model_bytes()
+            )));
+        }
+        let chunk_bytes = settings.chunk_bytes();
+        let mut whole = blake3::Hasher::new();
+        let mut chunks = Vec::with_capacity(size.div_ceil(u64::from(chunk_bytes)) as usize);
+        let mut buffer = vec![0; chunk_bytes as usize];
+        let mut left = size;
+        while left > 0 {
+            let take = left.min(u64::from(chunk_bytes)) as usize;
+            let chunk = &mut buffer[..take];
+            file.read_exact(chunk)?;
+            whole.update(chunk);
+            chunks.push(*blake3::hash(chunk).as_bytes());
+            left -= take as u64;
+        }
+        let offer = Offer {
+            version: VERSION,
+            mission: mission.into(),
+            aircraft: aircraft.into(),
+            sequence,
+            finished,
+            size,
+            chunk_bytes,
+            model: *whole.finalize().as_bytes(),
+            chunks,
+        };
+        Ok(Self { offer, file })
+    }
+
+    /// Bytes of chunk `index`, out of the open file.
+    pub fn chunk(&self, index: usize) -> std::io::Result<Vec<u8>> {
+        let mut bytes = vec![0; self.offer.chunk_len(index) as usize];
+        self.file.read_exact_at(&mut bytes, index as u64 * u64::from(self.offer.chunk_bytes))?;
+        Ok(bytes)
+    }
+
+    /// Index of the chunk with this hash.
+    pub fn find(&self, hash: &Hash) -> Option<usize> {
+        self.offer.chunks.iter().position(|c| c == hash)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings() -> UploadSettings {
+        UploadSettings { chunk_kib: 16, max_model_mib: 1, ..Default::default() }
+    }
+
+    fn offer(bytes: usize) -> Offer {
+        let dir = tempfile::tempdir().expect("temp dir");
+        let path = dir.path().join("m.dgtr");
+        std::fs::write(&path, vec![7; bytes]).expect("write");
+        OfferedModel::open(&path, &settings(), ("m", "a1"), 5, true).expect("offer").offer
+    }
+
+    #[test]
+    fn an_offer_survives_the_wire() {
+        let o = offer(40_000);
+        assert_eq!(o.chunks.len(), 3);
+        assert_eq!((o.chunk_len(0), o.chunk_len(2), o.chunk_len(3)), (16_384, 40_000 - 32_768, 0));
+        assert_eq!(Offer::decode(&o.encode(), &settings()), Ok(o));
+    }
+
+    #[test]
+    fn every_truncated_offer_is_refused() {
+        let bytes = offer(40_000).encode();
+        for n in 0..bytes.len() {
+            assert!(Offer::decode(&bytes[..n], &settings()).is_err(), "{n} of {}", bytes.len());
+        }
+        let mut longer = bytes;
+        longer.push(0);
+        assert!(Offer::decode(&longer, &settings()).is_err());
+    }
+
+    #[test]
+    fn lies_about_size_and_chunks_are_refused() {
+        let edit = |f: fn(&mut Offer)| {
+            let mut o = offer(40_000);
+            f(&mut o);
+            Offer::decode(&o.encode(), &settings())
+        };
+        assert!(matches!(edit(|o| o.size = 1 << 40), Err(OfferError::Oversize { .. })));
+        assert!(matches!(edit(|o| o.size = 0), Err(OfferError::Damaged(_))));
+        assert!(matches!(edit(|o| o.chunk_bytes = 1), Err(OfferError::Damaged(_))));
+        assert!(matches!(edit(|o| o.chunk_bytes = u32::MAX), Err(OfferError::Damaged(_))));
+        assert!(matches!(edit(|o| o.chunks.truncate(1)), Err(OfferError::Damaged(_))));
+        assert!(matches!(edit(|o| o.aircraft = "../../etc".into()), Err(OfferError::Damaged(_))));
+        assert!(matches!(edit(|o| o.mission = "a/**".into()), Err(OfferError::Damaged(_))));
+        assert!(matches!(edit(|o| o.version = 2), Err(OfferError::Version(2))));
+    }
+
+    #[test]
+    fn a_vast_chunk_count_does_not_allocate() {
+        // version, "m", "a", sequence, finished, size, chunk size, hash, then a length of 2^60 hashes.
+        let mut o = offer(40_000);
+        o.chunks.clear();
+        let mut bytes = o.encode();
+        bytes.pop();
+        bytes.extend([0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0x0f]);
+        assert!(matches!(Offer::decode(&bytes, &settings()), Err(OfferError::Damaged(_))));
+    }
+
+    #[test]
+    fn foreign_missions_and_strangers_are_told_apart() {
+        let o = offer(1);
+        assert_eq!(o.check("m", &["a1".into()]), Ok(()));
+        assert_eq!(o.check("other", &["a1".into()]), Err(OfferError::ForeignMission("m".into())));
+        assert_eq!(o.check("m", &["a2".into()]), Err(OfferError::UnknownAircraft("a1".into())));
+    }
+}

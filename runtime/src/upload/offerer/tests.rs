@@ -1,0 +1,205 @@
+//! Both real transports, end to end, in one process.
+
+use std::sync::atomic::AtomicBool;
+
+use super::*;
+use crate::upload::receive::Receiver;
+
+fn noise(n: usize, seed: u8) -> Vec<u8> {
+    let mut bytes = vec![0; n];
+    blake3::Hasher::new_keyed(&[seed; 32]).finalize_xof().fill(&mut bytes);
+    bytes
+}
+
+/// Writes a model as checkpoints are written: aside, then renamed.
+fn write_model(path: &Path, bytes: &[u8]) {
+    let aside = path.with_extension("tmp");
+    std::fs::write(&aside, bytes).expect("write");
+    std::fs::rename(&aside, path).expect("rename");
+}
+
+fn receive(r: &mut Receiver, limit: Duration, mut done: impl FnMut(&Receiver) -> bool) -> bool {
+    let until = Instant::now() + limit;
+    while Instant::now() < until {
+        r.round(&AtomicBool::new(false)).expect("round");
+        if done(r) {
+            return true;
+        }
+        r.wait();
+    }
+    false
+}
+
+const LIMIT: Duration = Duration::from_secs(60);
+
+#[test]
+fn a_model_travels_through_a_folder_that_is_plugged_in_late() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let stick = dir.path().join("stick");
+    let settings = UploadSettings {
+        folder: Some(stick.join("dgtr")),
+        chunk_kib: 16,
+        retry_min_s: 0.05,
+        retry_max_s: 0.1,
+        poll_s: 0.05,
+        ..Default::default()
+    };
+    let path = dir.path().join("m.dgtr");
+    write_model(&path, &noise(50_000, 1));
+    let o = Offerer::start(&settings, "m", "a1").expect("offerer");
+    o.offer_final(&path);
+    assert!(!o.wait_delivered(Duration::from_millis(300), || true));
+    assert!(o.status().failures > 0 && !o.status().last_error.is_empty());
+    std::fs::create_dir(&stick).expect("plug in");
+    assert!(o.wait_delivered(LIMIT, || true));
+    o.shutdown();
+    let mut r = Receiver::open(&settings, "m", &["a1".into()], &dir.path().join("g")).expect("receiver");
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
+    assert_eq!(std::fs::read(&r.received()[0].path).expect("read"), noise(50_000, 1));
+}
+
+#[test]
+fn without_a_way_to_the_ground_nothing_is_waited_for() {
+    let o = Offerer::start(&UploadSettings::default(), "m", "a1").expect("offerer");
+    o.offer_final(Path::new("/nonexistent"));
+    assert!(!o.wait_delivered(LIMIT, || true));
+    o.shutdown();
+}
+
+#[cfg(feature = "zenoh")]
+fn free_port() -> u16 {
+    let socket = std::net::TcpListener::bind("127.0.0.1:0").expect("bind");
+    socket.local_addr().expect("address").port()
+}
+
+#[cfg(feature = "zenoh")]
+#[test]
+fn two_aircraft_deliver_over_loopback_tcp_whoever_starts_first() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let settings = UploadSettings {
+        connect: vec![endpoint.clone()],
+        listen: vec![endpoint],
+        chunk_kib: 64,
+        retry_min_s: 0.1,
+        retry_max_s: 0.5,
+        poll_s: 0.2,
+        ..Default::default()
+    };
+    let ids = ["a1".to_owned(), "a2".to_owned()];
+    let paths = ["1.dgtr", "2.dgtr"].map(|n| dir.path().join(n));
+    // The first aircraft is up before the ground, and replaces its model while it is on offer.
+    let a1 = Offerer::start(&settings, "m", "a1").expect("offerer");
+    write_model(&paths[0], &noise(300_000, 1));
+    a1.offer(&paths[0]);
+    let mut r = Receiver::open(&settings, "m", &ids, &dir.path().join("g")).expect("receiver");
+    assert!(receive(&mut r, LIMIT, |r| r.received().len() == 1));
+    assert!(!r.received()[0].finished);
+    write_model(&paths[0], &noise(3_000_000, 2));
+    a1.offer_final(&paths[0]);
+    let a2 = Offerer::start(&settings, "m", "a2").expect("offerer");
+    write_model(&paths[1], &noise(1_000_000, 3));
+    a2.offer_final(&paths[1]);
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?} {:?}", r.counters, a1.status());
+    let got: Vec<Vec<u8>> = r.received().iter().map(|m| std::fs::read(&m.path).expect("read")).collect();
+    assert!(got[0] == noise(3_000_000, 2) && got[1] == noise(1_000_000, 3));
+    assert!(a1.wait_delivered(LIMIT, || true) && a2.wait_delivered(LIMIT, || true));
+    assert_eq!(r.counters.corrupt, 0);
+    a1.shutdown();
+    a2.shutdown();
+}
+
+#[cfg(feature = "zenoh")]
+#[test]
+fn a_ground_station_that_restarts_mid_transfer_resumes_over_the_network() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let settings = UploadSettings {
+        connect: vec![endpoint.clone()],
+        listen: vec![endpoint],
+        chunk_kib: 16,
+        retry_min_s: 0.1,
+        retry_max_s: 0.5,
+        poll_s: 0.02,
+        ..Default::default()
+    };
+    let path = dir.path().join("m.dgtr");
+    write_model(&path, &noise(8_000_000, 4));
+    let o = Offerer::start(&settings, "m", "a1").expect("offerer");
+    o.offer_final(&path);
+    let ids = ["a1".to_owned()];
+    let mut r = Receiver::open(&settings, "m", &ids, &dir.path().join("g")).expect("receiver");
+    assert!(receive(&mut r, LIMIT, |r| r.counters.chunks > 0));
+    let first = r.counters.chunks;
+    assert!(!r.all_finished());
+    drop(r);
+    let mut r = Receiver::open(&settings, "m", &ids, &dir.path().join("g")).expect("receiver");
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
+    assert_eq!(r.counters.chunks_reused, first);
+    assert_eq!(r.counters.chunks + first, 489);
+    assert!(o.wait_delivered(LIMIT, || true));
+    assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(8_000_000, 4));
+}
+
+/// Writes a certificate authority and one certificate signed by it; returns the settings that use them.
+#[cfg(feature = "zenoh")]
+fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
+    use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
+    std::fs::create_dir_all(dir).expect("folder");
+    let ca_path = dir.join("ca.pem");
+    let ca_key_path = dir.join("ca.key");
+    let mut ca = CertificateParams::new(vec![]).expect("parameters");
+    ca.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    let ca_key = match std::fs::read_to_string(&ca_key_path) {
+        Ok(pem) => KeyPair::from_pem(&pem).expect("key"),
+        Err(_) => {
+            let key = KeyPair::generate().expect("key");
+            std::fs::write(&ca_key_path, key.serialize_pem()).expect("write");
+            std::fs::write(&ca_path, ca.self_signed(&key).expect("sign").pem()).expect("write");
+            key
+        }
+    };
+    let key = KeyPair::generate().expect("key");
+    let own = CertificateParams::new(vec!["localhost".to_owned()]).expect("parameters");
+    let signed = own.signed_by(&key, &Issuer::from_params(&ca, &ca_key)).expect("sign");
+    let (certificate, key_path) = (dir.join(format!("{name}.pem")), dir.join(format!("{name}.key")));
+    std::fs::write(&certificate, signed.pem()).expect("write");
+    std::fs::write(&key_path, key.serialize_pem()).expect("write");
+    config::upload::TlsSettings { authority: ca_path, certificate, key: key_path }
+}
+
+#[cfg(feature = "zenoh")]
+#[test]
+fn over_tls_only_aircraft_of_the_same_authority_deliver() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let endpoint = format!("tls/localhost:{}", free_port());
+    let ours = dir.path().join("ours");
+    let ground = UploadSettings {
+        listen: vec![endpoint.clone()],
+        tls: Some(certificates(&ours, "ground")),
+        chunk_kib: 64,
+        poll_s: 0.2,
+        ..Default::default()
+    };
+    let aircraft = |tls| UploadSettings {
+        connect: vec![endpoint.clone()],
+        listen: vec![],
+        tls: Some(tls),
+        retry_min_s: 0.1,
+        retry_max_s: 0.5,
+        ..ground.clone()
+    };
+    let path = dir.path().join("m.dgtr");
+    write_model(&path, &noise(500_000, 5));
+    let ids = ["friend".to_owned(), "stranger".to_owned()];
+    let mut r = Receiver::open(&ground, "m", &ids, &dir.path().join("g")).expect("receiver");
+    let stranger = aircraft(certificates(&dir.path().join("theirs"), "stranger"));
+    let stranger = Offerer::start(&stranger, "m", "stranger").expect("offerer");
+    stranger.offer_final(&path);
+    let friend = Offerer::start(&aircraft(certificates(&ours, "friend")), "m", "friend").expect("offerer");
+    friend.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| !r.received().is_empty()), "{:?}", friend.status());
+    assert!(friend.wait_delivered(LIMIT, || true));
+    assert!(!receive(&mut r, Duration::from_secs(2), |r| r.received().len() > 1));
+    assert!(r.received()[0].aircraft == "friend" && !stranger.status().delivered);
+}

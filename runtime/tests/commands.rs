@@ -1,0 +1,214 @@
+//! Promises of the command line: exit codes, one line per error, valid files at every moment. Where there is no Vulkan
+//! device, what needs one is skipped and says so.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
+
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use glam::{DQuat, DVec3};
+use image::{Rgb, RgbImage};
+use models::camera::Pose;
+use models::cloud::GaussianCloud;
+use models::formats::model::{self, ModelHeader};
+use models::formats::transforms::pose_to_opengl;
+
+fn dgtr(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_dgtr")).args(arguments).output().unwrap()
+}
+
+fn error_line(output: &Output) -> String {
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("dgtr: ")).collect();
+    assert_eq!(lines.len(), 1, "{text}");
+    lines[0].to_owned()
+}
+
+fn has_device() -> bool {
+    let found = vulkan::gpu::Gpu::list().is_ok();
+    if !found {
+        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+    }
+    found
+}
+
+/// Twelve nadir pictures of a painted plane, 40 m up, 4 m apart.
+fn data_set(root: &Path) {
+    std::fs::create_dir_all(root.join("images")).unwrap();
+    let frames: Vec<String> = (0..12)
+        .map(|i| {
+            let (east, north) = (f64::from(i % 4) * 4.0, f64::from(i / 4) * 4.0);
+            let image = RgbImage::from_fn(48, 36, |x, y| {
+                let (e, n) = (east + f64::from(x) - 23.5, north - f64::from(y) + 17.5);
+                let stripe = |v: f64| if (v / 6.0).floor() as i64 % 2 == 0 { 200 } else { 60 };
+                Rgb([stripe(e), stripe(n), 90])
+            });
+            image.save(root.join(format!("images/{i:02}.png"))).unwrap();
+            let center = DVec3::new(east, north, 40.0);
+            let m = pose_to_opengl(&Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center });
+            format!(r#"{{"file_path":"images/{i:02}.png","transform_matrix":{m:?}}}"#)
+        })
+        .collect();
+    let text = format!(
+        r#"{{"fl_x":40,"fl_y":40,"cx":24,"cy":18,"w":48,"h":36,"enu_origin_wgs84":{{"lat":46.0,"lon":7.0,"alt":500.0}},"frames":[{}]}}"#,
+        frames.join(",")
+    );
+    std::fs::write(root.join("transforms.json"), text).unwrap();
+}
+
+#[test]
+fn bad_input_is_one_line_and_exit_code_2() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    std::fs::write(path("bad.dgtr"), b"dgtr\r\n\x1a\n rubbish that is no model").unwrap();
+    data_set(&dir.path().join("set"));
+    let cases: [(&[&str], &str); 7] = [
+        (&["export", &path("none.dgtr"), "--to", "ply"], "none.dgtr"),
+        (&["export", &path("bad.dgtr"), "--to", "ply"], "bad.dgtr"),
+        (&["import", &path("set/images/00.png")], "00.png"),
+        (&["eval", &path("bad.dgtr"), &path("nowhere"), "--json"], "nowhere"),
+        (&["eval", &path("bad.dgtr"), &path("set"), "--split", "valid"], "valid"),
+        (&["train", &path("nowhere"), "--out", &path("out")], "nowhere"),
+        (&["plan", "--budget-mib", "1"], "MiB"),
+    ];
+    for (arguments, named) in cases {
+        let output = dgtr(arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        assert!(error_line(&output).contains(named), "{arguments:?}");
+        assert!(output.stdout.is_empty(), "{arguments:?}");
+    }
+    assert_eq!(dgtr(&["no-such-command"]).status.code(), Some(2));
+    assert_eq!(dgtr(&["--help"]).status.code(), Some(0));
+}
+
+#[test]
+fn a_device_that_is_not_there_is_exit_code_3() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    let set = dir.path().to_string_lossy().into_owned();
+    let out = dir.path().join("out").to_string_lossy().into_owned();
+    let output = dgtr(&["train", &set, "--out", &out, "--device", "no such device"]);
+    assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
+    error_line(&output);
+}
+
+#[test]
+fn export_and_import_give_the_model_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let mut cloud = GaussianCloud::with_capacity(1, 1);
+    cloud.push([1.0, 2.0, 3.0], [-1.0; 3], [1.0, 0.0, 0.0, 0.0], 0.5, &[0.1; 12]);
+    let origin = Some(config::geodesy::Geodetic { lat_deg: 46.5, lon_deg: 7.25, alt_m: 500.125 });
+    model::write(&dir.path().join("m.dgtr"), &ModelHeader { origin, ..Default::default() }, &cloud).unwrap();
+    assert!(dgtr(&["export", &path("m.dgtr"), "--to", "ply"]).status.success());
+    assert!(dgtr(&["import", &path("m.ply"), "--out", &path("back.dgtr")]).status.success());
+    let (header, back) = model::read(&dir.path().join("back.dgtr")).unwrap();
+    assert_eq!((header.origin, back), (origin, cloud));
+}
+
+#[test]
+fn the_plan_is_printed_as_a_table_and_as_json() {
+    let table = String::from_utf8(dgtr(&["plan", "--budget-mib", "300"]).stdout).unwrap();
+    assert!(table.contains("Gaussians") && table.contains("total"), "{table}");
+    let json: serde_json::Value =
+        serde_json::from_slice(&dgtr(&["plan", "--budget-mib", "300", "--json"]).stdout).unwrap();
+    assert!(json["total_bytes"].as_u64().unwrap() <= 300 << 20);
+}
+
+#[test]
+fn training_improves_on_naive_guesses_and_its_report_says_what_it_took() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    data_set(&dir.path().join("set"));
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let output = dgtr(&[
+        "train",
+        &path("set"),
+        "--out",
+        &path("out"),
+        "--init",
+        "random",
+        "--max-gaussians",
+        "3000",
+        "--steps",
+        "150",
+        "--budget-mib",
+        "64",
+        "--seed",
+        "5",
+    ]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let report = runtime::run_json::RunReport::read(&dir.path().join("out")).unwrap();
+    assert_eq!((report.outcome.as_str(), report.steps, report.views), ("done", 150, 10));
+    assert!(report.device_bytes_peak > 0 && report.device_bytes_peak <= report.device_bytes_planned);
+    assert!(report.stage_ms.contains_key("train") && report.host_rss_peak > 0);
+    let save = path("eval");
+    let output = dgtr(&["eval", &path("out/model.dgtr"), &path("set"), "--json", "--baselines", "--save", &save]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let answer: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let number = |v: &serde_json::Value| v.as_f64().unwrap();
+    assert!((number(&answer["psnr"]) - report.psnr.unwrap()).abs() < 1e-9, "train and eval agree");
+    assert!(number(&answer["psnr"]) > number(&answer["baselines"]["mean_color"]["psnr"]), "{answer}");
+    assert_eq!(answer["views"].as_array().unwrap().len(), 2);
+    // The figures are those of the saved pictures.
+    let (mut sum, mut n) = (0.0, 0.0);
+    for view in answer["views"].as_array().unwrap() {
+        let name = view["name"].as_str().unwrap();
+        let open = |p: &Path| models::metrics::to_f32(&image::open(p).unwrap().into_rgb8());
+        let rendered = open(&dir.path().join("eval").join(name));
+        sum += models::metrics::psnr(&rendered, &open(&dir.path().join("set/images").join(name)));
+        n += 1.0;
+    }
+    assert!((sum / n - number(&answer["psnr"])).abs() < 1e-9);
+    let frames = path("frames");
+    assert!(
+        dgtr(&["render", &path("out/model.dgtr"), "--cameras", &path("set/transforms.json"), "--out", &frames])
+            .status
+            .success()
+    );
+    let depth = image::open(dir.path().join("frames/00_depth.png")).unwrap();
+    assert_eq!(depth.color(), image::ColorType::L16);
+}
+
+#[test]
+fn an_interrupted_training_leaves_a_valid_model_and_the_same_command_continues_it() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    data_set(&dir.path().join("set"));
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let (set, out, file) = (path("set"), path("out"), dir.path().join("out/model.dgtr"));
+    let train = |steps: &'static str| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_dgtr"));
+        c.args(["train", &set, "--out", &out, "--init", "random", "--max-gaussians", "500", "--budget-mib", "64"]);
+        c.args(["--steps", steps, "--no-eval"]).stderr(Stdio::piped()).stdout(Stdio::piped());
+        c
+    };
+    let mut child = train("1000000").spawn().unwrap();
+    let began = Instant::now();
+    // Wait until the first Gaussians are on disc, then let it take some steps.
+    while model::read_header(&file).map_or(0, |m| m.1) == 0 && began.elapsed() < Duration::from_secs(60) {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    std::thread::sleep(Duration::from_millis(700));
+    let pid = rustix::process::Pid::from_raw(child.id() as i32).unwrap();
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(4));
+    let (header, cloud) = model::read(&file).unwrap();
+    assert!(!header.finished && header.steps > 0 && !cloud.is_empty(), "{header:?}");
+    let goal: &'static str = Box::leak((header.steps + 5).to_string().into_boxed_str());
+    let output = train(goal).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let (continued, _) = model::read(&file).unwrap();
+    assert!(continued.finished && continued.steps == header.steps + 5, "{} after {}", continued.steps, header.steps);
+    // Other pictures in the same folder are not silently replaced.
+    let output = Command::new(env!("CARGO_BIN_EXE_dgtr"))
+        .args(["train", &set, "--out", &out, "--split", "all"])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    assert!(error_line(&output).contains("--fresh"));
+}

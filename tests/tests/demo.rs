@@ -1,0 +1,43 @@
+//! The README's first promise: the whole system on one machine, under a memory limit.
+
+mod support;
+
+use serde_json::Value;
+
+fn json(folder: &std::path::Path, arguments: &[&str]) -> Value {
+    let output = support::run(folder, arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).expect("one JSON object")
+}
+
+#[test]
+fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the_naive_guesses() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let output = support::run(dir.path(), &["demo", "--out", "demo", "--seconds", "15", "--process-mib", "640"]);
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    println!("{text}");
+    let out = dir.path().join("demo");
+    for file in ["report.html", "mission.toml", "ground/out/global.dgtr", "west/out/model.dgtr", "east/out/run.json"] {
+        assert!(out.join(file).is_file(), "{file} is missing:\n{text}");
+    }
+    for aircraft in ["west", "east"] {
+        let truth = format!("{aircraft}/truth");
+        let model = format!("{aircraft}/out/model.dgtr");
+        let own = json(&out, &["eval", &model, &truth, "--json", "--baselines"]);
+        let global = json(&out, &["eval", "ground/out/global.dgtr", &truth, "--json"]);
+        let psnr = |v: &Value| v["psnr"].as_f64().expect("psnr");
+        let naive = &own["baselines"];
+        // Fifteen seconds on a busy machine are few steps; the initialisation alone is well above both guesses.
+        assert!(psnr(&own) > psnr(&naive["ground_warp"]) + 0.5, "{aircraft}: {own}");
+        assert!(psnr(&own) > psnr(&naive["mean_color"]) + 4.0, "{aircraft}: {own}");
+        assert!(psnr(&global) > psnr(&own) - 0.5, "{aircraft}: {global}\n{own}");
+        let run = json_file(&out.join(aircraft).join("out/run.json"));
+        assert_eq!(run["outcome"], "done");
+        assert_eq!(run["device_bytes_planned"], run["device_bytes_peak"]);
+    }
+}
+
+fn json_file(path: &std::path::Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).expect("readable")).expect("JSON")
+}

@@ -1,0 +1,49 @@
+#version 450
+// Counts instances per tile. Each lane walks its own contiguous share of the Gaussians in depth order and keeps its own
+// histogram. Mode 1 counts only the total inside a band (the histogram is there already).
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+#include "spans.glsl"
+#include "walk.glsl"
+
+layout(set = 0, binding = 9) uniform samplerBuffer projected;
+layout(set = 0, binding = 10) uniform usamplerBuffer order;
+layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
+layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+
+void main() {
+    uint lane = gl_GlobalInvocationID.x;
+    if (lane >= SORT_BLOCKS) return;
+    uint tile_count = frame.window.z * frame.window.w, total = 0u, base = lane * tile_count;
+    uint cursor = WALK_CURSORS + lane * 4u;
+    Walk w = walk_begin(lane, status[0]);
+    if (push.pass > 0u) {
+        w.i = status[cursor];
+        w.row = int(status[cursor + 1u]);
+        total = status[cursor + 2u];
+    }
+    while (w.i < w.end && w.left > 0u) {
+        int at = int(texelFetch(order, int(w.i)).x) * 3;
+        Spans s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+        if (w.row >= 0) s.row = w.row;
+        for (; s.row <= s.last_row && w.left > 0u; s.row++) {
+            ivec2 span = span_in_band(s, s.row);
+            uint touched = uint(max(span.y - span.x + 1, 0));
+            total += touched;
+            if (push.mode == 0u) {
+                uint line = base + uint(s.row) * frame.window.z;
+                for (int x = span.x; x <= span.y; x++) tiles[line + uint(x)] += 1u;
+            }
+            walk_pay(w, touched + 1u);
+        }
+        bool finished = s.row > s.last_row;
+        w.row = finished ? -1 : s.row;
+        w.i += finished ? 1u : 0u;
+        walk_pay(w, 1u);
+    }
+    status[16u + lane] = total;
+    status[cursor] = w.i;
+    status[cursor + 1u] = uint(w.row);
+    status[cursor + 2u] = total;
+    status[cursor + 3u] = w.i >= w.end ? 1u : 0u;
+}

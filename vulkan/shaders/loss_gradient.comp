@@ -1,0 +1,71 @@
+#version 450
+// The loss's gradient at every pixel: L1, SSIM (second pass of its gradient, along columns) and Pearson depth; the
+// values of L1 and the exposure's gradient are left as one partial sum per strip.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+#include "window.glsl"
+
+layout(set = 0, binding = 9) uniform samplerBuffer blurred;
+layout(set = 0, binding = 10) uniform samplerBuffer image;
+layout(set = 0, binding = 11) uniform usamplerBuffer target;
+layout(std430, set = 0, binding = 1) writeonly buffer ImageGradient { vec4 image_gradient[]; };
+layout(std430, set = 0, binding = 2) buffer Partials { vec4 partials[]; };
+layout(std430, set = 0, binding = 3) readonly buffer Status { uint status[]; };
+
+void main() {
+    uint width = frame.size.x, i = gl_GlobalInvocationID.x;
+    int height = int(frame.size.y);
+    if (i >= width * uint((height + STRIP - 1) / STRIP)) return;
+    uint column = i % width, pixels = frame.size.x * frame.size.y;
+    int y0 = int(i / width) * STRIP;
+    vec3 by_mean[STRIP], by_square[STRIP], by_product[STRIP];
+    [[unroll]] for (int o = 0; o < STRIP; o++) {
+        by_mean[o] = vec3(0.0);
+        by_square[o] = vec3(0.0);
+        by_product[o] = vec3(0.0);
+    }
+    [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
+        int y = y0 + j;
+        [[unroll]] for (int c = 0; c < 3; c++) {
+            vec3 v = texelFetch(blurred, c * int(pixels) + clamp(y, 0, height - 1) * int(width) + int(column)).xyz;
+            v = y >= 0 && y < height ? v : vec3(0.0);
+            [[unroll]] for (int o = 0; o < STRIP; o++) {
+                if (abs(j - o) <= RADIUS) {
+                    by_mean[o][c] += tap(j - o) * v.x;
+                    by_square[o][c] += tap(j - o) * v.y;
+                    by_product[o][c] += tap(j - o) * v.z;
+                }
+            }
+        }
+    }
+    vec3 gain_gradient = vec3(0.0), offset_gradient = vec3(0.0);
+    float l1 = 0.0;
+    vec3 depth_line = vec3(0.0);
+    if ((frame.counts.z & FLAG_DEPTH) != 0u) {
+        depth_line = vec3(uintBitsToFloat(status[512]), uintBitsToFloat(status[513]), uintBitsToFloat(status[514]));
+    }
+    [[unroll]] for (int o = 0; o < STRIP; o++) {
+        if (y0 + o < height) {
+            uint at = uint(y0 + o) * width + column;
+            vec4 raw = texelFetch(image, int(at));
+            uvec2 wanted = texelFetch(target, int(at)).xy;
+            vec4 y = unpackUnorm4x8(wanted.x);
+            vec3 x = raw.xyz * frame.exposure_gain.xyz + frame.exposure_offset.xyz;
+            vec3 d = x - y.xyz;
+            l1 += abs(d.x) + abs(d.y) + abs(d.z);
+            vec3 g = frame.loss.x * sign(d)
+                - frame.loss.y * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
+            offset_gradient += g;
+            g *= frame.exposure_gain.xyz;
+            gain_gradient += g * raw.xyz; // by the logarithm of the gain
+            float depth = 0.0;
+            if (y.w > 0.0 && y.w >= frame.exposure_gain.w) {
+                depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
+            }
+            image_gradient[at] = vec4(g, depth);
+        }
+    }
+    uint at = frame.step.z + i * 2u;
+    partials[at] = vec4(l1, gain_gradient);
+    partials[at + 1u] = vec4(offset_gradient, partials[at + 1u].w);
+}

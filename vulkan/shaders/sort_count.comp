@@ -1,0 +1,22 @@
+#version 450
+// One pass of the depth sort, first half: each lane counts the digits of its own contiguous block (no barrier, no
+// atomic: what software devices like, and stable by construction). Pass 0 also leaves out what is not visible.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+
+layout(std430, set = 0, binding = 1) readonly buffer Keys { uint keys[]; };
+layout(std430, set = 0, binding = 2) buffer Histogram { uint histogram[]; };
+layout(std430, set = 0, binding = 3) readonly buffer Status { uint status[]; };
+
+void main() {
+    uint lane = gl_GlobalInvocationID.x;
+    if (lane >= SORT_BLOCKS) return;
+    uint n = push.pass == 0u ? frame.counts.x : status[0];
+    uint share = (n + SORT_BLOCKS - 1u) / SORT_BLOCKS;
+    uint i = lane * share, end = min(i + share, n), shift = push.pass * 8u;
+    for (uint d = 0u; d < 256u; d++) histogram[lane * 256u + d] = 0u;
+    for (; i < end; i++) {
+        uint key = keys[i];
+        if (key != 0xFFFFFFFFu) histogram[lane * 256u + ((key >> shift) & 255u)] += 1u;
+    }
+}

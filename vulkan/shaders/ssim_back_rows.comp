@@ -1,0 +1,30 @@
+#version 450
+// SSIM's gradient, first pass: the window over the derivatives, along rows.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+#include "window.glsl"
+
+layout(set = 0, binding = 9) uniform samplerBuffer adjoint;
+layout(std430, set = 0, binding = 1) writeonly buffer Blurred { vec4 blurred[]; };
+
+void main() {
+    uint strips = (frame.size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
+    if (i >= strips * frame.size.y) return;
+    int width = int(frame.size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
+    uint pixels = frame.size.x * frame.size.y;
+    [[unroll]] for (uint c = 0u; c < 3u; c++) {
+        vec3 sum[STRIP];
+        [[unroll]] for (int o = 0; o < STRIP; o++) sum[o] = vec3(0.0);
+        [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
+            int x = x0 + j;
+            vec3 v = texelFetch(adjoint, int(c * pixels) + row * width + clamp(x, 0, width - 1)).xyz;
+            v = x >= 0 && x < width ? v : vec3(0.0);
+            [[unroll]] for (int o = 0; o < STRIP; o++) {
+                if (abs(j - o) <= RADIUS) sum[o] += tap(j - o) * v;
+            }
+        }
+        [[unroll]] for (int o = 0; o < STRIP; o++) {
+            if (x0 + o < width) blurred[c * pixels + uint(row * width + x0 + o)] = vec4(sum[o], 0.0);
+        }
+    }
+}

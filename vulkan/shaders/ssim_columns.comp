@@ -1,0 +1,43 @@
+#version 450
+// SSIM, second pass: along columns, then SSIM itself and its derivatives by the mean of x, by the mean of x2+y2 and by
+// the mean of xy, per pixel and channel.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+#include "window.glsl"
+
+layout(set = 0, binding = 9) uniform samplerBuffer moments;
+layout(std430, set = 0, binding = 1) writeonly buffer Adjoint { vec4 adjoint[]; };
+layout(std430, set = 0, binding = 2) buffer Partials { vec4 partials[]; };
+
+void main() {
+    uint width = frame.size.x, i = gl_GlobalInvocationID.x;
+    int height = int(frame.size.y);
+    if (i >= width * uint((height + STRIP - 1) / STRIP)) return;
+    uint column = i % width, pixels = frame.size.x * frame.size.y;
+    int y0 = int(i / width) * STRIP;
+    float total = 0.0;
+    [[unroll]] for (uint c = 0u; c < 3u; c++) {
+        vec4 sum[STRIP];
+        [[unroll]] for (int o = 0; o < STRIP; o++) sum[o] = vec4(0.0);
+        [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
+            int y = y0 + j;
+            vec4 v = texelFetch(moments, int(c * pixels + column) + clamp(y, 0, height - 1) * int(width));
+            v = y >= 0 && y < height ? v : vec4(0.0);
+            [[unroll]] for (int o = 0; o < STRIP; o++) {
+                if (abs(j - o) <= RADIUS) sum[o] += tap(j - o) * v;
+            }
+        }
+        [[unroll]] for (int o = 0; o < STRIP; o++) {
+            float ma = sum[o].x, mb = sum[o].y, cross2 = 2.0 * ma * mb, square = ma * ma + mb * mb;
+            float a1 = cross2 + SSIM_C1, a2 = 2.0 * sum[o].w - cross2 + SSIM_C2;
+            float b1 = square + SSIM_C1, b2 = sum[o].z - square + SSIM_C2;
+            float r1 = 1.0 / b1, r2 = 1.0 / b2, both = r1 * r2, s = a1 * a2 * both;
+            vec3 d = vec3(2.0 * mb * (a2 - a1) * both + 2.0 * ma * s * (r2 - r1), -s * r2, 2.0 * a1 * both);
+            if (y0 + o < height) {
+                adjoint[c * pixels + uint(y0 + o) * width + column] = vec4(d, 0.0);
+                total += s;
+            }
+        }
+    }
+    partials[frame.step.z + i * 2u + 1u] = vec4(0.0, 0.0, 0.0, total);
+}

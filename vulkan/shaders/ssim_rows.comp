@@ -1,0 +1,42 @@
+#version 450
+// SSIM, first pass: along rows, the window's means of x, y, x2+y2 and xy for each channel (x rendered with exposure,
+// y target). SSIM only ever needs the sum of the two variances.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+#include "window.glsl"
+
+layout(set = 0, binding = 9) uniform samplerBuffer image;
+layout(set = 0, binding = 10) uniform usamplerBuffer target;
+layout(std430, set = 0, binding = 1) writeonly buffer Moments { vec4 moments[]; };
+
+void main() {
+    uint strips = (frame.size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
+    if (i >= strips * frame.size.y) return;
+    int width = int(frame.size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
+    uint pixels = frame.size.x * frame.size.y;
+    vec4 sum[3 * STRIP];
+    [[unroll]] for (int k = 0; k < 3 * STRIP; k++) sum[k] = vec4(0.0);
+    [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
+        int x = x0 + j;
+        bool inside = x >= 0 && x < width;
+        vec3 a = vec3(0.0), b = vec3(0.0);
+        // Fetched in any case, from inside the row: cheaper than a branch.
+        int at = row * width + clamp(x, 0, width - 1);
+        vec3 shown = texelFetch(image, at).xyz * frame.exposure_gain.xyz + frame.exposure_offset.xyz;
+        vec3 wanted = unpackUnorm4x8(texelFetch(target, at).x).xyz;
+        a = inside ? shown : a;
+        b = inside ? wanted : b;
+        [[unroll]] for (int c = 0; c < 3; c++) {
+            vec4 v = vec4(a[c], b[c], fma(a[c], a[c], b[c] * b[c]), a[c] * b[c]);
+            [[unroll]] for (int o = 0; o < STRIP; o++) {
+                if (abs(j - o) <= RADIUS) sum[c * STRIP + o] += tap(j - o) * v;
+            }
+        }
+    }
+    [[unroll]] for (int o = 0; o < STRIP; o++) {
+        if (x0 + o < width) {
+            uint at = uint(row * width + x0 + o);
+            [[unroll]] for (int c = 0; c < 3; c++) moments[uint(c) * pixels + at] = sum[c * STRIP + o];
+        }
+    }
+}

@@ -1,0 +1,30 @@
+#version 450
+// The step's picture at working size: blocks of divisor x divisor pixels averaged; alpha is the depth prior's
+// confidence, which weighs the depth. One lane per pixel.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+
+layout(std430, set = 0, binding = 1) readonly buffer View { uint view[]; };
+layout(std430, set = 0, binding = 2) writeonly buffer Target { uvec2 target[]; };
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= frame.size.x * frame.size.y) return;
+    uint divisor = frame.counts.w, width = frame.source.x, depth_at = frame.source.z;
+    uvec2 corner = uvec2(i % frame.size.x, i / frame.size.x) * divisor;
+    vec4 sum = vec4(0.0);
+    float depth = 0.0;
+    for (uint y = 0u; y < divisor; y++) {
+        for (uint x = 0u; x < divisor; x++) {
+            uint at = (corner.y + y) * width + corner.x + x;
+            vec4 c = unpackUnorm4x8(view[at]);
+            sum += c;
+            if (depth_at != 0u && c.w > 0.0) {
+                uint pair = view[depth_at + at / 2u];
+                depth += c.w * float((at & 1u) == 0u ? pair & 0xFFFFu : pair >> 16);
+            }
+        }
+    }
+    depth = sum.w > 0.0 ? depth / sum.w : 0.0;
+    target[i] = uvec2(packUnorm4x8(sum / float(divisor * divisor)), uint(depth + 0.5));
+}

@@ -1,0 +1,19 @@
+#version 450
+// Per tile: where each sorting lane's instances begin, and how many there are in all. One lane per tile.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+
+layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
+layout(std430, set = 0, binding = 2) writeonly buffer Starts { uint starts[]; };
+
+void main() {
+    uint t = gl_GlobalInvocationID.x, tile_count = frame.window.z * frame.window.w;
+    if (t >= tile_count) return;
+    uint sum = 0u;
+    for (uint b = 0u; b < SORT_BLOCKS; b++) {
+        uint count = tiles[b * tile_count + t];
+        tiles[b * tile_count + t] = sum;
+        sum += count;
+    }
+    starts[t] = sum;
+}

@@ -1,0 +1,26 @@
+// A sorting lane's walk over its share of the Gaussians, in rounds: a dispatch takes a bounded number of iterations and
+// leaves a cursor for the next. llvmpipe ends every loop of an invocation after 65,535 iterations in all (its
+// LP_MAX_TGSI_LOOP_ITERATIONS), silently; eight or sixteen lanes in lockstep can add up their iterations.
+
+const uint WALK_BUDGET = 3000u;
+const uint WALK_CURSORS = 1024u; // word of `status` where the cursors begin; four words per lane
+
+struct Walk {
+    uint i, end;   // present Gaussian in depth order, one past the last
+    int row;       // row of tiles to go on with; -1 at the start of a Gaussian
+    uint left;     // iterations that remain in this round
+};
+
+Walk walk_begin(uint lane, uint n) {
+    uint share = (n + SORT_BLOCKS - 1u) / SORT_BLOCKS;
+    Walk w;
+    w.i = min(lane * share, n);
+    w.end = min(w.i + share, n);
+    w.row = -1;
+    w.left = WALK_BUDGET;
+    return w;
+}
+
+void walk_pay(inout Walk w, uint iterations) {
+    w.left -= min(w.left, iterations);
+}

@@ -1,0 +1,249 @@
+//! One command buffer, recorded and submitted again and again: dispatches in order, a barrier and a timestamp after
+//! each stage. Nothing here allocates after start-up.
+
+use crate::arena::{Arena, Section};
+use crate::gpu::{Gpu, GpuError};
+use crate::kernels::{KERNELS, Kernel};
+use crate::pipelines::Pipelines;
+use crate::stages::{STAGE_NAMES, Stage};
+use ash::vk;
+use std::cell::Cell;
+
+/// Timestamps per submission; a submission that dispatches more leaves the rest untimed.
+const STAMPS: usize = 64;
+
+/// How long a submission may take before the device counts as lost: lavapipe on a small board may need long.
+const TIMEOUT_NS: u64 = 600_000_000_000;
+
+/// What a kernel is told besides the frame: a band of tiles, a mode, a pass.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Push {
+    pub first: u32,
+    pub last: u32,
+    pub mode: u32,
+    pub pass: u32,
+}
+
+pub(crate) struct Commands {
+    gpu: Gpu,
+    pool: vk::CommandPool,
+    buffer: vk::CommandBuffer,
+    fence: vk::Fence,
+    queries: vk::QueryPool,
+    stamps: Cell<usize>,
+    stages: [Cell<Stage>; STAMPS],
+    stage_ms: Cell<[f64; STAGE_NAMES.len()]>,
+}
+
+impl Drop for Commands {
+    fn drop(&mut self) {
+        let device = self.gpu.device();
+        // SAFETY: every submission was waited for; handles are ours.
+        unsafe {
+            device.destroy_query_pool(self.queries, None);
+            device.destroy_fence(self.fence, None);
+            device.destroy_command_pool(self.pool, None);
+        }
+    }
+}
+
+fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
+    move |e| GpuError::from_vk(call, e)
+}
+
+impl Commands {
+    pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        let device = gpu.device();
+        let flags = vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER;
+        let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.family()).flags(flags);
+        let query_info =
+            vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(STAMPS as u32);
+        // SAFETY: `made` owns each handle as soon as it exists; null handles may be destroyed.
+        unsafe {
+            let pool = device.create_command_pool(&pool_info, None).map_err(vulkan("vkCreateCommandPool"))?;
+            let mut made = Self {
+                gpu: gpu.clone(),
+                pool,
+                buffer: vk::CommandBuffer::null(),
+                fence: vk::Fence::null(),
+                queries: vk::QueryPool::null(),
+                stamps: Cell::new(0),
+                stages: [const { Cell::new(Stage::Target) }; STAMPS],
+                stage_ms: Cell::new([0.0; STAGE_NAMES.len()]),
+            };
+            let allocate = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
+            made.buffer = device.allocate_command_buffers(&allocate).map_err(vulkan("vkAllocateCommandBuffers"))?[0];
+            made.fence = device.create_fence(&vk::FenceCreateInfo::default(), None).map_err(vulkan("vkCreateFence"))?;
+            made.queries = device.create_query_pool(&query_info, None).map_err(vulkan("vkCreateQueryPool"))?;
+            Ok(made)
+        }
+    }
+
+    /// Milliseconds per stage since they were last cleared.
+    pub fn stage_ms(&self) -> [f64; STAGE_NAMES.len()] {
+        self.stage_ms.get()
+    }
+
+    pub fn clear_times(&self) {
+        self.stage_ms.set([0.0; STAGE_NAMES.len()]);
+    }
+
+    /// Starts a recording; the one before was submitted or dropped.
+    pub fn begin<'a>(&'a self, pipelines: &'a Pipelines) -> Result<Recording<'a>, GpuError> {
+        let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
+        let timed = self.gpu.timestamp_ns() > 0.0;
+        // SAFETY: the buffer is not pending: `submit` waits.
+        unsafe {
+            let device = self.gpu.device();
+            device.begin_command_buffer(self.buffer, &info).map_err(vulkan("vkBeginCommandBuffer"))?;
+            self.stamps.set(0);
+            if timed {
+                device.cmd_reset_query_pool(self.buffer, self.queries, 0, STAMPS as u32);
+            }
+        }
+        let recording = Recording { commands: self, pipelines, timed };
+        recording.stamp(Stage::Target);
+        Ok(recording)
+    }
+
+    fn collect_times(&self) {
+        let stamps = self.stamps.get();
+        if stamps < 2 {
+            return;
+        }
+        let mut ticks = [0u64; STAMPS];
+        // SAFETY: the submission that wrote these queries has completed.
+        let read = unsafe {
+            self.gpu.device().get_query_pool_results(
+                self.queries,
+                0,
+                &mut ticks[..stamps],
+                vk::QueryResultFlags::TYPE_64,
+            )
+        };
+        if read.is_ok() {
+            let mut all = self.stage_ms.get();
+            for i in 1..stamps {
+                let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns();
+                all[self.stages[i].get() as usize] += ns * 1e-6;
+            }
+            self.stage_ms.set(all);
+        }
+    }
+}
+
+pub(crate) struct Recording<'a> {
+    commands: &'a Commands,
+    pipelines: &'a Pipelines,
+    timed: bool,
+}
+
+impl Recording<'_> {
+    /// Runs `kernel` on at least `lanes` lanes after everything recorded before it.
+    pub fn run(&self, kernel: Kernel, lanes: usize, push: Push) {
+        self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, push);
+        self.stamp(KERNELS[kernel as usize].stage);
+    }
+
+    /// Runs `kernel` again and again, `push.pass` counting from 0: work that goes on where the round before ended.
+    pub fn run_rounds(&self, kernel: Kernel, lanes: usize, push: Push, rounds: u32) {
+        for pass in 0..rounds {
+            self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, Push { pass, ..push });
+        }
+        self.stamp(KERNELS[kernel as usize].stage);
+    }
+
+    /// As [`Self::run`], with view `index`'s descriptor set.
+    pub fn run_view(&self, kernel: Kernel, index: usize, lanes: usize) {
+        self.dispatch(kernel, self.pipelines.view_set(index), lanes, Push::default());
+        self.stamp(KERNELS[kernel as usize].stage);
+    }
+
+    fn dispatch(&self, kernel: Kernel, set: vk::DescriptorSet, lanes: usize, push: Push) {
+        let words = [push.first, push.last, push.mode, push.pass];
+        let groups = self.pipelines.groups(kernel, lanes);
+        let (device, buffer) = (self.commands.gpu.device(), self.commands.buffer);
+        // SAFETY: the buffer is recording; pipeline, layout and set belong together and outlive the submission.
+        unsafe {
+            device.cmd_bind_pipeline(buffer, vk::PipelineBindPoint::COMPUTE, self.pipelines.pipeline_of(kernel));
+            let layout = self.pipelines.layout;
+            device.cmd_bind_descriptor_sets(buffer, vk::PipelineBindPoint::COMPUTE, layout, 0, &[set], &[]);
+            let stages = vk::ShaderStageFlags::COMPUTE;
+            device.cmd_push_constants(buffer, layout, stages, 0, bytemuck::cast_slice(&words));
+            device.cmd_dispatch(buffer, groups, 1, 1);
+        }
+        self.barrier();
+    }
+
+    /// Zeroes a section's first `bytes` bytes (a multiple of four).
+    pub fn clear(&self, arena: &Arena, section: Section, bytes: u64, stage: Stage) {
+        // SAFETY: the range lies inside the arena's buffer, which has TRANSFER_DST usage.
+        unsafe {
+            let bytes = bytes.min(section.bytes);
+            self.commands.gpu.device().cmd_fill_buffer(self.commands.buffer, arena.buffer, section.offset, bytes, 0);
+        }
+        self.barrier();
+        self.stamp(stage);
+    }
+
+    fn barrier(&self) {
+        let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
+        let all = vk::AccessFlags::SHADER_READ
+            | vk::AccessFlags::SHADER_WRITE
+            | vk::AccessFlags::TRANSFER_WRITE
+            | vk::AccessFlags::UNIFORM_READ;
+        let memory = [vk::MemoryBarrier::default().src_access_mask(all).dst_access_mask(all)];
+        // SAFETY: the buffer is recording.
+        unsafe {
+            self.commands.gpu.device().cmd_pipeline_barrier(
+                self.commands.buffer,
+                stages,
+                stages,
+                vk::DependencyFlags::empty(),
+                &memory,
+                &[],
+                &[],
+            );
+        }
+    }
+
+    fn stamp(&self, stage: Stage) {
+        let (c, at) = (self.commands, self.commands.stamps.get());
+        if self.timed && at < STAMPS {
+            // SAFETY: the buffer is recording and the query was reset in it.
+            unsafe {
+                let done = vk::PipelineStageFlags::BOTTOM_OF_PIPE;
+                c.gpu.device().cmd_write_timestamp(c.buffer, done, c.queries, at as u32);
+            }
+            c.stages[at].set(stage);
+            c.stamps.set(at + 1);
+        }
+    }
+
+    /// Submits what was recorded and waits until the device is done and the host can see it.
+    pub fn submit(self) -> Result<(), GpuError> {
+        let c = self.commands;
+        let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
+        let host = [vk::MemoryBarrier::default()
+            .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)
+            .dst_access_mask(vk::AccessFlags::HOST_READ | vk::AccessFlags::HOST_WRITE)];
+        let buffers = [c.buffer];
+        let submit = [vk::SubmitInfo::default().command_buffers(&buffers)];
+        // SAFETY: the buffer is recording and then submitted once; the fence is unsignalled before and reset after.
+        unsafe {
+            let device = c.gpu.device();
+            let none = vk::DependencyFlags::empty();
+            device.cmd_pipeline_barrier(c.buffer, stages, vk::PipelineStageFlags::HOST, none, &host, &[], &[]);
+            device.end_command_buffer(c.buffer).map_err(vulkan("vkEndCommandBuffer"))?;
+            device.queue_submit(c.gpu.queue(), &submit, c.fence).map_err(vulkan("vkQueueSubmit"))?;
+            match device.wait_for_fences(&[c.fence], true, TIMEOUT_NS) {
+                Ok(()) => {}
+                Err(vk::Result::TIMEOUT) => return Err(GpuError::DeviceLost { during: "vkWaitForFences" }),
+                Err(e) => return Err(GpuError::from_vk("vkWaitForFences", e)),
+            }
+            device.reset_fences(&[c.fence]).map_err(vulkan("vkResetFences"))?;
+        }
+        c.collect_times();
+        Ok(())
+    }
+}

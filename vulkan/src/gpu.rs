@@ -1,0 +1,218 @@
+//! The Vulkan device: found by name, opened with nothing beyond Vulkan 1.1 compute, so that lavapipe, V3DV, PanVK,
+//! Turnip and desktop drivers are all the same to the rest of the crate.
+
+mod error;
+
+pub use error::GpuError;
+
+use ash::{Device, Entry, Instance, vk};
+use std::ffi::CStr;
+use std::sync::Arc;
+
+/// What a device says about itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GpuInfo {
+    /// The driver's name of the device.
+    pub name: String,
+    /// Vulkan version, major and minor.
+    pub version: (u32, u32),
+    /// Whether this is a software renderer.
+    pub is_cpu: bool,
+    /// Invocations that run in lockstep.
+    pub subgroup_size: u32,
+    /// Bytes of the largest device-local heap.
+    pub heap_bytes: u64,
+}
+
+/// An opened device with its one compute queue. Cheap to clone; closed when the last clone is dropped.
+#[derive(Clone)]
+pub struct Gpu {
+    inner: Arc<Inner>,
+}
+
+struct Inner {
+    info: GpuInfo,
+    device: Device,
+    instance: Instance,
+    physical: vk::PhysicalDevice,
+    queue: vk::Queue,
+    family: u32,
+    timestamp_ns: f64,
+    // The loader stays open for as long as anything made by it.
+    _entry: Entry,
+}
+
+impl std::fmt::Debug for Gpu {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Gpu").field(&self.inner.info).finish()
+    }
+}
+
+impl Drop for Inner {
+    fn drop(&mut self) {
+        // SAFETY: everything made from the device holds a clone of `Gpu`, so nothing of it is alive any more.
+        unsafe {
+            let _ = self.device.device_wait_idle();
+            self.device.destroy_device(None);
+            self.instance.destroy_instance(None);
+        }
+    }
+}
+
+impl Gpu {
+    /// Every device with a compute queue.
+    ///
+    /// # Errors
+    /// [`GpuError::NoLoader`] without a Vulkan loader, [`GpuError::NoDevice`] when there is no device.
+    pub fn list() -> Result<Vec<GpuInfo>, GpuError> {
+        let (_entry, instance) = instance()?;
+        let found = devices(&instance).map(|all| all.into_iter().map(|d| d.1).collect::<Vec<_>>());
+        // SAFETY: nothing else was made from this instance.
+        unsafe { instance.destroy_instance(None) };
+        let found = found?;
+        if found.is_empty() { Err(GpuError::NoDevice { wanted: None, present: String::new() }) } else { Ok(found) }
+    }
+
+    /// Opens the device whose name contains `name` (case is ignored), or the first that is no software renderer, or
+    /// else the first.
+    ///
+    /// # Errors
+    /// As [`Gpu::list`]; [`GpuError::NoDevice`] names what is present when nothing matches.
+    pub fn open(name: Option<&str>) -> Result<Self, GpuError> {
+        let (entry, instance) = instance()?;
+        match open_in(&instance, name) {
+            Ok((physical, info, device, family, timestamp_ns)) => {
+                // SAFETY: queue 0 of `family` was requested when the device was made.
+                let queue = unsafe { device.get_device_queue(family, 0) };
+                let inner = Inner { info, device, instance, physical, queue, family, timestamp_ns, _entry: entry };
+                Ok(Self { inner: Arc::new(inner) })
+            }
+            Err(e) => {
+                // SAFETY: no device was made from this instance.
+                unsafe { instance.destroy_instance(None) };
+                Err(e)
+            }
+        }
+    }
+
+    /// What the device says about itself.
+    pub fn info(&self) -> &GpuInfo {
+        &self.inner.info
+    }
+
+    pub(crate) fn device(&self) -> &Device {
+        &self.inner.device
+    }
+
+    pub(crate) fn queue(&self) -> vk::Queue {
+        self.inner.queue
+    }
+
+    pub(crate) fn family(&self) -> u32 {
+        self.inner.family
+    }
+
+    /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
+    pub(crate) fn timestamp_ns(&self) -> f64 {
+        self.inner.timestamp_ns
+    }
+
+    pub(crate) fn memory_properties(&self) -> vk::PhysicalDeviceMemoryProperties {
+        // SAFETY: the physical device belongs to this live instance.
+        unsafe { self.inner.instance.get_physical_device_memory_properties(self.inner.physical) }
+    }
+}
+
+fn instance() -> Result<(Entry, Instance), GpuError> {
+    // SAFETY: loading the system's Vulkan loader runs its initialisers; it is the documented way to reach Vulkan.
+    let entry = unsafe { Entry::load() }.map_err(|e| GpuError::NoLoader(e.to_string()))?;
+    let application = vk::ApplicationInfo::default().application_name(c"dgtr").api_version(vk::API_VERSION_1_1);
+    let create = vk::InstanceCreateInfo::default().application_info(&application);
+    // SAFETY: `create` and what it points to outlive the call.
+    match unsafe { entry.create_instance(&create, None) } {
+        Ok(instance) => Ok((entry, instance)),
+        Err(vk::Result::ERROR_INCOMPATIBLE_DRIVER) => Err(GpuError::NoDevice { wanted: None, present: String::new() }),
+        Err(e) => Err(GpuError::from_vk("vkCreateInstance", e)),
+    }
+}
+
+type Found = (vk::PhysicalDevice, GpuInfo, u32, f64);
+
+fn devices(instance: &Instance) -> Result<Vec<Found>, GpuError> {
+    // SAFETY: the instance is alive; the handles below come from it.
+    let all = unsafe { instance.enumerate_physical_devices() }
+        .map_err(|e| GpuError::from_vk("vkEnumeratePhysicalDevices", e))?;
+    let mut found = Vec::new();
+    for physical in all {
+        let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
+        let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut subgroup);
+        // SAFETY: the structure chain is initialised and outlives the calls.
+        let (families, memory) = unsafe {
+            instance.get_physical_device_properties2(physical, &mut properties);
+            (
+                instance.get_physical_device_queue_family_properties(physical),
+                instance.get_physical_device_memory_properties(physical),
+            )
+        };
+        let p = properties.properties;
+        let compute = |f: &vk::QueueFamilyProperties| f.queue_flags.contains(vk::QueueFlags::COMPUTE);
+        let Some(family) = families.iter().position(compute) else { continue };
+        if p.api_version < vk::API_VERSION_1_1 {
+            continue;
+        }
+        let ticks = families[family].timestamp_valid_bits > 0;
+        let name = p.device_name_as_c_str().unwrap_or(c"unnamed");
+        let heaps =
+            memory.memory_heaps_as_slice().iter().filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
+        let info = GpuInfo {
+            name: CStr::to_string_lossy(name).into_owned(),
+            version: (vk::api_version_major(p.api_version), vk::api_version_minor(p.api_version)),
+            is_cpu: p.device_type == vk::PhysicalDeviceType::CPU,
+            subgroup_size: subgroup.subgroup_size,
+            heap_bytes: heaps.map(|h| h.size).max().unwrap_or(0),
+        };
+        let timestamp_ns = if ticks { f64::from(p.limits.timestamp_period) } else { 0.0 };
+        found.push((physical, info, family as u32, timestamp_ns));
+    }
+    Ok(found)
+}
+
+fn open_in(
+    instance: &Instance,
+    name: Option<&str>,
+) -> Result<(vk::PhysicalDevice, GpuInfo, Device, u32, f64), GpuError> {
+    let all = devices(instance)?;
+    let present = all.iter().map(|d| d.1.name.as_str()).collect::<Vec<_>>().join(", ");
+    let chosen = match name {
+        Some(part) => {
+            let part = part.to_lowercase();
+            all.into_iter().find(|d| d.1.name.to_lowercase().contains(&part))
+        }
+        None => all.iter().position(|d| !d.1.is_cpu).or(Some(0)).and_then(|i| all.into_iter().nth(i)),
+    };
+    let Some((physical, info, family, timestamp_ns)) = chosen else {
+        return Err(GpuError::NoDevice { wanted: name.map(str::to_owned), present });
+    };
+    let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
+    let create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+    // SAFETY: `create` asks for one queue of an existing family, no extension and no feature.
+    let device = unsafe { instance.create_device(physical, &create, None) }
+        .map_err(|e| GpuError::from_vk("vkCreateDevice", e))?;
+    Ok((physical, info, device, family, timestamp_ns))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_device_name_is_refused_with_the_names_present() {
+        match Gpu::open(Some("no such device")) {
+            Err(GpuError::NoDevice { wanted, .. }) => {
+                assert!(wanted.is_none() || wanted.as_deref() == Some("no such device"))
+            }
+            Err(GpuError::NoLoader(_)) => {}
+            other => panic!("{other:?}"),
+        }
+    }
+}

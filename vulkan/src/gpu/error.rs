@@ -1,0 +1,66 @@
+//! What can go wrong between us and the driver, told apart where a caller can do something about it.
+
+use ash::vk;
+
+/// A device, driver or memory problem.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum GpuError {
+    /// There is no Vulkan loader on the system.
+    #[error("no Vulkan loader ({0}); install libvulkan1 and a driver such as mesa-vulkan-drivers")]
+    NoLoader(String),
+    /// No device, or none of that name.
+    #[error("no Vulkan device{}{}", .wanted.as_ref().map(|w| format!(" named like '{w}'")).unwrap_or_default(),
+        if .present.is_empty() { "; install mesa-vulkan-drivers".to_owned() } else { format!("; present: {}", .present) })]
+    NoDevice {
+        /// The name asked for.
+        wanted: Option<String>,
+        /// The names there are.
+        present: String,
+    },
+    /// The one allocation did not fit.
+    #[error("device memory: {bytes} bytes could not be allocated; lower memory.device_mib")]
+    OutOfMemory {
+        /// What was asked for.
+        bytes: u64,
+    },
+    /// The device went away (reset, hang, unplugged); the last checkpoint is still good.
+    #[error("the device was lost during {during}; restart from the last checkpoint")]
+    DeviceLost {
+        /// The call that noticed.
+        during: &'static str,
+    },
+    /// No memory type can be seen by both the host and the device.
+    #[error("the device has no host-visible memory type for {bytes} bytes")]
+    NoMemoryType {
+        /// What was asked for.
+        bytes: u64,
+    },
+    /// The device needs more than the plan holds (an alignment above what Vulkan promises).
+    #[error("the driver wants {wanted} bytes for a plan of {planned}; report this device")]
+    PlanMismatch {
+        /// The driver's figure.
+        wanted: u64,
+        /// The plan's.
+        planned: u64,
+    },
+    /// Anything else.
+    #[error("{call} failed: {result}")]
+    Vulkan {
+        /// The call.
+        call: &'static str,
+        /// The driver's answer.
+        result: String,
+    },
+}
+
+impl GpuError {
+    pub(crate) fn from_vk(call: &'static str, result: vk::Result) -> Self {
+        match result {
+            vk::Result::ERROR_DEVICE_LOST => Self::DeviceLost { during: call },
+            vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
+                Self::OutOfMemory { bytes: 0 }
+            }
+            other => Self::Vulkan { call, result: format!("{other:?}") },
+        }
+    }
+}

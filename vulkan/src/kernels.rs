@@ -1,0 +1,94 @@
+//! The list of kernels: for each its checked-in SPIR-V and the sections of the arena it binds, in binding order.
+
+use crate::arena::Section;
+use crate::stages::Stage;
+
+/// How many lanes a workgroup has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Group {
+    /// Plain loops over Gaussians or pixels.
+    Wide,
+    /// Lanes with much state or few of them: as many as the device runs in lockstep.
+    Narrow,
+    /// Exactly 256, one per digit or share of the tiles.
+    Scan,
+}
+
+pub(crate) struct KernelInfo {
+    pub name: &'static str,
+    pub spirv: &'static [u8],
+    pub bindings: &'static [&'static str],
+    /// Sections read through texel fetches, from binding [`FIRST_TEXELS`] on.
+    pub texels: &'static [&'static str],
+    pub group: Group,
+    pub stage: Stage,
+}
+
+macro_rules! kernels {
+    ($($id:ident $file:literal $stage:ident $group:ident [$($binding:literal)*] [$($texels:literal)*];)*) => {
+        /// One compute pipeline with its descriptor set.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub(crate) enum Kernel { $($id),* }
+
+        pub(crate) const KERNELS: &[KernelInfo] = &[$(KernelInfo {
+            name: stringify!($id),
+            spirv: include_bytes!(concat!("../shaders/spirv/", $file, ".spv")),
+            bindings: &[$($binding),*],
+            texels: &[$($texels),*],
+            group: Group::$group,
+            stage: Stage::$stage,
+        }),*];
+    };
+}
+
+kernels! {
+    Target "target" Target Wide ["view" "target"] [];
+    Project "project" Project Wide ["geometry" "projected" "keys"] ["geometry"];
+    SortCount "sort_count" Sort Narrow ["keys" "digits" "status"] [];
+    SortCountOther "sort_count" Sort Narrow ["keys_other" "digits" "status"] [];
+    SortScan "sort_scan" Sort Scan ["digits" "status"] [];
+    SortScatter "sort_scatter" Sort Narrow ["keys" "rows" "keys_other" "rows_other" "digits" "status"] [];
+    SortScatterBack "sort_scatter" Sort Narrow ["keys_other" "rows_other" "keys" "rows" "digits" "status"] [];
+    Shade "shade" Shade Wide ["rows" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "shaded"]
+        ["projected" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
+    Count "count" Count Narrow ["tiles" "status"] ["projected" "rows"];
+    TilePrefix "tile_prefix" Count Wide ["tiles" "tile_starts"] [];
+    TileScan "tile_scan" Count Scan ["tile_starts" "status"] [];
+    Emit "emit" Emit Narrow ["tiles" "tile_starts" "status" "instances" "slot_ranges"] ["projected" "rows"];
+    Rasterise "rasterise" Rasterise Narrow ["tile_starts" "image" "transmittance"] ["shaded" "instances"];
+    DepthSums "depth_sums" Loss Wide ["image" "target" "partials"] [];
+    DepthFinish "depth_finish" Loss Narrow ["partials" "status"] [];
+    SsimRows "ssim_rows" Loss Wide ["moments"] ["image" "target"];
+    SsimColumns "ssim_columns" Loss Wide ["adjoint" "partials"] ["moments"];
+    SsimBackRows "ssim_back_rows" Loss Wide ["moments"] ["adjoint"];
+    LossGradient "loss_gradient" Loss Wide ["image_gradient" "partials" "status"] ["moments" "image" "target"];
+    RasteriseBackward "rasterise_backward" RasteriseBackward Narrow ["tile_starts" "slots"]
+        ["shaded" "instances" "image" "image_gradient"];
+    RasteriseBackwardDepth "rasterise_backward_depth" RasteriseBackward Narrow ["tile_starts" "slots"]
+        ["shaded" "instances" "image" "image_gradient"];
+    Reduce "reduce" Reduce Wide ["reduced" "status"] ["slot_ranges" "slots"];
+    Optimise "optimise" Optimise Wide ["rows" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "partials"]
+        ["reduced" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
+}
+
+/// First of the texel bindings.
+pub(crate) const FIRST_TEXELS: u32 = 9;
+
+/// What a texel fetch of a section yields.
+pub(crate) fn texel_format(name: &str) -> ash::vk::Format {
+    match name {
+        "instances" | "target" | "slot_ranges" => ash::vk::Format::R32G32_UINT,
+        "rows" => ash::vk::Format::R32_UINT,
+        _ => ash::vk::Format::R32G32B32A32_SFLOAT,
+    }
+}
+
+/// SSIM's maps lie where the gradient slots will be: each half as many vec4 as three channels of pixels need.
+pub(crate) fn part_of_slots(name: &str, slots: Section, pixels: usize) -> Option<Section> {
+    let half = 48 * pixels as u64;
+    match name {
+        "moments" => Some(Section { offset: slots.offset, bytes: half }),
+        "adjoint" => Some(Section { offset: slots.offset + half, bytes: half }),
+        _ => None,
+    }
+}

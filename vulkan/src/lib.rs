@@ -1,0 +1,13 @@
+//! The renderer and the fixed-memory trainer: Vulkan compute over one device allocation.
+//!
+//! [`gpu::Gpu`] opens a device, [`config::plan::Plan`] says what is allocated, [`trainer::Trainer`] trains and renders.
+
+mod arena;
+mod commands;
+pub mod constants;
+pub mod gpu;
+mod kernels;
+mod pipelines;
+pub mod stages;
+pub mod trainer;
+pub mod twin;

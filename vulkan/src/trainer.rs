@@ -1,0 +1,263 @@
+//! The trainer: views and Gaussians in one arena, one gradient step after the other, nothing allocated in between.
+//!
+//! A step is two submissions: projection, sort and counting first, so that the host knows how many instances there are;
+//! then blending, loss, gradient and Adam — in several bands of tiles when the instances do not fit, with the same bits.
+
+mod bands;
+mod control;
+mod deferred;
+mod density;
+mod error;
+pub(crate) mod frame;
+mod gradient;
+mod pose;
+mod render;
+mod report;
+mod rows;
+mod sampler;
+mod step;
+mod views;
+
+pub use error::TrainError;
+pub use gradient::ViewGradients;
+pub use render::Rendering;
+pub use report::{Counters, RunBudget, StepReport, StopReason, TrainSummary};
+pub use rows::LoadReport;
+
+use crate::arena::Arena;
+use crate::commands::{Commands, Push, Recording};
+use crate::gpu::Gpu;
+use crate::kernels::Kernel;
+use crate::pipelines::Pipelines;
+use crate::stages::STAGE_NAMES;
+use bytemuck::Zeroable;
+use config::plan::{LOOP_LANES, Plan};
+use config::training::{Strategy, TrainSettings, scene_extent};
+use std::ops::ControlFlow;
+use std::time::Instant;
+
+/// Gaussians, views and optimiser state on one device.
+pub struct Trainer {
+    // Dropped in this order: what refers to the arena first, the device last.
+    commands: Commands,
+    pipelines: Pipelines,
+    arena: Arena,
+    gpu: Gpu,
+    plan: Plan,
+    settings: TrainSettings,
+    rows: rows::Rows,
+    frame: Box<frame::Frame>,
+    deferred: deferred::Deferred,
+    views: Vec<views::Resident>,
+    sampler: sampler::Sampler,
+    density: density::Scratch,
+    bands: Vec<bands::Band>,
+    /// Dispatches that counting and emitting are spread over.
+    walk_rounds: u32,
+    strategy: Strategy,
+    gaussians: usize,
+    extent: f32,
+    /// Steps taken since `load`.
+    steps: u32,
+    /// Whether every Gaussian has made up for the steps it was not seen in.
+    flushed: bool,
+    /// Gradients are left where the first moments are, and nothing moves (gradient checks).
+    gradients_only: bool,
+    /// Seconds of training since `load`.
+    elapsed_s: f64,
+    /// Steps and seconds that earlier processes spent on the same schedule.
+    before: (u32, f64),
+    totals: report::Totals,
+}
+
+impl std::fmt::Debug for Trainer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Trainer({} Gaussians, {} views, step {})", self.gaussians, self.views.len(), self.steps)
+    }
+}
+
+impl Trainer {
+    /// Allocates everything training will ever need: one device allocation of `plan.total_bytes`, all pipelines, and the
+    /// host's own lists.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`] (device, driver, memory); [`TrainError::Settings`].
+    pub fn new(gpu: &Gpu, plan: &Plan, settings: &TrainSettings) -> Result<Self, TrainError> {
+        settings.check()?;
+        let arena = Arena::new(gpu, plan)?;
+        let pipelines = Pipelines::new(gpu, plan, &arena)?;
+        let commands = Commands::new(gpu)?;
+        let rows = rows::Rows::new(&arena, plan.sh_degree);
+        Ok(Self {
+            commands,
+            pipelines,
+            arena,
+            gpu: gpu.clone(),
+            plan: plan.clone(),
+            rows,
+            frame: Box::new(frame::Frame::zeroed()),
+            deferred: deferred::Deferred::new(&settings.adam),
+            views: Vec::with_capacity(plan.views),
+            sampler: sampler::Sampler::new(settings.seed, plan.views),
+            density: density::Scratch::new(plan.gaussians),
+            bands: Vec::with_capacity(plan.tiles),
+            walk_rounds: bands::WALK_ROUNDS,
+            strategy: Strategy::None,
+            gaussians: 0,
+            extent: 1.0,
+            steps: 0,
+            flushed: true,
+            gradients_only: false,
+            elapsed_s: 0.0,
+            before: (0, 0.0),
+            totals: report::Totals::default(),
+            settings: settings.clone(),
+        })
+    }
+
+    /// Starts the schedule anew for the Gaussians just loaded.
+    fn restart(&mut self) {
+        self.steps = 0;
+        self.elapsed_s = 0.0;
+        self.before = (0, 0.0);
+        self.flushed = true;
+        self.deferred.reset();
+        self.sampler.reset();
+        self.strategy = self.settings.density.resolve(self.gaussians, self.plan.gaussians);
+        self.totals = report::Totals::default();
+        self.extent = 0.0;
+        self.density.last = 0;
+        self.density.last_flush = 0;
+        self.commands.clear_times();
+    }
+
+    /// Trains until the budget, the schedule or `each` says stop. The schedule fits itself to the budget: `steps` and
+    /// `seconds` given here replace those of the settings.
+    ///
+    /// # Errors
+    /// [`TrainError::NoViews`], [`TrainError::Empty`], [`TrainError::Gpu`]. What was trained before stays.
+    pub fn run(
+        &mut self,
+        budget: &RunBudget,
+        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
+    ) -> Result<TrainSummary, TrainError> {
+        if let Some(steps) = budget.steps {
+            self.settings.steps = steps.max(1);
+        } else if budget.seconds.is_some() {
+            self.settings.steps = u32::MAX;
+        }
+        self.settings.seconds = budget.seconds.or(self.settings.seconds);
+        let start = (Instant::now(), self.steps, self.elapsed_s);
+        let mut reason = StopReason::Schedule;
+        let mut last = None;
+        let mut patience = report::Patience::default();
+        while self.progress() < 1.0 {
+            let report = self.step()?;
+            let stop = each(&report).is_break();
+            last = Some(report);
+            if stop {
+                reason = StopReason::Caller;
+                break;
+            }
+            if patience.is_over(&self.settings.stop, &report, self.views.len()) {
+                reason = StopReason::Converged;
+                break;
+            }
+        }
+        Ok(TrainSummary {
+            steps: self.steps - start.1,
+            seconds: start.0.elapsed().as_secs_f64(),
+            reason,
+            gaussians: self.gaussians,
+            last,
+            counters: self.totals.counters,
+        })
+    }
+
+    /// Goes on with a schedule on which earlier processes spent `steps` and `seconds`; holds until the next
+    /// [`Trainer::load`].
+    pub fn continue_from(&mut self, steps: u32, seconds: f64) {
+        self.before = (steps, seconds);
+    }
+
+    /// How much of the schedule is over, 0…1.
+    pub fn progress(&self) -> f32 {
+        self.settings.progress(self.before.0.saturating_add(self.steps), self.before.1 + self.elapsed_s)
+    }
+
+    /// Seconds of training since the last [`Trainer::load`].
+    pub fn elapsed_s(&self) -> f64 {
+        self.elapsed_s
+    }
+
+    /// Number of Gaussians.
+    pub fn gaussians(&self) -> usize {
+        self.gaussians
+    }
+
+    /// Steps taken since the last [`Trainer::load`].
+    pub fn steps(&self) -> u32 {
+        self.steps
+    }
+
+    /// The plan everything was allocated by.
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
+    /// Bytes really allocated on the device.
+    pub fn device_bytes(&self) -> u64 {
+        self.arena.total_bytes
+    }
+
+    /// Device milliseconds per stage since `load`, in pipeline order; zeros on devices without timestamps.
+    pub fn stage_ms(&self) -> [(&'static str, f64); STAGE_NAMES.len()] {
+        let ms = self.commands.stage_ms();
+        std::array::from_fn(|i| (STAGE_NAMES[i], ms[i]))
+    }
+
+    /// Length scale of the scene, metres (see [`scene_extent`]); learning rates of positions are relative to it.
+    fn measure_extent(&mut self) {
+        if self.extent > 0.0 {
+            return;
+        }
+        let geometry = self.arena.slice::<[f32; 4]>(self.rows.geometry);
+        let means: Vec<[f32; 3]> =
+            geometry.chunks_exact(rows::GEOMETRY).take(self.gaussians).map(|g| [g[0][0], g[0][1], g[0][2]]).collect();
+        let centres: Vec<[f64; 3]> = self.views.iter().map(|v| v.view.pose.center.to_array()).collect();
+        self.extent = scene_extent(&means, &centres);
+    }
+
+    /// Every Gaussian makes up for the steps it was not seen in, so that rows may be read or moved.
+    fn flush(&mut self) -> Result<(), TrainError> {
+        if self.flushed || self.gaussians == 0 {
+            return Ok(());
+        }
+        self.frame.counts[0] = self.gaussians as u32;
+        self.frame.step[0] = self.steps + 1;
+        self.deferred.write(&mut self.frame.deferred);
+        self.write_frame();
+        let all = Push { mode: 1, ..Push::default() };
+        let recording = self.take_recording()?;
+        recording.run(Kernel::Project, self.gaussians, all);
+        recording.run(Kernel::Shade, LOOP_LANES as usize, all);
+        recording.submit()?;
+        self.flushed = true;
+        Ok(())
+    }
+
+    fn take_recording(&self) -> Result<Recording<'_>, TrainError> {
+        Ok(self.commands.begin(&self.pipelines)?)
+    }
+
+    fn write_frame(&mut self) {
+        let section = self.arena.section("frame");
+        let bytes = bytemuck::bytes_of(&*self.frame);
+        self.arena.slice_mut::<u8>(section)[..bytes.len()].copy_from_slice(bytes);
+    }
+}

@@ -1,0 +1,31 @@
+//! What a running job may change between steps: other views, fewer pixels.
+
+use config::training::RateSettings;
+
+use super::{TrainError, Trainer};
+
+impl Trainer {
+    /// Forgets all resident views; their memory is used again by the next ones. The Gaussians stay.
+    pub fn clear_views(&mut self) {
+        self.views.clear();
+        self.sampler.forget();
+    }
+
+    /// Trains on pictures of at most 1/`divisor` of their size from now on, whatever the schedule says (1 = as scheduled):
+    /// the failsafe's way to a third of the work without touching the model.
+    pub fn set_least_divisor(&mut self, divisor: u32) {
+        self.settings.resolution.least_divisor = divisor.max(1);
+    }
+
+    /// Takes other learning rates from the next step on.
+    ///
+    /// # Errors
+    /// [`TrainError::Settings`] when one is negative or not a number; the old ones then stay.
+    pub fn set_rates(&mut self, rates: &RateSettings) -> Result<(), TrainError> {
+        let mut settings = self.settings.clone();
+        settings.rates = *rates;
+        settings.check()?;
+        self.settings = settings;
+        Ok(())
+    }
+}

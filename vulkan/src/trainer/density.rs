@@ -1,0 +1,237 @@
+//! Density control under the hard cap, on the host between two steps: dead Gaussians move onto live ones and free rows
+//! are filled by splitting, both with the opacity and scale that leave the picture unchanged (3DGS-MCMC, Kheradmand et
+//! al. 2024, eq. 9); or dead ones are only removed.
+
+use super::rows::GEOMETRY;
+use super::{TrainError, Trainer};
+use crate::trainer::frame::DEFERRED_STEPS;
+use config::training::Strategy;
+use rand::Rng;
+
+/// Copies of one Gaussian that the formula is tabulated for (as the reference implementation's `N_max`).
+const MOST_COPIES: usize = 51;
+/// Opacities are kept inside this before the formula: at 1 every copy would be opaque, at 0 none visible.
+const OPACITY_RANGE: (f64, f64) = (1e-6, 1.0 - 1e-6);
+
+/// Lists that density control works in, allocated once.
+pub(crate) struct Scratch {
+    dead: Vec<u32>,
+    /// Running sum of the live Gaussians' opacities.
+    cumulative: Vec<f64>,
+    /// How many copies of each row are wanted besides itself.
+    copies: Vec<u32>,
+    /// Rows to write and the rows they are copies of.
+    moves: Vec<[u32; 2]>,
+    binomials: Vec<[f64; MOST_COPIES]>,
+    pub last: u32,
+    pub last_flush: u32,
+}
+
+impl Scratch {
+    pub fn new(capacity: usize) -> Self {
+        let mut binomials = vec![[0.0; MOST_COPIES]; MOST_COPIES];
+        for n in 0..MOST_COPIES {
+            for k in 0..=n {
+                binomials[n][k] = if k == 0 { 1.0 } else { binomials[n][k - 1] * (n + 1 - k) as f64 / k as f64 };
+            }
+        }
+        Self {
+            dead: Vec::with_capacity(capacity),
+            cumulative: Vec::with_capacity(capacity),
+            copies: vec![0; capacity],
+            moves: Vec::with_capacity(capacity),
+            binomials,
+            last: 0,
+            last_flush: 0,
+        }
+    }
+
+    /// Opacity and scale factor of each of `n` equal Gaussians that together look like one of `opacity`.
+    fn split(&self, opacity: f64, n: usize) -> (f64, f64) {
+        let n = n.clamp(1, MOST_COPIES);
+        let opacity = opacity.clamp(OPACITY_RANGE.0, OPACITY_RANGE.1);
+        let each = 1.0 - (1.0 - opacity).powf(1.0 / n as f64);
+        let mut sum = 0.0;
+        for i in 0..n {
+            for k in 0..=i {
+                let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+                sum += self.binomials[i][k] * sign * each.powi(k as i32 + 1) / ((k + 1) as f64).sqrt();
+            }
+        }
+        (each, opacity / sum)
+    }
+}
+
+fn opacity(logit: f32) -> f64 {
+    1.0 / (1.0 + (-f64::from(logit)).exp())
+}
+
+fn logit(opacity: f64) -> f32 {
+    let o = opacity.clamp(OPACITY_RANGE.0, OPACITY_RANGE.1);
+    (o / (1.0 - o)).ln() as f32
+}
+
+impl Trainer {
+    /// Runs density control when its time has come.
+    pub(super) fn control_density(&mut self, progress: f32) -> Result<(), TrainError> {
+        let since_flush = self.steps - self.density.last_flush;
+        let d = self.settings.density;
+        // With a budget in seconds the number of steps is what the pace so far promises.
+        let expected = if self.settings.seconds.is_some() && progress > 0.01 {
+            (self.steps as f32 / progress) as u32
+        } else {
+            self.settings.steps
+        };
+        let due = self.steps - self.density.last >= d.interval(expected);
+        if self.strategy == Strategy::None || progress >= d.until || !due {
+            if since_flush as usize >= DEFERRED_STEPS - 12 {
+                self.flush()?;
+                self.density.last_flush = self.steps;
+            }
+            return Ok(());
+        }
+        self.flush()?;
+        self.density.last_flush = self.steps;
+        self.density.last = self.steps;
+        self.decay_opacities(progress);
+        self.drop_unsound_rows();
+        match self.strategy {
+            Strategy::Prune => self.prune(),
+            _ => self.relocate_and_grow(),
+        }
+        Ok(())
+    }
+
+    fn decay_opacities(&mut self, progress: f32) {
+        let amount = f64::from(self.settings.regularise.opacity_decay * (1.0 - progress));
+        if amount <= 0.0 {
+            return;
+        }
+        let n = self.gaussians;
+        for g in self.arena.slice_mut::<[f32; 4]>(self.rows.geometry).chunks_exact_mut(GEOMETRY).take(n) {
+            g[0][3] = logit(opacity(g[0][3]) - amount);
+        }
+    }
+
+    /// Rows that went bad in spite of everything leave; the last rows take their places.
+    fn drop_unsound_rows(&mut self) {
+        let mut row = 0;
+        while row < self.gaussians && self.gaussians > 1 {
+            let g = &self.arena.slice::<[f32; 4]>(self.rows.geometry)[row * GEOMETRY..row * GEOMETRY + 3];
+            let numbers = g[0].iter().chain(&g[1][..3]).chain(&g[2]);
+            if numbers.into_iter().all(|v| v.is_finite()) {
+                row += 1;
+            } else {
+                self.remove(row);
+            }
+        }
+    }
+
+    fn remove(&mut self, row: usize) {
+        self.gaussians -= 1;
+        let rows = self.rows;
+        if row != self.gaussians {
+            rows.shift(&mut self.arena, self.gaussians, row);
+        }
+        self.totals.counters.pruned += 1;
+    }
+
+    fn prune(&mut self) {
+        let limit = f64::from(self.settings.density.dead_opacity);
+        let mut row = 0;
+        while row < self.gaussians && self.gaussians > 1 {
+            let dead = opacity(self.arena.slice::<[f32; 4]>(self.rows.geometry)[row * GEOMETRY][3]) < limit;
+            if dead { self.remove(row) } else { row += 1 }
+        }
+    }
+
+    fn relocate_and_grow(&mut self) {
+        let n = self.gaussians;
+        let limit = f64::from(self.settings.density.dead_opacity);
+        let s = &mut self.density;
+        s.dead.clear();
+        s.cumulative.clear();
+        s.moves.clear();
+        let mut sum = 0.0;
+        let geometry = self.arena.slice::<[f32; 4]>(self.rows.geometry);
+        for (i, g) in geometry.chunks_exact(GEOMETRY).take(n).enumerate() {
+            let o = opacity(g[0][3]);
+            if o < limit {
+                s.dead.push(i as u32);
+            } else {
+                sum += o;
+            }
+            s.cumulative.push(sum);
+        }
+        // All dead: nothing worth copying; training or pruning must go on from what there is.
+        if sum <= 0.0 {
+            return;
+        }
+        let grown = (n as f32 * self.settings.density.growth) as usize;
+        let free = grown.min(self.plan.gaussians - n);
+        s.copies[..n].fill(0);
+        let rng = self.sampler.rng();
+        let (dead, room) = (s.dead.len(), s.dead.len() + free);
+        for k in 0..room {
+            let at: f64 = rng.random_range(0.0..sum);
+            let source = s.cumulative.partition_point(|c| *c <= at).min(n - 1);
+            if s.copies[source] + 1 >= MOST_COPIES as u32 {
+                continue;
+            }
+            s.copies[source] += 1;
+            let to = if k < dead { s.dead[k] } else { u32::MAX };
+            s.moves.push([source as u32, to]);
+        }
+        self.apply_copies(n);
+    }
+
+    fn apply_copies(&mut self, n: usize) {
+        let rows = self.rows;
+        for row in 0..n {
+            let copies = self.density.copies[row] as usize;
+            if copies > 0 {
+                let g = &mut self.arena.slice_mut::<[f32; 4]>(rows.geometry)[row * GEOMETRY..];
+                let (each, factor) = self.density.split(opacity(g[0][3]), copies + 1);
+                g[0][3] = logit(each.max(f64::from(self.settings.density.dead_opacity)));
+                for s in &mut g[1][..3] {
+                    *s += factor.ln() as f32;
+                }
+            }
+        }
+        for i in 0..self.density.moves.len() {
+            let [from, to] = self.density.moves[i].map(|v| v as usize);
+            if to == u32::MAX as usize {
+                rows.copy(&mut self.arena, from, self.gaussians);
+                self.gaussians += 1;
+                self.totals.counters.added += 1;
+            } else {
+                rows.copy(&mut self.arena, from, to);
+                self.totals.counters.relocated += 1;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn split_gaussians_together_are_as_opaque_as_the_one_they_replace() {
+        let s = Scratch::new(1);
+        for o in [0.01, 0.3, 0.9, 0.999] {
+            for n in [1, 2, 5, 51] {
+                let (each, factor) = s.split(o, n);
+                assert!((1.0 - (1.0 - each).powi(n as i32) - o).abs() < 1e-9);
+                assert!(factor.is_finite() && factor > 0.0 && factor <= 1.0 + 1e-6, "{o} {n} {factor}");
+            }
+        }
+    }
+
+    #[test]
+    fn an_opacity_of_one_splits_into_finite_ones() {
+        let (each, factor) = Scratch::new(1).split(1.0, 3);
+        assert!(each < 1.0 && factor.is_finite());
+        assert!(logit(1.0).is_finite() && logit(-1.0).is_finite());
+    }
+}

@@ -1,0 +1,46 @@
+//! What can go wrong while training.
+
+use crate::gpu::GpuError;
+use config::training::TrainSettingsError;
+
+/// Why a training call failed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum TrainError {
+    /// Device, driver or memory.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    /// A setting outside its range.
+    #[error(transparent)]
+    Settings(#[from] TrainSettingsError),
+    /// There is nothing to train.
+    #[error("no Gaussian to train: {unsound} rows were not finite; check the initialisation")]
+    Empty {
+        /// Rows that were dropped.
+        unsound: usize,
+    },
+    /// There is nothing to train on.
+    #[error("no view to train on; add at least one")]
+    NoViews,
+    /// More views than planned.
+    #[error("the memory plan holds {planned} views; plan for more (PlanRequest::views)")]
+    TooManyViews {
+        /// Views in the plan.
+        planned: usize,
+    },
+    /// A picture, pose, lens or depth prior that cannot be used.
+    #[error("picture '{name}' cannot be used: {why}")]
+    BadView {
+        /// Name of the picture.
+        name: String,
+        /// What is wrong.
+        why: String,
+    },
+    /// A picture so wide that one row of tiles exceeds the plan.
+    #[error("a picture {width} pixels wide cannot be rendered: the plan holds {pixels} pixels")]
+    TooWide {
+        /// Width asked for.
+        width: u32,
+        /// Pixels in the plan.
+        pixels: usize,
+    },
+}

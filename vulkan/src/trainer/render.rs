@@ -1,0 +1,103 @@
+//! Rendering any camera at any size, in windows when it is larger than planned and in bands when it is too crowded.
+
+use super::frame::Window;
+use super::views::pose_is_sound;
+use super::{TrainError, Trainer};
+use models::camera::View;
+
+/// A rendering on the host; reused from call to call.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Rendering {
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+    /// r, g, b per pixel over black; not clamped above.
+    pub rgb: Vec<f32>,
+    /// Alpha-blended depth along the optical axis (paper, depth equation), per pixel.
+    pub depth: Vec<f32>,
+    /// What remains of the light behind all Gaussians, per pixel, 0…1.
+    pub transmittance: Vec<f32>,
+}
+
+impl Trainer {
+    /// Renders the present Gaussians with all trained SH degrees, without exposure, over black.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] for a camera that is not finite, [`TrainError::TooWide`], [`TrainError::Gpu`].
+    pub fn render(&mut self, view: &View, into: &mut Rendering) -> Result<(), TrainError> {
+        let lens = view.intrinsics;
+        let numbers = [lens.fx, lens.fy, lens.cx, lens.cy];
+        let whole = lens.width > 0 && lens.height > 0 && lens.fx > 0.0 && lens.fy > 0.0;
+        if !whole || !pose_is_sound(&view.pose) || numbers.iter().any(|v| !v.is_finite()) {
+            let why = "size, lens and pose of the camera must be finite and positive".to_owned();
+            return Err(TrainError::BadView { name: "rendering".into(), why });
+        }
+        self.flush()?;
+        into.width = lens.width;
+        into.height = lens.height;
+        let pixels = lens.pixels();
+        into.rgb.resize(3 * pixels, 0.0);
+        into.depth.resize(pixels, 0.0);
+        into.transmittance.resize(pixels, 1.0);
+        let f = &mut *self.frame;
+        f.plain();
+        let degree = self.settings.sh.degree_at(1.0).min(self.plan.sh_degree);
+        f.counts = [self.gaussians as u32, degree.into(), 0, 1];
+        f.step[0] = self.steps + 1;
+        f.look(view);
+        let whole = Window::whole(lens.width, lens.height);
+        let rows = self.rows_per_window(&whole, lens.width)?;
+        let mut row = 0;
+        while row < whole.rows {
+            let window = Window { row, rows: rows.min(whole.rows - row), ..whole };
+            self.frame.show(window);
+            self.write_frame();
+            self.render_window()?;
+            self.copy_out(into);
+            row += window.rows;
+        }
+        Ok(())
+    }
+
+    fn rows_per_window(&self, whole: &Window, width: u32) -> Result<u32, TrainError> {
+        let by_pixels = self.plan.pixels as u64 / (u64::from(width) * config::plan::TILE_SIDE);
+        let by_tiles = self.plan.tiles as u64 / u64::from(whole.columns);
+        // A picture no higher than planned may end inside its last row of tiles.
+        if u64::from(width) * u64::from(self.frame.size[1]) <= self.plan.pixels as u64 && by_tiles >= whole.rows.into()
+        {
+            return Ok(whole.rows);
+        }
+        match by_pixels.min(by_tiles) {
+            0 => Err(TrainError::TooWide { width, pixels: self.plan.pixels }),
+            rows => Ok(rows as u32),
+        }
+    }
+
+    fn render_window(&mut self) -> Result<(), TrainError> {
+        let r = self.take_recording()?;
+        self.record_counting(&r);
+        r.submit()?;
+        self.cut_bands()?;
+        let single = self.bands.len() == 1;
+        for band in &self.bands {
+            let r = self.take_recording()?;
+            self.record_emit(&r, *band, single);
+            self.record_blend(&r, *band);
+            r.submit()?;
+        }
+        Ok(())
+    }
+
+    fn copy_out(&self, into: &mut Rendering) {
+        let [_, y, width, height] = self.frame.region;
+        let (first, pixels) = (y as usize * into.width as usize, width as usize * height as usize);
+        let image = &self.arena.slice::<[f32; 4]>(self.arena.section("image"))[..pixels];
+        let left = &self.arena.slice::<f32>(self.arena.section("transmittance"))[..pixels];
+        for (i, p) in image.iter().enumerate() {
+            into.rgb[3 * (first + i)..3 * (first + i) + 3].copy_from_slice(&p[..3]);
+            into.depth[first + i] = p[3];
+        }
+        into.transmittance[first..first + pixels].copy_from_slice(left);
+    }
+}

@@ -1,0 +1,55 @@
+//! Which view comes next: each once per epoch in a seeded shuffle, plus extra visits to those with the largest loss.
+
+use rand::{Rng, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+pub(crate) struct Sampler {
+    seed: u64,
+    rng: Pcg64Mcg,
+    order: Vec<u32>,
+    by_loss: Vec<u32>,
+}
+
+impl Sampler {
+    pub fn new(seed: u64, capacity: usize) -> Self {
+        let order = Vec::with_capacity(2 * capacity + 1);
+        Self { seed, rng: Pcg64Mcg::seed_from_u64(seed), order, by_loss: Vec::with_capacity(capacity) }
+    }
+
+    /// Back to the first epoch.
+    pub fn reset(&mut self) {
+        self.rng = Pcg64Mcg::seed_from_u64(self.seed);
+        self.order.clear();
+    }
+
+    /// The set of views changed: the present epoch ends.
+    pub fn forget(&mut self) {
+        self.order.clear();
+    }
+
+    /// A generator for what else needs chance (density control).
+    pub fn rng(&mut self) -> &mut Pcg64Mcg {
+        &mut self.rng
+    }
+
+    /// `losses(view)` is the view's last loss; `views` is at least 1.
+    pub fn next(&mut self, views: usize, residual_share: f32, losses: impl Fn(usize) -> f32) -> usize {
+        if self.order.is_empty() {
+            self.order.extend(0..views as u32);
+            let extra = (views as f32 * residual_share) as usize;
+            if extra > 0 {
+                self.by_loss.clear();
+                self.by_loss.extend(0..views as u32);
+                self.by_loss
+                    .sort_unstable_by(|a, b| losses(*b as usize).total_cmp(&losses(*a as usize)).then(a.cmp(b)));
+                self.order.extend(self.by_loss.iter().take(extra.min(views)));
+            }
+            // Fisher–Yates.
+            for i in (1..self.order.len()).rev() {
+                let j = self.rng.random_range(0..=i);
+                self.order.swap(i, j);
+            }
+        }
+        self.order.pop().map_or(0, |v| v as usize)
+    }
+}

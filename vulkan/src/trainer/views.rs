@@ -1,0 +1,150 @@
+//! Training views: pixels resident on the device, pose and exposure on the host.
+
+use super::{TrainError, Trainer};
+use crate::arena::Section;
+use image::RgbImage;
+use models::camera::{DepthPrior, Pose, PosedImage, View};
+
+/// What the trainer keeps of a view.
+pub(crate) struct Resident {
+    pub view: View,
+    pub width: u32,
+    pub height: u32,
+    /// Offset of the packed depth prior inside the view, u32; 0 when there is none.
+    pub depth_at: u32,
+    pub last_loss: f32,
+    pub adjust: super::pose::Adjust,
+}
+
+impl Trainer {
+    /// Makes a picture resident, with an optional depth prior of any size; returns its index.
+    /// A picture with more pixels than planned is reduced to fit.
+    ///
+    /// # Errors
+    /// [`TrainError::TooManyViews`]; [`TrainError::BadView`] for empty pictures, poses or lenses that are not finite, or a
+    /// prior whose maps do not have the size it states.
+    pub fn add_view(&mut self, picture: &PosedImage, prior: Option<&DepthPrior>) -> Result<usize, TrainError> {
+        let index = self.views.len();
+        if index >= self.plan.views {
+            return Err(TrainError::TooManyViews { planned: self.plan.views });
+        }
+        check(picture, prior)?;
+        let (width, height) = self.fitting(picture.image.width(), picture.image.height());
+        let reduced: RgbImage;
+        let mut image = &picture.image;
+        if (width, height) != image.dimensions() {
+            reduced = image::imageops::resize(image, width, height, image::imageops::FilterType::Triangle);
+            image = &reduced;
+        }
+        let pixels = width as usize * height as usize;
+        let views = self.arena.section("views");
+        let section = Section {
+            offset: views.offset + index as u64 * config::plan::view_bytes(self.plan.pixels as u64),
+            bytes: config::plan::view_bytes(pixels as u64),
+        };
+        let words = self.arena.slice_mut::<u32>(section);
+        let (colours, depths) = words.split_at_mut(pixels);
+        let range = prior.and_then(depth_range);
+        depths.fill(0);
+        for (i, p) in image.pixels().enumerate() {
+            let mut confidence = 0u8;
+            if let (Some(prior), Some((low, high))) = (prior, range) {
+                let x = ((i as u32 % width) as f32 + 0.5) / width as f32 * prior.width as f32;
+                let y = ((i as u32 / width) as f32 + 0.5) / height as f32 * prior.height as f32;
+                let at = (y as usize).min(prior.height as usize - 1) * prior.width as usize
+                    + (x as usize).min(prior.width as usize - 1);
+                if usable(prior, at) {
+                    confidence = (prior.confidence[at].clamp(0.0, 1.0) * 255.0).round() as u8;
+                    let quantum = ((prior.depth[at] - low) / (high - low) * 65535.0).round() as u32;
+                    depths[i / 2] |= quantum << (16 * (i as u32 % 2));
+                }
+            }
+            colours[i] = u32::from_le_bytes([p[0], p[1], p[2], confidence]);
+        }
+        self.pipelines.bind_view(index, &self.arena, section);
+        let mut view = picture.view;
+        view.intrinsics = view.intrinsics.resized(width, height);
+        let depth_at = if range.is_some() { pixels as u32 } else { 0 };
+        let adjust = super::pose::Adjust::default();
+        self.views.push(Resident { view, width, height, depth_at, last_loss: f32::INFINITY, adjust });
+        self.sampler.forget();
+        Ok(index)
+    }
+
+    /// The largest size of the same shape that the plan holds.
+    fn fitting(&self, width: u32, height: u32) -> (u32, u32) {
+        let fits = |w: u32, h: u32| {
+            let tiles = super::frame::Window::whole(w, h).tiles() as usize;
+            w as usize * h as usize <= self.plan.pixels && tiles <= self.plan.tiles
+        };
+        let (mut w, mut h) = (width, height);
+        let mut factor = (self.plan.pixels as f64 / (f64::from(width) * f64::from(height))).sqrt().min(1.0);
+        while !fits(w, h) && (w > 1 || h > 1) {
+            w = ((f64::from(width) * factor) as u32).max(1);
+            h = ((f64::from(height) * factor) as u32).max(1);
+            factor *= 0.99;
+        }
+        (w, h)
+    }
+
+    /// Camera of view `index` as it is now, refined pose included; `None` when there is no such view.
+    pub fn view_pose(&self, index: usize) -> Option<View> {
+        self.views.get(index).map(|v| v.view)
+    }
+
+    /// Number of resident views.
+    pub fn view_count(&self) -> usize {
+        self.views.len()
+    }
+
+    /// Replaces the camera pose of view `index` (a better estimate arrived); its picture stays.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] when there is no such view or the pose is not finite.
+    pub fn set_pose(&mut self, index: usize, pose: Pose) -> Result<(), TrainError> {
+        let bad = |why: &str| TrainError::BadView { name: format!("view {index}"), why: why.to_owned() };
+        if !pose_is_sound(&pose) {
+            return Err(bad("its pose is not finite"));
+        }
+        self.views.get_mut(index).ok_or_else(|| bad("does not exist"))?.view.pose = pose;
+        Ok(())
+    }
+}
+
+pub(crate) fn pose_is_sound(pose: &Pose) -> bool {
+    pose.center.is_finite() && pose.rotation.is_finite() && pose.rotation.length_squared() > 1e-12
+}
+
+fn check(picture: &PosedImage, prior: Option<&DepthPrior>) -> Result<(), TrainError> {
+    let bad = |why: &str| Err(TrainError::BadView { name: picture.name.clone(), why: why.to_owned() });
+    let lens = picture.view.intrinsics;
+    if picture.image.width() == 0 || picture.image.height() == 0 {
+        return bad("has no pixels");
+    }
+    let lens_is_sound = [lens.fx, lens.fy, lens.cx, lens.cy].iter().all(|v| v.is_finite());
+    if !lens_is_sound || lens.fx <= 0.0 || lens.fy <= 0.0 || lens.width == 0 || lens.height == 0 {
+        return bad("its focal length or principal point is not usable");
+    }
+    if !pose_is_sound(&picture.view.pose) {
+        return bad("its pose is not finite");
+    }
+    if let Some(p) = prior {
+        let n = p.width as usize * p.height as usize;
+        if n == 0 || p.depth.len() != n || p.confidence.len() != n {
+            return bad("its depth prior's maps do not have the stated size");
+        }
+    }
+    Ok(())
+}
+
+fn usable(prior: &DepthPrior, at: usize) -> bool {
+    prior.depth[at].is_finite() && prior.confidence[at] > 0.0
+}
+
+/// Least and greatest usable depth; `None` when they coincide, which correlates with nothing.
+fn depth_range(prior: &DepthPrior) -> Option<(f32, f32)> {
+    let at = (0..prior.depth.len()).filter(|i| usable(prior, *i));
+    let (low, high) =
+        at.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), i| (l.min(prior.depth[i]), h.max(prior.depth[i])));
+    (high > low && (high - low).is_finite()).then_some((low, high))
+}

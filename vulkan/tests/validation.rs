@@ -1,0 +1,68 @@
+//! Training, rendering in bands and reading back raise no word from the Khronos validation layer, synchronisation
+//! checks included. The layer reads its settings from the environment, so the work is done in a child process.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
+
+mod scenes;
+
+use config::plan::{Plan, PlanRequest};
+use models::camera::DepthPrior;
+use models::cloud::GaussianCloud;
+use scenes::device::{plain, posed};
+use scenes::{cloud, photo, view};
+use std::process::Command;
+use vulkan::gpu::Gpu;
+use vulkan::trainer::{Rendering, Trainer};
+
+const CHILD: &str = "DGTR_VALIDATION_CHILD";
+
+#[test]
+fn the_validation_layer_has_nothing_to_say() {
+    if std::env::var_os(CHILD).is_some() {
+        return work();
+    }
+    let layer = "VK_LAYER_KHRONOS_validation";
+    let present = ["/usr/share/vulkan/explicit_layer.d", "/etc/vulkan/explicit_layer.d"]
+        .iter()
+        .any(|d| std::path::Path::new(d).join("VkLayer_khronos_validation.json").exists());
+    if !present || Gpu::open(None).is_err() {
+        return println!("skipped: needs a Vulkan device and {layer}");
+    }
+    let child = Command::new(std::env::current_exe().unwrap())
+        .args(["the_validation_layer_has_nothing_to_say", "--exact", "--nocapture"])
+        .env(CHILD, "1")
+        .env("VK_INSTANCE_LAYERS", layer)
+        .env("VK_LAYER_ENABLES", "VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT")
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&child.stdout).into_owned() + &String::from_utf8_lossy(&child.stderr);
+    assert!(child.status.success(), "{said}");
+    assert!(said.contains("work done"), "{said}");
+    assert!(!said.contains("VUID") && !said.contains("SYNC-HAZARD") && !said.contains("Validation Error"), "{said}");
+}
+
+fn work() {
+    let gpu = Gpu::open(None).unwrap();
+    let v = view(64, 48);
+    let request = PlanRequest { device_mib: 64, width: 64, height: 48, views: 2, sh_degree: 3, max_gaussians: None };
+    for instances in [1 << 16, 400] {
+        let plan = Plan::with_capacities(&request, 300, instances);
+        let mut settings = plain();
+        settings.refine_poses = true;
+        settings.refine_exposure = true;
+        let mut t = Trainer::new(&gpu, &plan, &settings).unwrap();
+        t.load(&cloud(3, 200, 3)).unwrap();
+        let depth: Vec<f32> = (0..64 * 48).map(|i| (i % 64) as f32).collect();
+        let prior = DepthPrior { width: 64, height: 48, confidence: vec![1.0; depth.len()], depth };
+        t.add_view(&posed(&v, &photo(1, &v)), Some(&prior)).unwrap();
+        t.add_view(&posed(&v, &photo(2, &v)), None).unwrap();
+        for _ in 0..4 {
+            t.step().unwrap();
+        }
+        let mut drawn = Rendering::default();
+        t.render(&v, &mut drawn).unwrap();
+        t.render(&view(150, 90), &mut drawn).unwrap();
+        let mut after = GaussianCloud::default();
+        t.snapshot(&mut after).unwrap();
+    }
+    println!("work done");
+}
