@@ -11,7 +11,7 @@ use heapless::{Deque, HistoryBuf};
 
 use crate::traits::PictureClues;
 use crate::trigger::Trigger;
-use clues::Learnt;
+use clues::{Choice, Learnt, WITNESSES};
 
 /// Exposures waiting for their picture.
 const TRIGGERS: usize = 64;
@@ -46,6 +46,8 @@ pub enum Reason {
     NoPicture,
     /// The same picture again.
     Duplicate,
+    /// Its number says one exposure, its time another, and no later picture settled it.
+    Contradictory,
     /// More waited than there is room for.
     Overflow,
 }
@@ -93,12 +95,18 @@ pub struct Matcher<P> {
     numbers: HistoryBuf<u64, REMEMBERED>,
     learnt: Learnt,
     newest_matched: Option<u32>,
+    /// Newest exposure that was given up.
+    given_up: Option<u32>,
 }
 
 enum Decision {
     Wait,
     Match(usize),
+    /// As `Match`; the camera's numbers mean later exposures from here on.
+    Shift(usize),
     Alone(Reason),
+    /// As `Alone` without an exposure, because its number stands for this one.
+    Absent(u64),
 }
 
 impl<P> Matcher<P> {
@@ -111,6 +119,7 @@ impl<P> Matcher<P> {
             numbers: HistoryBuf::new(),
             learnt: Learnt::new(settings.latency_ns),
             newest_matched: None,
+            given_up: None,
         }
     }
 
@@ -148,6 +157,21 @@ impl<P> Matcher<P> {
                     let _ = self.pictures.push_back(waiting);
                 }
                 Decision::Match(index) => return Some(self.matched(index, waiting)),
+                Decision::Shift(index) => {
+                    if let Some(trigger) = self.triggers.iter().nth(index) {
+                        self.learnt.shifted(&waiting.clues, trigger);
+                    }
+                    return Some(self.matched(index, waiting));
+                }
+                Decision::Absent(sequence) => {
+                    let given_up = self.given_up.is_some_and(|newest| sequence <= u64::from(newest))
+                        && self.newest_matched.is_none_or(|newest| sequence > u64::from(newest));
+                    if !given_up {
+                        self.learnt.doubt_numbers();
+                    }
+                    let (picture, clues) = (waiting.picture, waiting.clues);
+                    return Some(Outcome::Picture { picture, clues, reason: Reason::NoTrigger });
+                }
                 Decision::Alone(reason) => {
                     return Some(Outcome::Picture { picture: waiting.picture, clues: waiting.clues, reason });
                 }
@@ -156,6 +180,7 @@ impl<P> Matcher<P> {
         let expired =
             self.triggers.front().is_some_and(|t| now_ns.saturating_sub(t.time_ns) > self.settings.patience_ns);
         let trigger = if expired { self.triggers.pop_front() } else { None };
+        self.given_up = trigger.map(|t| t.sequence).or(self.given_up);
         trigger.map(|trigger| Outcome::Trigger { trigger, reason: Reason::NoPicture })
     }
 
@@ -178,12 +203,37 @@ impl<P> Matcher<P> {
         }
         let age = now_ns.saturating_sub(clues.arrived_ns);
         match self.learnt.choose(clues, &self.triggers, self.settings.patience_ns) {
-            Some((index, certain)) if certain || age >= self.settings.settle_ns => Decision::Match(index),
-            Some(_) => Decision::Wait,
+            Choice::Exposure { index, certain } if certain || age >= self.settings.settle_ns => Decision::Match(index),
+            Choice::Exposure { .. } => Decision::Wait,
+            Choice::Contradiction { by_number, by_time, shift } => {
+                let (agree, differ) = self.witnesses(shift);
+                match () {
+                    () if differ > 0 => Decision::Match(by_number),
+                    // The picture asked about is out of the queue.
+                    () if agree + 1 >= WITNESSES => Decision::Shift(by_time),
+                    () if age > self.settings.patience_ns / 2 => Decision::Alone(Reason::Contradictory),
+                    () => Decision::Wait,
+                }
+            }
             // An announcement may be late, but not much.
-            None if age > 4 * self.settings.settle_ns => Decision::Alone(Reason::NoTrigger),
-            None => Decision::Wait,
+            Choice::Absent { sequence } if age > 4 * self.settings.settle_ns => Decision::Absent(sequence),
+            Choice::Absent { .. } => Decision::Wait,
+            Choice::None if age > 4 * self.settings.settle_ns => Decision::Alone(Reason::NoTrigger),
+            Choice::None => Decision::Wait,
         }
+    }
+
+    /// How many waiting pictures say that the camera skipped `shift` exposures, and how many say something else.
+    fn witnesses(&self, shift: u64) -> (usize, usize) {
+        let (mut agree, mut differ) = (0, 0);
+        for waiting in &self.pictures {
+            match self.learnt.choose(&waiting.clues, &self.triggers, self.settings.patience_ns) {
+                Choice::Contradiction { shift: other, .. } if other == shift => agree += 1,
+                Choice::None | Choice::Absent { .. } => {}
+                _ => differ += 1,
+            }
+        }
+        (agree, differ)
     }
 
     fn matched(&mut self, index: usize, waiting: Waiting<P>) -> Outcome<P> {

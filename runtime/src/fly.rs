@@ -15,6 +15,7 @@ use vulkan::trainer::{RunBudget, StepReport};
 mod carry;
 mod error;
 mod flight;
+mod geotags;
 mod health;
 mod reconstruction;
 
@@ -25,6 +26,7 @@ pub use reconstruction::{Progress, Reconstruction};
 use crate::interrupt::Interrupt;
 use crate::upload::Offerer;
 use flight::{Flight, FlightPlan};
+use geotags::Geotags;
 use health::Health;
 
 /// Between two checkpoints: what a power cut may cost.
@@ -98,6 +100,7 @@ pub fn fly(
         keyframes: mission.keyframes,
         earlier: reconstruction.store().poses(),
         end: options.end,
+        geotags: Geotags::open(&options.out, mission.origin).map_err(FlyError::Geotags)?,
     })?;
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };

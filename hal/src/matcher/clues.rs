@@ -13,8 +13,24 @@ const EARLY_NS: i64 = 300_000_000;
 /// Least spread of latencies assumed, before and after learning.
 const FIRST_SPREAD_NS: f64 = 1e9;
 const LEAST_SPREAD_NS: f64 = 0.1e9;
+/// So many pictures in a row must agree before their times overrule their numbers.
+pub(super) const WITNESSES: usize = 3;
 /// Weight of the newest latency.
 const BLEND: f64 = 0.2;
+
+/// What the clues of one picture say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Choice {
+    /// The exposure at this index; `certain` enough not to wait for more announcements.
+    Exposure { index: usize, certain: bool },
+    /// Number and time of arrival contradict each other: either pictures come late (a busy computer), or the camera
+    /// skipped exposures without leaving a gap in its numbers. The pictures that follow can tell.
+    Contradiction { by_number: usize, by_time: usize, shift: u64 },
+    /// Its number stands for this exposure, which does not wait for a picture (any more).
+    Absent { sequence: u64 },
+    /// No exposure fits.
+    None,
+}
 
 /// The relations learnt so far.
 pub(super) struct Learnt {
@@ -44,13 +60,13 @@ impl Learnt {
         }
     }
 
-    /// The exposure's index, and whether it is certain enough not to wait for more.
+    /// Which exposure a picture with these clues belongs to.
     pub(super) fn choose<const N: usize>(
         &self,
         clues: &PictureClues,
         triggers: &Deque<Trigger, N>,
         patience_ns: u64,
-    ) -> Option<(usize, bool)> {
+    ) -> Choice {
         let latency = |t: &Trigger| clues.arrived_ns as i64 - t.time_ns as i64;
         let possible = |t: &Trigger| (-EARLY_NS..=patience_ns as i64).contains(&latency(t));
         let off = |t: &Trigger| (latency(t) as f64 - self.latency_ns).abs();
@@ -59,7 +75,7 @@ impl Learnt {
             .enumerate()
             .filter(|(_, t)| possible(t))
             .min_by(|(_, a), (_, b)| off(a).total_cmp(&off(b)))
-            .map(|(i, t)| (i, off(t), latency(t)));
+            .map(|(i, t)| (i, off(t), latency(t), u64::from(t.sequence)));
 
         // The camera's own clock, once its offset is known, is decisive: it was read at the exposure.
         if let (Some(camera_ns), true) = (clues.camera_ns, self.camera_held >= BELIEVED) {
@@ -67,24 +83,49 @@ impl Learnt {
             let error = |t: &Trigger| (i128::from(camera_ns) - i128::from(t.boot_ns) - self.camera_offset_ns).abs();
             let mut fitting = triggers.iter().enumerate().filter(|(_, t)| possible(t) && error(t) <= resolution);
             if let (Some((index, _)), None) = (fitting.next(), fitting.next()) {
-                return Some((index, true));
+                return Choice::Exposure { index, certain: true };
             }
         }
-        // A number out of order belongs to a late picture: its time says nothing, its number does.
         if let Some((sequence, behind)) = self.sequence_of(clues) {
             let found = triggers.iter().position(|t| u64::from(t.sequence) == sequence && possible(t));
-            if behind {
-                return found.map(|index| (index, true));
-            }
-            if let (Some(index), Some((timed, ..))) = (found, by_time)
-                && index == timed
-            {
-                return Some((index, true));
+            match (found, by_time) {
+                // A number out of order belongs to a late picture: its time says nothing, its number does.
+                (Some(index), _) if behind => return Choice::Exposure { index, certain: true },
+                (None, _) if behind => return Choice::Absent { sequence },
+                (Some(index), Some((timed, ..))) if index == timed => return Choice::Exposure { index, certain: true },
+                (Some(by_number), Some((by_time, off, _, timed))) => {
+                    // Only where latencies scatter less than the exposures lie apart can a skip be told from lateness.
+                    let apart = |a: usize, b: usize| {
+                        let time = |i| triggers.iter().nth(i).map_or(0.0, |t: &Trigger| t.time_ns as f64);
+                        time(b) - time(a)
+                    };
+                    let told = 6.0 * self.spread_ns < apart(by_number, by_time);
+                    let fits = timed > sequence && off < 3.0 * self.spread_ns && told;
+                    return if fits {
+                        Choice::Contradiction { by_number, by_time, shift: timed - sequence }
+                    } else {
+                        // No skipped exposure explains that time: the picture is late.
+                        Choice::Exposure { index: by_number, certain: true }
+                    };
+                }
+                // Its announcement was lost or has been given up; another exposure's place must not be taken.
+                (None, _) => return Choice::Absent { sequence },
+                (Some(_), None) => {}
             }
         }
-        let (index, off, latency) = by_time?;
+        let Some((index, off, latency, _)) = by_time else { return Choice::None };
         let certain = self.matches > 2 && off < 3.0 * self.spread_ns && latency >= 0;
-        Some((index, certain))
+        Choice::Exposure { index, certain }
+    }
+
+    /// A number stood for an exposure that never was: the camera may have started to count anew.
+    pub(super) fn doubt_numbers(&mut self) {
+        self.number_held = self.number_held.saturating_sub(1);
+    }
+
+    /// The camera skipped exposures: from `clues` on its numbers mean later ones.
+    pub(super) fn shifted(&mut self, clues: &PictureClues, trigger: &Trigger) {
+        self.last = Some((*clues, *trigger));
     }
 
     /// The sequence that the picture's number stands for, and whether it lies behind the last one matched.

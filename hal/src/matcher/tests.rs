@@ -82,6 +82,36 @@ fn a_skipped_exposure_does_not_shift_the_following_pictures() {
 }
 
 #[test]
+fn pictures_that_fall_behind_a_busy_computer_keep_their_exposures() {
+    // From the 10th on each is 0.37 s later than the one before, up to five exposures late; then the backlog is made up.
+    let mut shots = shots(40);
+    for (i, shot) in shots.iter_mut().enumerate().skip(9) {
+        shot.delay_ms += 370 * (i as u64 - 8).min(34 - (i as u64).min(34));
+    }
+    let (matched, alone) = play(40, &shots, &[]);
+    assert!(all_right(&matched), "{matched:?}");
+    assert!(matched.len() >= 38 && alone.len() <= 4, "{} {alone:?}", matched.len());
+}
+
+#[test]
+fn a_picture_that_comes_after_its_exposure_was_given_up_takes_no_other_ones_place() {
+    let mut shots = shots(40);
+    shots[11].delay_ms = 16_000;
+    shots[12].delay_ms = 17_000;
+    let (matched, alone) = play(40, &shots, &[]);
+    assert!(matched.len() == 38 && all_right(&matched), "{matched:?}");
+    assert_eq!(alone.len(), 4, "{alone:?}");
+}
+
+#[test]
+fn a_camera_that_starts_to_count_anew_is_understood_after_a_few_pictures() {
+    let mut shots = shots(40);
+    shots.iter_mut().skip(20).for_each(|s| s.number = s.number.map(|n| n - 1040));
+    let (matched, _) = play(40, &shots, &[]);
+    assert!(matched.len() >= 34 && all_right(&matched), "{matched:?}");
+}
+
+#[test]
 fn a_late_picture_is_found_by_its_number() {
     let mut shots = shots(40);
     shots[11].delay_ms = 6_900;

@@ -105,6 +105,7 @@ impl std::fmt::Display for Unmatched {
             UnmatchedReason::Matching(Reason::NoTrigger) => ": no announced exposure",
             UnmatchedReason::Matching(Reason::NoPicture) => ": no picture came",
             UnmatchedReason::Matching(Reason::Duplicate) => ": the same picture again",
+            UnmatchedReason::Matching(Reason::Contradictory) => ": its number and its time say different exposures",
             UnmatchedReason::Matching(Reason::Overflow) | UnmatchedReason::Overflow => ": too many waiting",
             UnmatchedReason::Pose(PoseError::Empty) => ": no pose received yet",
             UnmatchedReason::Pose(PoseError::NotYet) => ": the pose messages stopped before it",

@@ -6,8 +6,8 @@
 use std::collections::BTreeSet;
 
 use glam::{DVec3, Vec3};
-use models::camera::{Intrinsics, View};
 use models::align::similarity::umeyama;
+use models::camera::{Intrinsics, View};
 use models::init::mutual_matches;
 use models::metrics::to_rgb8;
 use models::onnx::features::{FeatureNetwork, Features};

@@ -45,6 +45,9 @@ pub enum FlyError {
     /// Upload settings.
     #[error(transparent)]
     Upload(#[from] UploadError),
+    /// The list of pictures.
+    #[error("geotags.csv cannot be written: {0}")]
+    Geotags(std::io::Error),
     /// A thread could not be started or ended abnormally.
     #[error("the capture thread {0}")]
     Thread(String),

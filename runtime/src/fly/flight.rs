@@ -17,6 +17,7 @@ use hal::vehicle::{Event, Frame, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 
 use super::FlyError;
+use super::geotags::Geotags;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 
 /// Decoded key frames in the channel.
@@ -89,6 +90,8 @@ pub struct FlightPlan {
     pub earlier: Vec<Pose>,
     /// When it is over.
     pub end: EndOfFlight,
+    /// Where every matched picture is noted.
+    pub geotags: Geotags,
 }
 
 impl Flight {
@@ -244,6 +247,7 @@ impl Capture {
         let pose = Pose { rotation: frame.pose.rotation, center: frame.pose.position };
         let decision = self.selector.consider(&pose);
         tracing::debug!("picture {}: {decision:?}", frame.sequence);
+        self.plan.geotags.note(&frame, decision);
         if decision == Decision::Key {
             self.waiting.fetch_add(1, Ordering::AcqRel);
             self.pending.push_back(frame);
