@@ -160,12 +160,27 @@ impl Default for MemorySettings {
     }
 }
 
-/// Manifests of the user's own networks; absent = the embedded ones.
-#[derive(Clone, Debug, Default, Deserialize, Serialize)]
+/// Manifests (TOML) of the user's own networks.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct NetworkSettings {
-    /// Manifest (TOML) of a `pair` network.
+    /// A `pair` network; absent = the embedded plane sweep.
     pub pair: Option<PathBuf>,
+    /// A monocular `depth` network for the depth loss; absent = the pair network's depth × confidence.
+    pub depth: Option<PathBuf>,
+    /// A perceptual `metric` for held-out pictures; absent = PSNR and SSIM only.
+    pub metric: Option<PathBuf>,
+}
+
+impl NetworkSettings {
+    /// Takes relative paths as relative to `folder`, where the file that names them lies.
+    pub fn anchor(&mut self, folder: &Path) {
+        for path in [&mut self.pair, &mut self.depth, &mut self.metric].into_iter().flatten() {
+            if path.is_relative() {
+                *path = folder.join(&path);
+            }
+        }
+    }
 }
 
 /// Where an aircraft's pictures come from.
@@ -263,9 +278,7 @@ impl Mission {
                 *p = folder.join(&p);
             }
         };
-        if let Some(p) = &mut self.network.pair {
-            anchor(p);
-        }
+        self.network.anchor(folder);
         if let Some(p) = &mut self.upload.folder {
             anchor(p);
         }

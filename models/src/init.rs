@@ -6,6 +6,7 @@ mod consistency;
 mod fill;
 mod finish;
 mod frame;
+mod ground;
 mod initialiser;
 mod merge;
 mod pairs;

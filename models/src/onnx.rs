@@ -4,8 +4,11 @@
 //! A session is opened when it is needed and dropped when it is not; nothing here is global except the runtime
 //! library itself, which ONNX Runtime allows only once per process.
 
+pub mod depth;
 pub mod features;
 pub mod manifest;
+pub mod metric;
+mod named;
 pub mod network;
 pub mod picture;
 pub mod session;

@@ -8,6 +8,7 @@ use models::camera::{PosedImage, View};
 use models::dataset::Dataset;
 use models::formats::write_atomic;
 use models::metrics::{psnr, ssim, to_f32, to_rgb8};
+use models::onnx::metric::PerceptualMetric;
 use serde::Serialize;
 use vulkan::trainer::{Rendering, Trainer};
 
@@ -26,6 +27,18 @@ pub struct ViewScore {
     pub psnr: f64,
     /// −1…1.
     pub ssim: f64,
+    /// Distance by the user's metric, when there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub perceptual: Option<f64>,
+}
+
+/// A perceptual metric over several views.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Perceptual {
+    /// Which metric: the name in its manifest.
+    pub name: String,
+    /// Mean distance, in the metric's own unit.
+    pub mean: f64,
 }
 
 /// Figures over several views: means of the views' figures.
@@ -35,6 +48,9 @@ pub struct Scores {
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
+    /// Mean of the user's metric, when there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub perceptual: Option<Perceptual>,
     /// Each view.
     pub views: Vec<ViewScore>,
 }
@@ -43,7 +59,16 @@ impl Scores {
     fn of(views: Vec<ViewScore>) -> Self {
         let n = views.len().max(1) as f64;
         let mean = |f: fn(&ViewScore) -> f64| views.iter().map(f).sum::<f64>() / n;
-        Self { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), views }
+        Self { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), perceptual: None, views }
+    }
+
+    fn with_metric(mut self, metric: Option<&PerceptualMetric>) -> Self {
+        let distances: Vec<f64> = self.views.iter().filter_map(|v| v.perceptual).collect();
+        if let Some(metric) = metric.filter(|_| !distances.is_empty()) {
+            let mean = distances.iter().sum::<f64>() / distances.len() as f64;
+            self.perceptual = Some(Perceptual { name: metric.name().to_owned(), mean });
+        }
+        self
     }
 }
 
@@ -59,16 +84,17 @@ pub struct BaselineScores {
 /// Renders and scores `frames` of `set`.
 ///
 /// Poses are the data set's, carried into the model's frame by `transfer`. The rendering is rounded to 8 bits first, so
-/// that the figures are those of the pictures that `save` receives (`<stem>.png`).
+/// that the figures are those of the pictures that `save` receives (`<stem>.png`). `metric` is asked too, when given.
 ///
 /// # Errors
-/// A picture cannot be read, the device fails, or `save` cannot be written to.
+/// A picture cannot be read, the device or the metric fails, or `save` cannot be written to.
 pub fn evaluate(
     trainer: &mut Trainer,
     set: &Dataset,
     frames: &[usize],
     scale: f64,
     transfer: &PoseTransfer,
+    mut metric: Option<&mut PerceptualMetric>,
     save: Option<&Path>,
 ) -> Result<Scores, CliError> {
     let mut rendering = Rendering::default();
@@ -83,9 +109,13 @@ pub fn evaluate(
         if let Some(dir) = save {
             save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
         }
-        scores.push(score(&truth, &to_f32(&picture)));
+        let mut view = score(&truth, &to_f32(&picture));
+        if let Some(metric) = &mut metric {
+            view.perceptual = Some(metric.distance(&truth.image, &picture)?);
+        }
+        scores.push(view);
     }
-    Ok(Scores::of(scores))
+    Ok(Scores::of(scores).with_metric(metric.as_deref()))
 }
 
 /// Scores both baselines on the same pictures. `training` are the frames that a guess may use.
@@ -118,7 +148,17 @@ fn score(truth: &PosedImage, rgb: &[f32]) -> ViewScore {
         name: truth.name.clone(),
         psnr: psnr(rgb, &target).min(PSNR_CAP),
         ssim: ssim(rgb, &target, k.width as usize, k.height as usize),
+        perceptual: None,
     }
+}
+
+/// The metric that a manifest describes, for pictures of `size`.
+///
+/// # Errors
+/// The manifest, the network or ONNX Runtime is missing or does not fit.
+pub fn open_metric(manifest: Option<&Path>, size: (u32, u32)) -> Result<Option<PerceptualMetric>, CliError> {
+    let threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(4));
+    Ok(manifest.map(|path| PerceptualMetric::open(path, size, threads)).transpose()?)
 }
 
 /// File name without folder and extension.

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use config::init::InitSettings;
+use config::mission::NetworkSettings;
 use config::plan::{Plan, PlanRequest};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
@@ -14,6 +15,8 @@ use models::camera::{Pose, PosedImage};
 use models::cloud::GaussianCloud;
 use models::dataset::{Dataset, PoseSource, scaled};
 use models::formats::model::{self, ModelHeader};
+use models::onnx::depth::DepthNetwork;
+use models::onnx::metric::PerceptualMetric;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{RunBudget, StopReason, Trainer};
 
@@ -69,8 +72,8 @@ pub struct TrainJob {
     pub scale: f64,
     /// Part of the Vulkan device's name.
     pub device: Option<String>,
-    /// Manifest of the user's own network.
-    pub network: Option<PathBuf>,
+    /// `[network]`: manifests of the user's own networks.
+    pub network: NetworkSettings,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
     /// Whether a model in `out` is ignored.
@@ -83,6 +86,12 @@ pub struct TrainJob {
     pub init_settings: InitSettings,
     /// `[refine]`.
     pub refine_settings: RefineSettings,
+}
+
+/// The user's networks that training itself asks, checked before it begins.
+struct Networks {
+    depth: Option<DepthNetwork>,
+    metric: Option<PerceptualMetric>,
 }
 
 /// How a job ended.
@@ -118,8 +127,11 @@ impl TrainJob {
         let mut settings = self.training.clone();
         settings.steps = self.steps.unwrap_or(settings.steps);
         settings.seconds = self.seconds.or(settings.seconds);
+        // What the user names is looked at before anything slow begins.
+        let largest = self.largest(&set, &frames)?;
+        let mut networks = self.open_networks(largest)?;
         let gpu = Gpu::open(self.device.as_deref())?;
-        let plan = self.plan(&set, &frames, settings.sh.degree)?;
+        let plan = self.plan(&frames, largest, settings.sh.degree)?;
         let mut trainer = Trainer::new(&gpu, &plan, &settings)?;
         report.device = gpu.info().name.clone();
         report.seed = settings.seed;
@@ -151,7 +163,7 @@ impl TrainJob {
         let loaded = trainer.load(&start.cloud)?;
         report.skip("gaussians_not_finite", loaded.dropped_unsound as u64);
         report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
-        self.add_views(&mut trainer, &set, &frames, &posed.poses, &start)?;
+        self.add_views(&mut trainer, &set, &frames, &posed.poses, &start, networks.depth.take(), &mut report)?;
         if let Some(r) = &resumed {
             (header.steps, header.train_seconds) = (r.header.steps, r.header.train_seconds);
         }
@@ -161,7 +173,7 @@ impl TrainJob {
         if let Some(header) = &done
             && self.evaluate
         {
-            self.score(&mut trainer, &set, &frames, header, &mut report)?;
+            self.score(&mut trainer, &set, &frames, header, networks.metric.as_mut(), &mut report)?;
         }
         self.end(began, done.is_some(), steps_before + report.steps, report)
     }
@@ -174,11 +186,23 @@ impl TrainJob {
         Ok(Outcome { finished, steps, report })
     }
 
-    fn plan(&self, set: &Dataset, frames: &[usize], sh_degree: u8) -> Result<Plan, CliError> {
-        // The largest picture by area decides; the trainer fits the others in.
+    /// Size of the largest picture by area.
+    fn largest(&self, set: &Dataset, frames: &[usize]) -> Result<(u32, u32), CliError> {
         let sizes = frames.iter().map(|&i| scaled(&set.frames[i].view.intrinsics, self.scale));
         let sizes = sizes.collect::<Result<Vec<_>, _>>()?;
-        let (width, height) = sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height));
+        Ok(sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height)))
+    }
+
+    fn open_networks(&self, size: (u32, u32)) -> Result<Networks, CliError> {
+        let init = &self.init_settings;
+        let depth = self.network.depth.as_deref().filter(|_| self.training.loss.depth > 0.0);
+        let depth = depth.map(|path| DepthNetwork::open(path, size, init.max_side, init.threads)).transpose()?;
+        let metric = self.network.metric.as_deref().filter(|_| self.evaluate);
+        Ok(Networks { depth, metric: evaluate::open_metric(metric, size)? })
+    }
+
+    /// The largest picture decides; the trainer fits the others in.
+    fn plan(&self, frames: &[usize], (width, height): (u32, u32), sh_degree: u8) -> Result<Plan, CliError> {
         Ok(Plan::new(&PlanRequest {
             device_mib: self.budget_mib,
             width,
@@ -198,6 +222,7 @@ impl TrainJob {
         Ok(picture)
     }
 
+    #[allow(clippy::too_many_arguments)] // each is one thing the views need; a struct would only rename them
     fn add_views(
         &self,
         trainer: &mut Trainer,
@@ -205,10 +230,21 @@ impl TrainJob {
         frames: &[usize],
         poses: &HashMap<String, Pose>,
         start: &Start,
+        mut depth: Option<DepthNetwork>,
+        report: &mut RunReport,
     ) -> Result<(), CliError> {
+        let mut with_prior = 0;
         for &i in frames {
             let picture = self.posed(set, i, poses)?;
-            trainer.add_view(&picture, start.priors.get(&picture.name))?;
+            // One at a time: the trainer keeps the priors in the device's memory.
+            let estimated = depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
+            let prior = estimated.as_ref().or_else(|| start.priors.get(&picture.name));
+            with_prior += u64::from(prior.is_some());
+            trainer.add_view(&picture, prior)?;
+        }
+        if with_prior > 0 {
+            let by = depth.as_ref().map_or(start.priors_by.as_str(), DepthNetwork::name);
+            report.more.insert("depth_prior".to_owned(), serde_json::json!({ "name": by, "views": with_prior }));
         }
         Ok(())
     }
@@ -306,6 +342,7 @@ impl TrainJob {
         set: &Dataset,
         frames: &[usize],
         header: &ModelHeader,
+        metric: Option<&mut PerceptualMetric>,
         report: &mut RunReport,
     ) -> Result<(), CliError> {
         let Ok(held_out) = set.select("test", self.region.as_deref()) else { return Ok(()) };
@@ -315,8 +352,11 @@ impl TrainJob {
         }
         let from = Instant::now();
         let transfer = PoseTransfer::between(set, &header.views);
-        let scores = evaluate::evaluate(trainer, set, &held_out, self.scale, &transfer, None)?;
+        let scores = evaluate::evaluate(trainer, set, &held_out, self.scale, &transfer, metric, None)?;
         (report.psnr, report.ssim) = (Some(scores.psnr), Some(scores.ssim));
+        if let Some(p) = &scores.perceptual {
+            report.more.insert("perceptual".to_owned(), serde_json::to_value(p).map_err(CliError::failed)?);
+        }
         report.stage("evaluate", from);
         Ok(())
     }

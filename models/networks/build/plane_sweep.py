@@ -49,16 +49,19 @@ def build(p=None):
         """Row-normalised Gaussian band matrix [n, n]."""
         i = g.arange(n)
         d = g.sub(g.unsqueeze(i, 1), g.unsqueeze(i, 0))
-        e = g.op("Exp", g.mul(g.mul(d, d), np.float32(-0.5 / sigma**2)))
+        # Cut at four deviations: products with the denormal numbers of a full tail cost a hundred times a plain one.
+        near = g.cast(g.op("Less", g.op("Abs", d), np.float32(4 * sigma)), TensorProto.FLOAT)
+        e = g.mul(near, g.op("Exp", g.mul(g.mul(d, d), np.float32(-0.5 / sigma**2))))
         return g.div(e, g.total(e, 1))
 
     bands = {}
-    def blur(x, level, sigma):
-        """x [N, h, w]."""
-        key = (level, sigma)
+    def blur(x, level, sigma, weight=1.0):
+        """x [N, h, w]; `weight` multiplies the result, at the price of nothing."""
+        key = (level, sigma, weight)
         if key not in bands:
             h, w = {4: (H4, W4), 2: (H2, W2)}[level]
-            bands[key] = (band(h, sigma), g.op("Transpose", band(w, sigma), perm=[1, 0]))
+            by = band(h, sigma)
+            bands[key] = (by if weight == 1.0 else g.mul(by, np.float32(weight)), g.op("Transpose", band(w, sigma), perm=[1, 0]))
         by, bx = bands[key]
         return g.matmul(by, g.matmul(x, bx))
 
@@ -94,34 +97,29 @@ def build(p=None):
         y = g.add(g.mul(g.arange(h), np.float32(div)), np.float32(off))
         return g.unsqueeze(x, 0), g.unsqueeze(y, 1)
 
-    def scalar(s, r, c):
-        return g.pick(g.pick(g.pick("rel_proj", s), r), c)
-
     def sweep(level, s, ref, source, inverse):
         """Product of reference and warped source feature and its validity, for inverse depths [D,h,w] or [D,1,1]."""
         h, w = {4: (H4, W4), 2: (H2, W2)}[level]
         fh, fw = {4: (H2, W2), 2: (H, W)}[level]
         scale = level // 2
         x, y = pixels(h, w, level)
+        # Finer map: centre of index k at full-size coordinate scale*k + (scale-1)/2; rounding = floor(. + 1/2). Both are
+        # affine in the projection's rows, where they cost one small matrix product and not two passes over the volume.
+        gain, offset = (0.5, 0.25) if scale == 2 else (1.0, 0.5)
+        to_index = np.array([[gain, 0, offset, 0], [0, gain, offset, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)
+        projection = g.matmul(to_index, g.pick("rel_proj", s))
+        def entry(r, c):
+            return g.pick(g.pick(projection, r), c)
         rows = []
         for r in range(3):
-            base = g.add(g.add(g.mul(x, scalar(s, r, 0)), g.mul(y, scalar(s, r, 1))), scalar(s, r, 2))
-            rows.append(g.add(base, g.mul(inverse, scalar(s, r, 3))))
+            base = g.add(g.add(g.mul(x, entry(r, 0)), g.mul(y, entry(r, 1))), entry(r, 2))
+            rows.append(g.add(base, g.mul(inverse, entry(r, 3))))
         z = g.op("Reciprocal", g.op("Max", rows[2], np.float32(1e-6)))
-        # Finer map: centre of index k at full-size coordinate scale*k + (scale-1)/2; rounding = floor(. + 1/2).
-        def index(v):
-            t = g.mul(v, z)
-            if scale == 2:
-                t = g.mul(t, np.float32(0.5))
-                t = g.add(t, np.float32(0.25))
-            else:
-                t = g.add(t, np.float32(0.5))
-            return g.op("Floor", t)
         fwf, fhf = g.cast(fw, TensorProto.FLOAT), g.cast(fh, TensorProto.FLOAT)
-        ix, iy = index(rows[0]), index(rows[1])
-        cx = g.op("Min", g.op("Max", ix, np.float32(0)), g.sub(fwf, np.float32(1)))
-        cy = g.op("Min", g.op("Max", iy, np.float32(0)), g.sub(fhf, np.float32(1)))
-        inside = g.cast(g.op("Equal", g.add(g.op("Abs", g.sub(cx, ix)), g.op("Abs", g.sub(cy, iy))), np.float32(0)), TensorProto.FLOAT)
+        ix, iy = (g.op("Floor", g.mul(row, z)) for row in rows[:2])
+        cx = g.op("Clip", ix, np.float32(0), g.sub(fwf, np.float32(1)))
+        cy = g.op("Clip", iy, np.float32(0), g.sub(fhf, np.float32(1)))
+        inside = g.cast(g.op("And", g.op("Equal", cx, ix), g.op("Equal", cy, iy)), TensorProto.FLOAT)
         at = g.cast(g.add(g.mul(cy, fwf), cx), TensorProto.INT32)
         # GatherElements on flat arrays: a typed loop, where Gather copies every float by itself (three times slower).
         warped = g.op("GatherElements", g.pick(source, s), g.reshape(at, [-1]), axis=0)
@@ -141,9 +139,9 @@ def build(p=None):
         scores = []
         for s in range(S):
             c, v = sweep(level, s, ref, src, inverse)
-            a = blur(c, level, small)
+            a = blur(c, level, small, 1 - large_share)
             if large_share > 0:
-                a = g.add(g.mul(a, np.float32(1 - large_share)), g.mul(blur(c, level, large), np.float32(large_share)))
+                a = g.add(a, blur(c, level, large, large_share))
             # Where a source does not look, it has no opinion.
             scores.append((a, v))
         (a, va), (b, vb) = scores

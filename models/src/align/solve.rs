@@ -109,6 +109,15 @@ pub fn align(views: &[View], edges: &[Edge], steps: usize) -> Alignment {
     Alignment { sigma, maps, steps: taken, converged, mean_residual }
 }
 
+/// Host bytes that [`align`] takes beside its input and χ: a term per edge and pixel that takes part, the pixels, and the
+/// dense system with its factor and inverse.
+pub fn planned_bytes(pictures: u64, edges: u64) -> u64 {
+    let terms = edges * 2 * PIXELS as u64;
+    let pixels = pictures * PIXELS as u64;
+    // Twice: vectors grow by doubling.
+    2 * terms * (size_of::<Term>() as u64 + 8) + 2 * pixels * (size_of::<Pixel>() as u64 + 8) + 4 * edges * edges * 8
+}
+
 fn fits(views: &[View], edge: &Edge) -> bool {
     edge.first != edge.second
         && edge.views().iter().all(|(v, map)| {

@@ -11,6 +11,9 @@ const MIN_SHARE: f32 = 0.05;
 /// Rounds of reweighting; trees and roofs are outliers of the ground.
 const ROUNDS: usize = 6;
 
+/// Every how many samples, across and down, takes part in the fit of three numbers.
+const STEP: usize = 3;
+
 /// Depths for the whole grid; 0 where nothing should be filled. `None` when too little is known.
 pub fn continued(grid: &DepthGrid, range: [f32; 2]) -> Option<Vec<f32>> {
     let (w, h) = (grid.width, grid.height);
@@ -46,7 +49,8 @@ fn fit(known: &[f32], w: usize, h: usize) -> Option<[f32; 3]> {
         let mut b = nalgebra::Vector3::<f64>::zeros();
         let mut sum = 0.0;
         let mut weights = 0.0;
-        for (i, &v) in known.iter().enumerate().filter(|(_, v)| **v > 0.0) {
+        let sample = |i: usize| i % w % STEP == 0 && i / w % STEP == 0;
+        for (i, &v) in known.iter().enumerate().filter(|(i, v)| **v > 0.0 && sample(*i)) {
             let x = nalgebra::Vector3::new(1.0, (i % w) as f64 / w as f64, (i / w) as f64 / h as f64);
             let r = f64::from(v) - (plane[0] + plane[1] * x[1] + plane[2] * x[2]);
             let weight = if scale.is_finite() { 1.0 / (1.0 + (r / scale).powi(2)) } else { 1.0 };

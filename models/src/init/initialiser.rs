@@ -6,6 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use config::init::InitSettings;
+use rayon::prelude::*;
 
 use crate::camera::{Pose, PosedImage, View};
 use crate::onnx::features::{FeatureNetwork, Features};
@@ -13,20 +14,22 @@ use crate::onnx::manifest::{Manifest, Poses};
 use crate::onnx::picture::{center_crop, resized};
 
 use super::InitError;
-use super::frame::{DepthGrid, Frame, Projector, unproject};
-use super::merge::VoxelMerge;
+use super::frame::{Frame, Projector, unproject};
 use super::pairs::{Relation, SkippedPairs, partners, relate};
-use super::posed::{NetworkBytes, PosedNetwork};
+use super::posed::{NetworkBytes, PosedNetwork, Request};
 use super::range::DepthRange;
 use super::report::{InitReport, Initialisation};
 use super::unposed::{Appearance, Heads, PairNetwork, align_frames, appearance, keep_better};
 
 mod assemble;
+mod memory;
 
 /// Features per picture for the depth range.
 const RANGE_FEATURES: usize = 600;
+/// Longer side of the picture they are found in, pixels: to bound depths, a half of a pixel more does not matter.
+const RANGE_SIDE: u32 = 320;
 /// Every how many pictures the depth range is measured again.
-const RANGE_EVERY: usize = 8;
+const RANGE_EVERY: usize = 5;
 /// A depth is made again when its pictures' refined poses move it by more than this, pixels.
 const STALE_PX: f32 = 0.7;
 /// Finest voxels per Gaussian of the budget.
@@ -68,9 +71,12 @@ pub struct Initialiser {
     settings: InitSettings,
     network: Network,
     features: Option<FeatureNetwork>,
-    last_features: Option<(usize, Features)>,
+    /// Of the last picture that was looked at, with its camera at the size that features were found in.
+    last_features: Option<(usize, View, Features)>,
     frames: Vec<Frame>,
     range: DepthRange,
+    /// Depth range of each picture, as [`Self::build`] found it.
+    ranges: Vec<Option<[f32; 2]>>,
     /// What an unposed network says about each picture's Gaussians.
     appearance: Vec<Option<Appearance>>,
     report: InitReport,
@@ -110,6 +116,7 @@ impl Initialiser {
             last_features: None,
             frames: Vec::new(),
             range: DepthRange::default(),
+            ranges: Vec::new(),
             appearance: Vec::new(),
             report,
         })
@@ -166,9 +173,8 @@ impl Initialiser {
             made_as: None,
         });
         self.report.pictures = self.frames.len();
-        self.measure_range()?;
         self.report.add_ms += started.elapsed().as_secs_f64() * 1e3;
-        Ok(())
+        self.measure_range()
     }
 
     /// Replaces the pose of a picture after refinement; unknown names are ignored (their picture was no key frame).
@@ -183,30 +189,21 @@ impl Initialiser {
         points.into_iter().for_each(|p| self.range.push(p.into()));
     }
 
-    /// Host bytes planned for a number of pictures and Gaussians: pictures and depths at the network's size, the
-    /// merge, the network's tensors (measured: about 60 floats per pixel of one picture).
-    pub fn planned_bytes(&self, pictures: usize, max_gaussians: usize) -> u64 {
-        let pixels = self.frames.first().map_or(640 * 480, |f| f.view.intrinsics.pixels()) as u64;
-        let grid = pixels / u64::from(self.settings.stride).pow(2) * 8;
-        let network = pixels * 60 * 4;
-        pictures as u64 * (3 * pixels + 2 * grid)
-            + network
-            + VoxelMerge::planned_bytes(max_gaussians * VOXELS_PER_GAUSSIAN)
-    }
-
-    /// While flying: makes the depth of one picture that has neighbours on both sides; false when there was none to do.
+    /// While pictures still come: makes the depths of up to `most` pictures that have neighbours on both sides; returns
+    /// how many those were.
     ///
     /// # Errors
     /// The network fails.
-    pub fn advance(&mut self) -> Result<bool, InitError> {
+    pub fn advance(&mut self, most: usize) -> Result<usize, InitError> {
         if matches!(self.network, Network::Unposed(_)) {
-            return Ok(false);
+            return Ok(0);
         }
-        let ready = (0..self.frames.len().saturating_sub(1)).find(|&i| self.frames[i].made_as.is_none());
-        match ready {
-            Some(i) if self.depth_range(i).is_some() => self.make_depth(i).map(|_| true),
-            _ => Ok(false),
-        }
+        // Ranges of an earlier build know less than what has been measured since.
+        self.ranges.clear();
+        let next = (0..self.frames.len().saturating_sub(1)).filter(|&i| self.frames[i].made_as.is_none());
+        let ready: Vec<usize> = next.take_while(|&i| self.depth_range(i).is_some()).take(most).collect();
+        self.make_depths(&ready)?;
+        Ok(ready.len())
     }
 
     /// All pictures so far into at most `max_gaussians` Gaussians. May be called again after more pictures.
@@ -216,7 +213,11 @@ impl Initialiser {
     pub fn build(&mut self, max_gaussians: usize) -> Result<Initialisation, InitError> {
         let started = Instant::now();
         self.report.skipped = SkippedPairs::default();
+        if let Some(features) = &mut self.features {
+            features.close();
+        }
         let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
+        self.ranges = views.par_iter().map(|v| self.settings.depth_m.or_else(|| self.range.of(v))).collect();
         for i in 0..views.len() {
             if let Some(depth) = self.typical_depth(i) {
                 partners(i, &views, depth, &self.settings, &mut self.report.skipped);
@@ -224,11 +225,8 @@ impl Initialiser {
         }
         match self.network {
             Network::Posed(_) => {
-                for i in 0..self.frames.len() {
-                    if self.is_stale(i) {
-                        self.make_depth(i)?;
-                    }
-                }
+                let stale: Vec<usize> = (0..self.frames.len()).filter(|&i| self.is_stale(i)).collect();
+                self.make_depths(&stale)?;
             }
             Network::Unposed(_) => self.align_pairs(&views)?,
         }
@@ -241,20 +239,24 @@ impl Initialiser {
     }
 
     fn measure_range(&mut self) -> Result<(), InitError> {
+        let started = Instant::now();
         let i = self.frames.len() - 1;
-        let Some(network) = &mut self.features else { return Ok(()) };
         // Two pictures in a row out of every few; all until there are enough.
-        let wanted = self.range.of(&self.frames[i].view).is_none() || i % RANGE_EVERY < 2;
-        if !wanted {
-            return Ok(());
-        }
-        let found = network.extract(&self.frames[i].image, RANGE_FEATURES)?;
-        if let Some((j, previous)) = &self.last_features
+        let wanted = i % RANGE_EVERY < 2 || self.range.of(&self.frames[i].view).is_none();
+        let Some(network) = self.features.as_mut().filter(|_| wanted) else { return Ok(()) };
+        let frame = &self.frames[i];
+        let (w, h) = frame.image.dimensions();
+        let shrink = (f64::from(RANGE_SIDE) / f64::from(w.max(h))).min(1.0);
+        let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
+        let view = View { intrinsics: frame.view.intrinsics.resized(fit(w), fit(h)), pose: frame.view.pose };
+        let found = network.extract(&resized(&frame.image, fit(w), fit(h)), RANGE_FEATURES)?;
+        if let Some((j, previous_view, previous)) = &self.last_features
             && j + 1 == i
         {
-            self.range.measure((&self.frames[*j].view, previous), (&self.frames[i].view, &found));
+            self.range.measure((previous_view, previous), (&view, &found));
         }
-        self.last_features = Some((i, found));
+        self.last_features = Some((i, view, found));
+        self.report.features_ms += started.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }
 
@@ -262,9 +264,13 @@ impl Initialiser {
         self.settings.depth_m.or_else(|| self.range.of(&self.frames[i].view))
     }
 
+    /// As [`Self::build`] found it; before the first build, as it is now.
+    fn known_range(&self, i: usize) -> Option<[f32; 2]> {
+        self.ranges.get(i).copied().unwrap_or_else(|| self.depth_range(i))
+    }
+
     fn typical_depth(&self, i: usize) -> Option<f64> {
-        // The harmonic mean: what half-way means in disparity.
-        self.depth_range(i).map(|[n, f]| 2.0 / (1.0 / f64::from(n) + 1.0 / f64::from(f)))
+        self.known_range(i).map(middle)
     }
 
     fn sources_of(&self, i: usize, depth: f64) -> Vec<(usize, f64)> {
@@ -293,32 +299,44 @@ impl Initialiser {
         moved || best > 1.5 * now
     }
 
-    fn make_depth(&mut self, i: usize) -> Result<(), InitError> {
-        let started = Instant::now();
-        let (Some(range), Some(depth)) = (self.depth_range(i), self.typical_depth(i)) else {
-            return Err(InitError::NoRange { points: self.range.len() });
-        };
-        let sources = self.sources_of(i, depth);
-        let made_with: Vec<(usize, View)> = sources.iter().map(|s| (s.0, self.frames[s.0].view)).collect();
-        let view = self.frames[i].view;
-        let grid = if sources.is_empty() {
-            None
-        } else {
-            let partners: Vec<&Frame> = sources.iter().map(|s| &self.frames[s.0]).collect();
-            let Network::Posed(network) = &mut self.network else { return Ok(()) };
-            let (depth, conf) = network.run(&self.frames[i], &partners, range)?;
-            let (w, h) = (view.intrinsics.width as usize, view.intrinsics.height as usize);
-            let (grid, unsound) = DepthGrid::sampled(w, h, self.settings.stride as usize, &depth.data, &conf.data);
-            self.report.unsound_depths += unsound;
-            self.report.runs += 1;
-            self.report.run_ms += started.elapsed().as_secs_f64() * 1e3;
-            Some(grid)
-        };
-        let frame = &mut self.frames[i];
-        frame.depth = grid;
-        frame.made_with = made_with;
-        frame.made_as = Some(view);
-        self.report.depth_m = range;
+    /// Makes the depths of the given pictures, several at once.
+    fn make_depths(&mut self, wanted: &[usize]) -> Result<(), InitError> {
+        let mut chosen = Vec::with_capacity(wanted.len());
+        for &i in wanted {
+            let Some(range) = self.known_range(i) else {
+                return Err(InitError::NoRange { points: self.range.len() });
+            };
+            chosen.push((i, range, self.sources_of(i, middle(range))));
+        }
+        let Network::Posed(network) = &mut self.network else { return Ok(()) };
+        let frames = &self.frames;
+        let requests: Vec<Request<'_>> = chosen
+            .iter()
+            .filter(|(_, _, sources)| !sources.is_empty())
+            .map(|(i, range, sources)| Request {
+                reference: &frames[*i],
+                sources: sources.iter().map(|s| &frames[s.0]).collect(),
+                range: *range,
+            })
+            .collect();
+        let mut made = network.run_all(&requests, self.settings.stride as usize)?.into_iter();
+        self.report.open_ms = network.opening_ms();
+        for (i, range, sources) in chosen {
+            let made_with = sources.iter().map(|s| (s.0, self.frames[s.0].view)).collect();
+            let made = if sources.is_empty() { None } else { made.next() };
+            if let Some(made) = &made {
+                self.report.unsound_depths += made.unsound;
+                self.report.runs += 1;
+                self.report.run_ms += made.run_ms;
+                let [near, far] = &mut self.report.depth_m;
+                *near = if *near > 0.0 { near.min(range[0]) } else { range[0] };
+                *far = far.max(range[1]);
+            }
+            let frame = &mut self.frames[i];
+            frame.depth = made.map(|m| m.grid);
+            frame.made_with = made_with;
+            frame.made_as = Some(frame.view);
+        }
         Ok(())
     }
 
@@ -347,6 +365,7 @@ impl Initialiser {
             self.report.run_ms += started.elapsed().as_secs_f64() * 1e3;
         }
         let residual = network.pair().sh_residual;
+        let started = Instant::now();
         let alignment = align_frames(&mut self.frames, &edges, &self.settings);
         self.report.edges = edges.len();
         self.report.edges_without_scale = alignment.sigma.iter().filter(|s| s.is_none()).count();
@@ -360,8 +379,14 @@ impl Initialiser {
                 appearance(heads, &self.frames[v], first, &alignment, &self.settings, residual)
             })
             .collect();
+        self.report.align_ms += started.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }
+}
+
+/// The harmonic mean of a depth range: what half-way means in disparity.
+fn middle([near, far]: [f32; 2]) -> f64 {
+    2.0 / (1.0 / f64::from(near) + 1.0 / f64::from(far))
 }
 
 /// Largest shift, in pixels, of the reference's corners and centre in the source between two pairs of poses.

@@ -76,10 +76,13 @@ impl VoxelMerge {
         }
     }
 
-    /// Host bytes for a capacity: two cell arrays (merging writes into the second) and the sample buffer.
-    pub fn planned_bytes(capacity: usize) -> u64 {
+    /// Host bytes for a capacity: two cell arrays (merging writes into the second; the coarser levels of the tree later
+    /// take its place), the sample buffer, and `budget` Gaussians at the end.
+    pub fn planned_bytes(capacity: usize, budget: usize) -> u64 {
         let cells = 2 * (capacity + BUFFER) as u64 * size_of::<Cell>() as u64;
-        cells + BUFFER as u64 * (size_of::<(u64, Sample)>() + size_of::<(u64, u32)>()) as u64
+        cells
+            + BUFFER as u64 * (size_of::<(u64, Sample)>() + size_of::<(u64, u32)>()) as u64
+            + (budget * size_of::<Merged>()) as u64
     }
 
     /// Adds a sample; those that are not finite or without weight are dropped and counted.
@@ -131,6 +134,8 @@ impl VoxelMerge {
         order.par_sort_unstable();
         let mut out = std::mem::take(&mut self.spare);
         out.clear();
+        // Exactly, so that growing by doubling does not exceed the plan.
+        out.reserve_exact(self.cells.len() + order.len());
         let mut old = self.cells.iter().peekable();
         let mut new = order.iter().peekable();
         loop {
@@ -174,9 +179,9 @@ impl VoxelMerge {
         if budget == 0 || self.cells.is_empty() {
             return Vec::new();
         }
+        (self.spare, self.buffer) = (Vec::new(), Vec::new());
         let levels = tree::Levels::build(std::mem::take(&mut self.cells), self.origin, self.edge, LEVELS);
         let cut = levels.cut(budget);
-        self.spare = Vec::new();
         cut.into_par_iter().map(|(level, index)| levels.gaussian(level, index, spread)).collect()
     }
 }

@@ -1,15 +1,23 @@
 //! Running a posed pair network (IterMVS's signature, and the embedded plane sweep): pictures and relative
 //! projections in, depth and confidence out.
+//!
+//! The embedded network runs on several pictures at once, each on one thread with a session of its own: inside one picture
+//! the threads of ONNX Runtime wait for each other after every operator, between pictures they need not. A user's network,
+//! whose memory only its first run tells, is opened once and has all threads.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Instant;
 
 use glam::{DMat3, DMat4, DVec3};
 
 use crate::camera::{Intrinsics, View};
 use crate::onnx::manifest::{Contract, Manifest, Poses};
 use crate::onnx::picture::push_planes;
-use crate::onnx::session::{NetworkSession, Tensor};
+use crate::onnx::session::NetworkSession;
 use crate::onnx::{OnnxError, network};
 
-use super::frame::Frame;
+use super::frame::{DepthGrid, Frame};
 
 /// A network's bytes: shipped inside the binary, or read from the user's file.
 #[derive(Debug)]
@@ -30,15 +38,51 @@ impl NetworkBytes {
     }
 }
 
-/// A posed network; the session lives from the first run until [`Self::close`].
+/// Floats that the embedded network's session holds per pixel of a picture while it runs, inputs and outputs included
+/// (measured: 53).
+const EMBEDDED_FLOATS_PER_PIXEL: u64 = 64;
+/// The same of a user's network; IterMVS with three views takes 397.
+const OTHER_FLOATS_PER_PIXEL: u64 = 420;
+/// What opening a session takes beside its weights: the graph's nodes and plans (measured: 24 MiB for the plane sweep).
+const SESSION_BYTES: u64 = 28 << 20;
+
+/// A posed network; sessions live from the first run until [`Self::close`].
 #[derive(Debug)]
 pub struct PosedNetwork {
     manifest: Manifest,
     bytes: NetworkBytes,
+    /// ONNX Runtime's threads in each session.
     threads: usize,
     views: usize,
+    lanes: Vec<Lane>,
+}
+
+/// One picture at a time.
+#[derive(Debug, Default)]
+struct Lane {
     session: Option<((u32, u32), NetworkSession)>,
     planes: Vec<f32>,
+    opening_ms: f64,
+}
+
+/// One picture's depth to be made.
+pub struct Request<'a> {
+    /// The picture.
+    pub reference: &'a Frame,
+    /// Pictures it is compared with, best first; at least one.
+    pub sources: Vec<&'a Frame>,
+    /// Nearest and farthest depth, metres.
+    pub range: [f32; 2],
+}
+
+/// What became of a request.
+pub struct Made {
+    /// The depths, at the grid's stride.
+    pub grid: DepthGrid,
+    /// Depths claimed that were not positive finite numbers.
+    pub unsound: usize,
+    /// Milliseconds of the run.
+    pub run_ms: f64,
 }
 
 /// K as 4×4, so that K·T·K⁻¹ is one product.
@@ -75,7 +119,12 @@ impl PosedNetwork {
         match (&manifest.contract, &manifest.pair) {
             (Contract::Pair, Some(pair)) if pair.poses == Poses::Given => {
                 let views = pair.views;
-                Ok(Self { manifest, bytes, threads, views, session: None, planes: Vec::new() })
+                let (lanes, threads) = match bytes {
+                    NetworkBytes::Embedded(_) => (threads.max(1), 1),
+                    NetworkBytes::Read(_) => (1, threads),
+                };
+                let lanes = (0..lanes).map(|_| Lane::default()).collect();
+                Ok(Self { manifest, bytes, threads, views, lanes })
             }
             _ => Err(OnnxError::Manifest {
                 manifest: manifest.name,
@@ -95,40 +144,104 @@ impl PosedNetwork {
         self.views - 1
     }
 
-    /// Depth and confidence of `reference`, both `[1,1,H,W]`, from at least one source; when the network wants more
-    /// sources than there are, the best is given again.
+    /// Host bytes that its sessions take while they run on pictures of a number of pixels.
+    pub fn planned_bytes(&self, pixels: u64) -> u64 {
+        let floats = match self.bytes {
+            NetworkBytes::Embedded(_) => EMBEDDED_FLOATS_PER_PIXEL,
+            NetworkBytes::Read(_) => OTHER_FLOATS_PER_PIXEL,
+        };
+        let weights = self.bytes.get().len() as u64;
+        self.lanes.len() as u64 * (SESSION_BYTES + 2 * weights + pixels * floats * 4)
+    }
+
+    /// Makes the depths of all requests, in their order, on every `stride`-th pixel.
     ///
     /// # Errors
-    /// ONNX Runtime or the contract fails.
-    pub fn run(
+    /// Of the first request that failed: ONNX Runtime or the contract.
+    pub fn run_all(&mut self, requests: &[Request<'_>], stride: usize) -> Result<Vec<Made>, OnnxError> {
+        let next = AtomicUsize::new(0);
+        let done: Mutex<Vec<(usize, Result<Made, OnnxError>)>> = Mutex::new(Vec::with_capacity(requests.len()));
+        let (manifest, bytes, threads, views) = (&self.manifest, self.bytes.get(), self.threads, self.views);
+        let work = |lane: &mut Lane| {
+            loop {
+                let i = next.fetch_add(1, Ordering::Relaxed);
+                let Some(request) = requests.get(i) else { break };
+                let made = lane.run(manifest, bytes, threads, views, request, stride);
+                let failed = made.is_err();
+                done.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((i, made));
+                if failed {
+                    next.store(requests.len(), Ordering::Relaxed);
+                }
+            }
+        };
+        let busy = requests.len().min(self.lanes.len());
+        match &mut self.lanes[..busy] {
+            [] => {}
+            [only] => work(only),
+            [first, others @ ..] => std::thread::scope(|scope| {
+                for lane in others {
+                    scope.spawn(|| work(lane));
+                }
+                work(first);
+            }),
+        }
+        let mut done = done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+        done.sort_by_key(|(i, _)| *i);
+        done.into_iter().map(|(_, made)| made).collect()
+    }
+
+    /// Milliseconds spent opening sessions so far, over all threads.
+    pub fn opening_ms(&self) -> f64 {
+        self.lanes.iter().map(|l| l.opening_ms).sum()
+    }
+
+    /// Gives the sessions' memory back; the next run opens them again.
+    pub fn close(&mut self) {
+        for lane in &mut self.lanes {
+            (lane.session, lane.planes) = (None, Vec::new());
+        }
+    }
+}
+
+impl Lane {
+    /// When the network wants more sources than there are, the best is given again.
+    fn run(
         &mut self,
-        reference: &Frame,
-        sources: &[&Frame],
-        range: [f32; 2],
-    ) -> Result<(Tensor, Tensor), OnnxError> {
+        manifest: &Manifest,
+        bytes: &[u8],
+        threads: usize,
+        views: usize,
+        request: &Request<'_>,
+        stride: usize,
+    ) -> Result<Made, OnnxError> {
+        let reference = request.reference;
         let (w, h) = reference.image.dimensions();
         let session = match &mut self.session {
             Some((size, session)) if *size == (w, h) => session,
             slot => {
-                &mut slot.insert(((w, h), network::open(&self.manifest, self.bytes.get(), (w, h), self.threads)?)).1
+                let started = Instant::now();
+                let session = network::open(manifest, bytes, (w, h), threads)?;
+                self.opening_ms += started.elapsed().as_secs_f64() * 1e3;
+                &mut slot.insert(((w, h), session)).1
             }
         };
+        let started = Instant::now();
         let k = &reference.view.intrinsics;
         self.planes.clear();
-        push_planes(&reference.image, w, h, &self.manifest.input, &mut self.planes);
-        let mut projections = Vec::with_capacity(16 * (self.views - 1));
-        for i in 0..self.views - 1 {
-            let source = sources.get(i).or(sources.first()).copied().unwrap_or(reference);
-            push_planes(&source.image, w, h, &self.manifest.input, &mut self.planes);
+        push_planes(&reference.image, w, h, &manifest.input, &mut self.planes);
+        let mut projections = Vec::with_capacity(16 * (views - 1));
+        for i in 0..views - 1 {
+            let source = request.sources.get(i).or(request.sources.first()).copied().unwrap_or(reference);
+            push_planes(&source.image, w, h, &manifest.input, &mut self.planes);
             projections.extend(relative_projection(&reference.view, &source.view));
         }
         let k_ref = [k.fx, 0.0, k.cx - 0.5, 0.0, k.fy, k.cy - 0.5, 0.0, 0.0, 1.0];
-        let (views, rows, columns) = (self.views, h as usize, w as usize);
+        let (rows, columns) = (h as usize, w as usize);
         let mut out = session.run(
             &[
                 ("images", &[1, views, 3, rows, columns], &self.planes),
                 ("rel_proj", &[views - 1, 4, 4], &projections),
-                ("depth_range", &[2], &range),
+                ("depth_range", &[2], &request.range),
                 ("k_ref", &[3, 3], &k_ref),
             ],
             &["depth", "conf"],
@@ -136,21 +249,16 @@ impl PosedNetwork {
         let conf = out.pop();
         match (out.pop(), conf) {
             (Some(depth), Some(conf)) if depth.shape == [1, 1, rows, columns] && conf.shape == depth.shape => {
-                Ok((depth, conf))
+                let (grid, unsound) = DepthGrid::sampled(columns, rows, stride, &depth.data, &conf.data);
+                Ok(Made { grid, unsound, run_ms: started.elapsed().as_secs_f64() * 1e3 })
             }
             _ => Err(OnnxError::Contract {
-                network: self.manifest.name.clone(),
+                network: manifest.name.clone(),
                 contract: "pair",
                 tensor: "outputs `depth`, `conf`".into(),
                 expected: format!("[1,1,{rows},{columns}]"),
                 found: "other shapes".into(),
             }),
         }
-    }
-
-    /// Gives the session's memory back; the next run opens it again.
-    pub fn close(&mut self) {
-        self.session = None;
-        self.planes = Vec::new();
     }
 }

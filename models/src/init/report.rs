@@ -39,7 +39,7 @@ pub struct InitReport {
     pub align_steps: usize,
     /// Unposed networks: mean distance between χ and the pairs' points, metres.
     pub align_residual_m: f64,
-    /// Depth range of the last run, metres.
+    /// Nearest and farthest depth that any run was told to search, metres.
     pub depth_m: [f32; 2],
     /// Depths claimed by the network that were not positive finite numbers.
     pub unsound_depths: usize,
@@ -63,13 +63,27 @@ pub struct InitReport {
     pub abnormal: usize,
     /// Gaussians in the cloud.
     pub gaussians: usize,
-    /// Taking pictures in, depth range included.
+    /// Taking pictures in at the network's size.
     pub add_ms: f64,
-    /// Network runs alone.
+    /// Features and triangulation for the depth range.
+    pub features_ms: f64,
+    /// Opening the network, summed over threads.
+    pub open_ms: f64,
+    /// Network runs alone, summed over threads.
     pub run_ms: f64,
     /// Choosing partners and making depths in `build`, network runs included.
     pub depth_ms: f64,
-    /// Consistency, samples, merge.
+    /// Unposed networks: global alignment and scales of Σ (ICP, neighbours), within `depth_ms`.
+    pub align_ms: f64,
+    /// Comparing depths between pictures, summed over threads.
+    pub consistency_ms: f64,
+    /// Samples and their covariances, summed over threads.
+    pub samples_ms: f64,
+    /// Sorting samples into voxels.
+    pub voxels_ms: f64,
+    /// Cutting the tree and writing the cloud.
+    pub cloud_ms: f64,
+    /// Everything after the depths: the four above, side by side where they can be.
     pub merge_ms: f64,
     /// Host bytes planned.
     pub planned_bytes: u64,

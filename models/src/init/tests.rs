@@ -52,7 +52,7 @@ fn a_plane_comes_out_flat_within_the_budget_and_the_same_every_time() {
         let mut init = Initialiser::open(&settings(), None).unwrap();
         for i in 0..5 {
             init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
-            init.advance().unwrap();
+            init.advance(1).unwrap();
         }
         init.build(5000).unwrap()
     };
@@ -102,6 +102,25 @@ fn hovering_alone_and_too_many_pictures_are_one_clear_line() {
 }
 
 #[test]
+fn two_places_and_a_picture_taken_twice_become_one_cloud_and_useless_pairs_are_counted() {
+    if no_runtime() {
+        return;
+    }
+    let known = InitSettings { depth_m: Some([40.0, 60.0]), ..settings() };
+    let mut init = Initialiser::open(&known, None).unwrap();
+    for (i, x) in [0.0, 12.0, 12.0, 5000.0, 5012.0].into_iter().enumerate() {
+        init.add(&picture(i, x, 0.0)).unwrap();
+    }
+    let out = init.build(6000).unwrap();
+    // The copy has its depth from the picture beside it; with its original it has no baseline.
+    assert_eq!((out.report.runs, out.depth_priors.len()), (5, 5), "{:?}", out.report);
+    assert_eq!((out.report.skipped.no_baseline, out.report.skipped.too_wide), (1, 3), "{:?}", out.report.skipped);
+    let here = out.cloud.means.iter().filter(|m| m[0] < 100.0).count();
+    let there = out.cloud.means.iter().filter(|m| m[0] > 4900.0).count();
+    assert!(here > 500 && there > 500 && here + there == out.cloud.len(), "{here} {there}");
+}
+
+#[test]
 fn an_unposed_network_runs_the_whole_way_and_its_plane_is_put_at_its_height() {
     if no_runtime() {
         return;
@@ -121,4 +140,29 @@ fn an_unposed_network_runs_the_whole_way_and_its_plane_is_put_at_its_height() {
     println!("median height {} of {} Gaussians, {:?}", heights[heights.len() / 2], heights.len(), out.report);
     assert!(heights[heights.len() / 2].abs() < 1.0);
     assert!(out.cloud.log_scales.iter().flatten().all(|s| s.is_finite()));
+}
+
+#[test]
+fn the_scale_switches_of_the_ablation_set_the_extent_of_the_gaussians() {
+    if no_runtime() {
+        return;
+    }
+    // All three from the same depths; the budget holds every voxel, so that merging widens nothing.
+    let known = InitSettings { depth_m: Some([40.0, 60.0]), ..settings() };
+    let mut init = Initialiser::open(&known, None).unwrap();
+    for i in 0..3 {
+        init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
+    }
+    let mut extent = |global: bool, local: bool| {
+        init.reconfigure(&InitSettings { global_scale: global, local_scale: local, ..known.clone() }).unwrap();
+        let cloud = init.build(60_000).unwrap().cloud;
+        let mut longest: Vec<f32> = cloud.log_scales.iter().map(|s| s[0].exp()).collect();
+        longest.sort_by(f32::total_cmp);
+        (longest[longest.len() / 20], longest[longest.len() / 2])
+    };
+    // Without sᵍ a sample is as large as at depth 1; with it, at the typical depth; with sˡ, at its own.
+    let (neither, global, both) = (extent(false, false), extent(true, false), extent(true, true));
+    assert!((global.1 / neither.1 / 48.0 - 1.0).abs() < 0.02, "{neither:?} {global:?}");
+    assert!((global.0 / global.1 - 1.0).abs() < 1e-3, "one extent for all: {global:?}");
+    assert!(both.1 > global.1 && both.1 < 3.0 * global.1 && both.0 < 0.97 * both.1, "{global:?} {both:?}");
 }

@@ -78,6 +78,14 @@ impl PairNetwork {
         &self.pair
     }
 
+    /// Host bytes of its session while it runs: weights as the runtime keeps and packs them, and the tensors of the
+    /// contract alone. A network's inner tensors cannot be known before it runs.
+    pub fn planned_bytes(&self, pixels: u64) -> u64 {
+        let degree = u64::from(self.pair.sh_degree) + 1;
+        let floats = 2 * (3 + 3 + 1 + 3 + 4 + 3 * degree * degree + 1);
+        2 * self.bytes.get().len() as u64 + 2 * pixels * floats * 4
+    }
+
     /// Gives the session's memory back.
     pub fn close(&mut self) {
         self.session = None;
@@ -167,6 +175,21 @@ impl PairNetwork {
         heads.trust = map.confidence.iter().filter(|c| c.is_finite()).map(|c| f64::from(*c)).sum();
         (map, heads)
     }
+}
+
+/// Host bytes of the pairs' pointmaps, the pictures' heads and the global alignment, beside the networks: `samples` is
+/// the number of samples of a picture's grid.
+pub fn planned_bytes(pictures: u64, edges: u64, samples: u64) -> u64 {
+    let per_sample = size_of::<Vec3>() as u64;
+    let map = per_sample + 4;
+    // Points, scales, colours; rotation and opacity.
+    let heads = 3 * per_sample + 16 + 4;
+    let appearance = size_of::<Mat3>() as u64 + per_sample + 4;
+    // χ twice (aligned, as a grid), the world's points before and after.
+    let pointmaps = 2 * 8 + 2 * per_sample;
+    edges * 2 * samples * map
+        + (pictures + 2) * samples * (heads + appearance + pointmaps)
+        + crate::align::solve::planned_bytes(pictures, edges)
 }
 
 /// Keeps the more trusted heads of a picture.

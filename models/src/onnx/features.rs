@@ -73,6 +73,11 @@ impl FeatureNetwork {
         Ok(Self { manifest, bytes, threads, session: None, planes: Vec::new() })
     }
 
+    /// Gives the session's memory back; the next picture opens it again.
+    pub fn close(&mut self) {
+        (self.session, self.planes) = (None, Vec::new());
+    }
+
     /// Finds at most `max` features, best first.
     ///
     /// # Errors

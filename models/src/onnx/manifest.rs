@@ -3,6 +3,7 @@
 //!
 //! A user's own network is one line in the mission file: the path of its manifest.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -183,6 +184,9 @@ pub struct Manifest {
     pub blake3: Option<String>,
     /// How pictures become inputs.
     pub input: InputSettings,
+    /// What the file calls an input or output of the contract, where it calls it otherwise.
+    #[serde(default)]
+    pub names: BTreeMap<String, String>,
     /// For contract `pair`.
     #[serde(default)]
     pub pair: Option<PairSettings>,

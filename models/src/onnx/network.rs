@@ -27,8 +27,20 @@ pub fn open(manifest: &Manifest, bytes: &[u8], size: (u32, u32), threads: usize)
     if manifest.contract == Contract::Features {
         pinned.extend([("h8", h / 8), ("w8", w / 8)]);
     }
-    let session = NetworkSession::open(&manifest.name, bytes, threads, &pinned)?;
     let (inputs, outputs) = promises(manifest, w, h);
+    if let Some(unknown) = manifest.names.keys().find(|n| inputs.iter().chain(&outputs).all(|p| p.name != **n)) {
+        let there: Vec<&str> = inputs.iter().chain(&outputs).map(|p| p.name).collect();
+        return Err(OnnxError::Manifest {
+            manifest: manifest.name.clone(),
+            field: "names",
+            reason: format!(
+                "contract `{}` has no `{unknown}` (it has: {})",
+                manifest.contract.name(),
+                there.join(", ")
+            ),
+        });
+    }
+    let session = NetworkSession::open(&manifest.name, bytes, threads, &pinned, &manifest.names)?;
     check(manifest, session.inputs(), &inputs, "input")?;
     check(manifest, session.outputs(), &outputs, "output")?;
     if let Some(extra) = session.inputs().iter().find(|s| inputs.iter().all(|p| p.name != s.name)) {

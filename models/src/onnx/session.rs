@@ -3,6 +3,7 @@
 //!
 //! The library is loaded at run time, so that the binary starts on a board without it and says what is missing.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
@@ -44,17 +45,26 @@ pub type Input<'a> = (&'a str, &'a [usize], &'a [f32]);
 pub struct NetworkSession {
     name: String,
     session: Session,
+    /// Contract's name → the file's, where they differ.
+    names: BTreeMap<String, String>,
     inputs: Vec<TensorSpec>,
     outputs: Vec<TensorSpec>,
 }
 
 impl NetworkSession {
     /// Opens a network from its bytes. `dimensions` pins symbolic dimensions (`("h", 480)`) so that the runtime can
-    /// plan its memory; unknown names are ignored by the runtime.
+    /// plan its memory; unknown names are ignored by the runtime. `names` says what the file calls a tensor of the
+    /// contract; everywhere else it goes by the contract's name.
     ///
     /// # Errors
     /// The library is missing or unusable, or the bytes are no network it can run.
-    pub fn open(name: &str, bytes: &[u8], threads: usize, dimensions: &[(&str, usize)]) -> Result<Self, OnnxError> {
+    pub fn open(
+        name: &str,
+        bytes: &[u8],
+        threads: usize,
+        dimensions: &[(&str, usize)],
+        names: &BTreeMap<String, String>,
+    ) -> Result<Self, OnnxError> {
         let environment = environment()?;
         let fail = |e: String| OnnxError::Runtime { network: name.to_owned(), reason: e };
         let build = || -> ort::Result<Session> {
@@ -72,9 +82,9 @@ impl NetworkSession {
             b.commit_from_memory(bytes)
         };
         let session = build().map_err(|e| fail(one_line(e)))?;
-        let specs = |outlets: &[ort::value::Outlet]| outlets.iter().map(spec).collect::<Vec<_>>();
+        let specs = |outlets: &[ort::value::Outlet]| outlets.iter().map(|o| spec(o, names)).collect::<Vec<_>>();
         let (inputs, outputs) = (specs(session.inputs()), specs(session.outputs()));
-        Ok(Self { name: name.to_owned(), session, inputs, outputs })
+        Ok(Self { name: name.to_owned(), session, names: names.clone(), inputs, outputs })
     }
 
     /// What the network was called when it was opened.
@@ -103,13 +113,14 @@ impl NetworkSession {
         for &(name, shape, data) in inputs {
             let tensor = TensorRef::from_array_view((shape.to_vec(), data))
                 .map_err(|e| fail(format!("input {name}: {}", one_line(e))))?;
-            values.push((name, tensor));
+            values.push((self.names.get(name).map_or(name, String::as_str), tensor));
         }
         let results = self.session.run(values).map_err(|e| fail(one_line(e)))?;
         wanted
             .iter()
             .map(|&name| {
-                let value = results.get(name).ok_or_else(|| fail(format!("has no output `{name}`")))?;
+                let in_file = self.names.get(name).map_or(name, String::as_str);
+                let value = results.get(in_file).ok_or_else(|| fail(format!("has no output `{name}`")))?;
                 let (shape, data) =
                     value.try_extract_tensor::<f32>().map_err(|e| fail(format!("output {name}: {}", one_line(e))))?;
                 Ok(Tensor { shape: shape.iter().map(|&d| d as usize).collect(), data: data.to_vec() })
@@ -118,12 +129,13 @@ impl NetworkSession {
     }
 }
 
-fn spec(outlet: &ort::value::Outlet) -> TensorSpec {
+fn spec(outlet: &ort::value::Outlet, names: &BTreeMap<String, String>) -> TensorSpec {
     let (is_f32, shape) = match outlet.dtype() {
         ValueType::Tensor { ty, shape, .. } => (*ty == TensorElementType::Float32, shape.iter().copied().collect()),
         _ => (false, Vec::new()),
     };
-    TensorSpec { name: outlet.name().to_owned(), is_f32, shape }
+    let contract = names.iter().find(|(_, in_file)| *in_file == outlet.name()).map(|(contract, _)| contract.as_str());
+    TensorSpec { name: contract.unwrap_or(outlet.name()).to_owned(), is_f32, shape }
 }
 
 /// The places where the runtime library may be, in order.

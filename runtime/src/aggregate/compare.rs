@@ -11,7 +11,7 @@ use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::cli::CliError;
-use crate::evaluate::{Scores, evaluate, stem};
+use crate::evaluate::{Perceptual, Scores, evaluate, open_metric, stem};
 use crate::renderer;
 use crate::report::{Comparison, ReportData};
 use crate::transfer::PoseTransfer;
@@ -53,7 +53,7 @@ impl Opened {
 }
 
 /// Measures all models on the pictures of `split`; a picture counts for the model with the nearest training view.
-/// `locals` are names and files.
+/// `locals` are names and files, `metric` the manifest of a perceptual metric.
 ///
 /// # Errors
 /// The data set or a model cannot be read; the device fails.
@@ -63,21 +63,23 @@ pub fn compare(
     scale: f64,
     locals: &[(String, PathBuf)],
     global: &Path,
+    metric: Option<&Path>,
     device: Option<&str>,
 ) -> Result<Vec<Held>, CliError> {
     let frames = set.select(split, None)?;
     let Some(first) = frames.first() else { return Ok(Vec::new()) };
     let size = set.load(*first, scale)?.image.dimensions();
+    let mut metric = open_metric(metric, size)?;
     let owned = by_nearest_training_view(set, &frames, locals)?;
     let mut held = Vec::new();
     for ((name, path), mine) in locals.iter().zip(&owned).filter(|(_, mine)| !mine.is_empty()) {
         let mut own = Opened::new(path, set, size, device)?;
-        let local = evaluate(&mut own.trainer, set, mine, scale, &own.transfer, None)?;
+        let local = evaluate(&mut own.trainer, set, mine, scale, &own.transfer, metric.as_mut(), None)?;
         let photograph = set.load(mine[mine.len() / 2], scale)?;
         let shown = own.picture(&photograph.view)?;
         drop(own);
         let mut all = Opened::new(global, set, size, device)?;
-        let scores = evaluate(&mut all.trainer, set, mine, scale, &all.transfer, None)?;
+        let scores = evaluate(&mut all.trainer, set, mine, scale, &all.transfer, metric.as_mut(), None)?;
         let pictures = [photograph.image.clone(), shown, all.picture(&photograph.view)?];
         held.push(Held { name: name.clone(), local, global: scores, pictures: Some((photograph.name, pictures)) });
     }
@@ -104,6 +106,13 @@ fn by_nearest_training_view(
         }
     }
     Ok(owned)
+}
+
+/// The global model's mean perceptual distance over all held-out pictures, when there is a metric.
+pub fn perceptual(held: &[Held]) -> Option<Perceptual> {
+    let name = held.iter().find_map(|h| h.global.perceptual.as_ref())?.name.clone();
+    let all: Vec<f64> = held.iter().flat_map(|h| h.global.views.iter().filter_map(|v| v.perceptual)).collect();
+    Some(Perceptual { name, mean: all.iter().sum::<f64>() / all.len() as f64 })
 }
 
 /// Puts the figures into the report's table and the pictures before the others.

@@ -1,12 +1,12 @@
 //! `dgtr aggregate MODEL… --out DIR`: merges local models without a mission.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use config::ground::GroundSettings;
 use models::dataset::Dataset;
 
-use crate::aggregate::compare::{add_to, compare};
+use crate::aggregate::compare::{add_to, compare, perceptual};
 use crate::aggregate::{self, AggregateError, LocalModel, Outcome, summary};
 use crate::interrupt::Interrupt;
 use crate::report::ReportData;
@@ -64,6 +64,9 @@ pub struct Settings {
     /// Size at which they are compared, above 0 and at most 1.
     #[arg(long, default_value_t = 1.0)]
     pub compare_scale: f64,
+    /// Also measure a perceptual distance: manifest of a network of contract `metric`.
+    #[arg(long, value_name = "MANIFEST", requires = "compare")]
+    pub metric: Option<PathBuf>,
 }
 
 impl Settings {
@@ -81,19 +84,25 @@ impl Settings {
         to.validate().map_err(CliError::input)
     }
 
-    /// Measures the models on the held-out pictures of `--compare`, when given.
+    /// Measures the models on the held-out pictures of `--compare`, when given; `metric` is the mission's.
     pub(super) fn compare(
         &self,
         locals: &[(String, PathBuf)],
         outcome: &Outcome,
+        metric: Option<&Path>,
         (run, data): (&mut RunReport, &mut ReportData),
     ) -> Result<(), CliError> {
         let Some(root) = &self.compare else { return Ok(()) };
         let start = Instant::now();
         let set = Dataset::open(root)?;
-        let held = compare(&set, "test", self.compare_scale, locals, &outcome.path, self.device.as_deref())?;
+        let metric = self.metric.as_deref().or(metric);
+        let device = self.device.as_deref();
+        let held = compare(&set, "test", self.compare_scale, locals, &outcome.path, metric, device)?;
         let figures =
             held.iter().map(|h| (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global })));
+        if let Some(p) = perceptual(&held) {
+            run.more.insert("perceptual".into(), serde_json::to_value(p).map_err(CliError::failed)?);
+        }
         run.more.insert("held_out".into(), figures.collect::<serde_json::Map<_, _>>().into());
         add_to(data, held);
         let global = data.models.iter().find(|r| r.name == "global");
@@ -124,7 +133,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mut data = summary::report(&outcome);
     let names = outcome.models.iter().map(|m| m.0.clone());
     let locals: Vec<_> = names.zip(args.models.iter().cloned()).collect();
-    args.settings.compare(&locals, &outcome, (&mut run, &mut data))?;
+    args.settings.compare(&locals, &outcome, None, (&mut run, &mut data))?;
     for (row, path) in data.models.iter_mut().zip(&args.models) {
         row.uploaded = std::fs::metadata(path).ok().map(|m| m.len());
     }

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::CliError;
 use super::plan::largest;
-use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, stem};
+use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, open_metric, stem};
 use crate::renderer;
 use crate::transfer::PoseTransfer;
 
@@ -38,6 +38,9 @@ pub struct Args {
     /// Also score the two naive guesses: nearest training picture over flat ground, mean colour.
     #[arg(long)]
     pub baselines: bool,
+    /// Also measure a perceptual distance: manifest of a network of contract `metric`.
+    #[arg(long, value_name = "MANIFEST")]
+    pub metric: Option<PathBuf>,
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
@@ -66,9 +69,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let (header, cloud) = model::read(&args.model)?;
     let (width, height) = largest(&set, &frames, args.scale)?;
+    let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
     let mut trainer = renderer::open(args.device.as_deref(), &cloud, width, height)?;
     let transfer = PoseTransfer::between(&set, &header.views);
-    let scores = evaluate(&mut trainer, &set, &frames, args.scale, &transfer, args.save.as_deref())?;
+    let scores = evaluate(&mut trainer, &set, &frames, args.scale, &transfer, metric.as_mut(), args.save.as_deref())?;
     let naive = match args.baselines {
         true => Some(baselines(&set, &training_frames(&set, &header, &frames)?, &frames, args.scale)?),
         false => None,
@@ -87,10 +91,17 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Ok(());
     }
     for v in &scores.views {
-        println!("{:<28} {:>7.3} dB  SSIM {:.4}", v.name, v.psnr, v.ssim);
+        let distance = match (&metric, v.perceptual) {
+            (Some(m), Some(d)) => format!("  {} {d:.4}", m.name()),
+            _ => String::new(),
+        };
+        println!("{:<28} {:>7.3} dB  SSIM {:.4}{distance}", v.name, v.psnr, v.ssim);
     }
     let row = |what: &str, s: &Scores| println!("{what:<28} {:>7.3} dB  SSIM {:.4}", s.psnr, s.ssim);
     row(&format!("mean of {} views", scores.views.len()), &scores);
+    if let Some(p) = &scores.perceptual {
+        println!("{:<28} {:>7.4}", format!("mean {}", p.name), p.mean);
+    }
     if let Some(naive) = &naive {
         row("ground-plane warp", &naive.ground_warp);
         row("mean colour", &naive.mean_color);

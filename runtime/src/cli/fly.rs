@@ -117,6 +117,7 @@ impl From<FlyError> for CliError {
             FlyError::Mission(_) | FlyError::Plan(_) | FlyError::TooFewKeyframes(_) => Self::input(e),
             FlyError::Gpu(_) => Self::device(e),
             FlyError::Refine(models::refine::RefineError::Network(_)) => Self::device(e),
+            FlyError::Init(e) => e.into(),
             FlyError::Hal(_) => Self::input(e),
             _ => Self::failed(e),
         }

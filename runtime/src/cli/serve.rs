@@ -78,7 +78,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
     add_reception(&mut data, &reception);
     let readable = reception.received.iter().filter(|r| unreadable.iter().all(|u| u.0 != r.path));
     let locals: Vec<_> = readable.map(|r| (r.aircraft.clone(), r.path.clone())).collect();
-    args.settings.compare(&locals, &outcome, (&mut run, &mut data))?;
+    let metric = mission.network.metric.as_deref();
+    args.settings.compare(&locals, &outcome, metric, (&mut run, &mut data))?;
     for (path, why) in unreadable {
         data.warnings.push(format!("{} was received but cannot be used: {why}", path.display()));
     }

@@ -1,9 +1,10 @@
 //! `dgtr train DATASET --out DIR`: the onboard training, fed from a folder instead of an aircraft.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use config::init::InitSettings;
+use config::mission::NetworkSettings;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use models::dataset::PoseSource;
@@ -83,7 +84,7 @@ pub struct Args {
     /// Manifest of your own feed-forward network.
     #[arg(long = "model", value_name = "FILE")]
     network: Option<PathBuf>,
-    /// TOML file with any of the mission file's tables [training], [init], [refine].
+    /// TOML file with any of the mission file's tables [training], [init], [refine], [network].
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
     /// Seconds between two checkpoints.
@@ -104,6 +105,7 @@ struct Settings {
     training: TrainSettings,
     init: InitSettings,
     refine: RefineSettings,
+    network: NetworkSettings,
 }
 
 /// Runs `dgtr train`.
@@ -119,9 +121,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
             let bad = |what: String| CliError::from(FormatError::Invalid { path: path.clone(), what });
             let bytes = read_bounded(path, SETTINGS_LIMIT)?;
             let text = String::from_utf8(bytes).map_err(|_| bad("not UTF-8 text".to_owned()))?;
-            toml::from_str(&text).map_err(|e| bad(e.to_string()))?
+            let mut settings: Settings = toml::from_str(&text).map_err(|e| bad(e.to_string()))?;
+            settings.network.anchor(path.parent().unwrap_or(Path::new("")));
+            settings
         }
     };
+    if args.network.is_some() {
+        settings.network.pair = args.network;
+    }
     if let Some(seed) = args.seed {
         settings.training.seed = seed;
         settings.init.seed = seed;
@@ -147,7 +154,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         max_gaussians: args.max_gaussians,
         scale: args.scale,
         device: args.device,
-        network: args.network,
+        network: settings.network,
         checkpoint_seconds: args.checkpoint_seconds,
         fresh: args.fresh,
         evaluate: !args.no_eval,

@@ -13,6 +13,7 @@ use models::camera::{Intrinsics, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::init::{InitReport, Initialiser};
+use models::onnx::depth::DepthNetwork;
 use models::refine::{RefineReport, Refiner};
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{RunBudget, StepReport, Trainer};
@@ -55,6 +56,8 @@ pub struct Reconstruction {
     store: KeyframeStore,
     refiner: Refiner,
     initialiser: Initialiser,
+    /// The user's own network for the depth loss.
+    depth: Option<DepthNetwork>,
     trainer: Trainer,
     cloud: GaussianCloud,
     names: Vec<String>,
@@ -77,6 +80,10 @@ impl Reconstruction {
         refine.max_keyframes = refine.max_keyframes.max(max);
         let refiner = Refiner::open(&refine)?;
         let initialiser = Initialiser::open(&init, mission.network.pair.as_deref())?;
+        let size = (intrinsics.width, intrinsics.height);
+        let depth = mission.network.depth.as_deref().filter(|_| mission.training.loss.depth > 0.0);
+        let depth = depth.map(|path| DepthNetwork::open(path, size, init.max_side, init.threads)).transpose();
+        let depth = depth.map_err(models::init::InitError::Network)?;
         let gpu = Gpu::open(aircraft.device.as_deref())?;
         let plan = Plan::new(&PlanRequest {
             device_mib: mission.memory.device_mib,
@@ -101,6 +108,7 @@ impl Reconstruction {
             store,
             refiner,
             initialiser,
+            depth,
             trainer,
             cloud: GaussianCloud::with_capacity(mission.training.sh.degree, plan.gaussians),
             names: Vec::with_capacity(max),
@@ -168,7 +176,7 @@ impl Reconstruction {
         }
         self.initialiser.add(&posed)?;
         // The network runs on a picture once its neighbours are there; doing it now spreads the work over the flight.
-        self.initialiser.advance()?;
+        self.initialiser.advance(1)?;
         self.names.push(frame.name.clone());
         self.progress.init_s += clock.elapsed().as_secs_f64();
         Ok(())
@@ -255,10 +263,15 @@ impl Reconstruction {
             if let Some(lens) = self.refiner.intrinsics(&picture.name) {
                 picture.view.intrinsics = lens;
             }
-            let prior = fresh.depth_priors.iter().find(|(name, _)| *name == picture.name).map(|(_, prior)| prior);
-            self.trainer.add_view(&picture, prior)?;
+            let estimated = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose();
+            let estimated = estimated.map_err(models::init::InitError::Network)?;
+            let by_pairs = || fresh.depth_priors.iter().find(|(name, _)| *name == picture.name).map(|(_, prior)| prior);
+            self.trainer.add_view(&picture, estimated.as_ref().or_else(by_pairs))?;
             self.built.push(picture.view);
             self.header.views.push((picture.name, picture.view));
+        }
+        if let Some(network) = &mut self.depth {
+            network.close();
         }
         let refiner = &self.refiner;
         self.store.refine(|name| refiner.pose(name))?;

@@ -19,10 +19,15 @@ use crate::run_json::RunReport;
 /// Points of a random start (3DGS: 100,000).
 const RANDOM_POINTS: usize = 100_000;
 
+/// Depths made between two looks at whether somebody asked to stop.
+const DEPTHS_BETWEEN_STOPS: usize = 16;
+
 /// Gaussians and depth priors.
 pub(super) struct Start {
     pub cloud: GaussianCloud,
     pub priors: HashMap<String, DepthPrior>,
+    /// Name of the network that the priors come from; empty when there are none.
+    pub priors_by: String,
 }
 
 /// Where the pictures were taken from.
@@ -98,7 +103,7 @@ pub(super) fn start(
     report: &mut RunReport,
 ) -> Result<Option<Start>, CliError> {
     let from = Instant::now();
-    let needs_priors = job.training.loss.depth > 0.0;
+    let needs_priors = job.training.loss.depth > 0.0 && job.network.depth.is_none();
     let started = match (job.init, resumed) {
         (InitKind::FeedForward, Some(r)) if !needs_priors => Some(plain(r.cloud.clone())),
         (InitKind::FeedForward, r) => {
@@ -117,7 +122,7 @@ pub(super) fn start(
 }
 
 fn plain(cloud: GaussianCloud) -> Start {
-    Start { cloud, priors: HashMap::new() }
+    Start { cloud, priors: HashMap::new(), priors_by: String::new() }
 }
 
 fn feed_forward(
@@ -131,16 +136,31 @@ fn feed_forward(
 ) -> Result<Option<Start>, CliError> {
     let mut settings = job.init_settings.clone();
     settings.max_pictures = settings.max_pictures.max(frames.len());
-    let mut initialiser = Initialiser::open(&settings, job.network.as_deref())?;
+    let mut initialiser = Initialiser::open(&settings, job.network.pair.as_deref())?;
     initialiser.hint_points(posed.points.iter().map(|p| p.0));
-    let mut progress = Progress::new("initialising", frames.len() as u64);
+    let mut progress = Progress::new("initialising", 2 * frames.len() as u64);
     for (done, &i) in frames.iter().enumerate() {
         if stop.requested() {
             return Ok(None);
         }
-        initialiser.add(&job.posed(set, i, &posed.poses)?)?;
-        initialiser.advance()?;
+        let decoding = Instant::now();
+        let picture = job.posed(set, i, &posed.poses)?;
+        report.stage("decode", decoding);
+        initialiser.add(&picture)?;
         progress.set(done as u64 + 1, || set.frames[i].name.clone());
+    }
+    // With all pictures there, every depth is made once, from its best partners, on all threads.
+    let mut done = frames.len();
+    loop {
+        let more = initialiser.advance(DEPTHS_BETWEEN_STOPS)?;
+        done += more;
+        progress.set(done as u64, || "depth".to_owned());
+        if more == 0 {
+            break;
+        }
+        if stop.requested() {
+            return Ok(None);
+        }
     }
     let made = initialiser.build(capacity)?;
     progress.finish(&format!(
@@ -152,7 +172,8 @@ fn feed_forward(
     report.skip("pairs", made.report.skipped.total() as u64);
     report.skip("depth_samples_inconsistent", made.report.removed as u64);
     report.more.insert("init".to_owned(), serde_json::to_value(&made.report).map_err(CliError::failed)?);
-    Ok(Some(Start { cloud: made.cloud, priors: made.depth_priors.into_iter().collect() }))
+    let priors_by = made.report.network;
+    Ok(Some(Start { cloud: made.cloud, priors: made.depth_priors.into_iter().collect(), priors_by }))
 }
 
 fn sparse(

@@ -1,6 +1,8 @@
 //! Starting, watching and ending `dgtr` processes.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod plane;
+
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};

@@ -132,6 +132,20 @@ fn zero_confidence_leaves_the_edge_out_and_the_others_alone() {
 }
 
 #[test]
+fn no_confidence_anywhere_gives_no_scale_and_no_map_rather_than_a_guess() {
+    let mut rng = Pcg64Mcg::seed_from_u64(8);
+    let views = [view(0.0, 0.0, 0.0), view(15.0, 0.0, 0.0), view(30.0, 0.0, 0.0)];
+    for confidence in [0.0, f32::NAN, -1.0] {
+        let mut edges =
+            vec![edge(&views, 0, 1, 20.0, 0.0, 0.001, &mut rng), edge(&views, 1, 2, 50.0, 0.0, 0.001, &mut rng)];
+        edges.iter_mut().flat_map(|e| &mut e.maps).for_each(|m| m.confidence.fill(confidence));
+        let a = align(&views, &edges, 500);
+        assert!(a.sigma.iter().all(Option::is_none) && a.maps.iter().all(Option::is_none), "{confidence}: {a:?}");
+        assert_eq!(a.mean_residual, 0.0);
+    }
+}
+
+#[test]
 fn pure_rotation_and_duplicates_have_no_scale_of_their_own() {
     let mut rng = Pcg64Mcg::seed_from_u64(6);
     let views = [view(0.0, 0.0, 0.0), view(0.0, 0.0, 0.2)];

@@ -4,18 +4,21 @@
 use std::time::Instant;
 
 use config::init::InitSettings;
+use rayon::prelude::*;
 
 use super::{Initialiser, VOXELS_PER_GAUSSIAN};
 use crate::camera::{DepthPrior, View};
-use crate::init::consistency::resolve;
+use crate::init::consistency::{ConsistencyCount, resolve};
 use crate::init::fill::continued;
 use crate::init::frame::unproject;
-use crate::init::merge::VoxelMerge;
+use crate::init::merge::{Sample, VoxelMerge};
 use crate::init::pairs::{SkippedPairs, partners};
 use crate::init::report::Initialisation;
 use crate::init::samples::samples;
 use crate::init::{InitError, finish};
 
+/// Pictures that are checked at once, while as many others are being merged.
+pub(super) const AHEAD: usize = 2;
 /// Views that a depth is compared with.
 const WITNESSES: usize = 6;
 /// Edge of the finest voxels, in sample spacings.
@@ -41,55 +44,39 @@ impl Initialiser {
         let (edge, global_scale) = spacing.get(spacing.len() / 2).copied().unwrap_or((1.0, 1.0));
         let capacity = max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN);
         let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), capacity);
-        let mut depth_priors = Vec::new();
+        let mut depth_priors = Vec::with_capacity(self.frames.len());
         let report = &mut self.report;
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
-        for i in 0..self.frames.len() {
-            let Some(own) = &self.frames[i].depth else { continue };
-            let resolved = if self.settings.consistency {
-                let depth = self
-                    .settings
-                    .depth_m
-                    .or_else(|| self.range.of(&views[i]))
-                    .map_or(1.0, |[n, f]| f64::from(2.0 / (1.0 / n + 1.0 / f)));
-                let wide = InitSettings { covisible: WITNESSES, ..self.settings.clone() };
-                let mut others = partners(i, &views, depth, &wide, &mut SkippedPairs::default());
-                others.truncate(WITNESSES);
-                let others: Vec<usize> = others.into_iter().map(|o| o.0).collect();
-                let fill = match self.settings.depth_m.or_else(|| self.range.of(&views[i])) {
-                    Some(range) if self.settings.fill => continued(own, range),
-                    _ => None,
-                };
-                resolve(&self.frames, i, &others, self.settings.depth_tolerance, fill.as_deref()).map(
-                    |(grid, count)| {
-                        report.filled += count.filled;
-                        report.supported += count.supported;
-                        report.alone += count.alone;
-                        report.removed += count.removed;
-                        grid
-                    },
-                )
-            } else {
-                None
+        (report.consistency_ms, report.samples_ms, report.voxels_ms) = (0.0, 0.0, 0.0);
+        let with_depth: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].depth.is_some()).collect();
+        // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
+        let mut waiting: Vec<Checked> = Vec::new();
+        for next in with_depth.chunks(AHEAD).map(Some).chain([None]) {
+            let this = &*self;
+            let check = || -> Vec<Checked> {
+                next.unwrap_or(&[]).par_iter().filter_map(|&i| this.check(i, &views, global_scale)).collect()
             };
-            let grid = resolved.as_ref().unwrap_or(own);
-            for sample in samples(
-                &self.frames[i],
-                grid,
-                self.appearance.get(i).and_then(Option::as_ref),
-                &self.settings,
-                global_scale,
-            ) {
-                report.samples += 1;
-                merge.push(sample);
+            let sort = || {
+                let started = Instant::now();
+                waiting.iter().flat_map(|c| &c.samples).for_each(|s| merge.push(*s));
+                started.elapsed().as_secs_f64() * 1e3
+            };
+            let (checked, voxels_ms) = rayon::join(check, sort);
+            let report = &mut self.report;
+            report.voxels_ms += voxels_ms;
+            for done in std::mem::replace(&mut waiting, checked) {
+                report.consistency_ms += done.consistency_ms;
+                report.samples_ms += done.samples_ms;
+                report.samples += done.samples.len();
+                report.supported += done.count.supported;
+                report.alone += done.count.alone;
+                report.removed += done.count.removed;
+                report.filled += done.count.filled;
+                depth_priors.push((self.frames[done.index].name.clone(), done.prior));
             }
-            let (width, height) = (grid.width as u32, grid.height as u32);
-            let grid = grid.clone();
-            depth_priors.push((
-                self.frames[i].name.clone(),
-                DepthPrior { width, height, depth: grid.depth, confidence: grid.confidence },
-            ));
         }
+        let report = &mut self.report;
+        let cutting = Instant::now();
         report.voxels = merge.len();
         report.voxel_m = merge.edge();
         report.dropped_samples = merge.dropped();
@@ -98,10 +85,50 @@ impl Initialiser {
         let (cloud, abnormal) = finish::cloud(&merged, self.settings.max_scale_ratio);
         report.abnormal = abnormal;
         report.gaussians = cloud.len();
+        report.cloud_ms = cutting.elapsed().as_secs_f64() * 1e3;
         report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
-        report.planned_bytes = 0;
         let planned = self.planned_bytes(self.frames.len(), max_gaussians);
         self.report.planned_bytes = planned;
         Ok(Initialisation { cloud, depth_priors, report: self.report.clone() })
     }
+
+    /// The depths of picture `i` after comparison with the pictures that see the same ground, as samples and as a prior.
+    fn check(&self, i: usize, views: &[View], global_scale: f32) -> Option<Checked> {
+        let started = Instant::now();
+        let own = self.frames[i].depth.as_ref()?;
+        let range = self.known_range(i);
+        let mut count = ConsistencyCount::default();
+        let mut grid = None;
+        if self.settings.consistency {
+            let depth = self.typical_depth(i).unwrap_or(1.0);
+            let wide = InitSettings { covisible: WITNESSES, ..self.settings.clone() };
+            let mut others = partners(i, views, depth, &wide, &mut SkippedPairs::default());
+            others.truncate(WITNESSES);
+            let others: Vec<usize> = others.into_iter().map(|o| o.0).collect();
+            let fill = range.filter(|_| self.settings.fill).and_then(|range| continued(own, range));
+            if let Some((resolved, found)) =
+                resolve(&self.frames, i, &others, self.settings.depth_tolerance, fill.as_deref())
+            {
+                (grid, count) = (Some(resolved), found);
+            }
+        }
+        let grid = grid.unwrap_or_else(|| own.clone());
+        let consistency_ms = started.elapsed().as_secs_f64() * 1e3;
+        let appearance = self.appearance.get(i).and_then(Option::as_ref);
+        let samples = samples(&self.frames[i], &grid, appearance, &self.settings, global_scale);
+        let samples_ms = started.elapsed().as_secs_f64() * 1e3 - consistency_ms;
+        let (width, height) = (grid.width as u32, grid.height as u32);
+        let prior = DepthPrior { width, height, depth: grid.depth, confidence: grid.confidence };
+        Some(Checked { index: i, samples, prior, count, consistency_ms, samples_ms })
+    }
+}
+
+/// A picture whose depths have been compared with the others'.
+struct Checked {
+    index: usize,
+    samples: Vec<Sample>,
+    prior: DepthPrior,
+    count: ConsistencyCount,
+    consistency_ms: f64,
+    samples_ms: f64,
 }

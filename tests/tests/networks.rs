@@ -1,0 +1,104 @@
+//! The user's own networks of contracts `metric` and `depth`, named in a settings file or on the command line.
+
+mod support;
+
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+use support::plane::plane_dataset;
+use support::{refused, run};
+
+fn network(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/networks").join(name)
+}
+
+/// Trains a few steps on the plane in `at`; `settings` is the text of `--settings`. Returns `run.json`.
+fn train(at: &Path, out: &str, settings: &str) -> Value {
+    let file = format!("{out}.toml");
+    std::fs::write(at.join(&file), settings).expect("settings");
+    let budget = ["--steps", "6", "--max-gaussians", "6000", "--budget-mib", "64"];
+    let output = run(at, &[&["train", "set", "--out", out, "--settings", &file], &budget[..]].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    read_json(&at.join(out).join("run.json"))
+}
+
+fn read_json(path: &Path) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(path).expect("run.json")).expect("JSON")
+}
+
+#[test]
+fn a_metric_of_the_users_is_reported_under_its_own_name_per_view_and_in_run_json() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let at = dir.path();
+    plane_dataset(&at.join("set"), 2);
+    let metric = network("mean_square.toml");
+    let trained = train(at, "out", &format!("[network]\nmetric = {metric:?}\n"));
+    assert_eq!(trained["perceptual"]["name"], "mean-square", "{trained}");
+    let metric = metric.display().to_string();
+    let output = run(at, &["eval", "out/model.dgtr", "set", "--json", "--metric", &metric]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let scores: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(scores["perceptual"]["name"], "mean-square");
+    let views = scores["views"].as_array().expect("views");
+    assert!(views.len() >= 2, "{scores}");
+    let mut sum = 0.0;
+    for view in views {
+        // PSNR of the same two pictures is −10 log₁₀ of exactly this metric: no other pictures were compared.
+        let (distance, psnr) = (view["perceptual"].as_f64().expect("distance"), view["psnr"].as_f64().expect("psnr"));
+        assert!((-10.0 * distance.log10() - psnr).abs() < 1e-3, "{view}");
+        sum += distance;
+    }
+    let mean = scores["perceptual"]["mean"].as_f64().expect("mean");
+    assert!((mean - sum / views.len() as f64).abs() < 1e-9);
+    assert!((trained["perceptual"]["mean"].as_f64().expect("mean") - mean).abs() < 1e-9);
+    // Without a metric there is no such figure, rather than a zero.
+    let output = run(at, &["eval", "out/model.dgtr", "set", "--json"]);
+    assert!(!String::from_utf8_lossy(&output.stdout).contains("perceptual"));
+}
+
+#[test]
+fn the_depth_loss_listens_to_the_users_depth_network_else_to_the_pair_network() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let at = dir.path();
+    plane_dataset(&at.join("set"), 1);
+    let depth = network("random_depth.toml");
+    let by_pairs = train(at, "pairs", "");
+    let by_depth = train(at, "depth", &format!("[network]\ndepth = {depth:?}\n"));
+    let off = train(at, "off", &format!("[network]\ndepth = {depth:?}\n[training.loss]\ndepth = 0.0\n"));
+    let prior = |run: &Value| run["depth_prior"]["name"].as_str().map(str::to_owned);
+    assert_eq!(prior(&by_pairs).as_deref(), Some("plane-sweep"), "{by_pairs}");
+    assert_eq!(prior(&by_depth).as_deref(), Some("random-depth"));
+    assert_eq!(by_depth["depth_prior"]["views"], by_depth["views"]);
+    // A random network's depth says nothing about the ground: its correlation costs more than the pair network's.
+    let loss = |run: &Value| run["loss"].as_f64().expect("loss");
+    assert!(loss(&by_depth) > loss(&by_pairs) + 0.005, "{} {}", loss(&by_depth), loss(&by_pairs));
+    assert!(loss(&off) < loss(&by_pairs), "{} {}", loss(&off), loss(&by_pairs));
+}
+
+#[test]
+fn networks_that_do_not_fit_are_refused_in_one_line_before_anything_begins() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let at = dir.path();
+    plane_dataset(&at.join("set"), 1);
+    let train = |settings: String, words: &[&str]| {
+        std::fs::write(at.join("s.toml"), settings).expect("settings");
+        refused(at, &["train", "set", "--out", "o", "--settings", "s.toml", "--max-gaussians", "6000"], 2, words);
+        assert!(!at.join("o").exists(), "nothing is written before the networks are known to fit");
+    };
+    let (metric, depth) = (network("mean_square.toml"), network("random_depth.toml"));
+    train(format!("[network]\ndepth = {metric:?}\n"), &["mean_square.toml", "is `metric`, needed is `depth`"]);
+    train(format!("[network]\nmetric = {depth:?}\n"), &["random_depth.toml", "is `depth`, needed is `metric`"]);
+    train("[network]\ndepth = \"nowhere.toml\"\n".to_owned(), &["nowhere.toml"]);
+    // The right contract around the wrong network: a relative path is relative to the file that names it.
+    let wrong = |name: &str, contract: &str, file: &str| {
+        let file = network(file);
+        let text = format!(
+            "name='w'\ncontract='{contract}'\nfile={file:?}\nlicence='x'\n[input]\nrange=[0,1]\nmultiple=4\n[depth]\ninverse=false\n"
+        );
+        std::fs::write(at.join(name), text).expect("manifest");
+    };
+    wrong("wrong_depth.toml", "depth", "mean_square.onnx");
+    train("[network]\ndepth = \"wrong_depth.toml\"\n".to_owned(), &["input `image` is missing (there are: a, b)"]);
+    wrong("wrong_metric.toml", "metric", "random_depth.onnx");
+    train("[network]\nmetric = \"wrong_metric.toml\"\n".to_owned(), &["input `image0` is missing"]);
+}
