@@ -103,6 +103,7 @@ impl TrainSettings {
             ("regularise.noise", self.regularise.noise),
             ("regularise.opacity_decay", self.regularise.opacity_decay),
             ("density.growth", self.density.growth),
+            ("density.spread", self.density.spread),
         ];
         for (name, value) in non_negative {
             within(name, value, 0.0, f32::MAX)?;

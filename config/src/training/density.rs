@@ -32,6 +32,9 @@ pub struct DensitySettings {
     pub until: f32,
     /// At most this share of the present Gaussians is added at one densification.
     pub growth: f32,
+    /// A copy begins this far from its source, in standard deviations drawn from the source's own Gaussian. In a
+    /// schedule of a few hundred steps two Gaussians at one place would not part in time.
+    pub spread: f32,
     /// A Gaussian below this opacity is dead.
     pub dead_opacity: f32,
     /// Share of the plan's Gaussians from which on an initialisation counts as dense.
@@ -46,6 +49,7 @@ impl Default for DensitySettings {
             at_least: 6,
             until: 0.7,
             growth: 0.2,
+            spread: 0.5, // Brush; +0.4 dB on fox at 1,000 steps against copies at the same place (3DGS-MCMC)
             dead_opacity: 0.005, // 3DGS and 3DGS-MCMC min_opacity
             dense_share: 0.5,
         }

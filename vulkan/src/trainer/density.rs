@@ -1,11 +1,12 @@
 //! Density control under the hard cap, on the host between two steps: dead Gaussians move onto live ones and free rows
 //! are filled by splitting, both with the opacity and scale that leave the picture unchanged (3DGS-MCMC, Kheradmand et
-//! al. 2024, eq. 9); or dead ones are only removed.
+//! al. 2024, eq. 9) where they lie close together; or dead ones are only removed.
 
 use super::rows::GEOMETRY;
 use super::{TrainError, Trainer};
 use crate::trainer::frame::DEFERRED_STEPS;
 use config::training::Strategy;
+use glam::{Quat, Vec3};
 use rand::Rng;
 
 /// Copies of one Gaussian that the formula is tabulated for (as the reference implementation's `N_max`).
@@ -200,16 +201,46 @@ impl Trainer {
         }
         for i in 0..self.density.moves.len() {
             let [from, to] = self.density.moves[i].map(|v| v as usize);
-            if to == u32::MAX as usize {
-                rows.copy(&mut self.arena, from, self.gaussians);
+            let to = if to == u32::MAX as usize {
                 self.gaussians += 1;
                 self.totals.counters.added += 1;
+                self.gaussians - 1
             } else {
-                rows.copy(&mut self.arena, from, to);
                 self.totals.counters.relocated += 1;
+                to
+            };
+            rows.copy(&mut self.arena, from, to);
+            self.displace(to);
+        }
+    }
+
+    /// Moves a copy to a place drawn from the Gaussian it was copied from.
+    fn displace(&mut self, row: usize) {
+        let spread = self.settings.density.spread;
+        if spread <= 0.0 {
+            return;
+        }
+        let g = &mut self.arena.slice_mut::<[f32; 4]>(self.rows.geometry)[row * GEOMETRY..row * GEOMETRY + 3];
+        let [w, x, y, z] = g[2];
+        let rotation = Quat::from_xyzw(x, y, z, w).normalize();
+        let rng = self.sampler.rng();
+        // A Gaussian larger than the scene (log scales may be 40) sends no copy out of it.
+        let extent = self.extent;
+        let along = [0, 1, 2].map(|k| g[1][k].exp().min(extent) * normal(rng) * spread);
+        let offset = rotation * Vec3::from(along);
+        // A zero quaternion has no direction: the copy then stays where its source is.
+        if offset.is_finite() {
+            for (mean, offset) in g[0].iter_mut().zip(offset.to_array()) {
+                *mean += offset;
             }
         }
     }
+}
+
+/// A number of mean 0 and variance 1, at most 6 from 0 (Irwin and Hall): the same bits on every platform, as no
+/// library's logarithm takes part.
+fn normal(rng: &mut impl Rng) -> f32 {
+    (0..12).map(|_| rng.random_range(0.0..1.0f32)).sum::<f32>() - 6.0
 }
 
 #[cfg(test)]
