@@ -16,7 +16,7 @@ const ROLE: &str = "DGTR_TEST_ROLE";
 
 /// Two views, growth, relocation and noise: everything that draws random numbers.
 fn growing(steps: u32) -> Option<Trainer> {
-    let v = view(96, 64);
+    let v = view(64, 48);
     let mut settings = plain();
     settings.density.strategy = config::training::Strategy::Relocate;
     settings.steps = steps;
