@@ -134,3 +134,20 @@ impl Projector {
         (c.z > 1e-6).then(|| (c.x / c.z * self.k.fx + self.k.cx, c.y / c.z * self.k.fy + self.k.cy, c.z))
     }
 }
+
+/// Largest shift, in pixels, of the reference's corners and centre in the source between two pairs of poses.
+pub fn shift(reference: &View, source: &View, old_reference: &View, old_source: &View, depth: f32) -> f32 {
+    let (w, h) = (reference.intrinsics.width as f32, reference.intrinsics.height as f32);
+    let (new, old) = (Projector::new(source), Projector::new(old_source));
+    [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h), (w / 2.0, h / 2.0)]
+        .into_iter()
+        .map(|(x, y)| {
+            let a = new.project(unproject(reference, x, y, depth));
+            let b = old.project(unproject(old_reference, x, y, depth));
+            match (a, b) {
+                (Some(a), Some(b)) => (a.0 - b.0).hypot(a.1 - b.1),
+                _ => f32::INFINITY,
+            }
+        })
+        .fold(0.0, f32::max)
+}

@@ -14,7 +14,7 @@ use crate::onnx::manifest::{Manifest, Poses};
 use crate::onnx::picture::{center_crop, resized};
 
 use super::InitError;
-use super::frame::{Frame, Projector, unproject};
+use super::frame::{Frame, shift};
 use super::pairs::{Relation, SkippedPairs, partners, relate};
 use super::posed::{NetworkBytes, PosedNetwork, Request};
 use super::range::DepthRange;
@@ -328,9 +328,7 @@ impl Initialiser {
                 self.report.unsound_depths += made.unsound;
                 self.report.runs += 1;
                 self.report.run_ms += made.run_ms;
-                let [near, far] = &mut self.report.depth_m;
-                *near = if *near > 0.0 { near.min(range[0]) } else { range[0] };
-                *far = far.max(range[1]);
+                self.report.searched(range);
             }
             let frame = &mut self.frames[i];
             frame.depth = made.map(|m| m.grid);
@@ -344,10 +342,11 @@ impl Initialiser {
     fn align_pairs(&mut self, views: &[View]) -> Result<(), InitError> {
         let mut pairs: Vec<[usize; 2]> = Vec::new();
         for i in 0..views.len() {
-            let Some(depth) = self.typical_depth(i) else {
+            let Some(range) = self.known_range(i) else {
                 return Err(InitError::NoRange { points: self.range.len() });
             };
-            let good = partners(i, views, depth, &self.settings, &mut SkippedPairs::default());
+            self.report.searched(range);
+            let good = partners(i, views, middle(range), &self.settings, &mut SkippedPairs::default());
             pairs.extend(good.into_iter().map(|(j, _)| [i.min(j), i.max(j)]));
         }
         pairs.sort_unstable();
@@ -387,21 +386,4 @@ impl Initialiser {
 /// The harmonic mean of a depth range: what half-way means in disparity.
 fn middle([near, far]: [f32; 2]) -> f64 {
     2.0 / (1.0 / f64::from(near) + 1.0 / f64::from(far))
-}
-
-/// Largest shift, in pixels, of the reference's corners and centre in the source between two pairs of poses.
-fn shift(reference: &View, source: &View, old_reference: &View, old_source: &View, depth: f32) -> f32 {
-    let (w, h) = (reference.intrinsics.width as f32, reference.intrinsics.height as f32);
-    let (new, old) = (Projector::new(source), Projector::new(old_source));
-    [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h), (w / 2.0, h / 2.0)]
-        .into_iter()
-        .map(|(x, y)| {
-            let a = new.project(unproject(reference, x, y, depth));
-            let b = old.project(unproject(old_reference, x, y, depth));
-            match (a, b) {
-                (Some(a), Some(b)) => (a.0 - b.0).hypot(a.1 - b.1),
-                _ => f32::INFINITY,
-            }
-        })
-        .fold(0.0, f32::max)
 }

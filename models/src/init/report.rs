@@ -39,7 +39,7 @@ pub struct InitReport {
     pub align_steps: usize,
     /// Unposed networks: mean distance between χ and the pairs' points, metres.
     pub align_residual_m: f64,
-    /// Nearest and farthest depth that any run was told to search, metres.
+    /// Nearest and farthest depth that any picture was looked at for, metres.
     pub depth_m: [f32; 2],
     /// Depths claimed by the network that were not positive finite numbers.
     pub unsound_depths: usize,
@@ -87,4 +87,12 @@ pub struct InitReport {
     pub merge_ms: f64,
     /// Host bytes planned.
     pub planned_bytes: u64,
+}
+
+impl InitReport {
+    /// Widens [`Self::depth_m`] to hold a picture's range.
+    pub(super) fn searched(&mut self, [near, far]: [f32; 2]) {
+        let all = &mut self.depth_m;
+        *all = if all[1] > 0.0 { [all[0].min(near), all[1].max(far)] } else { [near, far] };
+    }
 }
