@@ -111,15 +111,31 @@ pub enum MountAttitude {
 }
 
 /// How the camera sits on the aircraft.
-#[derive(Clone, Copy, Debug, Default, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MountSettings {
     /// Where the camera's attitude comes from.
     pub attitude: MountAttitude,
-    /// Roll, pitch, yaw of the optical axis against the airframe for a fixed mount, degrees; pitch −90 looks down.
+    /// Roll, pitch, yaw of the optical axis against the airframe for a fixed mount, degrees; pitch −90 looks down. For a
+    /// gimbal the pitch it is set to, only for `max_tilt_deg`; zeros = not known.
     pub rotation_deg: [f32; 3],
     /// Camera centre in the body, metres forward, left, up of the position the autopilot reports.
     pub lever_arm_m: [f32; 3],
+    /// Exposures are left out when the optical axis is further than this from where the mount points it on a level airframe,
+    /// degrees (ArduPilot's "trigger immediately" fires in turns); 180 = never.
+    pub max_tilt_deg: f32,
+}
+
+impl Default for MountSettings {
+    fn default() -> Self {
+        Self {
+            attitude: MountAttitude::Gimbal,
+            rotation_deg: [0.0; 3],
+            lever_arm_m: [0.0; 3],
+            // Beyond what an autopilot flies on purpose: ArduPlane's ROLL_LIMIT_DEG is 45, ArduCopter's ANGLE_MAX 30.
+            max_tilt_deg: 50.0,
+        }
+    }
 }
 
 /// The key-frame rule of the paper (after NeuralRecon): moved more than `t_min_m` **or** turned more than `r_max_deg`.

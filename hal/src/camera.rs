@@ -3,11 +3,13 @@
 mod exif;
 mod folder;
 mod jpeg;
+mod light;
 mod pipe;
 mod undistort;
 
 use std::io::{BufRead, Seek};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use config::mission::{CameraSettings, CameraSource};
 use image::{ImageReader, RgbImage};
@@ -15,6 +17,7 @@ use image::{ImageReader, RgbImage};
 pub use exif::{ExifPose, exif_pose};
 pub use folder::FolderCamera;
 pub use jpeg::{JpegSplitter, is_complete};
+pub use light::{Blank, blank};
 pub use pipe::PipeCamera;
 pub use undistort::undistort;
 
@@ -36,9 +39,17 @@ impl Picture {
     /// The undistorted pixels of a picture taken with `lens`.
     ///
     /// # Errors
+    /// As [`Picture::decode`].
+    pub fn load(&self, lens: &CameraSettings) -> Result<RgbImage, HalError> {
+        Ok(undistort(self.decode(lens)?, lens))
+    }
+
+    /// The pixels of a picture taken with `lens`, as they left the camera.
+    ///
+    /// # Errors
     /// [`HalError::Picture`] when it cannot be decoded or is not of the lens's size (checked before anything is
     /// allocated).
-    pub fn load(&self, lens: &CameraSettings) -> Result<RgbImage, HalError> {
+    pub fn decode(&self, lens: &CameraSettings) -> Result<RgbImage, HalError> {
         let image = match self {
             Self::Path(path) => {
                 let wrong = |e: std::io::Error| HalError::Picture { path: path.clone(), why: e.to_string() };
@@ -50,7 +61,7 @@ impl Picture {
         if image.dimensions() != (lens.width, lens.height) {
             return Err(wrong_size(&self.name(), image.dimensions(), lens));
         }
-        Ok(undistort(image, lens))
+        Ok(image)
     }
 
     /// File name, or a word for pixels without one.
@@ -91,13 +102,13 @@ pub enum AnyCamera {
 }
 
 impl AnyCamera {
-    /// Opens the mission's source of pictures.
+    /// Opens the mission's source of pictures; those of a folder that were written after `since` count as new.
     ///
     /// # Errors
     /// [`HalError::Camera`] when the folder is missing or the program cannot be started.
-    pub fn open(source: &CameraSource, lens: &CameraSettings) -> Result<Self, HalError> {
+    pub fn open(source: &CameraSource, lens: &CameraSettings, since: Option<SystemTime>) -> Result<Self, HalError> {
         Ok(match source {
-            CameraSource::Folder(path) => Self::Folder(FolderCamera::open(path)?),
+            CameraSource::Folder(path) => Self::Folder(FolderCamera::open_since(path, since)?),
             CameraSource::Command(command) => Self::Pipe(PipeCamera::start(command, (lens.width, lens.height))?),
         })
     }

@@ -119,7 +119,9 @@ impl CameraComponent {
             return;
         }
         let Some(m) = frame.message::<COMMAND_LONG_DATA>() else { return };
-        if m.target_system != own_system || (m.target_component != self.component && m.target_component != 0) {
+        // 0 is everybody: PX4 sends DO_DIGICAM_CONTROL to the cameras of all systems.
+        let to_us = |target: u8, us: u8| target == us || target == 0;
+        if !to_us(m.target_system, own_system) || !to_us(m.target_component, self.component) {
             return;
         }
         let result = self.command(&m, now_ns);

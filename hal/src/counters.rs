@@ -60,12 +60,20 @@ pub struct HalCounters {
     pub pictures: u64,
     /// Pictures that were broken, or never completed.
     pub pictures_broken: u64,
+    /// Pictures left out because they were black.
+    pub pictures_black: u64,
+    /// Pictures left out because more than half of them was clipped.
+    pub pictures_overexposed: u64,
+    /// Pictures left out because they were of one colour.
+    pub pictures_constant: u64,
     /// The same picture again.
     pub picture_duplicates: u64,
     /// Pictures without an exposure.
     pub pictures_unmatched: u64,
     /// Pictures that came out of order or late.
     pub pictures_late: u64,
+    /// Exposures left out because the camera was tilted beyond `mount.max_tilt_deg`.
+    pub exposures_tilted: u64,
     /// Exposures or pictures without a usable pose.
     pub poseless: u64,
     /// Frames given to the runtime.

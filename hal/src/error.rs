@@ -100,6 +100,14 @@ mod with_std {
             /// What is wrong with it.
             why: String,
         },
+        /// One picture that shows nothing.
+        #[error("picture {}: {blank}, left out; check lens cap, exposure and camera", path.display())]
+        Blank {
+            /// The file.
+            path: PathBuf,
+            /// What is wrong with its light.
+            blank: crate::camera::Blank,
+        },
     }
 
     impl Error for HalError {
@@ -108,7 +116,11 @@ mod with_std {
                 Self::Address { .. } | Self::Signing { .. } => ErrorKind::Invalid,
                 Self::Closed { .. } => ErrorKind::Closed,
                 Self::Full { .. } => ErrorKind::Busy,
-                Self::Open { .. } | Self::Link { .. } | Self::Camera { .. } | Self::Picture { .. } => ErrorKind::Device,
+                Self::Open { .. }
+                | Self::Link { .. }
+                | Self::Camera { .. }
+                | Self::Picture { .. }
+                | Self::Blank { .. } => ErrorKind::Device,
             }
         }
     }

@@ -8,6 +8,7 @@ mod reconnect;
 mod serial;
 mod tcp;
 mod udp;
+mod wire;
 
 use std::path::Path;
 use std::time::Duration;
@@ -19,6 +20,7 @@ pub use reconnect::Reconnecting;
 pub use serial::SerialLink;
 pub use tcp::TcpLink;
 pub use udp::UdpLink;
+pub use wire::WireLink;
 
 use crate::error::HalError;
 use crate::traits::{Link, Received};

@@ -190,11 +190,12 @@ impl<P> Matcher<P> {
         if let Some(outcome) = self.poll(end) {
             return Some(outcome);
         }
-        self.pictures.pop_front().map(|w| Outcome::Picture {
-            picture: w.picture,
-            clues: w.clues,
-            reason: Reason::NoTrigger,
-        })
+        if let Some(Waiting { picture, clues }) = self.pictures.pop_front() {
+            return Some(Outcome::Picture { picture, clues, reason: Reason::NoTrigger });
+        }
+        // Exposures whose time lies in a future that will not come.
+        let trigger = self.triggers.pop_front()?;
+        Some(Outcome::Trigger { trigger, reason: Reason::NoPicture })
     }
 
     fn decide(&self, clues: &PictureClues, now_ns: u64) -> Decision {

@@ -10,6 +10,7 @@ pub mod faulty_link;
 mod messages;
 pub mod photographer;
 pub mod reference;
+pub mod rehearsal;
 pub mod session;
 pub mod survey;
 pub mod track;
@@ -62,6 +63,15 @@ pub struct SimSettings {
 }
 
 impl SimSettings {
+    /// The autopilot's settings, with the seed and the drift of this aircraft.
+    fn autopilot(&self) -> AutopilotSettings {
+        AutopilotSettings {
+            seed: self.seed,
+            clock_drift_ppm: self.imperfections.clock_drift_ppm,
+            ..self.autopilot.clone()
+        }
+    }
+
     /// The flight these settings lead to.
     ///
     /// # Errors
@@ -107,12 +117,7 @@ pub fn run(
     let link = session::open(address, settings.seed, on_ready)?;
     let world = Arc::new(World::new(settings.world_seed, &settings.world));
     let camera = camera_over(world, &flight, &settings.lens, camera_dir, reference_dir, settings.seed)?;
-    let autopilot = AutopilotSettings {
-        seed: settings.seed,
-        clock_drift_ppm: settings.imperfections.clock_drift_ppm,
-        ..settings.autopilot.clone()
-    };
-    session::fly(Autopilot::new(link, flight, autopilot), Some(camera), &settings.session, stop)
+    session::fly(Autopilot::new(link, flight, settings.autopilot()), Some(camera), &settings.session, stop)
 }
 
 /// A camera that renders a flight's true views of `world`.
@@ -147,8 +152,6 @@ pub(crate) fn camera_over(
     Photographer::new(camera_dir, flight.exposures.clone(), seed, picture, afterwards)
 }
 
-#[cfg(test)]
-mod fault_table;
 #[cfg(test)]
 pub(crate) mod listener;
 #[cfg(test)]

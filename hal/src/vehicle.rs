@@ -18,13 +18,14 @@ pub use event::{CameraPose, Event, Frame, PoseReport, Unmatched, UnmatchedReason
 pub use settings::VehicleSettings;
 
 use crate::autopilot::{Autopilot, AutopilotState, Heard, Ids};
-use crate::camera::{AnyCamera, Picture};
+use crate::camera::{AnyCamera, Blank, Picture, blank, undistort};
 use crate::counters::HalCounters;
 use crate::error::HalError;
 use crate::failsafe::Flags;
 use crate::link::Reconnecting;
 use crate::matcher::{Matcher, MatcherSettings};
 use crate::mavlink::channel::Channel;
+use crate::mavlink::dialect::MavSeverity;
 use crate::time::MonotonicClock;
 use crate::traits::{Camera, Clock, Link, LinkState, TriggerSource};
 use exposures::{Exposures, PendingFrame};
@@ -38,10 +39,11 @@ const PENDING: usize = 32;
 /// The link is read in slices of this, so that pictures and timers are served while it is silent.
 const SLICE: Duration = Duration::from_millis(20);
 
-/// A position worse than this does not place a picture, m; that many exposures in a row without a picture mean a silent
-/// camera; and ArduPilot's customary low battery, percent.
+/// A position worse than this does not place a picture, m; that many exposures in a row without a picture, or pictures
+/// that show nothing, mean that the camera needs somebody; and ArduPilot's customary low battery, percent.
 const POOR_SIGMA_M: f64 = 20.0;
 const SILENT_CAMERA: u32 = 3;
+const POOR_PICTURES: u32 = 3;
 const LOW_BATTERY: u8 = 20;
 
 /// The driver. `Vehicle` alone means the real thing: any link, any camera, the monotonic clock.
@@ -63,6 +65,8 @@ pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
     texts: u16,
     /// Exposures in a row without a picture.
     pictureless: u32,
+    /// Pictures in a row that showed nothing or could not be decoded.
+    poor: u32,
     finished: bool,
     counters: HalCounters,
 }
@@ -76,7 +80,7 @@ impl Vehicle {
     pub fn open(settings: &VehicleSettings) -> Result<Self, HalError> {
         let link = Reconnecting::open(settings.address.clone(), settings.patient)?;
         let camera = match &settings.camera {
-            Some(source) => AnyCamera::open(source, &settings.lens)?,
+            Some(source) => AnyCamera::open(source, &settings.lens, settings.pictures_since)?,
             None => AnyCamera::None,
         };
         Self::new(link, camera, MonotonicClock::default(), settings)
@@ -124,6 +128,7 @@ where
             link_losses: 0,
             texts: 0,
             pictureless: 0,
+            poor: 0,
             finished: false,
             counters: HalCounters::default(),
         })
@@ -175,6 +180,7 @@ where
             link_lost: self.lost && state.heartbeat_ns.is_some(),
             position_poor: state.gps_fix.is_some_and(|fix| fix < 3) || sigma.is_some_and(|s| s > POOR_SIGMA_M),
             camera_silent: self.pictureless >= SILENT_CAMERA,
+            pictures_poor: self.poor >= POOR_PICTURES,
             battery_low: state.battery_percent.is_some_and(|p| p <= LOW_BATTERY),
             ..Flags::default()
         }
@@ -190,12 +196,28 @@ where
         self.autopilot.state()
     }
 
-    /// Undistorted pixels of a frame.
+    /// Undistorted pixels of a frame. One that shows nothing is counted and the ground control station told.
     ///
     /// # Errors
-    /// [`HalError::Picture`] when it cannot be decoded or has the wrong size.
-    pub fn load(&self, frame: &Frame) -> Result<image::RgbImage, HalError> {
-        frame.picture.load(&self.settings.lens)
+    /// [`HalError::Picture`] when it cannot be decoded or has the wrong size, [`HalError::Blank`] when it shows nothing.
+    pub fn load(&mut self, frame: &Frame) -> Result<image::RgbImage, HalError> {
+        let decoded = frame.picture.decode(&self.settings.lens);
+        let blank = decoded.as_ref().ok().and_then(blank);
+        self.poor = if blank.is_some() || decoded.is_err() { self.poor.saturating_add(1) } else { 0 };
+        if let Some(blank) = blank {
+            let path = frame.picture.name();
+            *match blank {
+                Blank::Black => &mut self.counters.pictures_black,
+                Blank::Overexposed => &mut self.counters.pictures_overexposed,
+                Blank::Constant => &mut self.counters.pictures_constant,
+            } += 1;
+            if self.service.may_complain(self.now_ns()) {
+                let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+                self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &format!("dgtr: {name} is {blank}, left out"));
+            }
+            return Err(HalError::Blank { path, blank });
+        }
+        Ok(undistort(decoded?, &self.settings.lens))
     }
 
     /// Everything counted so far.
@@ -215,6 +237,10 @@ where
             triggers_unmatched: heard.triggers_unmatched + own.triggers_unmatched,
             pictures: own.pictures,
             pictures_broken: own.pictures_broken,
+            pictures_black: own.pictures_black,
+            pictures_overexposed: own.pictures_overexposed,
+            pictures_constant: own.pictures_constant,
+            exposures_tilted: own.exposures_tilted,
             picture_duplicates: own.picture_duplicates,
             pictures_unmatched: own.pictures_unmatched,
             pictures_late: own.pictures_late,
@@ -286,6 +312,9 @@ where
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
 
 /// Adds an event, dropping the oldest when nobody fetches them; returns how many were dropped.
 fn push(events: &mut VecDeque<Event>, event: Option<Event>) -> u64 {

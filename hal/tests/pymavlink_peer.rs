@@ -66,6 +66,7 @@ fn talk(python: &Path, signing: Signing, peer_key: Option<&str>) -> (serde_json:
         system_id: 1,
         link: LinkSettings { signing, signing_key: Some(key), ..LinkSettings::default() },
         camera: None,
+        pictures_since: None,
         lens: CameraSettings {
             width: 640,
             height: 480,

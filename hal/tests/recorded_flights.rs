@@ -92,6 +92,7 @@ fn settings(path: &Path) -> VehicleSettings {
         system_id: 1,
         link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
         camera: None,
+        pictures_since: None,
         lens: CameraSettings {
             width: 640,
             height: 480,

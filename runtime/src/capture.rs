@@ -21,6 +21,8 @@ pub enum Decision {
     BadPose,
     /// There are as many key frames as were planned for.
     Full,
+    /// It would have been a key frame, but shows nothing or cannot be decoded.
+    Unusable,
 }
 
 /// How many pictures met which fate.
@@ -36,6 +38,8 @@ pub struct KeyframeCounters {
     pub bad_pose: u32,
     /// Beyond the planned number.
     pub full: u32,
+    /// Showed nothing, or could not be decoded.
+    pub unusable: u32,
 }
 
 /// Chooses key frames; its memory is planned from [`KeyframeSettings::max`].
@@ -68,12 +72,22 @@ impl KeyframeSelector {
             Decision::Covered => &mut self.counters.covered,
             Decision::BadPose => &mut self.counters.bad_pose,
             Decision::Full => &mut self.counters.full,
+            Decision::Unusable => &mut self.counters.unusable,
         };
         *counter += 1;
         if decision == Decision::Key {
             self.chosen.push(*pose);
         }
         decision
+    }
+
+    /// Takes back the key frame chosen last: its picture turned out to show nothing.
+    pub fn retract(&mut self) -> Decision {
+        if self.chosen.pop().is_some() {
+            self.counters.key = self.counters.key.saturating_sub(1);
+            self.counters.unusable += 1;
+        }
+        Decision::Unusable
     }
 
     /// What has been counted so far.
@@ -140,6 +154,16 @@ mod tests {
         }
         assert_eq!(s.consider(&at(1.0, 5.0)), Decision::Covered);
         assert_eq!(s.consider(&at(1.0, 180.0)), Decision::Key);
+    }
+
+    #[test]
+    fn a_picture_that_shows_nothing_gives_its_place_to_the_next() {
+        let mut s = selector(10);
+        assert_eq!(s.consider(&at(0.0, 0.0)), Decision::Key);
+        assert_eq!(s.consider(&at(6.0, 0.0)), Decision::Key);
+        assert_eq!(s.retract(), Decision::Unusable);
+        assert_eq!(s.consider(&at(7.0, 0.0)), Decision::Key);
+        assert_eq!((s.counters().key, s.counters().unusable), (2, 1));
     }
 
     #[test]

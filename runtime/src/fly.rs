@@ -1,26 +1,33 @@
 //! `dgtr fly`: the onboard job. While pictures come in, the reconstruction already refines, initialises, trains, saves
 //! and offers; after landing it finishes the schedule. Ctrl-C at any moment leaves a valid model behind.
 
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::{Duration, SystemTime};
 
 use config::mission::{Aircraft, Mission};
-use hal::failsafe::{self, Action};
-use hal::mavlink::dialect::MavSeverity;
+use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
 use models::camera::Intrinsics;
-use vulkan::trainer::{RunBudget, StepReport};
+use vulkan::trainer::RunBudget;
 
 mod carry;
 mod error;
 mod flight;
 mod geotags;
+mod handover;
 mod health;
+mod intake;
+mod job;
 mod reconstruction;
+
+#[cfg(test)]
+mod fault_table;
+#[cfg(test)]
+mod rehearsal;
 
 pub use error::FlyError;
 pub use flight::{EndOfFlight, Ended, FlightCounters};
+pub use handover::Handover;
 pub use reconstruction::{Progress, Reconstruction};
 
 use crate::interrupt::Interrupt;
@@ -28,11 +35,8 @@ use crate::upload::Offerer;
 use flight::{Flight, FlightPlan};
 use geotags::Geotags;
 use health::Health;
+use job::{Job, JobEnd};
 
-/// Between two checkpoints: what a power cut may cost.
-const CHECKPOINT_EVERY: Duration = Duration::from_secs(15);
-/// Between two lines to the ground control station.
-const SAY_EVERY: Duration = Duration::from_secs(10);
 /// How long a finished aircraft keeps its model on offer for the ground to fetch.
 const DELIVERY: Duration = Duration::from_secs(120);
 
@@ -94,8 +98,10 @@ pub fn fly(
     let reconstruction = Reconstruction::open(mission, aircraft, &intrinsics, &options.out)?;
     let offerer = Offerer::start(&mission.upload, &mission.name, &aircraft.id)?;
     let flight = Flight::start(FlightPlan {
-        vehicle: VehicleSettings::from_mission(mission, aircraft)?,
-        lens: mission.camera,
+        vehicle: VehicleSettings {
+            pictures_since: last_saved(&options.out),
+            ..VehicleSettings::from_mission(mission, aircraft)?
+        },
         intrinsics,
         keyframes: mission.keyframes,
         earlier: reconstruction.store().poses(),
@@ -104,245 +110,40 @@ pub fn fly(
     })?;
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };
-    let job = Job {
-        reconstruction,
-        offerer,
-        out: options.out.clone(),
-        budget,
-        health: Health::new(mission.memory.host_mib),
-        failsafe: failsafe::State::default(),
-        training_failed: false,
-        started: Instant::now(),
-        last_save: Instant::now(),
-        last_said: None,
-    };
-    job.run(flight, interrupt)
+    let health = Health::new(mission.memory.host_mib);
+    let mut job = Job::new(reconstruction, offerer, &options.out, budget, health, MonotonicClock::default());
+    while job.turn(flight.handover(), interrupt)? {}
+    let (ended, counters) = flight.finish()?;
+    tracing::info!("capture is over ({ended:?}): {} key frames", job.keyframes());
+    let end = job.land(interrupt)?;
+    Ok(outcome(ended, counters, end, interrupt))
 }
 
-struct Job {
-    reconstruction: Reconstruction,
-    offerer: Offerer,
-    out: PathBuf,
-    budget: RunBudget,
-    health: Health,
-    failsafe: failsafe::State,
-    /// The device failed; the last checkpoint is what there is.
-    training_failed: bool,
-    started: Instant,
-    last_save: Instant,
-    last_said: Option<Instant>,
+/// Waits for the ground to have the finished model, then says what became of everything.
+fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, interrupt: &Interrupt) -> FlyOutcome {
+    let JobEnd { reconstruction, offerer, model, gaussians, finished } = end;
+    let delivered = finished && offerer.wait_delivered(DELIVERY, || !interrupt.requested());
+    offerer.shutdown();
+    let trainer = reconstruction.trainer();
+    FlyOutcome {
+        model,
+        gaussians,
+        ended,
+        finished,
+        delivered,
+        flight,
+        keyframes: reconstruction.keyframes(),
+        device_bytes: [trainer.plan().total_bytes, trainer.device_bytes()],
+        device: trainer.gpu().info().name.clone(),
+        stage_ms: trainer.stage_ms().to_vec(),
+        progress: reconstruction.progress().clone(),
+    }
 }
 
-impl Job {
-    fn run(mut self, flight: Flight, interrupt: &Interrupt) -> Result<FlyOutcome, FlyError> {
-        while flight.is_flying() && !interrupt.requested() {
-            self.take(&flight)?;
-            match self.watch(&flight)? {
-                Action::StopTraining | Action::UploadBest | Action::Hold => {
-                    std::thread::sleep(Duration::from_millis(50));
-                    continue;
-                }
-                _ => {}
-            }
-            let worked = self.reconstruct(&flight, interrupt);
-            self.survive(worked)?;
-        }
-        // What capture still hands over, until its thread has nothing left.
-        while !interrupt.requested() && (flight.waiting() > 0 || flight.is_flying()) {
-            self.take(&flight)?;
-        }
-        let (ended, counters) = flight.finish()?;
-        tracing::info!("capture is over ({ended:?}): {} key frames", self.reconstruction.keyframes());
-        if !self.training_failed {
-            let landed = self.land(interrupt);
-            self.survive(landed)?;
-        }
-        let finished = self.reconstruction.has_model() && !interrupt.requested() && !self.training_failed;
-        self.report(ended, counters, finished, interrupt)
-    }
-
-    fn reconstruct(&mut self, flight: &Flight, interrupt: &Interrupt) -> Result<(), FlyError> {
-        if self.reconstruction.wants_build(false) {
-            self.build(flight)?;
-        }
-        self.train(flight, interrupt)
-    }
-
-    /// A device that fails in flight must not end the capture: once there is a checkpoint, it is offered instead.
-    fn survive(&mut self, worked: Result<(), FlyError>) -> Result<(), FlyError> {
-        match worked {
-            Err(FlyError::Train(e)) if model_path(&self.out).is_file() => {
-                tracing::error!("{e}; training is over, the last checkpoint is kept");
-                self.training_failed = true;
-                self.offerer.offer(&model_path(&self.out));
-                Ok(())
-            }
-            other => other,
-        }
-    }
-
-    fn take(&mut self, flight: &Flight) -> Result<(), FlyError> {
-        let patience = if self.reconstruction.has_model() { Duration::ZERO } else { Duration::from_millis(200) };
-        if let Some(frame) = flight.next(patience) {
-            self.reconstruction.add(&frame)?;
-            tracing::info!("key frame {}: {}", self.reconstruction.keyframes(), frame.name);
-        }
-        Ok(())
-    }
-
-    /// One step of the failsafe ladder; says and does what a new rung asks for.
-    fn watch(&mut self, flight: &Flight) -> Result<Action, FlyError> {
-        let flags = self.health.flags(flight.flags(), self.training_failed);
-        let now_ms = self.started.elapsed().as_millis() as u64;
-        let before = self.failsafe.action();
-        self.failsafe = failsafe::update(now_ms, &self.failsafe, &flags);
-        let action = self.failsafe.action();
-        if action != before {
-            let line = format!("dgtr: {} ({})", action.name(), self.failsafe.cause().unwrap_or("recovered"));
-            tracing::warn!("{line}");
-            flight.say(
-                if action > before { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO },
-                line,
-            );
-            match action {
-                Action::UploadBest if self.reconstruction.has_model() && !self.training_failed => self.save(false)?,
-                Action::HalfResolution => self.reconstruction.halve_resolution(true),
-                Action::SmallerModel if self.reconstruction.has_model() => self.reconstruction.shrink()?,
-                Action::Nominal | Action::Warn => self.reconstruction.halve_resolution(false),
-                _ => {}
-            }
-        }
-        Ok(action)
-    }
-
-    fn build(&mut self, flight: &Flight) -> Result<(), FlyError> {
-        match self.reconstruction.build() {
-            Ok(()) => self.save(false),
-            // In flight more pictures may mend what too few of them could not do.
-            Err(FlyError::Init(e)) if flight.is_flying() => {
-                tracing::warn!("not built yet: {e}");
-                Ok(())
-            }
-            Err(e) => Err(e),
-        }
-    }
-
-    /// Trains until a key frame waits, a checkpoint is due, or capture ends.
-    fn train(&mut self, flight: &Flight, interrupt: &Interrupt) -> Result<(), FlyError> {
-        if !self.reconstruction.has_model() || flight.waiting() > 0 {
-            return Ok(());
-        }
-        if self.reconstruction.is_done(&self.budget) {
-            std::thread::sleep(Duration::from_millis(50));
-            return Ok(());
-        }
-        let due = self.last_save + CHECKPOINT_EVERY;
-        let mut last = None;
-        self.reconstruction.train(&self.budget, &mut |report: &StepReport| {
-            last = Some(*report);
-            let go_on = flight.waiting() == 0 && flight.is_flying() && !interrupt.requested() && Instant::now() < due;
-            if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-        })?;
-        if let Some(report) = last {
-            self.say(flight, &report);
-        }
-        if Instant::now() >= due { self.save(false) } else { Ok(()) }
-    }
-
-    /// After capture: the last build, and the rest of the schedule.
-    fn land(&mut self, interrupt: &Interrupt) -> Result<(), FlyError> {
-        if self.reconstruction.wants_build(true) && !interrupt.requested() {
-            self.reconstruction.build()?;
-            self.save(false)?;
-        }
-        if !self.reconstruction.has_model() {
-            return Ok(());
-        }
-        let mut progress = crate::console::Progress::new("training", 100);
-        while !self.reconstruction.is_done(&self.budget) && !interrupt.requested() {
-            let due = self.last_save + CHECKPOINT_EVERY;
-            let before = self.reconstruction.trainer().steps();
-            self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
-                progress.set((r.progress * 100.0) as u64, || {
-                    format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
-                });
-                let go_on = !interrupt.requested() && Instant::now() < due;
-                if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-            })?;
-            if self.reconstruction.trainer().steps() == before || Instant::now() < due {
-                // Converged before its budget: no step was left to take.
-                break;
-            }
-            self.save(false)?;
-        }
-        Ok(())
-    }
-
-    fn save(&mut self, finished: bool) -> Result<(), FlyError> {
-        let (path, gaussians) = self.reconstruction.checkpoint(&self.out, finished)?;
-        self.last_save = Instant::now();
-        tracing::debug!("saved {} ({gaussians} Gaussians)", path.display());
-        if finished {
-            self.offerer.offer_final(&path)
-        } else {
-            self.offerer.offer(&path)
-        }
-        Ok(())
-    }
-
-    fn say(&mut self, flight: &Flight, report: &StepReport) {
-        if self.last_said.is_some_and(|at| at.elapsed() < SAY_EVERY) {
-            return;
-        }
-        self.last_said = Some(Instant::now());
-        let line = format!(
-            "dgtr: {} views {}k gauss step {} loss {:.3}",
-            self.reconstruction.keyframes(),
-            report.gaussians / 1000,
-            report.step,
-            report.loss
-        );
-        tracing::info!("{line}");
-        flight.say(MavSeverity::MAV_SEVERITY_INFO, line);
-    }
-
-    fn report(
-        mut self,
-        ended: Ended,
-        flight: FlightCounters,
-        finished: bool,
-        interrupt: &Interrupt,
-    ) -> Result<FlyOutcome, FlyError> {
-        if !self.reconstruction.has_model() {
-            return Err(FlyError::TooFewKeyframes(self.reconstruction.keyframes()));
-        }
-        let (model, gaussians) = if self.training_failed {
-            (model_path(&self.out), self.reconstruction.trainer().gaussians())
-        } else {
-            self.reconstruction.checkpoint(&self.out, finished)?
-        };
-        if finished {
-            self.offerer.offer_final(&model);
-        } else {
-            self.offerer.offer(&model);
-        }
-        let delivered = finished && self.offerer.wait_delivered(DELIVERY, || !interrupt.requested());
-        self.offerer.shutdown();
-        let trainer = self.reconstruction.trainer();
-        Ok(FlyOutcome {
-            model,
-            gaussians,
-            ended,
-            finished,
-            delivered,
-            flight,
-            keyframes: self.reconstruction.keyframes(),
-            device_bytes: [trainer.plan().total_bytes, trainer.device_bytes()],
-            device: trainer.gpu().info().name.clone(),
-            stage_ms: trainer.stage_ms().to_vec(),
-            progress: self.reconstruction.progress().clone(),
-        })
-    }
+/// When an earlier run in `out` last saved a key frame or a model: what the camera wrote since then nobody has seen.
+fn last_saved(out: &Path) -> Option<SystemTime> {
+    let saved = [model_path(out), out.join("keyframes/transforms.json")];
+    saved.iter().filter_map(|path| path.metadata().ok()?.modified().ok()).max()
 }
 
 /// Where `dgtr fly` puts the model of an aircraft.

@@ -75,6 +75,9 @@ fn check_camera(m: &Mission) -> Result<(), MissionError> {
     if !mount.into_iter().all(|v| v.is_finite()) {
         return invalid("mount", "rotation_deg and lever_arm_m must be finite");
     }
+    if !(m.mount.max_tilt_deg > 0.0 && m.mount.max_tilt_deg <= 180.0) {
+        return invalid("mount.max_tilt_deg", "must be above 0 and at most 180 degrees");
+    }
     Ok(())
 }
 

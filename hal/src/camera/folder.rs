@@ -36,6 +36,8 @@ pub struct FolderCamera {
     /// Whole pictures waiting, the next one last.
     ready: Vec<(PictureClues, PathBuf)>,
     next_scan_ns: u64,
+    /// Files arrive when they are seen, not when they were written.
+    simulated_clock: bool,
 }
 
 fn key(path: &Path) -> u64 {
@@ -66,19 +68,37 @@ impl FolderCamera {
     /// # Errors
     /// [`HalError::Camera`] when it is not a readable folder.
     pub fn open(folder: &Path) -> Result<Self, HalError> {
+        Self::open_since(folder, None)
+    }
+
+    /// As [`FolderCamera::open`], but files written after `since` belong to this flight: it was interrupted then.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn open_since(folder: &Path, since: Option<SystemTime>) -> Result<Self, HalError> {
         let mut camera = Self {
             folder: folder.into(),
             done: HashSet::new(),
             growing: Vec::with_capacity(MAX_GROWING),
             ready: Vec::new(),
             next_scan_ns: 0,
+            simulated_clock: false,
+        };
+        let earlier = |path: &Path| {
+            let written = path.metadata().and_then(|m| m.modified());
+            since.is_none_or(|since| written.is_ok_and(|at| at <= since))
         };
         for path in camera.list()? {
-            if is_complete(&path).unwrap_or(false) {
+            if earlier(&path) && is_complete(&path).unwrap_or(false) {
                 camera.done.insert(key(&path));
             }
         }
         Ok(camera)
+    }
+
+    /// For a clock that is not the wall's: the age of a file says nothing then.
+    pub fn on_simulated_clock(self) -> Self {
+        Self { simulated_clock: true, ..self }
     }
 
     fn list(&self) -> Result<Vec<PathBuf>, HalError> {
@@ -133,7 +153,8 @@ impl FolderCamera {
         self.done.insert(key(&path));
         // When its last byte was written, on our clock; a clock that was set meanwhile counts for a scan at most.
         let age = meta.modified().ok().and_then(|m| SystemTime::now().duration_since(m).ok());
-        let age_ns = age.map_or(0, |a| a.as_nanos() as u64).min(2 * SCAN_EVERY_NS);
+        let longest_ns = if self.simulated_clock { 0 } else { 2 * SCAN_EVERY_NS };
+        let age_ns = age.map_or(0, |a| a.as_nanos() as u64).min(longest_ns);
         let (camera_ns, camera_resolution_ns) = camera_clock(&path).unzip();
         let clues = PictureClues {
             arrived_ns: now_ns.saturating_sub(age_ns),
@@ -192,6 +213,21 @@ mod tests {
         put("dji_11.jpg", &whole);
         assert_eq!(names(&mut camera, 1 + SCAN_EVERY_NS), ["dji_11.jpg"]);
         assert!(names(&mut camera, 9 * SCAN_EVERY_NS).is_empty());
+    }
+
+    #[test]
+    fn pictures_that_came_while_nobody_watched_are_taken_when_a_flight_is_continued() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let stopped = SystemTime::now() - std::time::Duration::from_secs(600);
+        for (name, age_s) in [("a_1.jpg", 900), ("a_2.jpg", 300), ("a_3.jpg", 200)] {
+            let path = folder.path().join(name);
+            std::fs::write(&path, jpeg()).expect("written");
+            let file = std::fs::File::options().write(true).open(&path).expect("opens");
+            file.set_modified(SystemTime::now() - std::time::Duration::from_secs(age_s)).expect("set");
+        }
+        let mut camera = FolderCamera::open_since(folder.path(), Some(stopped)).expect("opens");
+        assert_eq!(names(&mut camera, 1), ["a_2.jpg", "a_3.jpg"]);
+        assert!(names(&mut FolderCamera::open(folder.path()).expect("opens"), 1).is_empty());
     }
 
     #[test]

@@ -67,7 +67,7 @@ impl Learnt {
         triggers: &Deque<Trigger, N>,
         patience_ns: u64,
     ) -> Choice {
-        let latency = |t: &Trigger| clues.arrived_ns as i64 - t.time_ns as i64;
+        let latency = |t: &Trigger| clues.arrived_ns.wrapping_sub(t.time_ns) as i64;
         let possible = |t: &Trigger| (-EARLY_NS..=patience_ns as i64).contains(&latency(t));
         let off = |t: &Trigger| (latency(t) as f64 - self.latency_ns).abs();
         let by_time = triggers
@@ -137,7 +137,11 @@ impl Learnt {
         }
         let steps = number.abs_diff(last) / self.stride;
         let sequence = u64::from(trigger.sequence);
-        if number < last { Some((sequence.checked_sub(steps)?, true)) } else { Some((sequence + steps, false)) }
+        if number < last {
+            Some((sequence.checked_sub(steps)?, true))
+        } else {
+            Some((sequence.saturating_add(steps), false))
+        }
     }
 
     pub(super) fn learn(&mut self, clues: &PictureClues, trigger: &Trigger, late: bool) {

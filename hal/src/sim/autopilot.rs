@@ -16,6 +16,7 @@ use super::faulty_link::FaultyLink;
 use super::messages;
 use super::track::Sample;
 use crate::error::HalError;
+use crate::link::Reconnecting;
 use crate::mavlink::channel::{Channel, ChannelCounters};
 use crate::mavlink::dialect::{
     ATTITUDE_QUATERNION_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_RAW_INT_DATA,
@@ -23,8 +24,12 @@ use crate::mavlink::dialect::{
 };
 use crate::mavlink::signing::timestamp_of_unix_us;
 use crate::mavlink::{MessageData, Signer, SigningMode};
+use crate::traits::Link;
 
+mod announce;
 mod requests;
+
+pub use announce::Announcing;
 
 /// Message ids and rates of an ArduPilot with its streams set for a companion, Hz.
 const STREAMS: [(u32, f64); 8] = [
@@ -55,6 +60,8 @@ pub struct AutopilotSettings {
     pub gps_sigma_m: f64,
     /// Rate of SIM_STATE, the truth, Hz; 0 = only when asked for.
     pub truth_hz: f64,
+    /// By which messages exposures are announced.
+    pub announcing: Announcing,
     /// Signs with this key and requires signatures.
     pub signing_key: Option<[u8; 32]>,
     /// Seed of the faults.
@@ -72,6 +79,7 @@ impl Default for AutopilotSettings {
             clock_drift_ppm: 0.0,
             gps_sigma_m: 0.7,
             truth_hz: 0.0,
+            announcing: Announcing::default(),
             signing_key: None,
             seed: 0,
             faults: FaultSettings::default(),
@@ -87,8 +95,8 @@ struct Stream {
 }
 
 /// A flying autopilot.
-pub struct Autopilot {
-    channel: Channel<FaultyLink>,
+pub struct Autopilot<L: Link<Error = HalError> = Reconnecting> {
+    channel: Channel<FaultyLink<L>>,
     settings: AutopilotSettings,
     flight: Flight,
     frame: EnuFrame,
@@ -97,6 +105,7 @@ pub struct Autopilot {
     unix_start_us: u64,
     /// Simulation time of take-off.
     takeoff_s: Option<f64>,
+    landed: bool,
     next_exposure: usize,
     announced: u16,
     triggers_lost: u64,
@@ -106,9 +115,9 @@ pub struct Autopilot {
     list_from: Option<usize>,
 }
 
-impl Autopilot {
+impl<L: Link<Error = HalError>> Autopilot<L> {
     /// An autopilot on the ground at the start of `flight`.
-    pub fn new(link: FaultyLink, flight: Flight, settings: AutopilotSettings) -> Self {
+    pub fn new(link: FaultyLink<L>, flight: Flight, settings: AutopilotSettings) -> Self {
         let now =
             std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_micros() as u64);
         let unix_start_us = settings.unix_us.unwrap_or(now);
@@ -129,6 +138,7 @@ impl Autopilot {
             streams,
             unix_start_us,
             takeoff_s: None,
+            landed: false,
             next_exposure: 0,
             announced: 0,
             triggers_lost: 0,
@@ -155,7 +165,7 @@ impl Autopilot {
     }
 
     /// The line, for what was done to it.
-    pub fn line(&mut self) -> &FaultyLink {
+    pub fn line(&mut self) -> &FaultyLink<L> {
         self.channel.link()
     }
 
@@ -182,6 +192,16 @@ impl Autopilot {
             stream.next_s = now_s;
             stream.count = 0;
         }
+    }
+
+    /// Ends the flight: the motors are disarmed, which is said at once.
+    ///
+    /// # Errors
+    /// The link's.
+    pub fn land(&mut self, now_s: f64) -> Result<(), HalError> {
+        self.landed = true;
+        self.prepare_line(now_s);
+        self.say(HEARTBEAT_DATA::ID, 0, now_s)
     }
 
     fn boot_us(&self, now_s: f64) -> u64 {
@@ -289,7 +309,7 @@ impl Autopilot {
             HEARTBEAT_DATA::ID => {
                 let wall = timestamp_of_unix_us(self.unix_us(now_s));
                 self.channel.signer_mut().advance_to(wall);
-                self.channel.send(&messages::heartbeat())
+                self.channel.send(&announce::heartbeat(self.settings.announcing, !self.landed))
             }
             SYSTEM_TIME_DATA::ID => {
                 let lost = self.acting(now_s).unix_time_lost >= 0.5;
@@ -335,20 +355,5 @@ impl Autopilot {
             }
             _ => Ok(()),
         }
-    }
-
-    fn announce(&mut self, now_s: f64) -> Result<(), HalError> {
-        self.next_exposure += 1;
-        self.announced += 1;
-        let acting = self.acting(now_s);
-        if strikes(acting.trigger_loss_pct, self.settings.seed, About::Trigger, 0, u64::from(self.announced)) {
-            self.triggers_lost += 1;
-            return Ok(());
-        }
-        let (s, at) = self.reported(now_s);
-        // With a feedback pin ArduPilot's time is 32-bit boot µs.
-        let boot = self.boot_us(now_s) & u64::from(u32::MAX);
-        let time_us = if acting.feedback_boot_time >= 0.5 { boot } else { self.unix_us(now_s) };
-        self.channel.send(&messages::feedback(time_us, self.announced, &s, at, &self.frame))
     }
 }

@@ -24,8 +24,8 @@ pub struct LineFaults {
 }
 
 /// The simulator's end of a link.
-pub struct FaultyLink {
-    link: Reconnecting,
+pub struct FaultyLink<L = Reconnecting> {
+    link: L,
     seed: u64,
     acting: FaultSettings,
     /// Frames seen per message id: the key of the dice.
@@ -33,9 +33,9 @@ pub struct FaultyLink {
     done: LineFaults,
 }
 
-impl FaultyLink {
+impl<L> FaultyLink<L> {
     /// A link without faults until [`FaultyLink::set`].
-    pub fn new(link: Reconnecting, seed: u64) -> Self {
+    pub fn new(link: L, seed: u64) -> Self {
         Self { link, seed, acting: FaultSettings::default(), ordinals: HashMap::new(), done: LineFaults::default() }
     }
 
@@ -55,7 +55,7 @@ impl FaultyLink {
     }
 
     /// The link below.
-    pub fn inner(&self) -> &Reconnecting {
+    pub fn inner(&self) -> &L {
         &self.link
     }
 }
@@ -69,7 +69,7 @@ fn message_id(frame: &[u8]) -> u32 {
     }
 }
 
-impl Link for FaultyLink {
+impl<L: Link<Error = HalError>> Link for FaultyLink<L> {
     type Error = HalError;
 
     fn read(&mut self, into: &mut [u8], timeout: Duration) -> Result<Received, HalError> {

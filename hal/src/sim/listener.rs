@@ -47,6 +47,7 @@ pub fn accompany<R: Send>(
             system_id: 1,
             link,
             camera: Some(CameraSource::Folder(folder.into())),
+            pictures_since: None,
             lens: CameraSettings {
                 width: 64,
                 height: 48,

@@ -6,9 +6,10 @@ use glam::{DQuat, DVec3};
 use super::track::Sample;
 use crate::frames::{ned_to_enu, yaw_of_ned};
 use crate::mavlink::dialect::{
-    ATTITUDE_QUATERNION_DATA, CAMERA_FEEDBACK_DATA, CameraFeedbackFlags, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA,
-    GLOBAL_POSITION_INT_DATA, GPS_RAW_INT_DATA, GimbalDeviceFlags, GpsFixType, HEARTBEAT_DATA, MavAutopilot,
-    MavModeFlag, MavState, MavType, SIM_STATE_DATA,
+    ATTITUDE_QUATERNION_DATA, CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_TRIGGER_DATA, COMMAND_LONG_DATA,
+    CameraFeedbackFlags, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_RAW_INT_DATA,
+    GimbalDeviceFlags, GpsFixType, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavModeFlag, MavState, MavType,
+    SIM_STATE_DATA,
 };
 
 /// ArduCopter's custom mode number of AUTO.
@@ -143,6 +144,63 @@ pub fn feedback(time_us: u64, index: u16, s: &Sample, at: Geodetic, frame: &EnuF
         cam_idx: 0,
         flags: CameraFeedbackFlags::CAMERA_FEEDBACK_PHOTO,
         completed_captures: index,
+    }
+}
+
+/// The component id of the first camera, MAV_COMP_ID_CAMERA.
+const CAMERA_COMPONENT: u8 = 100;
+
+/// PX4's announcement of an exposure: time since boot, and its counter.
+pub fn camera_trigger(boot_us: u64, sequence: u16) -> CAMERA_TRIGGER_DATA {
+    CAMERA_TRIGGER_DATA { time_usec: boot_us, seq: sequence.into() }
+}
+
+/// The same exposure as a command to the camera of the system; PX4 sends both this and [`digicam_control`].
+pub fn image_start_capture(system: u8) -> COMMAND_LONG_DATA {
+    COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_IMAGE_START_CAPTURE,
+        target_system: system,
+        target_component: CAMERA_COMPONENT,
+        param3: 1.0,
+        param4: f32::NAN,
+        param5: f32::NAN,
+        param6: f32::NAN,
+        param7: f32::NAN,
+        ..COMMAND_LONG_DATA::default()
+    }
+}
+
+/// The same exposure in the older way, to every system.
+pub fn digicam_control() -> COMMAND_LONG_DATA {
+    COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_DO_DIGICAM_CONTROL,
+        target_system: 0,
+        target_component: CAMERA_COMPONENT,
+        param1: f32::NAN,
+        param2: f32::NAN,
+        param3: f32::NAN,
+        param4: f32::NAN,
+        param5: 1.0,
+        param6: f32::NAN,
+        param7: f32::NAN,
+        ..COMMAND_LONG_DATA::default()
+    }
+}
+
+/// A picture was taken; `q` is the vehicle's attitude and the relative altitude is not known, as PX4 has it.
+pub fn image_captured(boot_us: u64, unix_us: u64, index: u16, s: &Sample, at: Geodetic) -> CAMERA_IMAGE_CAPTURED_DATA {
+    CAMERA_IMAGE_CAPTURED_DATA {
+        time_utc: unix_us,
+        time_boot_ms: (boot_us / 1000) as u32,
+        lat: degrees_e7(at.lat_deg),
+        lon: degrees_e7(at.lon_deg),
+        alt: millimetres(at.alt_m),
+        relative_alt: -1000,
+        q: wxyz(s.attitude),
+        image_index: index.into(),
+        camera_id: 1,
+        capture_result: MavBool::MAV_BOOL_TRUE,
+        ..CAMERA_IMAGE_CAPTURED_DATA::default()
     }
 }
 

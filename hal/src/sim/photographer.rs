@@ -55,6 +55,8 @@ pub struct Photographer {
     held: Vec<Delivery>,
     seed: u64,
     counters: PictureCounters,
+    /// Wait for a picture that is due and not made yet; else it comes later.
+    waits: bool,
     quit: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -95,9 +97,15 @@ impl Photographer {
             held: Vec::new(),
             seed,
             counters: PictureCounters::default(),
+            waits: false,
             quit,
             thread: Some(thread),
         })
+    }
+
+    /// For a clock that stands still meanwhile: pictures that are due are waited for, so that none is tardy.
+    pub fn waiting_for_pictures(self) -> Self {
+        Self { waits: true, ..self }
     }
 
     /// What was done so far.
@@ -116,7 +124,8 @@ impl Photographer {
     /// A picture that could not be made or written.
     pub fn deliver(&mut self, flight_s: f64, acting: &FaultSettings) -> Result<(), SimError> {
         while let Some(exposure) = self.exposures.get(self.next).filter(|e| e.ready_s <= flight_s) {
-            let bytes = match self.made.try_recv() {
+            let made = if self.waits { self.made.recv().map_err(TryRecvError::from) } else { self.made.try_recv() };
+            let bytes = match made {
                 Ok(made) => made?,
                 Err(TryRecvError::Empty) => break,
                 Err(TryRecvError::Disconnected) => return Err(SimError::CameraStopped { made: self.next }),

@@ -9,7 +9,9 @@ use super::autopilot::Autopilot;
 use super::error::SimError;
 use super::faulty_link::{FaultyLink, LineFaults};
 use super::photographer::{Photographer, PictureCounters};
+use crate::error::HalError;
 use crate::link::{LinkAddress, Reconnecting};
+use crate::traits::Link;
 
 /// Longest time between two looks at the link.
 const TICK: Duration = Duration::from_millis(2);
@@ -81,67 +83,112 @@ pub fn open(address: &LinkAddress, seed: u64, on_ready: &mut dyn FnMut(Option<&P
     Ok(FaultyLink::new(link, seed))
 }
 
+/// One flight in the making, turn by turn, on whatever clock.
+pub struct Session<L: Link<Error = HalError> = Reconnecting> {
+    autopilot: Autopilot<L>,
+    camera: Option<Photographer>,
+    settings: SessionSettings,
+    /// Wall-clock seconds of the first word of a peer, and of the flight's end.
+    heard_s: Option<f64>,
+    aloft: bool,
+    over_s: Option<f64>,
+    flight_s: f64,
+    peer: bool,
+}
+
+impl<L: Link<Error = HalError>> Session<L> {
+    /// An aircraft on the ground.
+    ///
+    /// # Errors
+    /// [`SimError::Settings`].
+    pub fn new(
+        autopilot: Autopilot<L>,
+        camera: Option<Photographer>,
+        settings: &SessionSettings,
+    ) -> Result<Self, SimError> {
+        settings.check()?;
+        let settings = *settings;
+        Ok(Self { autopilot, camera, settings, heard_s: None, aloft: false, over_s: None, flight_s: 0.0, peer: false })
+    }
+
+    /// Listens for `wait` at most, then says and delivers what is due; `wall_s` is the time since the start. False when
+    /// flight and lingering are over.
+    ///
+    /// # Errors
+    /// A link that cannot be read or written for good, or a picture that cannot be made or stored.
+    pub fn turn(&mut self, wall_s: &dyn Fn() -> f64, wait: Duration) -> Result<bool, SimError> {
+        let speed = self.settings.speed;
+        let now = || wall_s() * speed;
+        if !self.aloft {
+            let wall_s = wall_s();
+            if self.autopilot.heard() > 0 {
+                self.heard_s.get_or_insert(wall_s);
+            }
+            if wall_s >= self.heard_s.unwrap_or(self.settings.wait_for_peer_s) + self.settings.settle_s {
+                self.peer = self.heard_s.is_some();
+                self.autopilot.take_off(now());
+                self.aloft = true;
+            }
+        }
+        self.autopilot.listen(&now, wait)?;
+        let now_s = now();
+        self.autopilot.advance(now_s)?;
+        if !self.aloft {
+            return Ok(true);
+        }
+        self.flight_s = self.autopilot.flight_s(now_s);
+        if let Some(camera) = &mut self.camera {
+            camera.deliver(self.flight_s, &self.autopilot.acting(now_s))?;
+        }
+        let end_s = self.autopilot.flight().reported.end_s();
+        if self.flight_s >= end_s && self.camera.as_ref().is_none_or(Photographer::done) {
+            let wall_s = wall_s();
+            if self.over_s.is_none() {
+                self.autopilot.land(now_s)?;
+            }
+            return Ok(wall_s - *self.over_s.get_or_insert(wall_s) < self.settings.linger_s);
+        }
+        Ok(true)
+    }
+
+    /// Ends the session, whether the flight is over or not.
+    ///
+    /// # Errors
+    /// What went wrong in the camera's last work.
+    pub fn finish(mut self) -> Result<SessionReport, SimError> {
+        let completed = self.over_s.is_some();
+        let pictures = match self.camera {
+            Some(camera) => camera.finish(!completed)?,
+            None => PictureCounters::default(),
+        };
+        let (triggers, triggers_lost) = self.autopilot.triggers();
+        let counters = self.autopilot.counters();
+        Ok(SessionReport {
+            completed,
+            peer: self.peer,
+            triggers,
+            triggers_lost,
+            frames_sent: counters.sent,
+            frames_dropped: counters.send_failed,
+            line: self.autopilot.line().done(),
+            pictures,
+            flight_s: self.flight_s.min(self.autopilot.flight().reported.end_s()),
+        })
+    }
+}
+
 /// Flies `autopilot`'s flight while `camera` delivers its pictures, until it is over or `stop` is set.
 ///
 /// # Errors
 /// A link that cannot be read or written for good, or a picture that cannot be made or stored.
 pub fn fly(
-    mut autopilot: Autopilot,
-    mut camera: Option<Photographer>,
+    autopilot: Autopilot,
+    camera: Option<Photographer>,
     settings: &SessionSettings,
     stop: &AtomicBool,
 ) -> Result<SessionReport, SimError> {
-    settings.check()?;
+    let mut session = Session::new(autopilot, camera, settings)?;
     let start = Instant::now();
-    let now = || start.elapsed().as_secs_f64() * settings.speed;
-    let mut heard_at = None;
-    while !stop.load(Ordering::Relaxed) {
-        let wall_s = start.elapsed().as_secs_f64();
-        if autopilot.heard() > 0 {
-            heard_at.get_or_insert(wall_s);
-        }
-        if wall_s >= heard_at.unwrap_or(settings.wait_for_peer_s) + settings.settle_s {
-            break;
-        }
-        autopilot.listen(&now, TICK)?;
-        autopilot.advance(now())?;
-    }
-    let peer = heard_at.is_some();
-    autopilot.take_off(now());
-    let end_s = autopilot.flight().reported.end_s();
-    let mut over: Option<Instant> = None;
-    let mut flight_s = 0.0;
-    let mut completed = false;
-    while !stop.load(Ordering::Relaxed) {
-        autopilot.listen(&now, TICK)?;
-        let now_s = now();
-        autopilot.advance(now_s)?;
-        flight_s = autopilot.flight_s(now_s);
-        if let Some(camera) = &mut camera {
-            camera.deliver(flight_s, &autopilot.acting(now_s))?;
-        }
-        if flight_s >= end_s && camera.as_ref().is_none_or(Photographer::done) {
-            completed = true;
-            if over.get_or_insert_with(Instant::now).elapsed().as_secs_f64() >= settings.linger_s {
-                break;
-            }
-        }
-    }
-    let pictures = match camera {
-        Some(camera) => camera.finish(!completed)?,
-        None => PictureCounters::default(),
-    };
-    let (triggers, triggers_lost) = autopilot.triggers();
-    let counters = autopilot.counters();
-    Ok(SessionReport {
-        completed,
-        peer,
-        triggers,
-        triggers_lost,
-        frames_sent: counters.sent,
-        frames_dropped: counters.send_failed,
-        line: autopilot.line().done(),
-        pictures,
-        flight_s: flight_s.min(end_s),
-    })
+    while !stop.load(Ordering::Relaxed) && session.turn(&|| start.elapsed().as_secs_f64(), TICK)? {}
+    session.finish()
 }

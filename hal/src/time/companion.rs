@@ -1,5 +1,6 @@
 //! The companion's clock: monotonic while flying, set by hand for recordings and tests.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
@@ -39,6 +40,12 @@ impl ManualClock {
 impl Clock for ManualClock {
     fn now_ns(&self) -> u64 {
         self.now.load(Ordering::Relaxed)
+    }
+}
+
+impl<C: Clock> Clock for Arc<C> {
+    fn now_ns(&self) -> u64 {
+        (**self).now_ns()
     }
 }
 

@@ -48,6 +48,8 @@ struct Fit {
 pub struct ClockMap {
     pairs: Deque<Pair, PAIRS>,
     fit: Option<Fit>,
+    /// Rate before the last jump: a clock that was set goes on as fast as before.
+    known_rate: Option<f64>,
     /// Start of the current span of arrivals, and the best of them.
     bin: Option<(u64, Pair)>,
     active: bool,
@@ -124,7 +126,7 @@ impl ClockMap {
 
     /// Boot seconds per companion second.
     pub fn rate(&self) -> f64 {
-        self.fit.map_or(1.0, |f| f.rate)
+        self.fit.map_or(self.known_rate.unwrap_or(1.0), |f| f.rate)
     }
 
     /// One standard deviation of the mapping, companion ns.
@@ -142,9 +144,10 @@ impl ClockMap {
         self.rejected
     }
 
-    /// Forgets everything, for a restarted autopilot.
+    /// Forgets everything but the rate, for a restarted autopilot.
     pub fn reset(&mut self) {
-        *self = Self { steps: self.steps, rejected: self.rejected, ..Self::default() };
+        let known_rate = self.fit.map(|f| f.rate).or(self.known_rate);
+        *self = Self { steps: self.steps, rejected: self.rejected, known_rate, ..Self::default() };
     }
 
     fn add(&mut self, pair: Pair) -> bool {
@@ -160,6 +163,7 @@ impl ClockMap {
                     return false;
                 }
                 self.pairs.clear();
+                self.known_rate = Some(fit.rate);
                 self.steps += 1;
             }
         }
@@ -188,7 +192,7 @@ impl ClockMap {
             .map(xy)
             .fold((0.0, 0.0), |a, (x, y)| (a.0 + (x - mx) * (x - mx), a.1 + (x - mx) * (y - my)));
         let span = self.pairs.front().map_or(0.0, |p| -xy(p).0);
-        let slope = if self.pairs.len() >= 3 && sxx > 1e-6 { sxy / sxx } else { 1.0 };
+        let slope = if self.pairs.len() >= 3 && sxx > 1e-6 { sxy / sxx } else { self.known_rate.unwrap_or(1.0) };
         let doubt = if self.active { 1.0 } else { PASSIVE_DOUBT };
         let believed = doubt * if span > LONG_SPAN_S { RATE_LONG } else { RATE_SHORT };
         let rate = if (slope - 1.0).abs() > believed && slope.is_finite() && slope > 0.01 { slope } else { 1.0 };
@@ -260,6 +264,18 @@ mod tests {
         assert!(error_ms(&map, companion, 5 * S + 7 * S * 8).abs() < 8.0 * 6.0);
         let back = map.to_companion_ns(map.to_boot_ns(companion).expect("mapped")).expect("mapped");
         assert!(back.abs_diff(companion) < 1000);
+    }
+
+    #[test]
+    fn the_rate_of_a_fast_simulator_outlives_a_jump_of_its_clock() {
+        let mut map = ClockMap::default();
+        for i in 0..10 {
+            map.round_trip(i * S, i * S + 2 * MS, 8 * (i * S + MS));
+        }
+        map.reset();
+        assert_eq!(map.to_boot_ns(11 * S), None, "what was known is gone");
+        map.round_trip(10 * S, 10 * S + 2 * MS, 8 * (10 * S + MS) + 500 * S);
+        assert!(error_ms(&map, 12 * S, 8 * 12 * S + 500 * S).abs() < 20.0, "one pair and the known rate");
     }
 
     #[test]

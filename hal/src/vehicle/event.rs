@@ -80,6 +80,8 @@ pub enum UnmatchedReason {
     NoGimbal,
     /// More matched pictures waited for their pose than there is room for.
     Overflow,
+    /// The camera looked further from where the mission's mount points it than `mount.max_tilt_deg`.
+    Tilted,
 }
 
 /// A picture or an exposure that will not become a frame.
@@ -111,6 +113,7 @@ impl std::fmt::Display for Unmatched {
             UnmatchedReason::Pose(PoseError::NotYet) => ": the pose messages stopped before it",
             UnmatchedReason::Pose(PoseError::TooOld) => ": older than the poses kept",
             UnmatchedReason::Pose(PoseError::Gap) => ": pose messages too far apart",
+            UnmatchedReason::Tilted => ": taken in a turn, the camera tilted beyond mount.max_tilt_deg",
             UnmatchedReason::NoGimbal => ": no gimbal attitude (mount.attitude = \"fixed\" if there is no gimbal)",
         })
     }

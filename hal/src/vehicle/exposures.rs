@@ -127,8 +127,11 @@ where
         self.hand_out(false);
     }
 
-    /// A recording is at its end: decides everything that waits.
-    pub(super) fn finish(&mut self) {
+    /// The flight is over: decides everything that waits, so that no picture and no exposure goes unaccounted for.
+    pub fn finish(&mut self) {
+        if self.finished {
+            return;
+        }
         let now_ns = self.now_ns();
         self.settle(now_ns);
         for exposure in self.exposures.ring.iter_mut().filter(|e| e.pose.is_none()) {
@@ -187,6 +190,11 @@ where
                 None if !at_end => drop(self.pending.push_back(waiting)),
                 None => self.give_up(waiting, UnmatchedReason::Pose(PoseError::NotYet)),
                 Some(Err(e)) => self.give_up(waiting, UnmatchedReason::Pose(e)),
+                Some(Ok(body)) if self.mount.is_tilted(&body) => {
+                    self.counters.exposures_tilted += 1;
+                    let (sequence, path) = (waiting.trigger.sequence, path_of(&waiting.picture));
+                    self.unmatched(Some(sequence), path, UnmatchedReason::Tilted);
+                }
                 Some(Ok(body)) => {
                     let sigma_s = waiting.trigger.sigma_ns as f64 * 1e-9;
                     match self.mount.camera_pose(&body, sigma_s) {

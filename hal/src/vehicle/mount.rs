@@ -22,6 +22,9 @@ pub(super) struct Mount {
     /// Mount → body; `None` when the gimbal says.
     fixed: Option<DQuat>,
     lever: DVec3,
+    /// Where a gimbal is set to look, radians above the horizon, when the mission says so.
+    gimbal_pitch: Option<f64>,
+    max_tilt: f64,
 }
 
 impl Mount {
@@ -30,7 +33,13 @@ impl Mount {
             MountAttitude::Gimbal => None,
             MountAttitude::Fixed => Some(fixed_mount(settings.rotation_deg)),
         };
-        Self { frame, fixed, lever: DVec3::from(settings.lever_arm_m.map(f64::from)) }
+        Self {
+            frame,
+            fixed,
+            lever: DVec3::from(settings.lever_arm_m.map(f64::from)),
+            gimbal_pitch: (settings.rotation_deg != [0.0; 3]).then(|| f64::from(settings.rotation_deg[1]).to_radians()),
+            max_tilt: f64::from(settings.max_tilt_deg).to_radians(),
+        }
     }
 
     /// The camera's pose; `None` when the mount needs a gimbal attitude that is missing. `time_sigma_s` is how far the
@@ -58,6 +67,21 @@ impl Mount {
             position_sigma_m: [sum(sigma.x, blur.x), sum(sigma.y, blur.y), sum(sigma.z, blur.z)],
             rotation_sigma_rad: [about(axes.x_axis), about(axes.y_axis), about(axes.z_axis)],
         })
+    }
+
+    /// Whether the camera looked further than the mission allows from where its mount points it on a level airframe.
+    pub(super) fn is_tilted(&self, body: &BodyPose) -> bool {
+        let tilt = match (self.fixed, body.gimbal, self.gimbal_pitch) {
+            (Some(fixed), ..) => {
+                let nose = body.attitude * DVec3::X;
+                let level = DQuat::from_rotation_z(nose.y.atan2(nose.x));
+                (body.attitude * fixed * DVec3::X).angle_between(level * fixed * DVec3::X)
+            }
+            // A gimbal turns about the vertical as it likes; its pitch is what was planned.
+            (None, Some(gimbal), Some(pitch)) => ((gimbal * DVec3::X).z.clamp(-1.0, 1.0).asin() - pitch).abs(),
+            (None, ..) => 0.0,
+        };
+        tilt > self.max_tilt
     }
 
     /// The camera's pose out of a picture's own data; `None` without angles.
@@ -97,6 +121,7 @@ mod tests {
             attitude: MountAttitude::Fixed,
             rotation_deg: [0.0, -90.0, 0.0],
             lever_arm_m: [0.3, 0.1, -0.2],
+            max_tilt_deg: 50.0,
         };
         let mount = Mount::new(&settings, EnuFrame::new(origin));
         let body = BodyPose {
@@ -115,5 +140,27 @@ mod tests {
         assert!((pose.rotation_sigma_rad[2] - 0.05).abs() < 1e-6 && (pose.rotation_sigma_rad[0] - 0.01).abs() < 1e-6);
         let gimbal = MountSettings { attitude: MountAttitude::Gimbal, ..settings };
         assert!(Mount::new(&gimbal, EnuFrame::new(origin)).camera_pose(&body, 0.0).is_none());
+    }
+
+    #[test]
+    fn a_steep_bank_tilts_a_fixed_camera_and_a_held_gimbal_stays_level() {
+        let origin = Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 400.0 };
+        let settings =
+            MountSettings { rotation_deg: [0.0, -90.0, 0.0], max_tilt_deg: 40.0, ..MountSettings::default() };
+        let banked = |roll_deg: f64, gimbal_pitch_deg: f64| BodyPose {
+            position: origin,
+            velocity: DVec3::ZERO,
+            attitude: attitude_to_enu(euler_to_ned(roll_deg.to_radians(), 0.05, 2.0)),
+            gimbal: Some(attitude_to_enu(euler_to_ned(0.0, gimbal_pitch_deg.to_radians(), 2.0))),
+            position_sigma_m: DVec3::ONE,
+            attitude_sigma_rad: DVec3::splat(0.01),
+        };
+        let tilted = |settings: &MountSettings, body| Mount::new(settings, EnuFrame::new(origin)).is_tilted(&body);
+        let fixed = MountSettings { attitude: MountAttitude::Fixed, ..settings };
+        assert!(tilted(&fixed, banked(45.0, -90.0)) && !tilted(&fixed, banked(35.0, -90.0)));
+        assert!(!tilted(&settings, banked(45.0, -89.0)) && tilted(&settings, banked(0.0, -45.0)));
+        let unsaid = MountSettings { rotation_deg: [0.0; 3], ..settings };
+        assert!(!tilted(&unsaid, banked(0.0, -45.0)), "nobody said where the gimbal should look");
+        assert!(!tilted(&MountSettings { max_tilt_deg: 180.0, ..fixed }, banked(170.0, 0.0)), "switched off");
     }
 }

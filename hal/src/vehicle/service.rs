@@ -31,6 +31,8 @@ pub(super) struct Service {
     next_timesync_ns: u64,
     requests: u32,
     next_complaint_ns: u64,
+    /// Restarts and steps of the autopilot's clock that were answered with fast TIMESYNC requests.
+    clock_events: u64,
     last_free_ns: Option<u64>,
 }
 
@@ -46,6 +48,7 @@ impl Service {
             next_timesync_ns: 0,
             requests: 0,
             next_complaint_ns: 0,
+            clock_events: 0,
             last_free_ns: None,
         };
         Ok((service, signer))
@@ -53,10 +56,18 @@ impl Service {
 
     /// Says in the log that a picture or the camera failed, not more often than is useful.
     pub(super) fn complain(&mut self, error: &HalError, now_ns: u64) {
-        if now_ns >= self.next_complaint_ns {
-            self.next_complaint_ns = now_ns + COMPLAIN_EVERY_NS;
+        if self.may_complain(now_ns) {
             tracing::warn!("{error}");
         }
+    }
+
+    /// Whether the last complaint is long enough ago for another one.
+    pub(super) fn may_complain(&mut self, now_ns: u64) -> bool {
+        let may = now_ns >= self.next_complaint_ns;
+        if may {
+            self.next_complaint_ns = now_ns + COMPLAIN_EVERY_NS;
+        }
+        may
     }
 
     /// An exposure was announced or asked for: the next free-running picture is due whatever its time.
@@ -121,6 +132,12 @@ where
         self.channel.set_ids(system, self.settings.link.own_component);
         while let Some(answer) = self.autopilot.next_answer() {
             send(&mut self.channel, &answer);
+        }
+        // A clock that jumped is learnt anew as fast as at the start.
+        let heard = self.autopilot.counters();
+        if heard.clock_restarts + heard.clock_steps != self.service.clock_events {
+            self.service.clock_events = heard.clock_restarts + heard.clock_steps;
+            (self.service.requests, self.service.next_timesync_ns) = (0, now_ns);
         }
         if now_ns >= self.service.next_timesync_ns {
             let every = if self.service.requests < FAST_REQUESTS { FAST_TIMESYNC_NS } else { SLOW_TIMESYNC_NS };

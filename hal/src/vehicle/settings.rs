@@ -1,5 +1,7 @@
 //! What a vehicle needs of the mission.
 
+use std::time::SystemTime;
+
 use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission, MountSettings};
@@ -20,6 +22,9 @@ pub struct VehicleSettings {
     pub link: LinkSettings,
     /// Where pictures come from; `None` = poses and triggers only.
     pub camera: Option<CameraSource>,
+    /// A continued flight: pictures of the folder that were written after this are taken as well, with the pose in their own
+    /// data if the exposure was not heard. `None` = only pictures that come from now on.
+    pub pictures_since: Option<SystemTime>,
     /// The lens.
     pub lens: CameraSettings,
     /// How the camera sits on the airframe.
@@ -40,6 +45,7 @@ impl VehicleSettings {
             system_id: aircraft.system_id,
             link: mission.link.clone(),
             camera: Some(aircraft.camera.clone()),
+            pictures_since: None,
             lens: mission.camera,
             mount: mission.mount,
             origin: mission.origin,

@@ -91,6 +91,7 @@ fn report(outcome: &FlyOutcome) -> RunReport {
         ("pictures_covered", k.covered),
         ("pictures_bad_pose", k.bad_pose),
         ("pictures_over_plan", k.full),
+        ("pictures_unusable", k.unusable),
         ("pictures_undecodable", outcome.flight.undecodable),
         ("pictures_or_triggers_unmatched", outcome.flight.unmatched),
     ] {

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use config::mission::{CameraSource, Mission};
 use hal::sim::aircraft::Imperfections;
-use hal::sim::autopilot::AutopilotSettings;
+use hal::sim::autopilot::{Announcing, AutopilotSettings};
 use hal::sim::reference::Lens;
 use hal::sim::survey::SurveySettings;
 use hal::sim::world::WorldSettings;
@@ -49,6 +49,10 @@ pub struct Args {
     /// Pitch of the camera, degrees; −90 looks straight down.
     #[arg(long, value_name = "DEG", default_value_t = -90.0, allow_hyphen_values = true)]
     pitch: f64,
+    /// By which messages exposures are announced: ArduPilot's CAMERA_FEEDBACK, PX4's CAMERA_TRIGGER with its two commands, the
+    /// same with CAMERA_IMAGE_CAPTURED, or CAMERA_IMAGE_CAPTURED alone.
+    #[arg(long, value_enum, default_value_t = Triggers::Ardupilot)]
+    triggers: Triggers,
     /// Fly a second set of lines across the first.
     #[arg(long)]
     cross: bool,
@@ -58,6 +62,26 @@ pub struct Args {
     /// Seconds to go on speaking after the flight.
     #[arg(long, value_name = "S", default_value_t = 5.0)]
     linger: f64,
+}
+
+/// How exposures are announced.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum Triggers {
+    Ardupilot,
+    Px4,
+    Px4Feedback,
+    Captured,
+}
+
+impl From<Triggers> for Announcing {
+    fn from(triggers: Triggers) -> Self {
+        match triggers {
+            Triggers::Ardupilot => Self::Feedback,
+            Triggers::Px4 => Self::Trigger,
+            Triggers::Px4Feedback => Self::TriggerAndCaptured,
+            Triggers::Captured => Self::Captured,
+        }
+    }
 }
 
 /// Runs the command.
@@ -94,6 +118,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         autopilot: AutopilotSettings {
             system_id: aircraft.system_id,
             faults: mission.faults,
+            announcing: args.triggers.into(),
             ..AutopilotSettings::default()
         },
         session: SessionSettings { speed: args.speed, linger_s: args.linger, ..SessionSettings::default() },

@@ -99,3 +99,14 @@ region_enu = [[-20.0, -20.0], [20.0, -20.0], [20.0, 20.0], [-20.0, 20.0]]
     std::fs::create_dir_all(folder.join("camera")).expect("camera");
     path
 }
+
+/// The mission's text changed: every `from` becomes its `to`.
+pub fn change_mission(folder: &Path, changes: &[(&str, &str)]) {
+    let path = folder.join("mission.toml");
+    let mut text = std::fs::read_to_string(&path).expect("mission");
+    for (from, to) in changes {
+        assert!(text.contains(from), "{from:?} is not in the mission");
+        text = text.replace(from, to);
+    }
+    std::fs::write(&path, text).expect("mission");
+}

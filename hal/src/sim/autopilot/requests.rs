@@ -6,6 +6,7 @@ use crate::mavlink::dialect::{
     COMMAND_ACK_DATA, COMMAND_LONG_DATA, MavCmd, MavParamType, MavResult, PARAM_REQUEST_LIST_DATA,
     PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, PARAM_VALUE_DATA, TIMESYNC_DATA,
 };
+use crate::traits::Link;
 use config::faults::FaultSettings;
 
 /// A request, copied out of the frame that carried it.
@@ -18,7 +19,7 @@ enum Request {
     Other,
 }
 
-impl Autopilot {
+impl<L: Link<Error = HalError>> Autopilot<L> {
     pub(super) fn answer(&mut self, now_s: &dyn Fn() -> f64) -> Result<(), HalError> {
         loop {
             let me = self.settings.system_id;

@@ -1,0 +1,394 @@
+//! The onboard job, turn by turn: takes key frames, builds, trains, saves, offers, climbs the failsafe ladder. It decides what
+//! is done when; a [`Reconstruct`] does it, and the clock is anybody's, so that a whole flight can be rehearsed in a second.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use hal::failsafe::{self, Action};
+use hal::mavlink::dialect::MavSeverity;
+use hal::traits::Clock;
+use models::camera::PosedImage;
+use vulkan::trainer::{RunBudget, StepReport};
+
+use super::handover::Handover;
+use super::health::Health;
+use super::{FlyError, Reconstruction, model_path};
+use crate::interrupt::Interrupt;
+use crate::upload::Offerer;
+
+/// Between two checkpoints: what a power cut may cost.
+const CHECKPOINT_EVERY_NS: u64 = 15_000_000_000;
+/// Between two lines to the ground control station.
+const SAY_EVERY_NS: u64 = 10_000_000_000;
+/// While there is nothing to train on a turn waits this long for the next key frame, and this long when there is
+/// nothing to do at all.
+const FOR_A_FRAME: Duration = Duration::from_millis(200);
+const IDLE: Duration = Duration::from_millis(50);
+
+/// What makes a model out of key frames.
+pub trait Reconstruct {
+    /// Takes in a new key frame.
+    ///
+    /// # Errors
+    /// It cannot be stored.
+    fn add(&mut self, frame: &PosedImage) -> Result<(), FlyError>;
+    /// Number of key frames.
+    fn keyframes(&self) -> usize;
+    /// Whether enough key frames came since the last build; with `last`, whether any did.
+    fn wants_build(&self, last: bool) -> bool;
+    /// Whether there is a model to train.
+    fn has_model(&self) -> bool;
+    /// (Re)builds the model from all key frames.
+    ///
+    /// # Errors
+    /// The network or the device fails; the pictures give no depth.
+    fn build(&mut self) -> Result<(), FlyError>;
+    /// Whether the schedule of `budget` is over.
+    fn is_done(&self, budget: &RunBudget) -> bool;
+    /// Steps taken since the last build.
+    fn steps(&self) -> u32;
+    /// Trains until the budget, the schedule, or `each` says stop.
+    ///
+    /// # Errors
+    /// The device fails; the last checkpoint stays valid.
+    fn train(
+        &mut self,
+        budget: &RunBudget,
+        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
+    ) -> Result<(), FlyError>;
+    /// Trains at half the size, or as scheduled again.
+    fn halve_resolution(&mut self, on: bool);
+    /// Gives up the least useful Gaussians.
+    ///
+    /// # Errors
+    /// The device fails.
+    fn shrink(&mut self) -> Result<(), FlyError>;
+    /// Gaussians of the model as it is now.
+    fn gaussians(&self) -> usize;
+    /// Writes the model as it is now; returns its path and its number of Gaussians.
+    ///
+    /// # Errors
+    /// The disk cannot be written; the file written before stays.
+    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), FlyError>;
+}
+
+/// One flight's job.
+pub(super) struct Job<R, K> {
+    reconstruction: R,
+    offerer: Offerer,
+    out: PathBuf,
+    budget: RunBudget,
+    health: Health,
+    clock: K,
+    failsafe: failsafe::State,
+    /// The device failed; the last checkpoint is what there is.
+    training_failed: bool,
+    saved_ns: u64,
+    said_ns: Option<u64>,
+    for_a_frame: Duration,
+    idle: Duration,
+}
+
+/// What a job leaves behind.
+pub(super) struct JobEnd<R> {
+    pub(super) reconstruction: R,
+    pub(super) offerer: Offerer,
+    pub(super) model: PathBuf,
+    pub(super) gaussians: usize,
+    /// Whether the schedule was finished (false: the model is a checkpoint).
+    pub(super) finished: bool,
+}
+
+impl<R: Reconstruct, K: Clock> Job<R, K> {
+    pub(super) fn new(
+        reconstruction: R,
+        offerer: Offerer,
+        out: &Path,
+        budget: RunBudget,
+        health: Health,
+        clock: K,
+    ) -> Self {
+        Self {
+            reconstruction,
+            offerer,
+            out: out.into(),
+            budget,
+            health,
+            saved_ns: clock.now_ns(),
+            clock,
+            failsafe: failsafe::State::default(),
+            training_failed: false,
+            said_ns: None,
+            for_a_frame: FOR_A_FRAME,
+            idle: IDLE,
+        }
+    }
+
+    /// Key frames taken so far.
+    pub(super) fn keyframes(&self) -> usize {
+        self.reconstruction.keyframes()
+    }
+
+    /// One turn in flight; false when capture is over and everything it handed over is taken.
+    pub(super) fn turn(&mut self, capture: &Handover, interrupt: &Interrupt) -> Result<bool, FlyError> {
+        if interrupt.requested() {
+            return Ok(false);
+        }
+        // Asked before looking into the channel: what was handed over before the end is still there.
+        let flying = capture.is_flying();
+        let taken = self.take(capture)?;
+        if !flying {
+            return Ok(taken);
+        }
+        match self.watch(capture)? {
+            Action::StopTraining | Action::UploadBest | Action::Hold => std::thread::sleep(self.idle),
+            _ => {
+                let worked = self.reconstruct(capture, interrupt);
+                self.survive(worked)?;
+            }
+        }
+        Ok(true)
+    }
+
+    fn reconstruct(&mut self, capture: &Handover, interrupt: &Interrupt) -> Result<(), FlyError> {
+        if self.reconstruction.wants_build(false) {
+            self.build(capture)?;
+        }
+        self.train(capture, interrupt)
+    }
+
+    /// A device that fails in flight must not end the capture: once there is a checkpoint, it is offered instead.
+    fn survive(&mut self, worked: Result<(), FlyError>) -> Result<(), FlyError> {
+        match worked {
+            Err(FlyError::Train(e)) if model_path(&self.out).is_file() => {
+                tracing::error!("{e}; training is over, the last checkpoint is kept");
+                self.training_failed = true;
+                self.offerer.offer(&model_path(&self.out));
+                Ok(())
+            }
+            other => other,
+        }
+    }
+
+    fn take(&mut self, capture: &Handover) -> Result<bool, FlyError> {
+        let patience = if self.reconstruction.has_model() { Duration::ZERO } else { self.for_a_frame };
+        let Some(frame) = capture.next(patience) else { return Ok(false) };
+        self.reconstruction.add(&frame)?;
+        tracing::info!("key frame {}: {}", self.reconstruction.keyframes(), frame.name);
+        Ok(true)
+    }
+
+    /// One step of the failsafe ladder; says and does what a new rung asks for.
+    fn watch(&mut self, capture: &Handover) -> Result<Action, FlyError> {
+        let flags = self.health.flags(capture.flags(), self.training_failed);
+        let before = self.failsafe.action();
+        self.failsafe = failsafe::update(self.clock.now_ns() / 1_000_000, &self.failsafe, &flags);
+        let action = self.failsafe.action();
+        if action != before {
+            let line = format!("dgtr: {} ({})", action.name(), self.failsafe.cause().unwrap_or("recovered"));
+            tracing::warn!("{line}");
+            let worse = action > before;
+            let severity = if worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
+            capture.say(severity, line);
+            match action {
+                Action::UploadBest if self.reconstruction.has_model() && !self.training_failed => self.save(false)?,
+                Action::HalfResolution => self.reconstruction.halve_resolution(true),
+                Action::SmallerModel if self.reconstruction.has_model() => self.reconstruction.shrink()?,
+                Action::Nominal | Action::Warn => self.reconstruction.halve_resolution(false),
+                _ => {}
+            }
+        }
+        Ok(action)
+    }
+
+    fn build(&mut self, capture: &Handover) -> Result<(), FlyError> {
+        match self.reconstruction.build() {
+            Ok(()) => self.save(false),
+            // In flight more pictures may mend what too few of them could not do.
+            Err(FlyError::Init(e)) if capture.is_flying() => {
+                tracing::warn!("not built yet: {e}");
+                Ok(())
+            }
+            Err(e) => Err(e),
+        }
+    }
+
+    /// Trains until a key frame waits, a checkpoint is due, or capture ends.
+    fn train(&mut self, capture: &Handover, interrupt: &Interrupt) -> Result<(), FlyError> {
+        if !self.reconstruction.has_model() || capture.waiting() > 0 {
+            return Ok(());
+        }
+        if self.reconstruction.is_done(&self.budget) {
+            std::thread::sleep(self.idle);
+            return Ok(());
+        }
+        let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
+        let mut last = None;
+        let clock = &self.clock;
+        self.reconstruction.train(&self.budget, &mut |report: &StepReport| {
+            last = Some(*report);
+            let undisturbed = capture.waiting() == 0 && capture.is_flying() && !interrupt.requested();
+            if undisturbed && clock.now_ns() < due_ns { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        })?;
+        if let Some(report) = last {
+            self.say(capture, &report);
+        }
+        if self.clock.now_ns() >= due_ns { self.save(false) } else { Ok(()) }
+    }
+
+    /// After capture: the last build, the rest of the schedule, and the model that remains.
+    ///
+    /// # Errors
+    /// The device fails before there was a checkpoint; there are too few key frames for a model.
+    pub(super) fn land(mut self, interrupt: &Interrupt) -> Result<JobEnd<R>, FlyError> {
+        if !self.training_failed {
+            let finished = self.finish_schedule(interrupt);
+            self.survive(finished)?;
+        }
+        if !self.reconstruction.has_model() {
+            return Err(FlyError::TooFewKeyframes(self.reconstruction.keyframes()));
+        }
+        let finished = !interrupt.requested() && !self.training_failed;
+        let (model, gaussians) = if self.training_failed {
+            (model_path(&self.out), self.reconstruction.gaussians())
+        } else {
+            self.reconstruction.checkpoint(&self.out, finished)?
+        };
+        if finished {
+            self.offerer.offer_final(&model);
+        } else {
+            self.offerer.offer(&model);
+        }
+        Ok(JobEnd { reconstruction: self.reconstruction, offerer: self.offerer, model, gaussians, finished })
+    }
+
+    fn finish_schedule(&mut self, interrupt: &Interrupt) -> Result<(), FlyError> {
+        if self.reconstruction.wants_build(true) && !interrupt.requested() {
+            self.reconstruction.build()?;
+            self.save(false)?;
+        }
+        if !self.reconstruction.has_model() {
+            return Ok(());
+        }
+        let mut progress = crate::console::Progress::new("training", 100);
+        while !self.reconstruction.is_done(&self.budget) && !interrupt.requested() {
+            let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
+            let before = self.reconstruction.steps();
+            let clock = &self.clock;
+            self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
+                progress.set((r.progress * 100.0) as u64, || {
+                    format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
+                });
+                let go_on = !interrupt.requested() && clock.now_ns() < due_ns;
+                if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            })?;
+            if self.reconstruction.steps() == before || self.clock.now_ns() < due_ns {
+                // Converged before its budget: no step was left to take.
+                break;
+            }
+            self.save(false)?;
+        }
+        Ok(())
+    }
+
+    fn save(&mut self, finished: bool) -> Result<(), FlyError> {
+        let (path, gaussians) = self.reconstruction.checkpoint(&self.out, finished)?;
+        self.saved_ns = self.clock.now_ns();
+        tracing::debug!("saved {} ({gaussians} Gaussians)", path.display());
+        if finished {
+            self.offerer.offer_final(&path)
+        } else {
+            self.offerer.offer(&path)
+        }
+        Ok(())
+    }
+
+    fn say(&mut self, capture: &Handover, report: &StepReport) {
+        let now_ns = self.clock.now_ns();
+        if self.said_ns.is_some_and(|at| now_ns.saturating_sub(at) < SAY_EVERY_NS) {
+            return;
+        }
+        self.said_ns = Some(now_ns);
+        let line = format!(
+            "dgtr: {} views {}k gauss step {} loss {:.3}",
+            self.reconstruction.keyframes(),
+            report.gaussians / 1000,
+            report.step,
+            report.loss
+        );
+        tracing::info!("{line}");
+        capture.say(MavSeverity::MAV_SEVERITY_INFO, line);
+    }
+
+    /// On a clock that stands still meanwhile there is nothing to wait for.
+    #[cfg(test)]
+    pub(super) fn without_waiting(self) -> Self {
+        Self { for_a_frame: Duration::ZERO, idle: Duration::ZERO, ..self }
+    }
+
+    #[cfg(test)]
+    pub(super) fn reconstruction_mut(&mut self) -> &mut R {
+        &mut self.reconstruction
+    }
+
+    /// Where the failsafe ladder stands, and why.
+    #[cfg(test)]
+    pub(super) fn failsafe(&self) -> failsafe::State {
+        self.failsafe
+    }
+}
+
+impl Reconstruct for Reconstruction {
+    fn add(&mut self, frame: &PosedImage) -> Result<(), FlyError> {
+        Self::add(self, frame)
+    }
+
+    fn keyframes(&self) -> usize {
+        Self::keyframes(self)
+    }
+
+    fn wants_build(&self, last: bool) -> bool {
+        Self::wants_build(self, last)
+    }
+
+    fn has_model(&self) -> bool {
+        Self::has_model(self)
+    }
+
+    fn build(&mut self) -> Result<(), FlyError> {
+        Self::build(self)
+    }
+
+    fn is_done(&self, budget: &RunBudget) -> bool {
+        Self::is_done(self, budget)
+    }
+
+    fn steps(&self) -> u32 {
+        self.trainer().steps()
+    }
+
+    fn train(
+        &mut self,
+        budget: &RunBudget,
+        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
+    ) -> Result<(), FlyError> {
+        Self::train(self, budget, each)
+    }
+
+    fn halve_resolution(&mut self, on: bool) {
+        Self::halve_resolution(self, on);
+    }
+
+    fn shrink(&mut self) -> Result<(), FlyError> {
+        Self::shrink(self)
+    }
+
+    fn gaussians(&self) -> usize {
+        self.trainer().gaussians()
+    }
+
+    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), FlyError> {
+        Self::checkpoint(self, out, finished)
+    }
+}
