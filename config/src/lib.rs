@@ -19,6 +19,8 @@ pub mod mission;
 #[cfg(feature = "std")]
 pub mod plan;
 #[cfg(feature = "std")]
+pub mod preset;
+#[cfg(feature = "std")]
 pub mod refine;
 #[cfg(feature = "std")]
 pub mod training;

@@ -13,14 +13,17 @@ use crate::geodesy::{EnuFrame, Geodetic};
 use crate::ground::GroundSettings;
 use crate::init::InitSettings;
 use crate::link::LinkSettings;
+use crate::preset::Preset;
 use crate::refine::RefineSettings;
 use crate::training::TrainSettings;
 use crate::upload::UploadSettings;
 
 mod error;
+mod memory;
 mod validate;
 
 pub use error::MissionError;
+pub use memory::MemorySettings;
 
 /// A mission file larger than this is refused before it is parsed.
 const MAX_FILE_BYTES: u64 = 1 << 20;
@@ -148,31 +151,13 @@ pub struct KeyframeSettings {
     pub r_max_deg: f32,
     /// Most key frames of one aircraft: the size of the rings and of the resident views.
     pub max: u32,
+    /// Leave out pictures from where an earlier key frame already stood.
+    pub skip_covered: bool,
 }
 
 impl Default for KeyframeSettings {
     fn default() -> Self {
-        Self { t_min_m: 5.0, r_max_deg: 15.0, max: 128 }
-    }
-}
-
-/// The two numbers everything is planned from.
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MemorySettings {
-    /// The one device allocation, MiB.
-    pub device_mib: u32,
-    /// Bound on the host's resident memory (refused at start when the plan exceeds it), MiB.
-    pub host_mib: u32,
-    /// Cap on the number of Gaussians below what the budget would hold.
-    pub max_gaussians: Option<u32>,
-    /// Pictures are trained at this fraction of their size, 0 < scale ≤ 1.
-    pub image_scale: f32,
-}
-
-impl Default for MemorySettings {
-    fn default() -> Self {
-        Self { device_mib: 512, host_mib: 2048, max_gaussians: None, image_scale: 1.0 }
+        Self { t_min_m: 5.0, r_max_deg: 15.0, max: 128, skip_covered: true }
     }
 }
 
@@ -257,6 +242,8 @@ impl Mission {
     pub fn parse(text: &str, folder: &Path) -> Result<Self, MissionError> {
         let mut mission: Self = toml::from_str(text).map_err(|e| MissionError::syntax(text, &e))?;
         mission.anchor_paths(folder);
+        let preset = mission.memory.preset.map(Preset::values);
+        mission.training.seconds = mission.training.seconds.or(preset.map(|p| p.seconds));
         validate::check(&mission)?;
         Ok(mission)
     }
@@ -352,6 +339,17 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
         assert!(refused("[10.0, 10.0]", "[20.0, 0.0]").contains("area"));
         assert!(refused("lat_deg = 28.0", "lat_deg = 280.0").contains("origin"));
         assert!(refused("id = \"a1\"", "id = \"a1\"\nsystem_id = 0").contains("system_id"));
+    }
+
+    #[test]
+    fn a_preset_gives_seconds_unless_the_mission_does() {
+        let seconds = |more: &str| {
+            let table = format!("name = \"park\"\nmemory = {{ preset = \"ci\" }}\n{more}");
+            let text = GOOD.replace("name = \"park\"", &table);
+            Mission::parse(&text, Path::new("/m")).expect("parses").training.seconds
+        };
+        assert_eq!(seconds(""), Some(Preset::Ci.values().seconds));
+        assert_eq!(seconds("training = { seconds = 7.0 }"), Some(7.0));
     }
 
     #[test]

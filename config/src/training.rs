@@ -7,10 +7,12 @@
 mod density;
 mod rates;
 mod schedule;
+mod skips;
 
 pub use density::{DensitySettings, Strategy};
 pub use rates::{AdamSettings, RateSettings};
 pub use schedule::{ResolutionSettings, ShSettings, StopSettings, ViewSettings};
+pub use skips::SkipSettings;
 
 use serde::{Deserialize, Serialize};
 
@@ -43,6 +45,8 @@ pub struct TrainSettings {
     pub stop: StopSettings,
     /// Regularisers that act on the parameters or on the rendering.
     pub regularise: RegulariseSettings,
+    /// Work that is left out because it changes nothing.
+    pub skips: SkipSettings,
     /// Optimise a 6-vector per view (rotation and translation of world → camera) together with the cloud.
     pub refine_poses: bool,
     /// Optimise six scalars per view: log gain and offset of each channel.
@@ -64,6 +68,7 @@ impl Default for TrainSettings {
             views: ViewSettings::default(),
             stop: StopSettings::default(),
             regularise: RegulariseSettings::default(),
+            skips: SkipSettings::default(),
             refine_poses: false,
             refine_exposure: false,
         }

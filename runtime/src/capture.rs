@@ -107,7 +107,7 @@ impl KeyframeSelector {
         };
         if near(last, t_min) {
             Decision::TooClose
-        } else if self.chosen.iter().any(|k| near(k, 0.5 * t_min)) {
+        } else if self.settings.skip_covered && self.chosen.iter().any(|k| near(k, 0.5 * t_min)) {
             Decision::Covered
         } else if self.chosen.len() >= self.settings.max as usize {
             Decision::Full
@@ -132,7 +132,7 @@ mod tests {
     }
 
     fn selector(max: u32) -> KeyframeSelector {
-        KeyframeSelector::new(KeyframeSettings { t_min_m: 5.0, r_max_deg: 15.0, max })
+        KeyframeSelector::new(KeyframeSettings { max, ..KeyframeSettings::default() })
     }
 
     #[test]
@@ -164,6 +164,14 @@ mod tests {
         assert_eq!(s.retract(), Decision::Unusable);
         assert_eq!(s.consider(&at(7.0, 0.0)), Decision::Key);
         assert_eq!((s.counters().key, s.counters().unusable), (2, 1));
+    }
+
+    #[test]
+    fn covered_places_are_captured_again_when_that_is_wanted() {
+        let mut s = KeyframeSelector::new(KeyframeSettings { skip_covered: false, ..KeyframeSettings::default() });
+        for x in [0.0, 6.0, 0.0] {
+            assert_eq!(s.consider(&at(x, 0.0)), Decision::Key);
+        }
     }
 
     #[test]

@@ -9,6 +9,7 @@ use clap::{Parser, Subcommand};
 use crate::console;
 
 mod aggregate;
+mod bench;
 mod demo;
 mod doctor;
 mod error;
@@ -75,6 +76,8 @@ enum Command {
     Export(export::Args),
     /// Makes a model of another program's file.
     Import(import::Args),
+    /// Measures run time, memory, error, skips and numerical promises.
+    Bench(bench::Args),
     /// Prints what a memory budget holds, section by section.
     Plan(plan::Args),
     /// Checks device, driver, ONNX Runtime, ports: what is there, what is missing, how to mend it.
@@ -112,6 +115,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Command::Demo(args) => demo::run(args),
         Command::Export(args) => export::run(args),
         Command::Import(args) => import::run(args),
+        Command::Bench(args) => bench::run(args),
         Command::Plan(args) => plan::run(args),
         Command::Doctor(args) => doctor::run(args),
     };

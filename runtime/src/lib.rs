@@ -1,6 +1,7 @@
 //! The order of work: capture, initialise, train, checkpoint, upload, aggregate, evaluate. Only this crate knows it.
 
 pub mod aggregate;
+pub mod bench;
 pub mod capture;
 pub mod cli;
 pub mod console;

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use image::RgbImage;
 use models::formats::{FormatError, write_atomic};
 
+pub mod chart;
 mod html;
 mod map;
 mod picture;
@@ -34,6 +35,8 @@ pub struct ReportData {
     pub skipped: Vec<(String, u64)>,
     /// What the reader should know before trusting the figures.
     pub warnings: Vec<String>,
+    /// Curves.
+    pub charts: Vec<chart::Chart>,
     /// Anything else in rows and columns.
     pub tables: Vec<Table>,
     /// Files that belong to the report: what, where.

@@ -309,6 +309,8 @@ impl TrainJob {
                 // The counters run on since `load`.
                 report.skipped.insert(name.to_owned(), count);
             }
+            let work = serde_json::json!({ "instances": c.instances, "evaluations": c.evaluations });
+            report.more.insert("work".to_owned(), work);
             let over = summary.reason != StopReason::Caller;
             if over {
                 break Some(save(trainer, report, true)?);

@@ -103,7 +103,7 @@ void main() {
         slots[slot] = vec4(q, qx, qy, total);
         slots[slot + 1u] = vec4(qxx, qxy, qyy, depth);
         slots[slot + 2u] = vec4(colour, 0.0);
-        live = most > 0.0;
+        live = most > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
         i++;
     }
     // Slots behind an opaque tile: a total of zero says that the other two vectors were not written.

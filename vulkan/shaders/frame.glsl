@@ -13,6 +13,11 @@ layout(constant_id = 4) const uint LOOP_LANES = 1024;
 
 const uint FLAG_FREEZE_SHAPE = 1u;
 const uint FLAG_DEPTH = 4u;
+// Skips switched off, for the benchmark that says what each is worth; they change no picture.
+const uint FLAG_KEEP_OUTSIDE = 8u;   // no culling at the picture's edges
+const uint FLAG_KEEP_FAINT = 16u;    // no culling by opacity
+const uint FLAG_WHOLE_BOXES = 32u;   // every tile of the bounding box, not only those the ellipse touches
+const uint FLAG_NO_EARLY_END = 64u;  // tiles are blended to the end, opaque or not
 
 layout(std140, set = 0, binding = 0) uniform Frame {
     vec4 view_row[3];      // world → camera, rotation rows and translation

@@ -48,7 +48,8 @@ void main() {
     float opacity = sigmoid(p0.w) / (1.0 - drop);
     bool dropped = drop > 0.0 && uniform_hash(g, 7u) < drop;
     z = dot(frame.view_row[2].xyz, p0.xyz) + frame.view_row[2].w;
-    bool visible = z >= frame.camera.w && z < 1.0e30 && opacity >= ALPHA_MIN && !dropped;
+    float faintest = (frame.counts.z & FLAG_KEEP_FAINT) != 0u ? 1.0e-30 : ALPHA_MIN;
+    bool visible = z >= frame.camera.w && z < 1.0e30 && opacity >= faintest && !dropped;
 
     Projection s = project_gaussian(p0.xyz, p1.xyz, p2);
     vec2 centre = s.p.xy / s.p.z * frame.lens.xy + frame.lens.zw;
@@ -60,7 +61,9 @@ void main() {
     // A hundredth of a pixel more than exact, so that rounding never drops a pixel that the blend would take.
     vec2 half_size = sqrt(max(reach, 0.0) * s.cov.xz) + 0.01;
     vec2 least = centre - half_size, most = centre + half_size;
-    visible = visible && all(lessThanEqual(least, vec2(frame.size.xy) - 0.5)) && all(greaterThanEqual(most, vec2(0.5)));
+    bool inside = all(lessThanEqual(least, vec2(frame.size.xy) - 0.5)) && all(greaterThanEqual(most, vec2(0.5)));
+    bool kept = (frame.counts.z & FLAG_KEEP_OUTSIDE) != 0u && all(lessThan(abs(centre), vec2(1.0e9)));
+    visible = visible && (inside || kept);
     // Comparisons with NaN are false: whatever is not a number is not visible.
     keys[g] = visible ? floatBitsToUint(z) : 0xFFFFFFFFu;
     if (visible) {

@@ -47,7 +47,7 @@ void main() {
                 most = max(most, T[k]);
             }
         }
-        live = most > 0.0;
+        live = most > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
         i++;
     }
     // Counted work: how many Gaussians were blended before the tile was opaque.

@@ -31,9 +31,10 @@ ivec2 span_in_row(Spans s, int row) {
     y0 = clamp(y0, -s.half_height, s.half_height);
     y1 = clamp(y1, -s.half_height, s.half_height);
     precise float square = s.half_height * s.half_height;
-    precise float dy = clamp(s.tip, y0, y1);
+    bool box = (frame.counts.z & FLAG_WHOLE_BOXES) != 0u;
+    precise float dy = box ? s.tip : clamp(s.tip, y0, y1);
     precise float right = s.slope * dy + s.width * sqrt(max(square - dy * dy, 0.0)) + 0.01;
-    dy = clamp(-s.tip, y0, y1);
+    dy = box ? -s.tip : clamp(-s.tip, y0, y1);
     precise float left = s.slope * dy - s.width * sqrt(max(square - dy * dy, 0.0)) - 0.01;
     precise float x = s.centre.x - float(frame.region.x) - 0.5;
     precise float first = clamp(floor((x + left - float(TILE_WIDTH - 1)) / float(TILE_WIDTH)) + 1.0, 0.0, 1.0e6);

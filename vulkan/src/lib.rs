@@ -3,6 +3,8 @@
 //! [`gpu::Gpu`] opens a device, [`config::plan::Plan`] says what is allocated, [`trainer::Trainer`] trains and renders.
 
 mod arena;
+pub mod cases;
+pub mod ceiling;
 mod commands;
 pub mod constants;
 pub mod gpu;

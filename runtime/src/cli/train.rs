@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::ValueEnum;
 use config::init::InitSettings;
 use config::mission::NetworkSettings;
+use config::preset::Preset;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use models::dataset::PoseSource;
@@ -66,15 +67,18 @@ pub struct Args {
     /// Seconds of training; with --steps, whichever comes first.
     #[arg(long)]
     seconds: Option<f64>,
-    /// Device memory, MiB, allocated once.
-    #[arg(long, default_value_t = 512)]
-    budget_mib: u32,
+    /// Budgets of a class of hardware, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
+    #[arg(long, value_parser = preset)]
+    preset: Option<Preset>,
+    /// Device memory, MiB, allocated once [default: 512].
+    #[arg(long)]
+    budget_mib: Option<u32>,
     /// Most Gaussians; default: what the budget holds.
     #[arg(long)]
     max_gaussians: Option<usize>,
-    /// Image scale, above 0 and at most 1.
-    #[arg(long, default_value_t = 1.0)]
-    scale: f64,
+    /// Image scale, above 0 and at most 1 [default: 1].
+    #[arg(long)]
+    scale: Option<f64>,
     /// Seed of everything random; same seed and device, same model.
     #[arg(long)]
     seed: Option<u64>,
@@ -108,6 +112,11 @@ struct Settings {
     network: NetworkSettings,
 }
 
+fn preset(name: &str) -> Result<Preset, String> {
+    let known = || Preset::ALL.map(|p| p.0).join(", ");
+    Preset::named(name).ok_or_else(|| format!("known presets: {}", known()))
+}
+
 /// Runs `dgtr train`.
 pub fn run(args: Args) -> Result<(), CliError> {
     for (name, value) in [("--seconds", args.seconds), ("--checkpoint-seconds", Some(args.checkpoint_seconds))] {
@@ -133,6 +142,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
         settings.training.seed = seed;
         settings.init.seed = seed;
     }
+    let preset = args.preset.map(Preset::values);
+    // A schedule in steps or in a settings file is not cut short by a preset.
+    let seconds = match args.steps.is_some() || settings.training.seconds.is_some() {
+        true => args.seconds,
+        false => args.seconds.or(preset.map(|p| p.seconds)),
+    };
     let job = TrainJob {
         dataset: args.dataset,
         out: args.out,
@@ -149,10 +164,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
         },
         refine: !args.no_refine,
         steps: args.steps,
-        seconds: args.seconds,
-        budget_mib: args.budget_mib,
-        max_gaussians: args.max_gaussians,
-        scale: args.scale,
+        seconds,
+        budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)).unwrap_or(512),
+        max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
+        scale: args.scale.or(preset.map(|p| p.image_scale.into())).unwrap_or(1.0),
         device: args.device,
         network: settings.network,
         checkpoint_seconds: args.checkpoint_seconds,

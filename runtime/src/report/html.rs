@@ -97,6 +97,11 @@ pub(super) fn page(data: &ReportData) -> Result<String, ReportError> {
     models(&mut out, data);
     comparisons(&mut out, &data.comparisons)?;
     timings(&mut out, data);
+    for chart in &data.charts {
+        if let Some(svg) = chart.svg(false) {
+            let _ = write!(out, "<h2>{}</h2><div class=\"card\">{svg}</div>\n", escape(&chart.title));
+        }
+    }
     for t in &data.tables {
         table(&mut out, t);
     }

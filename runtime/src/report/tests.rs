@@ -50,6 +50,7 @@ fn sample() -> ReportData {
         ],
         skipped: vec![("views without a seam, not distilled".into(), 31), ("pictures without a pose".into(), 1)],
         warnings: vec!["east's link was lost for 12 s; <3 pictures> & nothing else are missing".into()],
+        charts: vec![],
         tables: vec![],
         files: vec![("global model".into(), "/tmp/out/global.dgtr".into())],
     }

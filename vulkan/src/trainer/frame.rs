@@ -1,6 +1,7 @@
 //! The uniform block of a step, field by field what `shaders/frame.glsl` declares, and how a camera fills it.
 
 use crate::constants::{FRUSTUM_MARGIN, NEAR, TILE_HEIGHT, TILE_WIDTH};
+use config::training::SkipSettings;
 use models::camera::View;
 
 /// Steps in the table of deferred moments; no Gaussian is left behind for longer.
@@ -9,6 +10,19 @@ pub(crate) const DEFERRED_STEPS: usize = 512;
 /// Bits of `counts[2]`.
 pub(crate) const FLAG_FREEZE_SHAPE: u32 = 1;
 pub(crate) const FLAG_DEPTH: u32 = 4;
+const FLAG_KEEP_OUTSIDE: u32 = 8;
+const FLAG_KEEP_FAINT: u32 = 16;
+const FLAG_WHOLE_BOXES: u32 = 32;
+const FLAG_NO_EARLY_END: u32 = 64;
+
+/// The flags of the skips that are switched off.
+pub(crate) fn flags_of(skips: &SkipSettings) -> u32 {
+    let off = |on: bool, flag: u32| if on { 0 } else { flag };
+    off(skips.frustum, FLAG_KEEP_OUTSIDE)
+        | off(skips.opacity, FLAG_KEEP_FAINT)
+        | off(skips.exact_tiles, FLAG_WHOLE_BOXES)
+        | off(skips.early_end, FLAG_NO_EARLY_END)
+}
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]

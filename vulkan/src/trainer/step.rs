@@ -1,7 +1,7 @@
 //! One training step.
 
 use super::bands::Counted;
-use super::frame::{FLAG_DEPTH, FLAG_FREEZE_SHAPE};
+use super::frame::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, flags_of};
 use super::{StepReport, TrainError, Trainer};
 use crate::commands::Push;
 use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
@@ -43,6 +43,9 @@ impl Trainer {
         self.elapsed_s += start.elapsed().as_secs_f64();
         let mut report = self.read_loss(index, counted, divisor, progress);
         self.control_density(progress)?;
+        if !self.settings.skips.deferred_moments {
+            self.flush()?;
+        }
         report.gaussians = self.gaussians;
         Ok(report)
     }
@@ -63,7 +66,7 @@ impl Trainer {
         f.look(&view);
         let pixels = (width * height) as f32;
         let has_depth = resident.depth_at != 0 && s.loss.depth > 0.0;
-        let mut flags = 0;
+        let mut flags = flags_of(&s.skips);
         if s.loss.freeze_shape {
             flags |= FLAG_FREEZE_SHAPE;
         }

@@ -1,0 +1,14 @@
+//! `dgtr bench`: run time against error, memory, numerical stress and every skip, measured by the program itself, so that
+//! each figure of the README has a command that makes it anew.
+
+pub mod child;
+pub mod figures;
+pub mod front;
+pub mod memory;
+pub mod skips;
+pub mod slopes;
+pub mod stages;
+pub mod stress;
+pub mod synthetic;
+pub mod time_error;
+pub mod world;

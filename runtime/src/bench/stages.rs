@@ -1,0 +1,295 @@
+//! Milliseconds per stage from the device's own timestamps, beside the work counted for that stage and the least time the
+//! device could do it in.
+
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use config::plan::{Plan, PlanRequest, sh_columns};
+use config::training::{Strategy, TrainSettings};
+use models::camera::PosedImage;
+use models::cloud::GaussianCloud;
+use models::dataset::Dataset;
+use serde::Serialize;
+use vulkan::ceiling::Ceiling;
+use vulkan::gpu::Gpu;
+use vulkan::stages::work::{Load, work};
+use vulkan::stages::{STAGE_NAMES, STAGES};
+use vulkan::trainer::{Counters, RunBudget, Trainer};
+
+use super::figures::short;
+use super::slopes::{DRIVERS, Driver, Line, fit};
+use super::synthetic;
+use crate::cli::CliError;
+use crate::report::Table;
+
+/// Steps before the measured ones: the first compiles the kernels, the second finds the number of counting rounds.
+const WARM_UP: u32 = 3;
+/// Views of a synthetic scene, and how far apart they are in pictures.
+const SHIFTS: [f64; 3] = [0.0, -0.05, 0.05];
+/// Device memory a size may take, MiB; what is allocated is what its Gaussians and pixels need.
+const MOST_MIB: u32 = 16 << 10;
+
+/// One stage at one size, per step.
+#[derive(Clone, Debug, Serialize)]
+pub struct StageFigures {
+    /// Name of the stage.
+    pub stage: &'static str,
+    /// Measured device time, ms.
+    pub ms: f64,
+    /// Bytes it must move.
+    pub bytes: u64,
+    /// Operations it must do.
+    pub operations: u64,
+    /// Time the device needs at least for both, by its measured ceilings, ms.
+    pub least_ms: f64,
+}
+
+/// One size.
+#[derive(Clone, Debug, Serialize)]
+pub struct SizeFigures {
+    /// What was trained on.
+    pub scene: String,
+    /// Picture width, pixels.
+    pub width: u32,
+    /// Picture height, pixels.
+    pub height: u32,
+    /// Gaussians loaded.
+    pub gaussians: u64,
+    /// Gaussians in view, per step.
+    pub visible: u64,
+    /// Instances, per step.
+    pub instances: u64,
+    /// Gaussian–pixel evaluations of the forward blend, per step.
+    pub evaluations: u64,
+    /// Steps measured.
+    pub steps: u32,
+    /// Share of them that needed more than one band.
+    pub banded: f64,
+    /// Wall clock per step, ms.
+    pub step_ms: f64,
+    /// The stages.
+    pub stages: Vec<StageFigures>,
+    #[serde(skip)]
+    load: Load,
+}
+
+/// How one stage grows.
+#[derive(Clone, Debug, Serialize)]
+pub struct Growth {
+    /// Name of the stage.
+    pub stage: &'static str,
+    /// What it loops over.
+    pub driver: Driver,
+    /// Milliseconds against the driver's amount.
+    pub line: Line,
+    /// Why.
+    pub because: &'static str,
+}
+
+/// Pictures and Gaussians to train.
+pub struct Scene {
+    name: String,
+    pictures: Vec<PosedImage>,
+    cloud: GaussianCloud,
+}
+
+impl Scene {
+    /// `gaussians` synthetic Gaussians under a camera of `width` × `height`.
+    pub fn synthetic(gaussians: usize, width: u32, height: u32, seed: u64) -> Self {
+        let pictures = SHIFTS.iter().map(|s| synthetic::picture(&synthetic::view(width, height, *s), seed)).collect();
+        Self { name: "synthetic".into(), pictures, cloud: synthetic::cloud(gaussians, width, height, seed) }
+    }
+
+    /// The training pictures of a data set at `scale`, with its sparse points as Gaussians.
+    ///
+    /// # Errors
+    /// The data set cannot be read or has no sparse points.
+    pub fn of_dataset(root: &Path, scale: f64) -> Result<Self, CliError> {
+        let set = Dataset::open(root)?;
+        let frames = set.select("train", None)?;
+        let pictures = frames.iter().map(|&i| set.load(i, scale)).collect::<Result<Vec<_>, _>>()?;
+        let points = set.sparse_points_of(&frames)?;
+        let (positions, colours): (Vec<[f32; 3]>, Vec<[u8; 3]>) =
+            points.iter().map(|p| (p.position.map(|v| v as f32), p.color)).unzip();
+        let cloud = models::init::from_sfm(&positions, &colours, positions.len().max(1))?;
+        let name = root.file_name().map_or_else(|| "data set".into(), |n| n.to_string_lossy().into_owned());
+        Ok(Self { name, pictures, cloud })
+    }
+}
+
+/// Trains `steps` steps of `scene` at full size without density control, and divides by them.
+///
+/// # Errors
+/// The device, or its memory.
+pub fn measure(gpu: &Gpu, ceiling: &Ceiling, scene: &Scene, steps: u32) -> Result<SizeFigures, CliError> {
+    let largest = scene.pictures.iter().map(|p| p.image.dimensions()).max_by_key(|(w, h)| w * h);
+    let Some((width, height)) = largest else {
+        return Err(CliError::input(format!("{}: no training pictures", scene.name)));
+    };
+    let plan = Plan::new(&PlanRequest {
+        device_mib: MOST_MIB,
+        width,
+        height,
+        views: scene.pictures.len() as u32,
+        sh_degree: 3,
+        max_gaussians: Some(scene.cloud.len()),
+    })?;
+    let mut settings = TrainSettings { steps: WARM_UP + steps, ..TrainSettings::default() };
+    settings.density.strategy = Strategy::None;
+    (settings.resolution.quarter_until, settings.resolution.half_until) = (0.0, 0.0);
+    settings.stop.enabled = false;
+    let mut trainer = Trainer::new(gpu, &plan, &settings)?;
+    trainer.load(&scene.cloud)?;
+    for p in &scene.pictures {
+        trainer.add_view(p, None)?;
+    }
+    let budget = RunBudget { steps: Some(settings.steps), seconds: None };
+    let warm = trainer.run(&budget, &mut |r| match r.step < WARM_UP {
+        true => ControlFlow::Continue(()),
+        false => ControlFlow::Break(()),
+    })?;
+    let before = trainer.stage_ms();
+    let summary = trainer.run(&budget, &mut |_| ControlFlow::Continue(()))?;
+    let n = u64::from(summary.steps.max(1));
+    let c = per_step(&summary.counters, &warm.counters, n);
+    let gaussians = trainer.gaussians() as u64;
+    let load = Load {
+        gaussians,
+        visible: gaussians.saturating_sub(c.culled),
+        instances: c.instances,
+        evaluations: c.evaluations,
+        pixels: u64::from(width) * u64::from(height),
+        sh_columns: sh_columns(3),
+    };
+    let after = trainer.stage_ms();
+    let stages = STAGES.iter().enumerate().map(|(i, stage)| {
+        let w = work(*stage, &load);
+        StageFigures {
+            stage: STAGE_NAMES[i],
+            ms: (after[i].1 - before[i].1) / n as f64,
+            bytes: w.bytes,
+            operations: w.operations,
+            least_ms: 1e3 * ceiling.least_seconds(w.bytes, w.operations),
+        }
+    });
+    Ok(SizeFigures {
+        scene: scene.name.clone(),
+        width,
+        height,
+        gaussians,
+        visible: load.visible,
+        instances: load.instances,
+        evaluations: load.evaluations,
+        steps: summary.steps,
+        banded: (summary.counters.banded_steps - warm.counters.banded_steps) as f64 / n as f64,
+        step_ms: 1e3 * summary.seconds / n as f64,
+        stages: stages.collect(),
+        load,
+    })
+}
+
+/// The counters that grow with every step, less what the warm-up had counted.
+fn per_step(all: &Counters, warm: &Counters, steps: u64) -> Counters {
+    Counters {
+        culled: (all.culled - warm.culled) / steps,
+        instances: (all.instances - warm.instances) / steps,
+        evaluations: (all.evaluations - warm.evaluations) / steps,
+        ..Counters::default()
+    }
+}
+
+/// A line per stage through all sizes.
+pub fn growth(sizes: &[SizeFigures]) -> Vec<Growth> {
+    let line = |i: usize| {
+        let (driver, because) = Driver::of(STAGES[i]);
+        let points: Vec<_> = sizes.iter().map(|s| (driver.amount(&s.load) as f64, s.stages[i].ms)).collect();
+        fit(&points).map(|line| Growth { stage: STAGE_NAMES[i], driver, line, because })
+    };
+    (0..STAGES.len()).filter_map(line).collect()
+}
+
+/// One table per size.
+pub fn size_table(size: &SizeFigures) -> Table {
+    let share = |least: f64, ms: f64| match ms > 0.0 {
+        true => format!("{:.0} %", 100.0 * least / ms),
+        false => "–".into(),
+    };
+    let row = |name: &str, ms: f64, bytes: f64, operations: f64, least: f64| {
+        vec![name.into(), short(ms), short(bytes * 1e-6), short(operations * 1e-6), short(least), share(least, ms)]
+    };
+    let mut rows: Vec<Vec<String>> =
+        size.stages.iter().map(|s| row(s.stage, s.ms, s.bytes as f64, s.operations as f64, s.least_ms)).collect();
+    let sum = |f: fn(&StageFigures) -> f64| size.stages.iter().map(f).sum::<f64>();
+    rows.push(row("sum", sum(|s| s.ms), sum(|s| s.bytes as f64), sum(|s| s.operations as f64), sum(|s| s.least_ms)));
+    rows.push(vec!["wall clock".into(), short(size.step_ms)]);
+    Table {
+        title: format!("{}: {} Gaussians, {}×{}", size.scene, size.gaussians, size.width, size.height),
+        note: format!(
+            "Per step: {} visible, {} instances, {:.2} M evaluations{}; mean of {} steps.",
+            size.visible,
+            size.instances,
+            size.evaluations as f64 * 1e-6,
+            if size.banded > 0.0 {
+                format!(", {:.0} % of the steps in bands", 100.0 * size.banded)
+            } else {
+                String::new()
+            },
+            size.steps
+        ),
+        head: ["stage", "ms", "MB moved", "M operations", "least ms", "of the ceiling"].map(String::from).to_vec(),
+        rows,
+    }
+}
+
+/// One row per size: what a step took in all.
+pub fn overview_table(sizes: &[SizeFigures]) -> Table {
+    let row = |s: &SizeFigures| {
+        let device: f64 = s.stages.iter().map(|x| x.ms).sum();
+        let least: f64 = s.stages.iter().map(|x| x.least_ms).sum();
+        vec![
+            format!("{} {}×{}", s.scene, s.width, s.height),
+            s.gaussians.to_string(),
+            s.visible.to_string(),
+            s.instances.to_string(),
+            short(s.evaluations as f64 * 1e-6),
+            short(s.step_ms),
+            short(device),
+            if device > 0.0 { format!("{:.0} %", 100.0 * least / device) } else { "–".into() },
+        ]
+    };
+    let head =
+        ["scene", "Gaussians", "visible", "instances", "M evaluations", "ms per step", "device ms", "of the ceiling"];
+    Table {
+        title: "Whole steps".into(),
+        note: String::new(),
+        head: head.map(String::from).to_vec(),
+        rows: sizes.iter().map(row).collect(),
+    }
+}
+
+/// The slopes, stage by stage, then added up by what they grow with.
+pub fn growth_table(growth: &[Growth]) -> Table {
+    let mut rows: Vec<Vec<String>> = growth
+        .iter()
+        .map(|g| {
+            vec![
+                g.stage.into(),
+                format!("per {}", g.driver.name()),
+                short(1e6 * g.line.per_unit),
+                short(g.line.fixed),
+                g.line.r_squared.map_or("–".into(), |r| format!("{r:.2}")),
+                g.because.into(),
+            ]
+        })
+        .collect();
+    for driver in DRIVERS {
+        let ns: f64 = growth.iter().filter(|g| g.driver == driver).map(|g| 1e6 * g.line.per_unit).sum();
+        rows.push(vec!["all stages".into(), format!("per {}", driver.name()), short(ns)]);
+    }
+    Table {
+        title: "How cost grows".into(),
+        note: "A straight line through every size: time = fixed + slope × amount.".into(),
+        head: ["stage", "grows", "slope, ns", "fixed, ms", "R²", "because"].map(String::from).to_vec(),
+        rows,
+    }
+}

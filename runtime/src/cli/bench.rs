@@ -1,0 +1,57 @@
+//! `dgtr bench …`: one subcommand per question; results as Markdown on standard output, JSON and CSV on request.
+
+mod memory;
+mod skips;
+mod stages;
+mod stress;
+mod time_error;
+
+use clap::{Subcommand, ValueEnum};
+
+use super::CliError;
+
+/// Arguments of `dgtr bench`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Milliseconds, bytes and operations per stage, against what the device can do.
+    Stages(stages::Args),
+    /// Planned against measured bytes, and quality, across memory budgets.
+    Memory(memory::Args),
+    /// Every skip off and on: work avoided, seconds saved, error added.
+    Skips(skips::Args),
+    /// Numbers that broke other renderers: the promise, the outcome, what was counted.
+    Stress(stress::Args),
+    /// Seconds from the first picture against held-out error, and the Pareto front.
+    TimeError(time_error::Args),
+}
+
+/// Where the first Gaussians come from, as `dgtr train --init` takes it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Init {
+    FeedForward,
+    Sfm,
+    Random,
+}
+
+impl Init {
+    fn flag(self) -> String {
+        self.to_possible_value().map_or_else(String::new, |v| v.get_name().to_owned())
+    }
+}
+
+/// Runs `dgtr bench`.
+pub fn run(args: Args) -> Result<(), CliError> {
+    match args.command {
+        Command::Stages(args) => stages::run(args),
+        Command::Memory(args) => memory::run(args),
+        Command::Skips(args) => skips::run(args),
+        Command::Stress(args) => stress::run(args),
+        Command::TimeError(args) => time_error::run(args),
+    }
+}

@@ -1,0 +1,134 @@
+//! Promises of `dgtr bench`: every subcommand ends with figures that can be trusted, on the smallest scenes there are.
+//! Seconds are never asserted.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use runtime::bench::world::write_data_set;
+use serde_json::Value;
+
+fn bench(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_dgtr")).arg("bench").args(arguments).output().unwrap()
+}
+
+fn held(output: &Output) -> String {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+fn has_device() -> bool {
+    let found = vulkan::gpu::Gpu::list().is_ok();
+    if !found {
+        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+    }
+    found
+}
+
+#[test]
+fn stages_have_time_work_and_a_ceiling() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("stages.json");
+    let path = file.to_string_lossy().into_owned();
+    let arguments = ["stages", "--gaussians", "300,600", "--sizes", "64x48", "--steps", "2", "--json", &path];
+    let text = held(&bench(&arguments));
+    assert!(text.contains("How cost grows") && text.contains("rasterise_backward"), "{text}");
+    let all = json(&file);
+    assert!(all["operations_per_s"].as_f64().unwrap() > 0.0);
+    let sizes = all["sizes"].as_array().unwrap();
+    assert_eq!(sizes.len(), 2);
+    for size in sizes {
+        let stages = size["stages"].as_array().unwrap();
+        assert_eq!(stages.len(), vulkan::stages::STAGES.len());
+        assert!(stages.iter().all(|s| s["bytes"].as_u64().unwrap() > 0 && s["least_ms"].as_f64().unwrap() > 0.0));
+        assert!(size["instances"].as_u64().unwrap() > size["visible"].as_u64().unwrap() / 2);
+    }
+}
+
+#[test]
+fn a_budget_is_what_is_allocated_and_one_too_small_is_a_row_that_says_so() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("memory.json");
+    let path = file.to_string_lossy().into_owned();
+    let arguments = ["memory", "--budgets", "16,40", "--steps", "2", "--scale", "0.5", "--init", "random"];
+    let text = held(&bench(&[&arguments[..], &["--json", &path]].concat()));
+    assert!(text.contains("as planned"), "{text}");
+    let budgets = json(&file)["budgets"].as_array().unwrap().clone();
+    let measured: Vec<&Value> = budgets.iter().filter(|b| b["failed"].is_null()).collect();
+    assert!(!measured.is_empty());
+    for b in measured {
+        assert_eq!(b["planned_bytes"], b["allocated_bytes"]);
+        assert!(b["resident_bytes"].as_u64().unwrap() <= b["limit_mib"].as_u64().unwrap() << 20, "{b}");
+    }
+    let refused = bench(&["memory", "--budgets", "1", "--steps", "2", "--init", "random"]);
+    assert!(held(&refused).contains("too few"), "a refused budget is a row");
+}
+
+#[test]
+fn time_against_error_leaves_figures_a_picture_and_a_page_and_keeps_what_it_measured() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    write_data_set(&dir.path().join("world"), 2).unwrap();
+    let (set, out) = (path("world"), path("out"));
+    let arguments = [
+        "time-error",
+        &set,
+        "--out",
+        &out,
+        "--seconds",
+        "0.5,1",
+        "--seeds",
+        "1",
+        "--init",
+        "random",
+        "--scale",
+        "0.25",
+        "--max-gaussians",
+        "2000",
+    ];
+    let text = held(&bench(&arguments));
+    assert!(text.contains("world random"), "{text}");
+    let first = json(&dir.path().join("out/result.json"));
+    assert_eq!(first["points"].as_array().unwrap().len(), 2);
+    assert!(first["groups"].as_array().unwrap().iter().any(|g| g["on_front"] == true));
+    let svg = std::fs::read_to_string(dir.path().join("out/world.svg")).unwrap();
+    assert!(svg.contains("<circle"), "{svg}");
+    assert!(std::fs::read_to_string(dir.path().join("out/report.html")).unwrap().contains("<svg"));
+    held(&bench(&arguments));
+    assert_eq!(json(&dir.path().join("out/result.json")), first, "points that are there were measured again");
+}
+
+#[test]
+fn every_skip_is_a_row_with_a_verdict() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("skips.json");
+    let path = file.to_string_lossy().into_owned();
+    let arguments = ["skips", "--steps", "2", "--scale", "0.25", "--init", "random", "--max-gaussians", "500"];
+    let text = held(&bench(&[&arguments[..], &["--json", &path]].concat()));
+    let runs = json(&file)["runs"].as_array().unwrap().clone();
+    let switched = runtime::bench::skips::SKIPS.iter().filter(|s| !s.feed_forward).count();
+    assert_eq!(runs.len(), switched + 1, "{text}");
+    assert!(text.contains("by the rule") && text.contains("key frames of 24 pictures"), "{text}");
+}
+
+#[test]
+fn the_twin_keeps_every_promise_without_a_device() {
+    let text = held(&bench(&["stress", "--twin-only"]));
+    assert!(text.contains("held") && !text.contains("BROKEN"), "{text}");
+}

@@ -1,0 +1,94 @@
+//! What the device itself can do, measured: bytes moved and multiply-adds per second by kernels that do nothing else.
+//! `dgtr bench stages` holds every stage's counted work against these two figures.
+
+mod probe;
+
+use crate::gpu::{Gpu, GpuError};
+use probe::{Kind, Probe};
+use std::time::Instant;
+
+/// Bytes of each of the two buffers that are copied into one another: far beyond any cache of a companion computer.
+const BUFFER_BYTES: u64 = 64 << 20;
+/// A measurement repeats its kernel until it takes this long, so that submitting costs nothing in comparison.
+const LEAST_SECONDS: f64 = 0.04;
+/// The best of so many: what else runs on the machine can only make a measurement slower.
+const MEASUREMENTS: usize = 5;
+/// Lanes of the arithmetic kernel: enough for the widest GPU, short of work for none.
+const FMA_LANES: u32 = 1 << 18;
+/// Turns of its loop; llvmpipe ends an invocation's loops after 65,535.
+const FMA_TURNS: u32 = 64;
+/// Operations per turn and lane: 16 chains × 8 unrolled, a multiply and an addition each (`ceiling_fma.comp`).
+const FMA_PER_TURN: u64 = 16 * 8 * 2;
+
+/// Measured rates of a device.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ceiling {
+    /// Bytes read plus bytes written per second by a compute kernel that copies.
+    pub kernel_bytes_per_s: f64,
+    /// The same by the device's own copy command.
+    pub command_bytes_per_s: f64,
+    /// Floating-point operations per second, a fused multiply-add counted as two.
+    pub operations_per_s: f64,
+}
+
+impl Ceiling {
+    /// The larger of the two copying rates.
+    pub fn bytes_per_s(&self) -> f64 {
+        self.kernel_bytes_per_s.max(self.command_bytes_per_s)
+    }
+
+    /// Seconds that moving `bytes` and computing `operations` takes at least, both at once.
+    pub fn least_seconds(&self, bytes: u64, operations: u64) -> f64 {
+        (bytes as f64 / self.bytes_per_s()).max(operations as f64 / self.operations_per_s)
+    }
+}
+
+/// Measures `gpu`; takes about a second.
+///
+/// # Errors
+/// [`GpuError`], in particular when 128 MiB of device memory cannot be had.
+pub fn measure(gpu: &Gpu) -> Result<Ceiling, GpuError> {
+    let probe = Probe::new(gpu, BUFFER_BYTES)?;
+    let moved = 2 * BUFFER_BYTES;
+    Ok(Ceiling {
+        kernel_bytes_per_s: rate(&probe, Kind::CopyKernel, moved)?,
+        command_bytes_per_s: rate(&probe, Kind::CopyCommand, moved)?,
+        operations_per_s: rate(
+            &probe,
+            Kind::Fma { lanes: FMA_LANES, turns: FMA_TURNS },
+            u64::from(FMA_LANES) * u64::from(FMA_TURNS) * FMA_PER_TURN,
+        )?,
+    })
+}
+
+/// Units per second when one run of `kind` is worth `units`.
+fn rate(probe: &Probe, kind: Kind, units: u64) -> Result<f64, GpuError> {
+    let timed = |repeats: u32| {
+        let start = Instant::now();
+        probe.run(kind, repeats)?;
+        Ok::<f64, GpuError>(start.elapsed().as_secs_f64().max(1e-9))
+    };
+    // The first run also compiles.
+    timed(1)?;
+    let mut repeats = 1;
+    while repeats < 1 << 12 && timed(repeats)? < LEAST_SECONDS {
+        repeats *= 2;
+    }
+    let mut best = 0.0f64;
+    for _ in 0..MEASUREMENTS {
+        best = best.max(units as f64 * f64::from(repeats) / timed(repeats)?);
+    }
+    Ok(best)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_slower_of_moving_and_computing_decides() {
+        let c = Ceiling { kernel_bytes_per_s: 10.0, command_bytes_per_s: 5.0, operations_per_s: 100.0 };
+        assert_eq!(c.least_seconds(100, 100), 10.0);
+        assert_eq!(c.least_seconds(10, 1000), 10.0);
+    }
+}
