@@ -29,8 +29,11 @@ void main() {
         }
         [[unroll]] for (int o = 0; o < STRIP; o++) {
             float ma = sum[o].x, mb = sum[o].y, cross2 = 2.0 * ma * mb, square = ma * ma + mb * mb;
-            float a1 = cross2 + SSIM_C1, a2 = 2.0 * sum[o].w - cross2 + SSIM_C2;
-            float b1 = square + SSIM_C1, b2 = sum[o].z - square + SSIM_C2;
+            // Rounding may make a variance negative, or the covariance larger than both: far beyond colours of 1 the
+            // denominator would otherwise reach zero.
+            float variances = max(sum[o].z - square, 0.0);
+            float a1 = cross2 + SSIM_C1, a2 = clamp(2.0 * sum[o].w - cross2, -variances, variances) + SSIM_C2;
+            float b1 = square + SSIM_C1, b2 = variances + SSIM_C2;
             float r1 = 1.0 / b1, r2 = 1.0 / b2, both = r1 * r2, s = a1 * a2 * both;
             vec3 d = vec3(2.0 * mb * (a2 - a1) * both + 2.0 * ma * s * (r2 - r1), -s * r2, 2.0 * a1 * both);
             if (y0 + o < height) {
