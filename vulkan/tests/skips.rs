@@ -64,16 +64,18 @@ fn a_skip_switched_off_costs_work_and_changes_no_gaussian() {
     let (got, c, _) = train(SkipSettings { early_end: false, ..on }).unwrap();
     assert!(got == expected && c.evaluations > counted.evaluations && c.behind_opaque == 0, "early end");
     assert!(counted.behind_opaque > 0);
+    // What differs is rounding alone, which Adam's normalisation enlarges where a gradient is nearly zero.
+    let moved = furthest(&crowd(), &expected);
     for (name, skips) in
         [("frustum", SkipSettings { frustum: false, ..on }), ("opacity", SkipSettings { opacity: false, ..on })]
     {
         let (got, _, more) = train(skips).unwrap();
         let error = furthest(&got, &expected);
-        println!("{name}: {more} visible instead of {visible}, {error:.1e} apart");
-        assert!(more > visible && error < 1e-4, "{name}: {error}");
+        println!("{name}: {more} visible instead of {visible}, {error:.1e} apart, moved {moved:.1e}");
+        assert!(more > visible && error < 1e-3 * moved, "{name}: {error}");
     }
     let (got, c, _) = train(SkipSettings { deferred_moments: false, ..on }).unwrap();
     let error = furthest(&got, &expected);
     println!("deferred moments: {error:.1e} apart");
-    assert!(error < 1e-4 && c.instances == counted.instances, "deferred moments: {error}");
+    assert!(error < 1e-3 * moved && c.instances == counted.instances, "deferred moments: {error}");
 }
