@@ -102,7 +102,7 @@ pub struct Matcher<P> {
 enum Decision {
     Wait,
     Match(usize),
-    /// As `Match`; the camera's numbers mean later exposures from here on.
+    /// As `Match`; the camera's numbers mean other exposures from here on.
     Shift(usize),
     Alone(Reason),
     /// As `Alone` without an exposure, because its number stands for this one.
@@ -217,7 +217,15 @@ impl<P> Matcher<P> {
                 }
             }
             // An announcement may be late, but not much.
-            Choice::Absent { sequence } if age > 4 * self.settings.settle_ns => Decision::Absent(sequence),
+            Choice::Absent { sequence, by_time } if age > 4 * self.settings.settle_ns => {
+                let newest = self.triggers.iter().map(|t| t.sequence).chain(self.newest_matched).max();
+                match by_time {
+                    // A number beyond everything announced: the camera was also released by hand.
+                    Some(index) if newest.is_none_or(|n| sequence > u64::from(n)) => Decision::Shift(index),
+                    // Its own exposure's announcement was lost or has been given up; no other one's place is taken.
+                    _ => Decision::Absent(sequence),
+                }
+            }
             Choice::Absent { .. } => Decision::Wait,
             Choice::None if age > 4 * self.settings.settle_ns => Decision::Alone(Reason::NoTrigger),
             Choice::None => Decision::Wait,

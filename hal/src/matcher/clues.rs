@@ -26,8 +26,8 @@ pub(super) enum Choice {
     /// Number and time of arrival contradict each other: either pictures come late (a busy computer), or the camera
     /// skipped exposures without leaving a gap in its numbers. The pictures that follow can tell.
     Contradiction { by_number: usize, by_time: usize, shift: u64 },
-    /// Its number stands for this exposure, which does not wait for a picture (any more).
-    Absent { sequence: u64 },
+    /// Its number stands for this exposure, which does not wait for a picture (any more); its time fits `by_time`.
+    Absent { sequence: u64, by_time: Option<usize> },
     /// No exposure fits.
     None,
 }
@@ -91,7 +91,7 @@ impl Learnt {
             match (found, by_time) {
                 // A number out of order belongs to a late picture: its time says nothing, its number does.
                 (Some(index), _) if behind => return Choice::Exposure { index, certain: true },
-                (None, _) if behind => return Choice::Absent { sequence },
+                (None, _) if behind => return Choice::Absent { sequence, by_time: None },
                 (Some(index), Some((timed, ..))) if index == timed => return Choice::Exposure { index, certain: true },
                 (Some(by_number), Some((by_time, off, _, timed))) => {
                     // Only where latencies scatter less than the exposures lie apart can a skip be told from lateness.
@@ -108,8 +108,10 @@ impl Learnt {
                         Choice::Exposure { index: by_number, certain: true }
                     };
                 }
-                // Its announcement was lost or has been given up; another exposure's place must not be taken.
-                (None, _) => return Choice::Absent { sequence },
+                (None, near) => {
+                    let fitting = near.filter(|(_, off, ..)| *off < 3.0 * self.spread_ns);
+                    return Choice::Absent { sequence, by_time: fitting.map(|(index, ..)| index) };
+                }
                 (Some(_), None) => {}
             }
         }
@@ -123,7 +125,7 @@ impl Learnt {
         self.number_held = self.number_held.saturating_sub(1);
     }
 
-    /// The camera skipped exposures: from `clues` on its numbers mean later ones.
+    /// The camera skipped exposures, or took pictures nobody announced: from `clues` on its numbers mean other ones.
     pub(super) fn shifted(&mut self, clues: &PictureClues, trigger: &Trigger) {
         self.last = Some((*clues, *trigger));
     }
@@ -162,8 +164,10 @@ impl Learnt {
             let (steps, sequences) = (a.saturating_sub(last), u64::from(trigger.sequence.saturating_sub(b.sequence)));
             let stride = if sequences > 0 && steps % sequences == 0 { steps / sequences } else { 0 };
             let holds = stride > 0 && (stride == self.stride || self.number_held == 0);
-            self.number_held =
-                if holds { (self.number_held + 1).min(BELIEVED + 2) } else { self.number_held.saturating_sub(2) };
+            if sequences > 0 {
+                self.number_held =
+                    if holds { (self.number_held + 1).min(BELIEVED + 2) } else { self.number_held.saturating_sub(2) };
+            }
             if self.number_held <= 1 {
                 self.stride = stride;
             }

@@ -112,6 +112,17 @@ fn a_camera_that_starts_to_count_anew_is_understood_after_a_few_pictures() {
 }
 
 #[test]
+fn pictures_released_by_hand_in_between_do_not_cost_the_announced_ones() {
+    // Their files lie elsewhere; what is seen is that the numbers jump, at last with the last picture.
+    let mut shots = shots(40);
+    for (i, shot) in shots.iter_mut().enumerate() {
+        shot.number = shot.number.map(|n| n + 2 * [7, 8, 20, 39].iter().filter(|at| i >= **at).count() as u64);
+    }
+    let (matched, alone) = play(40, &shots, &[]);
+    assert!(matched.len() == 40 && all_right(&matched) && alone.is_empty(), "{matched:?} {alone:?}");
+}
+
+#[test]
 fn a_late_picture_is_found_by_its_number() {
     let mut shots = shots(40);
     shots[11].delay_ms = 6_900;
