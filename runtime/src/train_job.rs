@@ -294,7 +294,8 @@ impl TrainJob {
                 loss = step.loss;
                 let at = budget.steps.map_or((step.progress * 100.0) as u64, |_| steps_before + u64::from(step.step));
                 progress.set(at, || format!("loss {:.4}, {} Gaussians", step.loss, step.gaussians));
-                if stop.requested() || last.elapsed() >= every {
+                // Only where saving leaves no trace: the same seed gives the same bytes however slow the machine is.
+                if stop.requested() || (step.settled && last.elapsed() >= every) {
                     ControlFlow::Break(())
                 } else {
                     ControlFlow::Continue(())

@@ -1,4 +1,4 @@
-//! The same seed gives the same bytes whatever number of threads the driver uses, and a long run needs no more memory
+//! The same seed gives the same bytes whatever number of threads the driver uses and whenever a checkpoint is taken, and a long run needs no more memory
 //! than a short one. Both are questions to a whole process, so the test starts itself again as a child.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
@@ -40,10 +40,11 @@ fn hash(trainer: &mut Trainer) -> u64 {
 }
 
 /// Runs this binary's test `name` in the given role and returns what it printed behind `=`.
-fn child(name: &str, threads: &str) -> Option<String> {
+fn child(name: &str, threads: &str, save_at: &str) -> Option<String> {
     let output = Command::new(std::env::current_exe().unwrap())
         .args(["--exact", name, "--nocapture"])
         .env(ROLE, "child")
+        .env("DGTR_TEST_SAVE_AT", save_at)
         .env("LP_NUM_THREADS", threads) // threads of Mesa's software driver; other drivers do not look at it
         .output()
         .unwrap();
@@ -57,14 +58,19 @@ fn the_same_seed_gives_the_same_model_with_one_thread_and_with_two() {
     let name = "the_same_seed_gives_the_same_model_with_one_thread_and_with_two";
     if std::env::var_os(ROLE).is_some() {
         let Some(mut trainer) = growing(120) else { return };
-        for _ in 0..120 {
-            trainer.step().unwrap();
+        let save_at: usize = std::env::var("DGTR_TEST_SAVE_AT").map_or(0, |at| at.parse().unwrap());
+        let mut saved = GaussianCloud::with_capacity(3, 800);
+        for step in 0..120 {
+            // A checkpoint falls where the clock says.
+            if trainer.step().unwrap().settled && step >= save_at && saved.is_empty() {
+                trainer.snapshot(&mut saved).unwrap();
+            }
         }
         assert!(trainer.gaussians() > 300, "density control did not run");
         println!("answer={:016x}", hash(&mut trainer));
         return;
     }
-    let hashes = ["1", "2", "2"].map(|threads| child(name, threads));
+    let hashes = [("1", "0"), ("2", "50"), ("2", "119")].map(|(threads, save_at)| child(name, threads, save_at));
     println!("{hashes:?}");
     assert!(hashes.iter().all(|h| *h == hashes[0]), "{hashes:?}");
 }
@@ -93,7 +99,7 @@ fn ten_thousand_steps_need_no_more_memory_than_one_thousand() {
         println!("answer={early},{},{},{}", high_water(), trainer.gaussians(), counters.unsound_gradients);
         return;
     }
-    let Some(answer) = child(name, "2") else { return };
+    let Some(answer) = child(name, "2", "0") else { return };
     println!("KiB after 1,000 and 10,000 steps, Gaussians, unsound gradients: {answer}");
     let parts: Vec<&str> = answer.split(',').collect();
     let (early, late): (u64, u64) = (parts[0].parse().unwrap(), parts[1].parse().unwrap());

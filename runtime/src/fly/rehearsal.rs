@@ -99,6 +99,7 @@ impl Reconstruct for Ledger {
                 divisor: 1,
                 elapsed_s: 0.0,
                 progress: 0.0,
+                settled: true,
             };
             if each(&report).is_break() || !self.landed {
                 break;

@@ -63,6 +63,12 @@ impl Scratch {
     }
 }
 
+/// Steps after which Gaussians that were not in view make up for them. The result would be the same without, but not to
+/// the bit: a snapshot taken in between decides the rounding. So it is done at fixed steps, and who wants identical
+/// bytes takes snapshots there ([`StepReport::settled`](super::StepReport::settled)).
+const FLUSH_EVERY: u32 = 32;
+const _: () = assert!((FLUSH_EVERY as usize) < DEFERRED_STEPS);
+
 fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + (-f64::from(logit)).exp())
 }
@@ -85,7 +91,7 @@ impl Trainer {
         };
         let due = self.steps - self.density.last >= d.interval(expected);
         if self.strategy == Strategy::None || progress >= d.until || !due {
-            if since_flush as usize >= DEFERRED_STEPS - 12 {
+            if since_flush >= FLUSH_EVERY {
                 self.flush()?;
                 self.density.last_flush = self.steps;
             }

@@ -40,6 +40,8 @@ pub struct StepReport {
     pub elapsed_s: f64,
     /// Share of the schedule that is over, 0…1.
     pub progress: f32,
+    /// Every Gaussian is up to date: a snapshot taken now does not change the bits of what follows.
+    pub settled: bool,
 }
 
 /// Why a run ended.

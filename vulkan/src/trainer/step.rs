@@ -47,6 +47,7 @@ impl Trainer {
             self.flush()?;
         }
         report.gaussians = self.gaussians;
+        report.settled = self.flushed;
         Ok(report)
     }
 
@@ -199,6 +200,7 @@ impl Trainer {
             divisor,
             elapsed_s: self.elapsed_s,
             progress,
+            settled: false,
         }
     }
 
