@@ -39,7 +39,7 @@ fn sim(at: &Path, link: &str) -> Running {
 /// `dgtr fly` to its end: its log and its run.json.
 fn fly(at: &Path, during: impl FnOnce(&Path)) -> (String, Value) {
     let log = at.join("fly.log");
-    let mut job = Running::start(at, &["fly", "--mission", "mission.toml", "--out", "out", "--silence", "4"], &log);
+    let mut job = Running::start(at, &["fly", "--mission", "mission.toml", "--out", "out", "--silence", "8"], &log);
     during(&log);
     let code = job.code(PATIENCE);
     let said = std::fs::read_to_string(&log).unwrap_or_default();
@@ -94,6 +94,8 @@ fn an_unplugged_port_is_counted_and_the_mission_carries_on_when_it_is_back() {
             wait_until("the first key frame", log, PATIENCE, || says("key frame 1"));
             pulled.store(true, Ordering::Relaxed);
             wait_until("the loss being noticed", log, PATIENCE, || says("link to the autopilot lost"));
+            // The job looks at its failsafe ladder a few times a second; a cable put back at once would go unseen there.
+            wait_until("the failsafe ladder's warning", log, PATIENCE, || says("autopilot silent"));
             pulled.store(false, Ordering::Relaxed);
             wait_until("the autopilot being heard again", log, PATIENCE, || says("is back"));
         });
@@ -101,7 +103,6 @@ fn an_unplugged_port_is_counted_and_the_mission_carries_on_when_it_is_back() {
         assert_eq!(run["outcome"], "done", "{said}");
         assert!(run["hal"]["link_losses"].as_u64() >= Some(1) && run["links_lost"].as_u64() >= Some(1), "{run}");
         assert!(run["views"].as_u64() >= Some(3) && run["gaussians"].as_u64() > Some(500), "{run}\n{said}");
-        assert!(said.contains("autopilot silent"), "the failsafe ladder warned: {said}");
     });
 }
 
