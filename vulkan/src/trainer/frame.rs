@@ -27,6 +27,8 @@ pub(crate) fn flags_of(skips: &SkipSettings) -> u32 {
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Frame {
+    /// First on purpose: see `frame.glsl`.
+    pub adam: [f32; 4],
     pub view_row: [[f32; 4]; 3],
     pub lens: [f32; 4],
     pub camera: [f32; 4],
@@ -40,7 +42,6 @@ pub(crate) struct Frame {
     pub exposure_offset: [f32; 4],
     pub rates: [f32; 4],
     pub rates_more: [f32; 4],
-    pub adam: [f32; 4],
     pub bias: [f32; 4],
     pub step: [u32; 4],
     pub loss: [f32; 4],
