@@ -9,6 +9,7 @@ pub mod colmap;
 pub mod model;
 pub mod ply;
 pub mod split;
+pub mod spz;
 pub mod telemetry;
 pub mod transforms;
 

@@ -2,6 +2,7 @@
 //! malloc that one does not see) by the process's own high-water mark.
 //!
 //! One test, because both marks are the process's.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 #![allow(unsafe_code, reason = "a counting allocator has to implement GlobalAlloc")]
 
 use std::alloc::{GlobalAlloc, Layout, System};

@@ -103,7 +103,11 @@ fn export_and_import_give_the_model_back() {
     assert!(dgtr(&["export", &path("m.dgtr"), "--to", "ply"]).status.success());
     assert!(dgtr(&["import", &path("m.ply"), "--out", &path("back.dgtr")]).status.success());
     let (header, back) = model::read(&dir.path().join("back.dgtr")).unwrap();
-    assert_eq!((header.origin, back), (origin, cloud));
+    assert_eq!((header.origin, &back), (origin, &cloud));
+    assert!(dgtr(&["export", &path("m.dgtr"), "--to", "spz"]).status.success());
+    assert!(dgtr(&["import", &path("m.spz"), "--out", &path("rounded.dgtr")]).status.success());
+    let (_, rounded) = model::read(&dir.path().join("rounded.dgtr")).unwrap();
+    assert_eq!((rounded.means, rounded.log_scales), (cloud.means, cloud.log_scales), "these are representable");
 }
 
 #[test]

@@ -1,4 +1,5 @@
 //! The switches of the paper's two ablations act through `dgtr train --settings`.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
 

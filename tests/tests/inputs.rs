@@ -1,4 +1,5 @@
 //! Bad input: one line that says what, where and how to mend it, and the documented exit code.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
 

@@ -1,4 +1,5 @@
 //! Nothing that was saved is lost: Ctrl-C, a second start, a port that goes away, a picture that is none.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
 

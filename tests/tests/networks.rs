@@ -1,4 +1,5 @@
 //! The user's own networks of contracts `metric` and `depth`, named in a settings file or on the command line.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
 

@@ -1,6 +1,7 @@
 //! A flight recorded from ArduPilot's simulator, played to `dgtr fly` over a pseudo-terminal: what the autopilot said is
 //! real, the pictures are ray-cast from where it truly was (SIM_STATE). The short recording is in the repository; with
 //! the shared data the whole survey is flown.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
 

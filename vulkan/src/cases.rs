@@ -5,12 +5,14 @@
 /// Ends the case as broken unless the condition holds.
 macro_rules! promise {
     ($holds:expr $(,)?) => {
-        if !$holds {
+        let holds: bool = $holds;
+        if !holds {
             return Err($crate::cases::Broken(stringify!($holds).to_owned()));
         }
     };
     ($holds:expr, $($words:tt)+) => {
-        if !$holds {
+        let holds: bool = $holds;
+        if !holds {
             return Err($crate::cases::Broken(format!($($words)+)));
         }
     };

@@ -34,10 +34,10 @@ fn the_driver_compiles_nothing_more_however_many_cameras_are_seen() {
     let mut drawn = Rendering::default();
     let mut look = |i: u32| {
         let turn = DQuat::from_axis_angle(DVec3::new(0.3, 1.0, 0.2).normalize(), 0.2 + 0.01 * f64::from(i));
-        let mut turned = v.clone();
+        let mut turned = v;
         turned.pose.rotation = turn * v.pose.rotation;
-        trainer.set_pose(0, turned.pose.clone()).unwrap();
-        trainer.set_pose(1, turned.pose.clone()).unwrap();
+        trainer.set_pose(0, turned.pose).unwrap();
+        trainer.set_pose(1, turned.pose).unwrap();
         trainer.step().unwrap();
         trainer.render(&turned, &mut drawn).unwrap();
     };

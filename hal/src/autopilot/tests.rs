@@ -253,6 +253,6 @@ fn other_systems_and_our_own_echo_are_ignored_and_a_timesync_is_answered() {
     h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() });
     let answer = h.autopilot.next_answer().expect("an answer");
     assert_eq!((answer.ts1, answer.tc1), (77, h.now_ns as i64));
-    h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 78, target_system: 1, target_component: 50, ..Default::default() });
+    h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 78, target_system: 1, target_component: 50 });
     assert_eq!(h.autopilot.next_answer(), None);
 }

@@ -49,7 +49,7 @@ fn fit(known: &[f32], w: usize, h: usize) -> Option<[f32; 3]> {
         let mut b = nalgebra::Vector3::<f64>::zeros();
         let mut sum = 0.0;
         let mut weights = 0.0;
-        let sample = |i: usize| i % w % STEP == 0 && i / w % STEP == 0;
+        let sample = |i: usize| (i % w).is_multiple_of(STEP) && (i / w).is_multiple_of(STEP);
         for (i, &v) in known.iter().enumerate().filter(|(i, v)| **v > 0.0 && sample(*i)) {
             let x = nalgebra::Vector3::new(1.0, (i % w) as f64 / w as f64, (i / w) as f64 / h as f64);
             let r = f64::from(v) - (plane[0] + plane[1] * x[1] + plane[2] * x[2]);

@@ -92,14 +92,14 @@ pub(super) fn page(data: &ReportData) -> Result<String, ReportError> {
     }
     warnings(&mut out, &data.warnings);
     if let Some(svg) = map::svg(data) {
-        let _ = write!(out, "<h2>Regions and cameras</h2><div class=\"card map\">{svg}</div>\n");
+        let _ = writeln!(out, "<h2>Regions and cameras</h2><div class=\"card map\">{svg}</div>");
     }
     models(&mut out, data);
     comparisons(&mut out, &data.comparisons)?;
     timings(&mut out, data);
     for chart in &data.charts {
         if let Some(svg) = chart.svg(false) {
-            let _ = write!(out, "<h2>{}</h2><div class=\"card\">{svg}</div>\n", escape(&chart.title));
+            let _ = writeln!(out, "<h2>{}</h2><div class=\"card\">{svg}</div>", escape(&chart.title));
         }
     }
     for t in &data.tables {
@@ -117,7 +117,7 @@ pub(super) fn page(data: &ReportData) -> Result<String, ReportError> {
         }
         out.push_str("</ul>\n");
     }
-    let _ = write!(out, "<footer>dgtr {}</footer></main></body></html>\n", env!("CARGO_PKG_VERSION"));
+    let _ = writeln!(out, "<footer>dgtr {}</footer></main></body></html>", env!("CARGO_PKG_VERSION"));
     Ok(out)
 }
 
