@@ -1,4 +1,4 @@
-//! The user's own networks of contracts `metric` and `depth`, named in a settings file or on the command line.
+//! The user's own networks, named in a settings file, the mission file or on the command line.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
@@ -102,4 +102,63 @@ fn networks_that_do_not_fit_are_refused_in_one_line_before_anything_begins() {
     train("[network]\ndepth = \"wrong_depth.toml\"\n".to_owned(), &["input `image` is missing (there are: a, b)"]);
     wrong("wrong_metric.toml", "metric", "random_depth.onnx");
     train("[network]\nmetric = \"wrong_metric.toml\"\n".to_owned(), &["input `image0` is missing"]);
+}
+
+/// Five pictures of a real survey and a held-out one, as a data set of its own; `None` without the shared data.
+fn six_photographs(at: &Path) -> Option<PathBuf> {
+    let root = std::env::var_os("DGTR_DATA").map(PathBuf::from).unwrap_or_else(|| "../../shared".into());
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join(root);
+    let from = root.join("data/sheffield_cross");
+    if !from.is_dir() {
+        println!("skipped: {} is not there; DGTR_DATA names the folder that holds data/ and models/", from.display());
+        return None;
+    }
+    let (train, test) = (["0054", "0058", "0064", "0068", "0072"], ["0062"]);
+    let name = |n: &&str| format!("DJI_{n}.jpg");
+    let mut world = read_json(&from.join("transforms.json"));
+    let frames = world["frames"].as_array_mut().expect("frames");
+    frames
+        .retain(|f| train.iter().chain(&test).any(|n| f["file_path"].as_str().is_some_and(|p| p.ends_with(&name(n)))));
+    assert_eq!(frames.len(), 6);
+    std::fs::create_dir_all(at.join("photos/images")).expect("mkdir");
+    for frame in frames {
+        let path = frame["file_path"].as_str().expect("path");
+        std::fs::copy(from.join(path), at.join("photos").join(path)).expect("copy");
+    }
+    std::fs::write(at.join("photos/transforms.json"), world.to_string()).expect("write");
+    let split = serde_json::json!({ "train": train.iter().map(name).collect::<Vec<_>>(), "test": test.iter().map(name).collect::<Vec<_>>() });
+    std::fs::write(at.join("photos/split.json"), split.to_string()).expect("write");
+    Some(root)
+}
+
+/// IterMVS (MIT) is no part of this project: it stands for any network a user brings.
+#[test]
+fn a_trained_network_of_the_users_is_one_line_and_initialises_real_photographs() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let at = dir.path();
+    let Some(root) = six_photographs(at) else { return };
+    let file = root.join("models/itermvs_blendedmvs_v3_352x640.onnx");
+    if !file.is_file() {
+        return println!("skipped: {} is not there", file.display());
+    }
+    let manifest = format!(
+        "name = 'itermvs'\ncontract = 'pair'\nfile = {file:?}\nlicence = 'MIT'\n[input]\nwidth = 640\nheight = 352\n\
+         range = [-1.0, 1.0]\n[pair]\nposes = 'given'\nviews = 3\n"
+    );
+    std::fs::write(at.join("itermvs.toml"), manifest).expect("manifest");
+    let start = |out: &str, settings: &str| {
+        std::fs::write(at.join("s.toml"), settings).expect("settings");
+        let budget = ["--steps", "1", "--max-gaussians", "60000", "--budget-mib", "256"];
+        let output = run(at, &[&["train", "photos", "--out", out, "--settings", "s.toml"], &budget[..]].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        read_json(&at.join(out).join("run.json"))
+    };
+    let own = start("own", "[network]\npair = 'itermvs.toml'\n");
+    let embedded = start("embedded", "");
+    println!("before training: the user's {} dB, the embedded {} dB", own["psnr"], embedded["psnr"]);
+    assert_eq!((&own["init"]["network"], &embedded["init"]["network"]), (&"itermvs".into(), &"plane-sweep".into()));
+    assert_eq!(own["init"]["runs"], 5);
+    let psnr = |run: &Value| run["psnr"].as_f64().expect("psnr");
+    assert!(psnr(&own) > 17.0, "{own}");
+    assert!((psnr(&own) - psnr(&embedded)).abs() < 1.0, "{} against {}", psnr(&own), psnr(&embedded));
 }
