@@ -22,24 +22,36 @@ void main() {
         w.row = int(status[cursor + 1u]);
         total = status[cursor + 2u];
     }
-    while (w.i < w.end && w.left > 0u) {
-        int at = int(texelFetch(order, int(w.i)).x) * 3;
-        Spans s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
-        if (w.row >= 0) s.row = w.row;
-        for (; s.row <= s.last_row && w.left > 0u; s.row++) {
-            ivec2 span = span_in_band(s, s.row);
-            uint touched = uint(max(span.y - span.x + 1, 0));
-            total += touched;
-            if (push.mode == 0u) {
-                uint line = base + uint(s.row) * frame.window.z;
-                for (int x = span.x; x <= span.y; x++) tiles[line + uint(x)] += 1u;
+    // One loop over all tiles of all Gaussians, not a loop in a loop in a loop: lanes in lockstep would wait in each for
+    // the one with the largest Gaussian.
+    Spans s;
+    ivec2 span = ivec2(0, -1); // tiles of the present row that remain
+    uint line = 0u;
+    bool open = false;
+    while (span.x <= span.y || (w.i < w.end && w.left > 0u)) {
+        if (span.x > span.y) {
+            if (!open) {
+                int at = int(texelFetch(order, int(w.i)).x) * 3;
+                s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+                if (w.row >= 0) s.row = w.row;
+                open = true;
             }
-            walk_pay(w, touched + 1u);
+            if (s.row <= s.last_row) {
+                span = span_in_band(s, s.row);
+                line = base + uint(s.row) * frame.window.z;
+                total += uint(max(span.y - span.x + 1, 0));
+                if (push.mode == 1u) span.y = span.x - 1;
+                s.row++;
+            }
+            open = s.row <= s.last_row;
+            w.row = open ? s.row : -1;
+            w.i += open ? 0u : 1u;
         }
-        bool finished = s.row > s.last_row;
-        w.row = finished ? -1 : s.row;
-        w.i += finished ? 1u : 0u;
-        walk_pay(w, 1u);
+        if (span.x <= span.y) {
+            tiles[line + uint(span.x)] += 1u;
+            span.x++;
+        }
+        walk_pay(w);
     }
     status[16u + lane] = total;
     status[cursor] = w.i;

@@ -8,16 +8,16 @@
 
 layout(set = 0, binding = 9) uniform samplerBuffer projected;
 layout(set = 0, binding = 10) uniform usamplerBuffer order;
+layout(set = 0, binding = 11) uniform usamplerBuffer starts;
 layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
-layout(std430, set = 0, binding = 2) readonly buffer Starts { uint starts[]; };
-layout(std430, set = 0, binding = 3) buffer Status { uint status[]; };
-layout(std430, set = 0, binding = 4) writeonly buffer Instances { uvec2 instances[]; };
-layout(std430, set = 0, binding = 5) writeonly buffer SlotRanges { uvec2 slot_ranges[]; };
+layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 3) writeonly buffer Instances { uvec2 instances[]; };
+layout(std430, set = 0, binding = 4) writeonly buffer SlotRanges { uvec2 slot_ranges[]; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
     if (lane >= SORT_BLOCKS) return;
-    uint tile_count = frame.window.z * frame.window.w, base = lane * tile_count, origin = starts[push.first];
+    uint tile_count = frame.window.z * frame.window.w, base = lane * tile_count, origin = texelFetch(starts, int(push.first)).x;
     uint cursor = WALK_CURSORS + lane * 4u, slot = 0u, begin;
     Walk w = walk_begin(lane, status[0]);
     for (uint b = 0u; b < lane; b++) slot += status[16u + b];
@@ -28,29 +28,44 @@ void main() {
         slot = status[cursor + 2u];
         begin = status[cursor + 3u];
     }
-    while (w.i < w.end && w.left > 0u) {
-        int at = int(texelFetch(order, int(w.i)).x) * 3;
-        Spans s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
-        if (w.row >= 0) s.row = w.row;
-        for (; s.row <= s.last_row && w.left > 0u; s.row++) {
-            ivec2 span = span_in_band(s, s.row);
-            uint row = uint(s.row) * frame.window.z;
-            for (int x = span.x; x <= span.y; x++) {
-                uint t = row + uint(x), rank = tiles[base + t];
-                tiles[base + t] = rank + 1u;
-                instances[starts[t] - origin + rank] = uvec2(w.i, slot);
-                slot++;
+    // One loop, as in count.comp.
+    Spans s;
+    ivec2 span = ivec2(0, -1);
+    uint line = 0u, gaussian = 0u;
+    bool open = false;
+    while (span.x <= span.y || (w.i < w.end && w.left > 0u)) {
+        if (span.x > span.y) {
+            if (!open) {
+                int at = int(texelFetch(order, int(w.i)).x) * 3;
+                s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+                if (w.row >= 0) s.row = w.row;
+                open = true;
             }
-            walk_pay(w, uint(max(span.y - span.x + 1, 0)) + 1u);
+            gaussian = w.i;
+            uint touched = 0u;
+            if (s.row <= s.last_row) {
+                span = span_in_band(s, s.row);
+                line = uint(s.row) * frame.window.z;
+                touched = uint(max(span.y - span.x + 1, 0));
+                s.row++;
+            }
+            open = s.row <= s.last_row;
+            w.row = open ? s.row : -1;
+            if (!open) {
+                uint end = slot + touched;
+                slot_ranges[gaussian] = uvec2(begin, end - begin);
+                begin = end;
+                w.i++;
+            }
         }
-        bool finished = s.row > s.last_row;
-        if (finished) {
-            slot_ranges[w.i] = uvec2(begin, slot - begin);
-            begin = slot;
+        if (span.x <= span.y) {
+            uint t = line + uint(span.x), rank = tiles[base + t];
+            tiles[base + t] = rank + 1u;
+            instances[texelFetch(starts, int(t)).x - origin + rank] = uvec2(gaussian, slot);
+            slot++;
+            span.x++;
         }
-        w.row = finished ? -1 : s.row;
-        w.i += finished ? 1u : 0u;
-        walk_pay(w, 1u);
+        walk_pay(w);
     }
     status[cursor] = w.i;
     status[cursor + 1u] = uint(w.row);

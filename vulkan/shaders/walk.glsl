@@ -1,8 +1,8 @@
 // A sorting lane's walk over its share of the Gaussians, in rounds: a dispatch takes a bounded number of iterations and
 // leaves a cursor for the next. llvmpipe ends every loop of an invocation after 65,535 iterations in all (its
-// LP_MAX_TGSI_LOOP_ITERATIONS), silently; eight or sixteen lanes in lockstep can add up their iterations.
+// LP_MAX_TGSI_LOOP_ITERATIONS), silently; the walk is one loop, which ends a row of tiles after its budget at the latest.
 
-const uint WALK_BUDGET = 3000u;
+const uint WALK_BUDGET = 24000u;
 const uint WALK_CURSORS = 1024u; // word of `status` where the cursors begin; four words per lane
 
 struct Walk {
@@ -21,6 +21,6 @@ Walk walk_begin(uint lane, uint n) {
     return w;
 }
 
-void walk_pay(inout Walk w, uint iterations) {
-    w.left -= min(w.left, iterations);
+void walk_pay(inout Walk w) {
+    w.left -= min(w.left, 1u);
 }

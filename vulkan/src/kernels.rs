@@ -54,7 +54,7 @@ kernels! {
     Count "count" Count Narrow ["tiles" "status"] ["projected" "rows"];
     TilePrefix "tile_prefix" Count Wide ["tiles" "tile_starts"] [];
     TileScan "tile_scan" Count Scan ["tile_starts" "status"] [];
-    Emit "emit" Emit Narrow ["tiles" "tile_starts" "status" "instances" "slot_ranges"] ["projected" "rows"];
+    Emit "emit" Emit Narrow ["tiles" "status" "instances" "slot_ranges"] ["projected" "rows" "tile_starts"];
     Rasterise "rasterise" Rasterise Narrow ["tile_starts" "image" "transmittance"] ["shaded" "instances"];
     DepthSums "depth_sums" Loss Wide ["image" "target" "partials"] [];
     DepthFinish "depth_finish" Loss Narrow ["partials" "status"] [];
@@ -78,7 +78,7 @@ pub(crate) const FIRST_TEXELS: u32 = 9;
 pub(crate) fn texel_format(name: &str) -> ash::vk::Format {
     match name {
         "instances" | "target" | "slot_ranges" => ash::vk::Format::R32G32_UINT,
-        "rows" => ash::vk::Format::R32_UINT,
+        "rows" | "tile_starts" => ash::vk::Format::R32_UINT,
         _ => ash::vk::Format::R32G32B32A32_SFLOAT,
     }
 }

@@ -9,7 +9,7 @@ use config::plan::{LOOP_LANES, SORT_BLOCKS};
 /// Where the sorting lanes leave their cursors in `status` (`shaders/walk.glsl`).
 const WALK_CURSORS: usize = 1024;
 /// Rounds of counting and emitting to begin with; more are taken, and kept, when a frame needs them.
-pub(crate) const WALK_ROUNDS: u32 = 8;
+pub(crate) const WALK_ROUNDS: u32 = 2;
 
 /// Tiles [first, last).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
