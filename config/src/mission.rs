@@ -97,7 +97,8 @@ pub struct CameraSettings {
     /// Brown–Conrady k1, k2, p1, p2 (OpenCV's order); zeros for pictures that are already undistorted.
     #[serde(default)]
     pub distortion: [f32; 4],
-    /// From the trigger's time stamp to the middle of the exposure, milliseconds.
+    /// From the trigger's time stamp (of a video device, the driver's) to the middle of the exposure, milliseconds; most
+    /// drivers stamp the end of a picture, so that it is negative there.
     #[serde(default)]
     pub exposure_delay_ms: f32,
 }
@@ -192,6 +193,8 @@ pub enum CameraSource {
     Folder(PathBuf),
     /// A program that writes an MJPEG stream to its standard output, with its arguments.
     Command(Vec<String>),
+    /// A video device of the kernel, e.g. `/dev/video0`; only in programs built with the feature `v4l2`.
+    V4l2(PathBuf),
 }
 
 /// One aircraft and its region.
@@ -339,6 +342,14 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
         assert!(refused("[10.0, 10.0]", "[20.0, 0.0]").contains("area"));
         assert!(refused("lat_deg = 28.0", "lat_deg = 280.0").contains("origin"));
         assert!(refused("id = \"a1\"", "id = \"a1\"\nsystem_id = 0").contains("system_id"));
+    }
+
+    #[test]
+    fn a_video_device_is_a_camera_if_its_path_is_absolute() {
+        let text = GOOD.replace("folder = \"a1\"", "v4l2 = \"/dev/video2\"");
+        let m = Mission::parse(&text, Path::new("/m")).expect("parses");
+        assert_eq!(m.aircraft[0].camera, CameraSource::V4l2("/dev/video2".into()));
+        assert!(refused("folder = \"a1\"", "v4l2 = \"video2\"").contains("/dev/video0"));
     }
 
     #[test]

@@ -60,6 +60,8 @@ pub struct HalCounters {
     pub pictures: u64,
     /// Pictures that were broken, or never completed.
     pub pictures_broken: u64,
+    /// Pictures of a video device that never came, by the driver's numbers.
+    pub pictures_lost: u64,
     /// Pictures left out because they were black.
     pub pictures_black: u64,
     /// Pictures left out because more than half of them was clipped.

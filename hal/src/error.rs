@@ -92,6 +92,16 @@ mod with_std {
             /// What is wrong with it and how to mend it.
             why: String,
         },
+        /// A video device that cannot be used, or not now.
+        #[error("camera {}: {why}", device.display())]
+        Video {
+            /// Its path.
+            device: PathBuf,
+            /// Invalid: it never will as given; busy: another program has it; closed: it was unplugged.
+            kind: ErrorKind,
+            /// What is wrong and how to mend it.
+            why: String,
+        },
         /// One picture that could not be used.
         #[error("picture {}: {why}", path.display())]
         Picture {
@@ -116,6 +126,7 @@ mod with_std {
                 Self::Address { .. } | Self::Signing { .. } => ErrorKind::Invalid,
                 Self::Closed { .. } => ErrorKind::Closed,
                 Self::Full { .. } => ErrorKind::Busy,
+                Self::Video { kind, .. } => *kind,
                 Self::Open { .. }
                 | Self::Link { .. }
                 | Self::Camera { .. }

@@ -77,6 +77,9 @@ pub trait TriggerSource {
 pub struct PictureClues {
     /// When it was complete, companion clock, ns: the exposure was some latency earlier.
     pub arrived_ns: u64,
+    /// The driver's time stamp on the companion's clock, ns, when there is one: the middle of the exposure is the lens's
+    /// `exposure_delay_ms` later.
+    pub stamped_ns: Option<u64>,
     /// Number in its file name or stream.
     pub number: Option<u64>,
     /// The camera's own clock at exposure (EXIF), ns since an arbitrary start.
@@ -101,5 +104,10 @@ pub trait Camera {
     /// True for video: its pictures belong to no announced exposure, each is posed by its own time.
     fn is_continuous(&self) -> bool {
         false
+    }
+
+    /// Pictures that the camera took and that were not given out by [`Camera::next_picture`], by the camera's own numbers.
+    fn lost_pictures(&self) -> u64 {
+        0
     }
 }

@@ -237,6 +237,7 @@ where
             triggers_unmatched: heard.triggers_unmatched + own.triggers_unmatched,
             pictures: own.pictures,
             pictures_broken: own.pictures_broken,
+            pictures_lost: self.camera.lost_pictures(),
             pictures_black: own.pictures_black,
             pictures_overexposed: own.pictures_overexposed,
             pictures_constant: own.pictures_constant,

@@ -120,7 +120,7 @@ proptest! {
             while let Some(at) = pictures.first().filter(|p| p.0 <= *t).map(|p| p.0) {
                 let (_, number, camera) = pictures.remove(0);
                 let camera_ns = camera.map(|c| c * S);
-                let clues = PictureClues { arrived_ns: at * S, number, camera_ns, camera_resolution_ns: S };
+                let clues = PictureClues { arrived_ns: at * S, number, camera_ns, camera_resolution_ns: S, ..PictureClues::default() };
                 matcher.push_picture(clues, ()).map(&mut take);
             }
             now = now.max(time_ns);

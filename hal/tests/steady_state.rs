@@ -219,6 +219,7 @@ fn ten_million_hostile_bytes_neither_panic_nor_allocate() {
                 arrived_ns: if wild { u64::from(random.next()) << (random.next() % 33) } else { now_ns },
                 number: (!random.one_in(4)).then(|| u64::from(random.next() % 100)),
                 camera_ns: (random.one_in(4)).then(|| u64::from(random.next()) << 31),
+                stamped_ns: None,
                 camera_resolution_ns: 1_000_000_000,
             }
         });

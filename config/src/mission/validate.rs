@@ -99,6 +99,11 @@ fn check_aircraft(m: &Mission) -> Result<(), MissionError> {
         {
             return invalid(format!("{field}.camera"), "command needs at least a program");
         }
+        if let CameraSource::V4l2(device) = &a.camera
+            && !device.is_absolute()
+        {
+            return invalid(format!("{field}.camera"), "v4l2 needs the device's whole path, e.g. /dev/video0");
+        }
         if a.region_enu.is_empty() == a.region_wgs84.is_empty() {
             return invalid(field, "give exactly one of region_enu and region_wgs84");
         }

@@ -93,6 +93,7 @@ pub fn match_up(data: &[u8]) {
                 arrived_ns: about_ns,
                 number: (event[9] & 2 != 0).then_some(event[10].into()),
                 camera_ns: (event[9] & 4 != 0).then_some(number(4) << (event[11] % 32)),
+                stamped_ns: None,
                 camera_resolution_ns: 1 << (event[11] % 40),
             };
             matcher.push_picture(clues, 0).map(&mut count);

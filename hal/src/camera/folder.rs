@@ -160,6 +160,7 @@ impl FolderCamera {
             arrived_ns: now_ns.saturating_sub(age_ns),
             number: number_of(&path),
             camera_ns,
+            stamped_ns: None,
             camera_resolution_ns: camera_resolution_ns.unwrap_or(0),
         };
         self.ready.push((clues, path));

@@ -32,6 +32,17 @@ pub fn is_complete(path: &Path) -> std::io::Result<bool> {
     })
 }
 
+/// The same picture with the marker of motion JPEG. Many cameras leave the Huffman tables out of the pictures of a stream,
+/// because they are always the standard's (ITU-T T.81, annex K.3); a decoder that sees the marker puts them where they are
+/// missing. What is not a JPEG is returned as it is.
+pub(super) fn marked_as_mjpeg(jpeg: &[u8]) -> Vec<u8> {
+    const MARKER: &[u8] = b"\xFF\xE0\x00\x08AVI1\0\0";
+    match jpeg.split_first_chunk::<2>() {
+        Some((start @ [0xFF, 0xD8], rest)) => [start, MARKER, rest].concat(),
+        _ => jpeg.to_vec(),
+    }
+}
+
 /// What the splitter expects next.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum State {
@@ -189,5 +200,26 @@ mod tests {
             std::fs::write(&path, &whole[..len]).expect("written");
             assert_eq!(is_complete(&path).expect("read"), len == whole.len(), "{len}");
         }
+    }
+
+    #[test]
+    fn a_picture_of_a_stream_without_huffman_tables_is_decoded() {
+        let photo = image::RgbImage::from_fn(16, 8, |x, y| image::Rgb([(x * 15) as u8, (y * 30) as u8, 90]));
+        let mut jpeg = std::io::Cursor::new(Vec::new());
+        photo.write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("JPEG");
+        let jpeg = jpeg.into_inner();
+        let (mut bare, mut at) = (jpeg[..2].to_vec(), 2);
+        while jpeg[at + 1] != 0xDA {
+            let end = at + 2 + usize::from(u16::from_be_bytes([jpeg[at + 2], jpeg[at + 3]]));
+            if jpeg[at + 1] != 0xC4 {
+                bare.extend_from_slice(&jpeg[at..end]);
+            }
+            at = end;
+        }
+        bare.extend_from_slice(&jpeg[at..]);
+        assert!(bare.len() + 300 < jpeg.len(), "the tables were there");
+        let decode = |bytes: &[u8]| image::load_from_memory(&marked_as_mjpeg(bytes)).expect("decodes").into_rgb8();
+        assert_eq!(decode(&bare), image::load_from_memory(&jpeg).expect("decodes").into_rgb8());
+        assert_eq!(decode(&bare), decode(&jpeg));
     }
 }

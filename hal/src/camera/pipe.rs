@@ -5,19 +5,17 @@
 use std::io::Read;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, TrySendError, sync_channel};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use image::RgbImage;
 
+use super::restart::Restart;
 use super::{JpegSplitter, Picture};
 use crate::error::HalError;
 use crate::traits::{Camera, PictureClues};
 
 /// Pictures waiting between the pipe and us; when nobody fetches them, the newest are dropped.
 const WAITING: usize = 4;
-/// A program that ends is started again after this, doubling up to the longest.
-const FIRST_DELAY: Duration = Duration::from_millis(500);
-const LONGEST_DELAY: Duration = Duration::from_secs(10);
 
 struct Grabbed {
     picture: Picture,
@@ -31,8 +29,7 @@ pub struct PipeCamera {
     size: (u32, u32),
     child: Option<Child>,
     pictures: Receiver<Grabbed>,
-    restart_at: Instant,
-    delay: Duration,
+    restart: Restart,
 }
 
 impl PipeCamera {
@@ -42,29 +39,18 @@ impl PipeCamera {
     /// [`HalError::Camera`] when it is empty or cannot be started.
     pub fn start(command: &[String], size: (u32, u32)) -> Result<Self, HalError> {
         let (child, pictures) = spawn(command, size)?;
-        Ok(Self {
-            command: command.to_vec(),
-            size,
-            child: Some(child),
-            pictures,
-            restart_at: Instant::now(),
-            delay: FIRST_DELAY,
-        })
+        Ok(Self { command: command.to_vec(), size, child: Some(child), pictures, restart: Restart::default() })
     }
 
     /// The program ended: says so once, and starts it again when its time has come.
     fn revive(&mut self) -> Result<(), HalError> {
         if let Some(mut child) = self.child.take() {
             let status = child.wait().map_or_else(|e| e.to_string(), |s| s.to_string());
-            self.restart_at = Instant::now() + self.delay;
-            self.delay = (self.delay * 2).min(LONGEST_DELAY);
+            self.restart.failed();
             return Err(failed(&self.command, format!("ended ({status}); it is started again")));
         }
-        if Instant::now() >= self.restart_at {
-            let (child, pictures) = spawn(&self.command, self.size).inspect_err(|_| {
-                self.restart_at = Instant::now() + self.delay;
-                self.delay = (self.delay * 2).min(LONGEST_DELAY);
-            })?;
+        if self.restart.is_due() {
+            let (child, pictures) = spawn(&self.command, self.size).inspect_err(|_| self.restart.failed())?;
             (self.child, self.pictures) = (Some(child), pictures);
         }
         Ok(())
@@ -147,7 +133,7 @@ impl Camera for PipeCamera {
             Err(TryRecvError::Empty) => return Ok(None),
             Err(TryRecvError::Disconnected) => return self.revive().map(|()| None),
         };
-        self.delay = FIRST_DELAY;
+        self.restart.works();
         let clues = PictureClues {
             arrived_ns: now_ns.saturating_sub(grabbed.at.elapsed().as_nanos() as u64),
             number: Some(grabbed.number),
@@ -163,6 +149,8 @@ impl Camera for PipeCamera {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     /// Everything a program writes, and its last words.

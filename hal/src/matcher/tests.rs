@@ -44,7 +44,13 @@ fn play(n: u32, shots: &[Shot], unannounced: &[u32]) -> (Vec<(u32, u32)>, Vec<Re
             let arrived_ns = trigger(shot.of).time_ns + shot.delay_ms * MS;
             if arrived_ns / (100 * MS) == now / (100 * MS) {
                 let camera_ns = shot.camera.then(|| (trigger(shot.of).boot_ns + 7777 * S) / S * S);
-                let clues = PictureClues { arrived_ns, number: shot.number, camera_ns, camera_resolution_ns: S };
+                let clues = PictureClues {
+                    arrived_ns,
+                    number: shot.number,
+                    camera_ns,
+                    camera_resolution_ns: S,
+                    ..PictureClues::default()
+                };
                 matcher.push_picture(clues, shot.of).map(&mut take);
             }
         }

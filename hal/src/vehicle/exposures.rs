@@ -81,11 +81,11 @@ where
                 }
                 Ok(None) => break,
                 Err(e) => {
-                    self.counters.pictures_broken += 1;
                     self.service.complain(&e, now_ns);
                     if e.kind() != ErrorKind::Device {
-                        break;
+                        break; // the camera, not a picture
                     }
+                    self.counters.pictures_broken += 1;
                 }
             }
         }
@@ -94,7 +94,11 @@ where
     /// Pictures nobody announced are their own exposures.
     fn take_free_running(&mut self, clues: &PictureClues, picture: Picture, now_ns: u64) {
         let ns = |ms: f32| (f64::from(ms.max(0.0)) * 1e6) as u64;
-        let time_ns = clues.arrived_ns.saturating_sub(ns(self.settings.link.picture_latency_ms));
+        let delay_ns = (f64::from(self.settings.lens.exposure_delay_ms) * 1e6) as i64;
+        let time_ns = match clues.stamped_ns {
+            Some(stamped_ns) => stamped_ns.saturating_add_signed(delay_ns),
+            None => clues.arrived_ns.saturating_sub(ns(self.settings.link.picture_latency_ms)),
+        };
         if !self.service.is_due(time_ns, ns(self.settings.link.picture_interval_ms)) {
             return;
         }

@@ -163,7 +163,7 @@ pub fn camera_dir(asked: Option<PathBuf>, camera: &CameraSource) -> Result<PathB
         (Some(folder), _) => folder,
         (None, CameraSource::Folder(folder)) => folder.clone(),
         (None, _) => {
-            return Err(CliError::input("the mission's camera is a program; say where pictures go with --camera-dir"));
+            return Err(CliError::input("the mission's camera is no folder; say where pictures go with --camera-dir"));
         }
     };
     std::fs::create_dir_all(&folder).map_err(|e| CliError::input(format!("{}: {e}", folder.display())))?;
