@@ -67,6 +67,8 @@ pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
     pictureless: u32,
     /// Pictures in a row that showed nothing or could not be decoded.
     poor: u32,
+    /// The ground control station knows of them.
+    poor_told: bool,
     finished: bool,
     counters: HalCounters,
 }
@@ -129,6 +131,7 @@ where
             texts: 0,
             pictureless: 0,
             poor: 0,
+            poor_told: false,
             finished: false,
             counters: HalCounters::default(),
         })
@@ -196,14 +199,19 @@ where
         self.autopilot.state()
     }
 
-    /// Undistorted pixels of a frame. One that shows nothing is counted and the ground control station told.
+    /// Undistorted pixels of a frame. One that shows nothing is counted and the ground control station told: once when they
+    /// begin, and how many there were when they are over.
     ///
     /// # Errors
     /// [`HalError::Picture`] when it cannot be decoded or has the wrong size, [`HalError::Blank`] when it shows nothing.
     pub fn load(&mut self, frame: &Frame) -> Result<image::RgbImage, HalError> {
         let decoded = frame.picture.decode(&self.settings.lens);
         let blank = decoded.as_ref().ok().and_then(blank);
-        self.poor = if blank.is_some() || decoded.is_err() { self.poor.saturating_add(1) } else { 0 };
+        if blank.is_none() && decoded.is_ok() {
+            self.tell_recovery();
+        } else {
+            self.poor = self.poor.saturating_add(1);
+        }
         if let Some(blank) = blank {
             let path = frame.picture.name();
             *match blank {
@@ -211,13 +219,23 @@ where
                 Blank::Overexposed => &mut self.counters.pictures_overexposed,
                 Blank::Constant => &mut self.counters.pictures_constant,
             } += 1;
-            if self.service.may_complain(self.now_ns()) {
+            if !self.poor_told && self.service.may_complain(self.now_ns()) {
+                self.poor_told = true;
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &format!("dgtr: {name} is {blank}, left out"));
             }
             return Err(HalError::Blank { path, blank });
         }
         Ok(undistort(decoded?, &self.settings.lens))
+    }
+
+    /// A picture is good again.
+    fn tell_recovery(&mut self) {
+        if std::mem::take(&mut self.poor_told) {
+            let text = format!("dgtr: pictures are good again, {} were not", self.poor);
+            self.status_text(MavSeverity::MAV_SEVERITY_INFO, &text);
+        }
+        self.poor = 0;
     }
 
     /// Everything counted so far.

@@ -19,6 +19,7 @@ mod health;
 mod intake;
 mod job;
 mod reconstruction;
+mod shortage;
 
 #[cfg(test)]
 mod fault_table;
@@ -115,7 +116,7 @@ pub fn fly(
     while job.turn(flight.handover(), interrupt)? {}
     let (ended, counters) = flight.finish()?;
     tracing::info!("capture is over ({ended:?}): {} key frames", job.keyframes());
-    let end = job.land(interrupt)?;
+    let end = job.land(&counters, interrupt)?;
     Ok(outcome(ended, counters, end, interrupt))
 }
 

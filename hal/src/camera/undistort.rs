@@ -5,8 +5,9 @@ use config::mission::CameraSettings;
 use image::RgbImage;
 use rayon::prelude::*;
 
-/// The pinhole picture of a distorted one; pixels that the lens did not see are black. A lens without distortion returns
-/// the picture untouched.
+/// The pinhole picture of a distorted one; where the pinhole sees past it the picture's edge is repeated, as for data sets:
+/// training has no mask, and a black border would be learnt as black ground. A lens without distortion returns the picture
+/// untouched.
 pub fn undistort(image: RgbImage, lens: &CameraSettings) -> RgbImage {
     let [k1, k2, p1, p2] = lens.distortion;
     if lens.distortion == [0.0; 4] || image.width() == 0 || image.height() == 0 {
@@ -28,12 +29,9 @@ pub fn undistort(image: RgbImage, lens: &CameraSettings) -> RgbImage {
     out
 }
 
-/// Bilinear; (0.5, 0.5) is the centre of the first pixel.
+/// Bilinear; (0.5, 0.5) is the centre of the first pixel, positions outside take the nearest pixel of the edge.
 fn sample(image: &RgbImage, u: f32, v: f32, pixel: &mut [u8]) {
     let (w, h) = image.dimensions();
-    if !(u >= 0.0 && v >= 0.0 && u <= w as f32 && v <= h as f32) {
-        return;
-    }
     let (u, v) = ((u - 0.5).clamp(0.0, (w - 1) as f32), (v - 0.5).clamp(0.0, (h - 1) as f32));
     let (x, y) = (u as u32, v as u32);
     let (fx, fy) = (u - x as f32, v - y as f32);
@@ -73,6 +71,15 @@ mod tests {
         let out = undistort(image, &lens);
         assert_eq!(out.get_pixel(50 + 40, 50).0, [255; 3]);
         assert_eq!(out.get_pixel(50 + 38, 50).0, [0; 3]);
+    }
+
+    #[test]
+    fn where_the_lens_saw_nothing_the_edge_is_repeated_and_nothing_is_black() {
+        // Pincushion: the pinhole's corners lie outside of the picture.
+        let image = RgbImage::from_fn(101, 101, |x, _| image::Rgb([if x < 50 { 80 } else { 160 }, 90, 100]));
+        let out = undistort(image, &lens([0.3, 0.0, 0.0, 0.0]));
+        assert_eq!((out.get_pixel(0, 0).0, out.get_pixel(100, 100).0), ([80, 90, 100], [160, 90, 100]));
+        assert!(out.pixels().all(|p| p.0[0] >= 80 && p.0[1] == 90 && p.0[2] == 100));
     }
 
     #[test]

@@ -13,7 +13,10 @@ use exif::{Field, In, Rational, Tag, Value};
 use super::*;
 use crate::camera::FolderCamera;
 use crate::link::{LinkAddress, WireLink};
+use crate::mavlink::Framer;
+use crate::mavlink::dialect::STATUSTEXT_DATA;
 use crate::time::ManualClock;
+use crate::traits::Received;
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84, lon_deg: -91.99, alt_m: 200.0 };
 const LENS: CameraSettings = CameraSettings {
@@ -72,7 +75,7 @@ fn photograph(path: &Path, at: Geodetic, light: u8) {
     let xmp = b"http://ns.adobe.com/xap/1.0/\0<rdf:Description drone-dji:GimbalRollDegree=\"+0.00\" \
         drone-dji:GimbalPitchDegree=\"-90.00\" drone-dji:GimbalYawDegree=\"+30.00\"/>";
     let mut jpeg = std::io::Cursor::new(Vec::new());
-    let pixel = |x: u32, y: u32| image::Rgb([((x * 9 + y * 5) % 120) as u8 * light; 3]);
+    let pixel = |x: u32, y: u32| image::Rgb([((x * 9 + y * 5) % 120 * u32::from(light)).min(255) as u8; 3]);
     let picture = image::RgbImage::from_fn(LENS.width, LENS.height, pixel);
     picture.write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("JPEG");
     let jpeg = jpeg.into_inner();
@@ -95,8 +98,28 @@ fn ten_seconds(vehicle: &mut Still, clock: &ManualClock) -> Vec<Event> {
 }
 
 fn still(folder: &Path, since: Option<SystemTime>, clock: &Arc<ManualClock>) -> Still {
+    overheard(folder, since, clock).0
+}
+
+/// As [`still`], with the other end of its line.
+fn overheard(folder: &Path, since: Option<SystemTime>, clock: &Arc<ManualClock>) -> (Still, WireLink) {
     let camera = FolderCamera::open_since(folder, since).expect("the folder").on_simulated_clock();
-    Vehicle::new(WireLink::pair().0, camera, clock.clone(), &settings()).expect("a vehicle")
+    let (line, other) = WireLink::pair();
+    (Vehicle::new(line, camera, clock.clone(), &settings()).expect("a vehicle"), other)
+}
+
+/// Every text the ground control station was told.
+fn texts(line: &mut WireLink) -> Vec<(MavSeverity, String)> {
+    let (mut framer, mut texts, mut bytes) = (Framer::new(), Vec::new(), [0; 256]);
+    while let Ok(Received { bytes: count @ 1.., .. }) = line.read(&mut bytes, Duration::ZERO) {
+        framer.push(&bytes[..count]);
+        while let Some(frame) = framer.next_frame() {
+            let Some(said) = frame.message::<STATUSTEXT_DATA>() else { continue };
+            let text = said.text.to_str().expect("UTF-8").to_owned();
+            texts.push((said.severity, text));
+        }
+    }
+    texts
 }
 
 #[test]
@@ -137,4 +160,35 @@ fn three_black_pictures_are_counted_refused_and_raise_the_flag() {
     }
     assert_eq!(flags, [false, false, true, false]);
     assert_eq!(vehicle.counters().pictures_black, 3);
+}
+
+#[test]
+fn bursts_of_black_and_overexposed_pictures_are_told_once_each_with_their_count() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let clock = Arc::new(ManualClock::default());
+    let (mut vehicle, mut line) = overheard(folder.path(), None, &clock);
+    // Four black ones, a good one, three overexposed ones, a good one.
+    let lights = [0, 0, 0, 0, 2, 255, 255, 255, 2];
+    for (k, light) in lights.into_iter().enumerate() {
+        photograph(&folder.path().join(format!("DJI_{k}.jpg")), ORIGIN, light);
+    }
+    let events = ten_seconds(&mut vehicle, &clock);
+    let _ = texts(&mut line);
+    let mut said = Vec::new();
+    for (k, event) in events.iter().enumerate() {
+        let Event::Frame(frame) = event else { panic!("{event:?}") };
+        // A picture every two seconds: a burst lasts longer than complaints are kept back.
+        clock.set(20_000_000_000 + k as u64 * 2_000_000_000);
+        assert_eq!(vehicle.load(frame).is_ok(), lights[k] == 2);
+        said.extend(texts(&mut line).into_iter().map(|(severity, text)| (k, severity, text)));
+    }
+    let (warning, info) = (MavSeverity::MAV_SEVERITY_WARNING, MavSeverity::MAV_SEVERITY_INFO);
+    let expected = [
+        (0, warning, "dgtr: DJI_0.jpg is black, left out"),
+        (4, info, "dgtr: pictures are good again, 4 were not"),
+        (5, warning, "dgtr: DJI_5.jpg is overexposed, left out"),
+        (8, info, "dgtr: pictures are good again, 3 were not"),
+    ];
+    assert_eq!(said, expected.map(|(k, severity, text)| (k, severity, text.to_owned())));
+    assert_eq!((vehicle.counters().pictures_black, vehicle.counters().pictures_overexposed), (4, 3));
 }

@@ -115,7 +115,7 @@ fn report(outcome: &FlyOutcome) -> RunReport {
 impl From<FlyError> for CliError {
     fn from(e: FlyError) -> Self {
         match e {
-            FlyError::Mission(_) | FlyError::Plan(_) | FlyError::TooFewKeyframes(_) => Self::input(e),
+            FlyError::Mission(_) | FlyError::Plan(_) | FlyError::TooFewKeyframes { .. } => Self::input(e),
             FlyError::Gpu(_) => Self::device(e),
             FlyError::Refine(models::refine::RefineError::Network(_)) => Self::device(e),
             FlyError::Init(e) => e.into(),

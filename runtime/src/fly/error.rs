@@ -52,8 +52,11 @@ pub enum FlyError {
     #[error("the capture thread {0}")]
     Thread(String),
     /// The flight ended before there was anything to build from.
-    #[error(
-        "only {0} key frames: nothing to build a model from; check [keyframes] t_min_m, the camera folder and the triggers"
-    )]
-    TooFewKeyframes(usize),
+    #[error("only {keyframes} key frames, nothing to build a model from: {cause}")]
+    TooFewKeyframes {
+        /// How many there were.
+        keyframes: usize,
+        /// The most likely cause by what was counted, and the remedy.
+        cause: String,
+    },
 }

@@ -11,8 +11,10 @@ use hal::traits::Clock;
 use models::camera::PosedImage;
 use vulkan::trainer::{RunBudget, StepReport};
 
+use super::flight::FlightCounters;
 use super::handover::Handover;
 use super::health::Health;
+use super::shortage::likely_cause;
 use super::{FlyError, Reconstruction, model_path};
 use crate::interrupt::Interrupt;
 use crate::upload::Offerer;
@@ -237,17 +239,18 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         if self.clock.now_ns() >= due_ns { self.save(false) } else { Ok(()) }
     }
 
-    /// After capture: the last build, the rest of the schedule, and the model that remains.
+    /// After capture, which counted `flight`: the last build, the rest of the schedule, and the model that remains.
     ///
     /// # Errors
     /// The device fails before there was a checkpoint; there are too few key frames for a model.
-    pub(super) fn land(mut self, interrupt: &Interrupt) -> Result<JobEnd<R>, FlyError> {
+    pub(super) fn land(mut self, flight: &FlightCounters, interrupt: &Interrupt) -> Result<JobEnd<R>, FlyError> {
         if !self.training_failed {
             let finished = self.finish_schedule(interrupt);
             self.survive(finished)?;
         }
         if !self.reconstruction.has_model() {
-            return Err(FlyError::TooFewKeyframes(self.reconstruction.keyframes()));
+            let keyframes = self.reconstruction.keyframes();
+            return Err(FlyError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
         }
         let finished = !interrupt.requested() && !self.training_failed;
         let (model, gaussians) = if self.training_failed {

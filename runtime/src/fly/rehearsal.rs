@@ -133,6 +133,8 @@ pub(super) struct Script {
     pub(super) sim: SimSettings,
     pub(super) vehicle: VehicleSettings,
     pub(super) end: EndOfFlight,
+    /// Somebody asks the program to end (Ctrl-C) at this time.
+    pub(super) interrupt_at: Option<Duration>,
 }
 
 /// What became of it.
@@ -142,8 +144,8 @@ pub(super) struct Rehearsed {
     pub(super) counters: FlightCounters,
     /// The rungs of the failsafe ladder that were climbed to, with their cause.
     pub(super) rungs: Vec<(Action, &'static str)>,
-    /// Views and completeness of the model file that remained; how many key frames there were for none.
-    pub(super) model: Result<(usize, bool), usize>,
+    /// Views and completeness of the model file that remained; else how many key frames there were, and why so few.
+    pub(super) model: Result<(usize, bool), (usize, String)>,
 }
 
 /// Flies `script`, with its files in `folder`.
@@ -183,6 +185,9 @@ pub(super) fn rehearse(script: &Script, world: Arc<World>, folder: &Path) -> Reh
     let (mut flying, mut over, mut rungs) = (true, None, Vec::new());
     for turn in 1..=MOST_TURNS {
         clock.set(u64::from(turn) * TURN_NS);
+        if script.interrupt_at.is_some_and(|at| Duration::from_nanos(u64::from(turn) * TURN_NS) >= at) {
+            interrupt.request();
+        }
         flying = flying && aircraft.turn().expect("the aircraft flies");
         if let Some(mut capturing) = intake.take() {
             match capturing.turn(Duration::ZERO).expect("capture goes on") {
@@ -199,15 +204,24 @@ pub(super) fn rehearse(script: &Script, world: Arc<World>, folder: &Path) -> Reh
             break;
         }
     }
-    let (ended, counters) = over.expect("the flight ends within ten minutes");
+    // As `Flight::finish`: a capture that goes on is asked to end.
+    capture.stop();
+    while let Some(mut capturing) = intake.take() {
+        match capturing.turn(Duration::ZERO).expect("capture goes on") {
+            Some(ended) => over = Some((ended, capturing.finish())),
+            None => intake = Some(capturing),
+        }
+    }
+    let (ended, counters) = over.expect("the flight ends");
+    assert!(ended != Ended::Asked || interrupt.requested(), "still flying after ten minutes");
     job.reconstruction_mut().landed = true;
-    let model = match job.land(&interrupt) {
+    let model = match job.land(&counters, &interrupt) {
         Ok(end) => {
             let (header, _) = model::read(&end.model).expect("a valid model file");
             assert_eq!(header.finished, end.finished);
             Ok((header.views.len(), header.finished))
         }
-        Err(FlyError::TooFewKeyframes(n)) => Err(n),
+        Err(FlyError::TooFewKeyframes { keyframes, cause }) => Err((keyframes, cause)),
         Err(e) => panic!("the job failed: {e}"),
     };
     Rehearsed { happened: aircraft.finish().expect("a report"), ended, counters, rungs, model }
