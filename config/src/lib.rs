@@ -13,6 +13,8 @@ pub mod ground;
 #[cfg(feature = "std")]
 pub mod init;
 #[cfg(feature = "std")]
+pub mod kernels;
+#[cfg(feature = "std")]
 pub mod link;
 #[cfg(feature = "std")]
 pub mod mission;

@@ -36,7 +36,8 @@ pub use error::CliError;
 #[command(subcommand_required = true, arg_required_else_help = true)]
 #[command(
     after_help = "Exit codes: 0 done, 1 failed, 2 usage or bad input, 3 device or driver missing, 4 interrupted with a \
-                  valid checkpoint."
+                  valid checkpoint.\n\nDGTR_KERNELS=auto|default|WIDExNARROW: workgroup sizes; auto measures them once per \
+                  hardware device and driver (dgtr doctor shows them), default measures nothing. Models do not depend on them."
 )]
 struct Cli {
     #[command(subcommand)]

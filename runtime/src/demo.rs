@@ -5,6 +5,8 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use vulkan::gpu::Gpu;
+
 mod evaluate;
 mod mission;
 mod processes;
@@ -14,6 +16,7 @@ pub use evaluate::Figures;
 pub use summary::Summary;
 
 use crate::interrupt::Interrupt;
+use crate::kernels;
 use processes::Process;
 
 /// What the command line may change.
@@ -93,6 +96,10 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
     let mission = out.join("mission.toml");
     std::fs::write(&mission, mission::text(options)).map_err(io(&mission))?;
 
+    // Once, and before anything else is at work; the jobs find the result. Without a device they say so themselves.
+    if let Ok(gpu) = Gpu::open(None) {
+        kernels::shape_of(&gpu);
+    }
     let spawn = |name: &str, arguments: &[&str]| Process::spawn(name, arguments, &out, options.limit_mib);
     let mission = mission.to_string_lossy().into_owned();
     let path = |a: &str, b: &str| out.join(a).join(b).to_string_lossy().into_owned();

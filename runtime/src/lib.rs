@@ -9,6 +9,7 @@ pub mod demo;
 pub mod evaluate;
 pub mod fly;
 pub mod interrupt;
+pub mod kernels;
 pub mod keyframe_store;
 pub mod renderer;
 pub mod report;

@@ -24,6 +24,7 @@ use crate::cli::CliError;
 use crate::console::Progress;
 use crate::evaluate;
 use crate::interrupt::Interrupt;
+use crate::kernels;
 use crate::run_json::RunReport;
 use crate::transfer::PoseTransfer;
 
@@ -132,7 +133,7 @@ impl TrainJob {
         let mut networks = self.open_networks(largest)?;
         let gpu = Gpu::open(self.device.as_deref())?;
         let plan = self.plan(&frames, largest, settings.sh.degree)?;
-        let mut trainer = Trainer::new(&gpu, &plan, &settings)?;
+        let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::shape_of(&gpu))?;
         report.device = gpu.info().name.clone();
         report.seed = settings.seed;
         report.views = frames.len() as u64;

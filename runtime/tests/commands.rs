@@ -13,8 +13,15 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms::pose_to_opengl;
 
+/// `dgtr`, which measures no workgroup sizes and leaves the user's cache folder alone.
+fn program() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_dgtr"));
+    command.env(config::kernels::VARIABLE, "default");
+    command
+}
+
 fn dgtr(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_dgtr")).args(arguments).output().unwrap()
+    program().args(arguments).output().unwrap()
 }
 
 fn error_line(output: &Output) -> String {
@@ -186,7 +193,7 @@ fn an_interrupted_training_leaves_a_valid_model_and_the_same_command_continues_i
     let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
     let (set, out, file) = (path("set"), path("out"), dir.path().join("out/model.dgtr"));
     let train = |steps: &'static str| {
-        let mut c = Command::new(env!("CARGO_BIN_EXE_dgtr"));
+        let mut c = program();
         c.args(["train", &set, "--out", &out, "--init", "random", "--max-gaussians", "500", "--budget-mib", "64"]);
         c.args(["--steps", steps, "--no-eval"]).stderr(Stdio::piped()).stdout(Stdio::piped());
         c
@@ -209,10 +216,29 @@ fn an_interrupted_training_leaves_a_valid_model_and_the_same_command_continues_i
     let (continued, _) = model::read(&file).unwrap();
     assert!(continued.finished && continued.steps == header.steps + 5, "{} after {}", continued.steps, header.steps);
     // Other pictures in the same folder are not silently replaced.
-    let output = Command::new(env!("CARGO_BIN_EXE_dgtr"))
-        .args(["train", &set, "--out", &out, "--split", "all"])
-        .output()
-        .unwrap();
+    let output = dgtr(&["train", &set, "--out", &out, "--split", "all"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(error_line(&output).contains("--fresh"));
+}
+
+#[test]
+fn a_damaged_cache_of_workgroup_sizes_costs_a_warning_and_not_the_run() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    data_set(&dir.path().join("set"));
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let (set, out) = (path("set"), path("out"));
+    let file = dir.path().join("dgtr/kernels.toml");
+    std::fs::create_dir_all(dir.path().join("dgtr")).unwrap();
+    std::fs::write(&file, "[[device]]\nwide = ").unwrap();
+    let few = ["--init", "random", "--max-gaussians", "300", "--budget-mib", "64", "--steps", "3", "--no-eval"];
+    let command = &mut program();
+    command.env(config::kernels::VARIABLE, "auto").env("XDG_CACHE_HOME", dir.path());
+    let output = command.args(["train", &set, "--out", &out]).args(few).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let warnings: Vec<&str> = said.lines().filter(|l| l.contains("WARN")).collect();
+    assert!(warnings.len() == 1 && warnings[0].contains("kernels.toml"), "{said}");
 }

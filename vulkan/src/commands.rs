@@ -3,7 +3,7 @@
 
 use crate::arena::{Arena, Section};
 use crate::gpu::{Gpu, GpuError};
-use crate::kernels::{KERNELS, Kernel};
+use crate::kernels::{Group, KERNELS, Kernel};
 use crate::pipelines::Pipelines;
 use crate::stages::{STAGE_NAMES, Stage};
 use ash::vk;
@@ -33,6 +33,9 @@ pub(crate) struct Commands {
     stamps: Cell<usize>,
     stages: [Cell<Stage>; STAMPS],
     stage_ms: Cell<[f64; STAGE_NAMES.len()]>,
+    /// What ran up to each timestamp; none where no kernel did.
+    groups: [Cell<Option<Group>>; STAMPS],
+    group_ms: Cell<[f64; 3]>,
 }
 
 impl Drop for Commands {
@@ -70,6 +73,8 @@ impl Commands {
                 stamps: Cell::new(0),
                 stages: [const { Cell::new(Stage::Target) }; STAMPS],
                 stage_ms: Cell::new([0.0; STAGE_NAMES.len()]),
+                groups: [const { Cell::new(None) }; STAMPS],
+                group_ms: Cell::new([0.0; 3]),
             };
             let allocate = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
             made.buffer = device.allocate_command_buffers(&allocate).map_err(vulkan("vkAllocateCommandBuffers"))?[0];
@@ -84,7 +89,13 @@ impl Commands {
         self.stage_ms.get()
     }
 
+    /// Milliseconds that wide, narrow and scanning kernels took since they were last cleared (by `Group as usize`).
+    pub fn group_ms(&self) -> [f64; 3] {
+        self.group_ms.get()
+    }
+
     pub fn clear_times(&self) {
+        self.group_ms.set([0.0; 3]);
         self.stage_ms.set([0.0; STAGE_NAMES.len()]);
     }
 
@@ -102,7 +113,7 @@ impl Commands {
             }
         }
         let recording = Recording { commands: self, pipelines, timed };
-        recording.stamp(Stage::Target);
+        recording.stamp(Stage::Target, None);
         Ok(recording)
     }
 
@@ -122,12 +133,16 @@ impl Commands {
             )
         };
         if read.is_ok() {
-            let mut all = self.stage_ms.get();
+            let (mut all, mut groups) = (self.stage_ms.get(), self.group_ms.get());
             for i in 1..stamps {
                 let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns();
                 all[self.stages[i].get() as usize] += ns * 1e-6;
+                if let Some(group) = self.groups[i].get() {
+                    groups[group as usize] += ns * 1e-6;
+                }
             }
             self.stage_ms.set(all);
+            self.group_ms.set(groups);
         }
     }
 }
@@ -142,7 +157,7 @@ impl Recording<'_> {
     /// Runs `kernel` on at least `lanes` lanes after everything recorded before it.
     pub fn run(&self, kernel: Kernel, lanes: usize, push: Push) {
         self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, push);
-        self.stamp(KERNELS[kernel as usize].stage);
+        self.stamp_kernel(kernel);
     }
 
     /// Runs `kernel` again and again, `push.pass` counting from 0: work that goes on where the round before ended.
@@ -150,13 +165,13 @@ impl Recording<'_> {
         for pass in 0..rounds {
             self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, Push { pass, ..push });
         }
-        self.stamp(KERNELS[kernel as usize].stage);
+        self.stamp_kernel(kernel);
     }
 
     /// As [`Self::run`], with view `index`'s descriptor set.
     pub fn run_view(&self, kernel: Kernel, index: usize, lanes: usize) {
         self.dispatch(kernel, self.pipelines.view_set(index), lanes, Push::default());
-        self.stamp(KERNELS[kernel as usize].stage);
+        self.stamp_kernel(kernel);
     }
 
     fn dispatch(&self, kernel: Kernel, set: vk::DescriptorSet, lanes: usize, push: Push) {
@@ -183,7 +198,7 @@ impl Recording<'_> {
             self.commands.gpu.device().cmd_fill_buffer(self.commands.buffer, arena.buffer, section.offset, bytes, 0);
         }
         self.barrier();
-        self.stamp(stage);
+        self.stamp(stage, None);
     }
 
     fn barrier(&self) {
@@ -207,7 +222,12 @@ impl Recording<'_> {
         }
     }
 
-    fn stamp(&self, stage: Stage) {
+    fn stamp_kernel(&self, kernel: Kernel) {
+        let info = &KERNELS[kernel as usize];
+        self.stamp(info.stage, Some(info.group));
+    }
+
+    fn stamp(&self, stage: Stage, group: Option<Group>) {
         let (c, at) = (self.commands, self.commands.stamps.get());
         if self.timed && at < STAMPS {
             // SAFETY: the buffer is recording and the query was reset in it.
@@ -216,6 +236,7 @@ impl Recording<'_> {
                 c.gpu.device().cmd_write_timestamp(c.buffer, done, c.queries, at as u32);
             }
             c.stages[at].set(stage);
+            c.groups[at].set(group);
             c.stamps.set(at + 1);
         }
     }

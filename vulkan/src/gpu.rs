@@ -2,8 +2,11 @@
 //! Turnip and desktop drivers are all the same to the rest of the crate.
 
 mod error;
+mod limits;
+mod objects;
 
 pub use error::GpuError;
+pub use limits::DeviceLimits;
 
 use ash::{Device, Entry, Instance, vk};
 use std::ffi::CStr;
@@ -22,6 +25,12 @@ pub struct GpuInfo {
     pub subgroup_size: u32,
     /// Bytes of the largest device-local heap.
     pub heap_bytes: u64,
+    /// Vulkan's numbers of the vendor and of the device.
+    pub ids: (u32, u32),
+    /// The driver's version, packed as the driver likes.
+    pub driver_version: u32,
+    /// What the device refuses beyond.
+    pub limits: DeviceLimits,
 }
 
 /// An opened device with its one compute queue. Cheap to clone; closed when the last clone is dropped.
@@ -100,6 +109,16 @@ impl Gpu {
         &self.inner.info
     }
 
+    /// The same device, were its limits these.
+    #[cfg(test)]
+    pub(crate) fn limited(mut self, limits: DeviceLimits) -> Self {
+        if let Some(inner) = Arc::get_mut(&mut self.inner) {
+            inner.info.limits = limits;
+        }
+        assert_eq!(self.info().limits, limits, "somebody else holds this device");
+        self
+    }
+
     pub(crate) fn device(&self) -> &Device {
         &self.inner.device
     }
@@ -170,6 +189,9 @@ fn devices(instance: &Instance) -> Result<Vec<Found>, GpuError> {
             is_cpu: p.device_type == vk::PhysicalDeviceType::CPU,
             subgroup_size: subgroup.subgroup_size,
             heap_bytes: heaps.map(|h| h.size).max().unwrap_or(0),
+            ids: (p.vendor_id, p.device_id),
+            driver_version: p.driver_version,
+            limits: DeviceLimits::of(&p.limits),
         };
         let timestamp_ns = if ticks { f64::from(p.limits.timestamp_period) } else { 0.0 };
         found.push((physical, info, family as u32, timestamp_ns));

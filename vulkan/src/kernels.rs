@@ -10,9 +10,12 @@ pub(crate) enum Group {
     Wide,
     /// Lanes with much state or few of them: as many as the device runs in lockstep.
     Narrow,
-    /// Exactly 256, one per digit or share of the tiles.
+    /// Exactly [`SCAN_LANES`], one per digit or share of the tiles.
     Scan,
 }
+
+/// Lanes of a scanning workgroup (a number inside its shaders).
+pub(crate) const SCAN_LANES: u32 = 256;
 
 pub(crate) struct KernelInfo {
     pub name: &'static str,
@@ -69,6 +72,13 @@ kernels! {
     Reduce "reduce" Reduce Wide ["reduced" "status"] ["slot_ranges" "slots"];
     Optimise "optimise" Optimise Wide ["rows" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "partials"]
         ["reduced" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
+}
+
+/// A number that changes whenever any kernel does (FNV-1a over names and SPIR-V): what was measured with other kernels
+/// says nothing about these.
+pub(crate) fn fingerprint() -> u64 {
+    let bytes = KERNELS.iter().flat_map(|k| k.name.bytes().chain(k.spirv.iter().copied()));
+    bytes.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3))
 }
 
 /// First of the texel bindings.

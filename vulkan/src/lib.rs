@@ -3,6 +3,7 @@
 //! [`gpu::Gpu`] opens a device, [`config::plan::Plan`] says what is allocated, [`trainer::Trainer`] trains and renders.
 
 mod arena;
+pub mod calibration;
 pub mod cases;
 pub mod ceiling;
 mod commands;
@@ -10,6 +11,7 @@ pub mod constants;
 pub mod gpu;
 mod kernels;
 mod pipelines;
+pub mod shape;
 pub mod stages;
 pub mod trainer;
 pub mod twin;

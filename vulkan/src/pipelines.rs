@@ -2,10 +2,10 @@
 
 use crate::arena::{Arena, Section};
 use crate::gpu::{Gpu, GpuError};
-use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, part_of_slots, texel_format};
+use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_of_slots, texel_format};
+use crate::shape::KernelShape;
 use ash::vk;
 use config::plan::{LOOP_LANES, Plan, SORT_BLOCKS, sh_columns};
-use std::io::Cursor;
 
 /// Storage buffers a kernel may bind (V3DV allows eight per stage).
 const STORAGE_BINDINGS: u32 = 8;
@@ -22,8 +22,7 @@ pub(crate) struct Pipelines {
     sets: Vec<vk::DescriptorSet>,
     view_sets: Vec<vk::DescriptorSet>,
     texel_views: Vec<vk::BufferView>,
-    wide: u32,
-    narrow: u32,
+    shape: KernelShape,
 }
 
 impl Drop for Pipelines {
@@ -59,7 +58,9 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 }
 
 impl Pipelines {
-    pub fn new(gpu: &Gpu, plan: &Plan, arena: &Arena) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Gpu, plan: &Plan, arena: &Arena, shape: KernelShape) -> Result<Self, GpuError> {
+        let limits = &gpu.info().limits;
+        limits.check_workgroup(shape.wide.max(shape.narrow).max(SCAN_LANES))?;
         let device = gpu.device();
         let binding = |i: u32| {
             let kind = match i {
@@ -86,8 +87,6 @@ impl Pipelines {
                 descriptor_count: set_count * TEXEL_BINDINGS,
             },
         ];
-        // Software renderers run a workgroup on one core: small groups of tiles balance better there.
-        let narrow = if gpu.info().is_cpu { 8 } else { 32 };
         let set_info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings);
         let pool_info = vk::DescriptorPoolCreateInfo::default().max_sets(set_count).pool_sizes(&sizes);
         // SAFETY: all create infos outlive their calls; `made` owns each handle as soon as it exists, so an early
@@ -104,8 +103,7 @@ impl Pipelines {
                 sets: Vec::new(),
                 view_sets: Vec::new(),
                 texel_views: Vec::new(),
-                wide: 64,
-                narrow,
+                shape,
             };
             let layouts = [set_layout];
             let push = [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(16)];
@@ -133,7 +131,7 @@ impl Pipelines {
                 for (i, name) in kernel.texels.iter().enumerate() {
                     let part = part_of_slots(name, arena.section("slots"), plan.pixels);
                     let section = part.unwrap_or_else(|| arena.section(name));
-                    made.bind_texels(made.sets[index], FIRST_TEXELS + i as u32, arena, section, texel_format(name))?;
+                    made.bind_texels(made.sets[index], FIRST_TEXELS + i as u32, arena, section, name)?;
                 }
             }
             Ok(made)
@@ -154,18 +152,12 @@ impl Pipelines {
         binding: u32,
         arena: &Arena,
         section: Section,
-        format: vk::Format,
+        name: &'static str,
     ) -> Result<(), GpuError> {
-        let info = vk::BufferViewCreateInfo::default()
-            .buffer(arena.buffer)
-            .format(format)
-            .offset(section.offset)
-            .range(section.bytes);
-        let device = self.gpu.device();
         // SAFETY: the section lies inside the buffer and the buffer allows texel views; the view is kept and destroyed
         // with the pipelines, before the arena.
         unsafe {
-            let view = device.create_buffer_view(&info, None).map_err(vulkan("vkCreateBufferView"))?;
+            let view = self.gpu.texel_view(name, arena.buffer, section, texel_format(name))?;
             self.texel_views.push(view);
             let views = [view];
             let write = [vk::WriteDescriptorSet::default()
@@ -173,7 +165,7 @@ impl Pipelines {
                 .dst_binding(binding)
                 .descriptor_type(vk::DescriptorType::UNIFORM_TEXEL_BUFFER)
                 .texel_buffer_view(&views)];
-            device.update_descriptor_sets(&write, &[]);
+            self.gpu.device().update_descriptor_sets(&write, &[]);
         }
         Ok(())
     }
@@ -194,9 +186,6 @@ impl Pipelines {
     /// `self.layout` is a valid pipeline layout.
     unsafe fn pipeline(&self, index: usize, plan: &Plan) -> Result<vk::Pipeline, GpuError> {
         let kernel = &KERNELS[index];
-        let device = self.gpu.device();
-        let code = ash::util::read_spv(&mut Cursor::new(kernel.spirv))
-            .map_err(|e| GpuError::Vulkan { call: kernel.name, result: e.to_string() })?;
         let constants = Specialisation {
             local_size: self.local_size(kernel.group),
             sh_columns: sh_columns(plan.sh_degree) as u32,
@@ -210,31 +199,15 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
-        // SAFETY: the SPIR-V is checked in and validated by a test; infos outlive the calls.
-        unsafe {
-            let module = device
-                .create_shader_module(&vk::ShaderModuleCreateInfo::default().code(&code), None)
-                .map_err(vulkan("vkCreateShaderModule"))?;
-            let stage = vk::PipelineShaderStageCreateInfo::default()
-                .stage(vk::ShaderStageFlags::COMPUTE)
-                .module(module)
-                .name(c"main")
-                .specialization_info(&special);
-            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(self.layout)];
-            let made = device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
-            device.destroy_shader_module(module, None);
-            match made {
-                Ok(p) => Ok(p[0]),
-                Err((_, e)) => Err(GpuError::from_vk("vkCreateComputePipelines", e)),
-            }
-        }
+        // SAFETY: by this function's contract; the constants are those that `frame.glsl` declares.
+        unsafe { self.gpu.compute_pipeline(kernel.name, kernel.spirv, self.layout, &special) }
     }
 
     fn local_size(&self, group: Group) -> u32 {
         match group {
-            Group::Wide => self.wide,
-            Group::Narrow => self.narrow,
-            Group::Scan => 256,
+            Group::Wide => self.shape.wide,
+            Group::Narrow => self.shape.narrow,
+            Group::Scan => SCAN_LANES,
         }
     }
 

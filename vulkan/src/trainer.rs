@@ -29,6 +29,7 @@ use crate::commands::{Commands, Push, Recording};
 use crate::gpu::Gpu;
 use crate::kernels::Kernel;
 use crate::pipelines::Pipelines;
+use crate::shape::KernelShape;
 use crate::stages::STAGE_NAMES;
 use bytemuck::Zeroable;
 use config::plan::{LOOP_LANES, Plan};
@@ -77,15 +78,28 @@ impl std::fmt::Debug for Trainer {
 }
 
 impl Trainer {
-    /// Allocates everything training will ever need: one device allocation of `plan.total_bytes`, all pipelines, and the
-    /// host's own lists.
+    /// As [`Trainer::with_shape`], with the device's standard shape.
     ///
     /// # Errors
-    /// [`TrainError::Gpu`] (device, driver, memory); [`TrainError::Settings`].
+    /// As there.
     pub fn new(gpu: &Gpu, plan: &Plan, settings: &TrainSettings) -> Result<Self, TrainError> {
+        Self::with_shape(gpu, plan, settings, KernelShape::standard(gpu.info()))
+    }
+
+    /// Allocates everything training will ever need: one device allocation of `plan.total_bytes`, all pipelines, and the
+    /// host's own lists. The shape decides how fast the kernels run and changes no bit of what they compute.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`] (device, driver, memory, limits); [`TrainError::Settings`].
+    pub fn with_shape(
+        gpu: &Gpu,
+        plan: &Plan,
+        settings: &TrainSettings,
+        shape: KernelShape,
+    ) -> Result<Self, TrainError> {
         settings.check()?;
         let arena = Arena::new(gpu, plan)?;
-        let pipelines = Pipelines::new(gpu, plan, &arena)?;
+        let pipelines = Pipelines::new(gpu, plan, &arena, shape)?;
         let commands = Commands::new(gpu)?;
         let rows = rows::Rows::new(&arena, plan.sh_degree);
         Ok(Self {
@@ -219,6 +233,11 @@ impl Trainer {
     pub fn stage_ms(&self) -> [(&'static str, f64); STAGE_NAMES.len()] {
         let ms = self.commands.stage_ms();
         std::array::from_fn(|i| (STAGE_NAMES[i], ms[i]))
+    }
+
+    /// Device milliseconds of the wide, the narrow and the scanning kernels since `load`; zeros without timestamps.
+    pub(crate) fn group_ms(&self) -> [f64; 3] {
+        self.commands.group_ms()
     }
 
     /// Length scale of the scene, metres (see [`scene_extent`]); learning rates of positions are relative to it.

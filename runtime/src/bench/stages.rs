@@ -12,6 +12,7 @@ use models::dataset::Dataset;
 use serde::Serialize;
 use vulkan::ceiling::Ceiling;
 use vulkan::gpu::Gpu;
+use vulkan::shape::KernelShape;
 use vulkan::stages::work::{Load, work};
 use vulkan::stages::{STAGE_NAMES, STAGES};
 use vulkan::trainer::{Counters, RunBudget, Trainer};
@@ -121,7 +122,13 @@ impl Scene {
 ///
 /// # Errors
 /// The device, or its memory.
-pub fn measure(gpu: &Gpu, ceiling: &Ceiling, scene: &Scene, steps: u32) -> Result<SizeFigures, CliError> {
+pub fn measure(
+    gpu: &Gpu,
+    shape: KernelShape,
+    ceiling: &Ceiling,
+    scene: &Scene,
+    steps: u32,
+) -> Result<SizeFigures, CliError> {
     let largest = scene.pictures.iter().map(|p| p.image.dimensions()).max_by_key(|(w, h)| w * h);
     let Some((width, height)) = largest else {
         return Err(CliError::input(format!("{}: no training pictures", scene.name)));
@@ -138,7 +145,7 @@ pub fn measure(gpu: &Gpu, ceiling: &Ceiling, scene: &Scene, steps: u32) -> Resul
     settings.density.strategy = Strategy::None;
     (settings.resolution.quarter_until, settings.resolution.half_until) = (0.0, 0.0);
     settings.stop.enabled = false;
-    let mut trainer = Trainer::new(gpu, &plan, &settings)?;
+    let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
     trainer.load(&scene.cloud)?;
     for p in &scene.pictures {
         trainer.add_view(p, None)?;

@@ -2,10 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use config::kernels::{KernelChoice, VARIABLE};
 use models::onnx::{features::FeatureNetwork, session};
-use vulkan::gpu::Gpu;
+use vulkan::gpu::{Gpu, GpuInfo};
 
 use super::CliError;
+use crate::kernels::{self, Source};
 use crate::resources;
 
 /// Arguments of `dgtr doctor`.
@@ -14,6 +16,10 @@ pub struct Args {
     /// Also check this network manifest (may be given more than once).
     #[arg(long, value_name = "FILE")]
     pub model: Vec<PathBuf>,
+    /// Measure anew which workgroup sizes are the fastest on each Vulkan device, and remember them. Hardware is measured at
+    /// its first training anyway, software renderers only here.
+    #[arg(long)]
+    pub calibrate: bool,
 }
 
 /// How a check came out.
@@ -49,6 +55,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 let text =
                     format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
                 tell("vulkan", Finding::Ok(text));
+                tell("kernels", workgroups(&d, args.calibrate));
             }
         }
     }
@@ -95,6 +102,29 @@ pub fn run(args: Args) -> Result<(), CliError> {
         0 => Ok(()),
         n => Err(CliError::device(format!("{n} of the checks above failed; each line says how to mend it"))),
     }
+}
+
+/// Which workgroup sizes are in use on a device, and why.
+fn workgroups(info: &GpuInfo, calibrate: bool) -> Finding {
+    let measured = match calibrate {
+        true => Gpu::open(Some(&info.name)).ok().and_then(|gpu| kernels::measure(&gpu)),
+        false => None,
+    };
+    if calibrate && measured.is_none() {
+        return Finding::Note("workgroup sizes could not be measured; the default is used".to_owned());
+    }
+    let (shape, source) = measured.unwrap_or_else(|| kernels::known(info));
+    let why = match source {
+        Source::Fixed => format!("{VARIABLE} says so"),
+        Source::Kept(path) => format!("measured, kept in {}", path.display()),
+        Source::Measured => "measured, not kept".to_owned(),
+        Source::Standard if KernelChoice::from_environment() == Ok(KernelChoice::Calibrated) => match info.is_cpu {
+            true => "default; dgtr doctor --calibrate measures them, in a minute or so".to_owned(),
+            false => "default until the first training or dgtr doctor --calibrate measures them".to_owned(),
+        },
+        Source::Standard => format!("default, by {VARIABLE}"),
+    };
+    Finding::Ok(format!("workgroups of {} and {} lanes ({why})", shape.wide, shape.narrow))
 }
 
 /// Ports an autopilot may hang on, and whether this user may open them.

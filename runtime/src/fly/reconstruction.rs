@@ -20,6 +20,7 @@ use vulkan::trainer::{RunBudget, StepReport, Trainer};
 
 use super::FlyError;
 use super::carry::carry_over;
+use crate::kernels;
 use crate::keyframe_store::KeyframeStore;
 
 /// Fewer key frames than this say too little about the ground.
@@ -93,7 +94,8 @@ impl Reconstruction {
             sh_degree: mission.training.sh.degree,
             max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
         })?;
-        let trainer = Trainer::new(&gpu, &plan, &mission.training)?;
+        // Before capture begins: measuring takes a second or two.
+        let trainer = Trainer::with_shape(&gpu, &plan, &mission.training, kernels::shape_of(&gpu))?;
         let store = KeyframeStore::open(&out.join("keyframes"), intrinsics, mission.origin)?;
         let header = ModelHeader {
             mission: mission.name.clone(),

@@ -5,7 +5,6 @@ use crate::arena::Arena;
 use crate::gpu::{Gpu, GpuError};
 use ash::vk;
 use config::plan::Plan;
-use std::io::Cursor;
 
 /// Long enough for 128 copies on a very small board.
 const TIMEOUT_NS: u64 = 600_000_000_000;
@@ -111,11 +110,6 @@ impl Probe {
         let sets_info = vk::DescriptorPoolCreateInfo::default().max_sets(1).pool_sizes(&sizes);
         let flags = vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER;
         let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.family()).flags(flags);
-        let view_info = vk::BufferViewCreateInfo::default()
-            .buffer(made.arena.buffer)
-            .format(vk::Format::R32G32B32A32_SFLOAT)
-            .offset(source.offset)
-            .range(source.bytes);
         // SAFETY: all create infos outlive their calls; `made` owns each handle as soon as it exists, so an early return
         // destroys exactly what was made.
         unsafe {
@@ -134,9 +128,10 @@ impl Probe {
             let set_allocate =
                 vk::DescriptorSetAllocateInfo::default().descriptor_pool(made.sets).set_layouts(&layouts);
             made.set = device.allocate_descriptor_sets(&set_allocate).map_err(vulkan("vkAllocateDescriptorSets"))?[0];
-            made.texels = device.create_buffer_view(&view_info, None).map_err(vulkan("vkCreateBufferView"))?;
-            made.pipelines[0] = made.pipeline(include_bytes!("../../shaders/spirv/ceiling_copy.spv"))?;
-            made.pipelines[1] = made.pipeline(include_bytes!("../../shaders/spirv/ceiling_fma.spv"))?;
+            made.texels = gpu.texel_view("source", made.arena.buffer, source, vk::Format::R32G32B32A32_SFLOAT)?;
+            made.pipelines[0] =
+                made.pipeline("ceiling_copy", include_bytes!("../../shaders/spirv/ceiling_copy.spv"))?;
+            made.pipelines[1] = made.pipeline("ceiling_fma", include_bytes!("../../shaders/spirv/ceiling_fma.spv"))?;
         }
         made.bind();
         Ok(made)
@@ -161,29 +156,12 @@ impl Probe {
 
     /// # Safety
     /// `self.layout` is a valid pipeline layout.
-    unsafe fn pipeline(&self, spirv: &[u8]) -> Result<vk::Pipeline, GpuError> {
-        let call = "vkCreateComputePipelines";
-        let code = ash::util::read_spv(&mut Cursor::new(spirv))
-            .map_err(|e| GpuError::Vulkan { call, result: e.to_string() })?;
+    unsafe fn pipeline(&self, name: &'static str, spirv: &[u8]) -> Result<vk::Pipeline, GpuError> {
         let size = LOCAL_SIZE.to_ne_bytes();
         let entries = [vk::SpecializationMapEntry { constant_id: 0, offset: 0, size: 4 }];
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(&size);
-        let device = self.gpu.device();
-        // SAFETY: the SPIR-V is checked in and compared with its source by a test; infos outlive the calls.
-        unsafe {
-            let module = device
-                .create_shader_module(&vk::ShaderModuleCreateInfo::default().code(&code), None)
-                .map_err(vulkan("vkCreateShaderModule"))?;
-            let stage = vk::PipelineShaderStageCreateInfo::default()
-                .stage(vk::ShaderStageFlags::COMPUTE)
-                .module(module)
-                .name(c"main")
-                .specialization_info(&special);
-            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(self.layout)];
-            let made = device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
-            device.destroy_shader_module(module, None);
-            made.map(|p| p[0]).map_err(|(_, e)| GpuError::from_vk(call, e))
-        }
+        // SAFETY: by this function's contract.
+        unsafe { self.gpu.compute_pipeline(name, spirv, self.layout, &special) }
     }
 
     /// Runs `kind` `repeats` times, one after the other, and waits.

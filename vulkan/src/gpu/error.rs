@@ -43,6 +43,27 @@ pub enum GpuError {
         /// The plan's.
         planned: u64,
     },
+    /// A workgroup larger than the device runs.
+    #[error("the device runs at most {limit} lanes in a workgroup, {needed} are needed")]
+    WorkgroupTooLarge {
+        /// Lanes asked for.
+        needed: u32,
+        /// Lanes the device allows.
+        limit: u32,
+    },
+    /// A section that the device cannot show to a kernel as a whole.
+    #[error(
+        "the device shows a kernel at most {limit} elements of '{section}', the plan has {needed}; \
+         lower memory.max_gaussians or memory.image_scale"
+    )]
+    ViewTooLarge {
+        /// The section.
+        section: &'static str,
+        /// Its elements.
+        needed: u64,
+        /// The device's `maxTexelBufferElements`.
+        limit: u32,
+    },
     /// Anything else.
     #[error("{call} failed: {result}")]
     Vulkan {

@@ -8,6 +8,7 @@ use vulkan::gpu::Gpu;
 use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::stages::{Scene, SizeFigures, growth, growth_table, measure, overview_table, size_table};
 use crate::cli::CliError;
+use crate::kernels;
 use crate::report::Table;
 
 /// Arguments of `dgtr bench stages`.
@@ -56,17 +57,20 @@ fn size(text: &str) -> Result<(u32, u32), String> {
 /// Runs `dgtr bench stages`.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
+    let shape = kernels::shape_of(&gpu);
     let ceiling = ceiling::measure(&gpu)?;
     println!(
-        "{}: copies {} GB/s by a kernel and {} GB/s by command (read + written), computes {} G operations/s\n",
+        "{}: copies {} GB/s by a kernel and {} GB/s by command (read + written), computes {} G operations/s; kernels {}x{}\n",
         gpu.info().name,
         short(ceiling.kernel_bytes_per_s * 1e-9),
         short(ceiling.command_bytes_per_s * 1e-9),
-        short(ceiling.operations_per_s * 1e-9)
+        short(ceiling.operations_per_s * 1e-9),
+        shape.wide,
+        shape.narrow
     );
     let mut sizes = Vec::new();
     let mut add = |scene: &Scene| -> Result<(), CliError> {
-        let figures = measure(&gpu, &ceiling, scene, args.steps)?;
+        let figures = measure(&gpu, shape, &ceiling, scene, args.steps)?;
         println!("{}", markdown(&size_table(&figures)));
         sizes.push(figures);
         Ok(())
@@ -93,6 +97,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if let Some(path) = &args.json {
         let all = serde_json::json!({
             "device": gpu.info().name,
+            "kernels": { "wide": shape.wide, "narrow": shape.narrow },
             "kernel_bytes_per_s": ceiling.kernel_bytes_per_s,
             "command_bytes_per_s": ceiling.command_bytes_per_s,
             "operations_per_s": ceiling.operations_per_s,

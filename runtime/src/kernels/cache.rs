@@ -1,0 +1,200 @@
+//! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the shape that was
+//! measured. It is only a cache: it may be deleted, be damaged or be somebody's handiwork at any time.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use models::formats::{FormatError, read_bounded, write_atomic};
+use serde::{Deserialize, Serialize};
+use vulkan::gpu::GpuInfo;
+use vulkan::shape::{KernelShape, kernels_fingerprint};
+
+/// Bound on the file; an entry takes some 200 bytes.
+const LIMIT: u64 = 64 << 10;
+/// Devices that are remembered; the one measured longest ago makes room.
+const MOST_DEVICES: usize = 64;
+
+/// The file.
+#[derive(Debug, Default, Deserialize, Serialize)]
+struct Kept {
+    /// The one measured last comes last.
+    #[serde(default)]
+    device: Vec<Entry>,
+}
+
+/// One device.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
+struct Entry {
+    name: String,
+    vendor_id: u32,
+    device_id: u32,
+    driver_version: u32,
+    /// Fingerprint of the kernels, hexadecimal.
+    kernels: String,
+    wide: u32,
+    narrow: u32,
+}
+
+impl Entry {
+    fn of(info: &GpuInfo, shape: KernelShape) -> Self {
+        Self {
+            name: info.name.clone(),
+            vendor_id: info.ids.0,
+            device_id: info.ids.1,
+            driver_version: info.driver_version,
+            kernels: format!("{:016x}", kernels_fingerprint()),
+            wide: shape.wide,
+            narrow: shape.narrow,
+        }
+    }
+
+    fn shape(&self) -> KernelShape {
+        KernelShape { wide: self.wide, narrow: self.narrow }
+    }
+
+    fn is_device(&self, other: &Self) -> bool {
+        (&self.name, self.vendor_id, self.device_id) == (&other.name, other.vendor_id, other.device_id)
+    }
+}
+
+/// Where the file lies; none without a home.
+pub(super) fn path() -> Option<PathBuf> {
+    let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|p| p.is_absolute());
+    let cache = folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))?;
+    Some(cache.join("dgtr/kernels.toml"))
+}
+
+/// What was measured on this very device, with this driver and these kernels; `None` when nothing was.
+///
+/// # Errors
+/// A file that is there and cannot be used.
+pub(super) fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatError> {
+    let kept = load(path)?;
+    // An entry equals the one that would be written for its own shape, or it is another driver's or other kernels'.
+    let found = kept.device.iter().rev().find(|e| **e == Entry::of(info, e.shape()));
+    match found.map(Entry::shape) {
+        Some(shape) if !shape.fits(info) => {
+            let what = format!("{}: {}x{} is no shape this device can run", info.name, shape.wide, shape.narrow);
+            Err(FormatError::Invalid { path: path.into(), what })
+        }
+        shape => Ok(shape),
+    }
+}
+
+/// Remembers `shape`, in place of whatever was remembered of the device. A damaged file is begun anew.
+///
+/// # Errors
+/// A file or folder that cannot be written.
+pub(super) fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), FormatError> {
+    let mut kept = load(path).unwrap_or_default();
+    let entry = Entry::of(info, shape);
+    kept.device.retain(|e| !e.is_device(&entry));
+    kept.device.push(entry);
+    let over = kept.device.len().saturating_sub(MOST_DEVICES);
+    kept.device.drain(..over);
+    let text = toml::to_string(&kept).map_err(|e| FormatError::Invalid { path: path.into(), what: e.to_string() })?;
+    write_atomic(path, |out| {
+        writeln!(out, "# Workgroup sizes measured by dgtr (`dgtr doctor --calibrate`); may be deleted.")?;
+        out.write_all(text.as_bytes())
+    })
+}
+
+fn load(path: &Path) -> Result<Kept, FormatError> {
+    if !path.exists() {
+        return Ok(Kept::default());
+    }
+    let invalid = |what: String| FormatError::Invalid { path: path.into(), what };
+    let text = String::from_utf8(read_bounded(path, LIMIT)?).map_err(|_| invalid("not UTF-8 text".into()))?;
+    // One line, as every warning is.
+    toml::from_str(&text).map_err(|e| invalid(e.message().to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vulkan::gpu::DeviceLimits;
+
+    const SHAPE: KernelShape = KernelShape { wide: 128, narrow: 16 };
+
+    fn device(name: &str) -> GpuInfo {
+        GpuInfo {
+            name: name.into(),
+            version: (1, 3),
+            is_cpu: false,
+            subgroup_size: 16,
+            heap_bytes: 1 << 30,
+            ids: (0x14e4, 42),
+            driver_version: 7,
+            limits: DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27 },
+        }
+    }
+
+    #[test]
+    fn every_device_gets_its_own_shape_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("deep/dgtr/kernels.toml");
+        let (a, b) = (device("V3D \"7.1\""), device("llvmpipe"));
+        assert_eq!(read(&path, &a).unwrap(), None);
+        write(&path, &a, SHAPE).unwrap();
+        write(&path, &b, KernelShape { wide: 32, narrow: 8 }).unwrap();
+        assert_eq!(read(&path, &a).unwrap(), Some(SHAPE));
+        assert_eq!(read(&path, &b).unwrap(), Some(KernelShape { wide: 32, narrow: 8 }));
+    }
+
+    #[test]
+    fn another_driver_version_or_other_kernels_are_measured_anew_and_replace_the_entry() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("kernels.toml");
+        let old = device("V3D");
+        let new = GpuInfo { driver_version: 8, ..old.clone() };
+        write(&path, &old, SHAPE).unwrap();
+        assert_eq!(read(&path, &new).unwrap(), None);
+        write(&path, &new, KernelShape { wide: 64, narrow: 32 }).unwrap();
+        assert_eq!(read(&path, &new).unwrap(), Some(KernelShape { wide: 64, narrow: 32 }));
+        assert_eq!(read(&path, &old).unwrap(), None);
+        let fingerprint = format!("{:016x}", kernels_fingerprint());
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert_eq!(text.matches(&fingerprint).count(), 1, "{text}");
+        std::fs::write(&path, text.replace(&fingerprint, "0123456789abcdef")).unwrap();
+        assert_eq!(read(&path, &new).unwrap(), None);
+    }
+
+    #[test]
+    fn a_damaged_file_is_reported_in_one_line_and_begun_anew() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("kernels.toml");
+        let info = device("V3D");
+        write(&path, &info, SHAPE).unwrap();
+        let sound = std::fs::read_to_string(&path).unwrap();
+        let unusable = sound.replace("wide = 128", "wide = 48");
+        let endless = "#".repeat(LIMIT as usize + 1);
+        let cut = sound.split_at(sound.find("kernels =").unwrap() + 12).0;
+        for damaged in [cut.as_bytes(), b"\xff\xfe", endless.as_bytes(), unusable.as_bytes(), b"device = 3"] {
+            std::fs::write(&path, damaged).unwrap();
+            let said = read(&path, &info).unwrap_err().to_string();
+            assert!(said.contains("kernels.toml") && said.lines().count() == 1, "{said}");
+            write(&path, &info, SHAPE).unwrap();
+            assert_eq!(read(&path, &info).unwrap(), Some(SHAPE));
+        }
+    }
+
+    #[test]
+    fn the_file_does_not_grow_without_end() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("kernels.toml");
+        for i in 0..MOST_DEVICES + 5 {
+            write(&path, &device(&format!("device {i}")), SHAPE).unwrap();
+        }
+        assert_eq!(load(&path).unwrap().device.len(), MOST_DEVICES);
+        assert_eq!(read(&path, &device("device 0")).unwrap(), None);
+        assert_eq!(read(&path, &device("device 68")).unwrap(), Some(SHAPE));
+        assert!(std::fs::metadata(&path).unwrap().len() < LIMIT);
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_written_is_an_error_and_no_panic() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("file"), b"").unwrap();
+        assert!(write(&dir.path().join("file/kernels.toml"), &device("V3D"), SHAPE).is_err());
+    }
+}

@@ -1,0 +1,103 @@
+//! The shape of the kernels changes no bit of the trained model, and calibration ends in time with one the device can run.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
+
+mod scenes;
+
+use config::plan::{Plan, PlanRequest};
+use models::camera::DepthPrior;
+use models::cloud::GaussianCloud;
+use scenes::device::{plain, posed};
+use scenes::{cloud, photo, view};
+use std::time::Duration;
+use vulkan::calibration::calibrate;
+use vulkan::gpu::Gpu;
+use vulkan::shape::KernelShape;
+use vulkan::trainer::{Rendering, Trainer};
+
+fn gpu() -> Option<Gpu> {
+    let gpu = Gpu::open(None);
+    if let Err(e) = &gpu {
+        println!("skipped: {e}");
+    }
+    gpu.ok()
+}
+
+/// Everything that draws random numbers or sums over many lanes: growth, relocation, noise, depth, pose and exposure,
+/// two views, and a picture that is no multiple of any workgroup. Few `instances` are done in bands.
+fn trained(gpu: &Gpu, shape: KernelShape, instances: usize, steps: u32) -> (GaussianCloud, Rendering, u64) {
+    let v = view(77, 53);
+    let mut settings = plain();
+    settings.density.strategy = config::training::Strategy::Relocate;
+    settings.steps = steps;
+    settings.regularise.noise = 2.0;
+    settings.regularise.opacity_decay = 0.004;
+    settings.loss.depth = 0.2;
+    (settings.refine_poses, settings.refine_exposure) = (true, true);
+    let request =
+        PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, sh_degree: 3, max_gaussians: Some(3000) };
+    let plan = Plan::with_capacities(&request, 3000, instances);
+    let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape).unwrap();
+    trainer.load(&cloud(8, 1500, 3)).unwrap();
+    let depth: Vec<f32> = (0..77 * 53).map(|i| 2.0 + (i % 77) as f32 * 0.05).collect();
+    let confidence = depth.iter().map(|d| d / 8.0).collect();
+    let prior = DepthPrior { width: 77, height: 53, depth, confidence };
+    trainer.add_view(&posed(&v, &photo(1, &v)), Some(&prior)).unwrap();
+    trainer.add_view(&posed(&v, &photo(2, &v)), None).unwrap();
+    let mut banded = 0;
+    for _ in 0..steps {
+        banded += u64::from(trainer.step().unwrap().bands > 1);
+    }
+    let mut model = GaussianCloud::with_capacity(3, trainer.gaussians());
+    trainer.snapshot(&mut model).unwrap();
+    let mut drawn = Rendering::default();
+    trainer.render(&v, &mut drawn).unwrap();
+    (model, drawn, banded)
+}
+
+/// Bit for bit, NaN included.
+fn bits(model: &GaussianCloud) -> Vec<u32> {
+    let all = model.means.as_flattened().iter().chain(model.log_scales.as_flattened());
+    let all = all.chain(model.rotations.as_flattened()).chain(&model.opacity_logits).chain(&model.sh);
+    all.map(|v| v.to_bits()).collect()
+}
+
+/// Together with the standard shape: the smallest and the largest of each size (each shape costs a compilation).
+fn shapes(gpu: &Gpu) -> [KernelShape; 2] {
+    let (wide, narrow) = (KernelShape::wide_candidates(gpu.info()), KernelShape::narrow_candidates(gpu.info()));
+    let (w, n) = (wide.len() - 1, narrow.len() - 1);
+    [(0, n), (w, 0)].map(|(i, j)| KernelShape { wide: wide[i], narrow: narrow[j] })
+}
+
+#[test]
+fn the_trained_model_and_its_pictures_are_the_same_to_the_bit_with_every_shape() {
+    let Some(gpu) = gpu() else { return };
+    let (model, drawn, _) = trained(&gpu, KernelShape::standard(gpu.info()), 200_000, 110);
+    assert!(model.len() > 1500, "density control did not run");
+    for shape in shapes(&gpu) {
+        let (other, other_drawn, _) = trained(&gpu, shape, 200_000, 110);
+        assert!(bits(&other) == bits(&model), "{shape:?}: another model");
+        assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{shape:?}: another picture");
+    }
+}
+
+#[test]
+fn in_bands_the_model_is_the_same_to_the_bit_with_every_shape() {
+    let Some(gpu) = gpu() else { return };
+    let (model, _, banded) = trained(&gpu, KernelShape::standard(gpu.info()), 3000, 6);
+    assert_eq!(banded, 6, "the plan holds every instance at once");
+    for shape in shapes(&gpu) {
+        let (other, _, _) = trained(&gpu, shape, 3000, 6);
+        assert!(bits(&other) == bits(&model), "{shape:?}: another model");
+    }
+}
+
+#[test]
+fn calibration_without_time_for_more_measures_the_standard_shape_and_keeps_it() {
+    let Some(gpu) = gpu() else { return };
+    let found = calibrate(&gpu, Some(Duration::ZERO)).unwrap();
+    println!("{found:?}");
+    let standard = KernelShape::standard(gpu.info());
+    assert_eq!((found.shape, found.trials.len(), found.trials[0].shape), (standard, 1, standard));
+    let t = found.trials[0];
+    assert!([t.wide_ms, t.narrow_ms].iter().all(|ms| *ms > 0.0 && *ms < 1e6), "{t:?}");
+}
