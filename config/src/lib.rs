@@ -15,6 +15,8 @@ pub mod init;
 #[cfg(feature = "std")]
 pub mod kernels;
 #[cfg(feature = "std")]
+pub mod lens;
+#[cfg(feature = "std")]
 pub mod link;
 #[cfg(feature = "std")]
 pub mod mission;

@@ -75,6 +75,9 @@ struct Rule {
     after_ms: u32,
 }
 
+/// Causes that outlast the landing: what is short or hot in the air is so on the ground.
+const LASTING: [&str; 2] = ["battery low", "too hot"];
+
 /// Ordered as they are reported when several ask for the same.
 const RULES: &[Rule] = &[
     Rule { name: "mission ends", seen: |f| f.ending, action: Action::UploadBest, after_ms: 0 },
@@ -113,6 +116,11 @@ impl State {
     /// What to do now.
     pub fn action(&self) -> Action {
         self.action
+    }
+
+    /// Whether training must not go on after the landing either.
+    pub fn forbids_training(&self) -> bool {
+        self.action >= Action::StopTraining && self.cause.is_some_and(|cause| LASTING.contains(&cause))
     }
 
     /// Why, in a few words.
@@ -213,6 +221,19 @@ mod tests {
         let state = run(state, 185_100, 220_000, lost);
         assert_eq!(state.action(), Action::Hold);
         assert_eq!(run(state, 220_100, 300_000, Flags::default()).action(), Action::Hold, "final");
+    }
+
+    #[test]
+    fn a_low_battery_forbids_training_on_the_ground_too_and_a_silent_autopilot_does_not() {
+        assert!(LASTING.iter().all(|cause| RULES.iter().any(|rule| rule.name == *cause)));
+        let low = run(State::default(), 0, 3_000, Flags { battery_low: true, ..Flags::default() });
+        assert_eq!((low.action(), low.forbids_training()), (Action::UploadBest, true));
+        let held = run(low, 3_100, 60_000, Flags { battery_low: true, ..Flags::default() });
+        assert_eq!((held.action(), held.forbids_training()), (Action::Hold, true));
+        let lost = run(State::default(), 0, 70_000, Flags { link_lost: true, ..Flags::default() });
+        assert_eq!((lost.action(), lost.forbids_training()), (Action::UploadBest, false));
+        let warm = run(State::default(), 0, 6_000, Flags { hot: true, ..Flags::default() });
+        assert!(!warm.forbids_training());
     }
 
     #[test]

@@ -11,7 +11,8 @@ use image::imageops;
 use crate::camera::{Intrinsics, PoseSigma, PosedImage, View};
 use crate::formats::telemetry::{self, Telemetry};
 use crate::formats::{FormatError, colmap, split};
-use crate::undistort::{Distortion, undistort};
+use crate::undistort::undistort;
+use config::lens::Distortion;
 
 mod sources;
 

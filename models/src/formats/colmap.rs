@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use super::transforms::{Focal, Lens};
 use super::{Bytes, FormatError, read_bounded};
 use crate::camera::Pose;
-use crate::undistort::Distortion;
+use config::lens::Distortion;
 
 /// A gigabyte holds some ten million points with their tracks, more than a board has room for.
 const LIMIT: u64 = 1 << 30;

@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use super::{FormatError, read_bounded};
 use crate::camera::Pose;
-use crate::undistort::Distortion;
+use config::lens::Distortion;
 
 /// A hundred thousand frames at 2 KiB of JSON each.
 const LIMIT: u64 = 200 << 20;

@@ -252,7 +252,12 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             let keyframes = self.reconstruction.keyframes();
             return Err(FlyError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
         }
-        let finished = !interrupt.requested() && !self.training_failed;
+        let spared = self.failsafe.forbids_training();
+        if spared {
+            let cause = self.failsafe.cause().unwrap_or_default();
+            tracing::warn!("{cause}: the rest of the training is left; the same command continues it later");
+        }
+        let finished = !interrupt.requested() && !self.training_failed && !spared;
         let (model, gaussians) = if self.training_failed {
             (model_path(&self.out), self.reconstruction.gaussians())
         } else {
@@ -271,7 +276,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             self.reconstruction.build()?;
             self.save(false)?;
         }
-        if !self.reconstruction.has_model() {
+        if !self.reconstruction.has_model() || self.failsafe.forbids_training() {
             return Ok(());
         }
         let mut progress = crate::console::Progress::new("training", 100);
