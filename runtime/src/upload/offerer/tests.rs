@@ -171,6 +171,10 @@ fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
 #[cfg(feature = "zenoh")]
 #[test]
 fn over_tls_only_aircraft_of_the_same_authority_deliver() {
+    // The certificates are for the name; an empty container may not know it.
+    if std::net::ToSocketAddrs::to_socket_addrs(&("localhost", 0)).is_err() {
+        return println!("skipped: this machine does not know the name localhost (no /etc/hosts?)");
+    }
     let dir = tempfile::tempdir().expect("temp dir");
     let endpoint = format!("tls/localhost:{}", free_port());
     let ours = dir.path().join("ours");
