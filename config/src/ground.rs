@@ -16,8 +16,8 @@ pub struct GroundSettings {
     pub epochs: u32,
     /// Seconds for distillation at most; None = all epochs.
     pub seconds: Option<f64>,
-    /// Size of the distillation pictures relative to the training pictures (Fed3DGS uses ¼; seams are thin, so the
-    /// default is higher).
+    /// Size of the distillation pictures relative to the training pictures (Fed3DGS uses ¼; smaller ones than the models
+    /// were trained on cost detail: sheffield_cross at ½ SSIM 0.800, at 1 SSIM 0.811).
     pub scale: f32,
     /// Width of the band along a border between two regions that counts as seam, metres.
     pub seam_m: f32,
@@ -46,12 +46,12 @@ impl Default for GroundSettings {
             max_gaussians: None,
             epochs: 5,
             seconds: None,
-            scale: 0.5,
+            scale: 1.0,
             seam_m: 8.0,
             seam_share: 0.02,
             all_views: false,
             between_views: true,
-            rate: 0.3,
+            rate: 1.0,
             prune_opacity: 0.005,
             register: true,
             seed: 0,

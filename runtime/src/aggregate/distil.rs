@@ -27,6 +27,8 @@ const SAMPLES_PER_MODEL: usize = 1;
 /// Stages of training, each at `STAGE_FACTOR` times the rates of the one before.
 const STAGES: u32 = 3;
 const STAGE_FACTOR: f32 = 0.25;
+/// Rates of means, scales and rotations beside those of colours and opacities.
+const SHAPE_FACTOR: f32 = 0.1;
 
 /// One view before and after, for the report.
 #[derive(Clone, Debug)]
@@ -207,8 +209,11 @@ fn school(
 /// The trainer's learning rates times `factor`.
 fn rates(factor: f32) -> RateSettings {
     let mut r = RateSettings::default();
-    // From a tenth of training's: what is to be mended is how clouds meet, not where the ground is.
-    r.mean_start *= 0.1;
+    // What is to be mended is how clouds meet and what colour they have from the neighbour's cameras, not where the ground is
+    // nor how fine: pictures smaller than those the models were trained on would blur it.
+    for shape in [&mut r.mean_start, &mut r.log_scale, &mut r.rotation] {
+        *shape *= SHAPE_FACTOR;
+    }
     for rate in [
         &mut r.mean_start,
         &mut r.mean_end,
