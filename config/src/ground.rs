@@ -12,7 +12,8 @@ pub struct GroundSettings {
     pub device_mib: u32,
     /// Upper bound of the global model; None = as many as the memory holds.
     pub max_gaussians: Option<usize>,
-    /// Passes over the distillation views (Fed3DGS uses 5). 0 = merge only.
+    /// Passes over the distillation views. 0 = merge only. Fed3DGS uses 5; sheffield_cross merged: 25.45 dB with 5, 25.65 with
+    /// 15, and its best aircraft's own views lose 0.31 and 0.12 dB.
     pub epochs: u32,
     /// Seconds for distillation at most; None = all epochs.
     pub seconds: Option<f64>,
@@ -44,7 +45,7 @@ impl Default for GroundSettings {
             device: None,
             device_mib: 1024,
             max_gaussians: None,
-            epochs: 5,
+            epochs: 15,
             seconds: None,
             scale: 1.0,
             seam_m: 8.0,

@@ -36,6 +36,8 @@ pub struct PlanRequest {
     pub sh_degree: u8,
     /// Upper bound on Gaussians; `None` takes what the memory allows.
     pub max_gaussians: Option<usize>,
+    /// Adam's moments of SH in 16 bits each.
+    pub half_moments: bool,
 }
 
 /// Capacities and the size of every section.
@@ -53,6 +55,8 @@ pub struct Plan {
     pub views: usize,
     /// Highest SH degree.
     pub sh_degree: u8,
+    /// Adam's moments of SH take 16 bits each instead of 32.
+    pub half_moments: bool,
     /// Name and bytes of every section, in the order in which they lie in memory.
     pub sections: Vec<(&'static str, u64)>,
     /// Bytes of the one device allocation.
@@ -170,14 +174,15 @@ impl Plan {
         let (across, down) = (u64::from(r.width).div_ceil(TILE_SIDE), u64::from(r.height).div_ceil(TILE_SIDE));
         let tiles = across * down + across.max(down) + 64;
         let sh = 16 * sh_columns(r.sh_degree) * n;
+        let moment = if r.half_moments { sh / 2 } else { sh };
         let sections: Vec<(&'static str, u64)> = [
             ("frame", 16 << 10), // uniforms and the table of deferred moments
             ("status", 8 << 10), // counters read back after every step, cursors of the sorting lanes
             ("partials", 32 * (LOOP_LANES + p.div_ceil(8) + u64::from(r.width) + u64::from(r.height) + 64)),
             ("geometry", 144 * n), // mean+opacity, log scale+state, rotation; each with two Adam moments
             ("sh", sh),
-            ("sh_first_moment", sh),
-            ("sh_second_moment", sh),
+            ("sh_first_moment", moment),
+            ("sh_second_moment", moment),
             ("projected", 48 * n), // centre, conic, span data
             ("shaded", 48 * n),    // the visible ones in depth order, with colour
             ("keys", 4 * n),       // depths of all, and of the visible ones while sorting
@@ -208,9 +213,16 @@ impl Plan {
             tiles: tiles as usize,
             views: r.views as usize,
             sh_degree: r.sh_degree,
+            half_moments: r.half_moments,
             sections,
             total_bytes: total.next_multiple_of(TOTAL_ALIGNMENT),
         }
+    }
+
+    /// What moments in 16 bits are multiplied by: gradients of a mean over the pixels of three channels come to the size of
+    /// one pixel's. A power of two, so that nothing is rounded.
+    pub fn moment_scale(&self) -> f32 {
+        (3 * self.pixels as u64).next_power_of_two() as f32
     }
 
     /// Bytes of the section `name`; 0 when there is none.
@@ -224,7 +236,7 @@ mod tests {
     use super::*;
 
     fn request(device_mib: u32) -> PlanRequest {
-        PlanRequest { device_mib, width: 640, height: 480, views: 50, sh_degree: 3, max_gaussians: None }
+        PlanRequest { device_mib, width: 640, height: 480, views: 50, sh_degree: 3, max_gaussians: None, half_moments: false }
     }
 
     #[test]

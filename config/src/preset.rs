@@ -91,6 +91,7 @@ mod tests {
                 views: 48,
                 sh_degree: 3,
                 max_gaussians: Some(v.max_gaussians as usize),
+                half_moments: false,
             });
             let plan = plan.unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(plan.gaussians, v.max_gaussians as usize, "{name}: the budget does not hold its Gaussians");

@@ -123,6 +123,7 @@ impl TrainSettings {
         within("density.dead_opacity", self.density.dead_opacity, 0.0, 0.5)?;
         within("views.residual_share", self.views.residual_share, 0.0, 1.0)?;
         within("sh.degree", f32::from(self.sh.degree), 0.0, 3.0)?;
+        within("sh.raise_share", self.sh.raise_share, 0.0, 1.0)?;
         within("steps", self.steps as f32, 1.0, 1e9)?;
         within("seconds", self.seconds.unwrap_or(1.0) as f32, 1e-3, 1e9)
     }

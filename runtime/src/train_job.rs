@@ -10,7 +10,7 @@ use config::init::InitSettings;
 use config::mission::NetworkSettings;
 use config::plan::{Plan, PlanRequest};
 use config::refine::RefineSettings;
-use config::training::TrainSettings;
+use config::training::{ShSettings, TrainSettings};
 use models::camera::{Pose, PosedImage};
 use models::cloud::GaussianCloud;
 use models::dataset::{Dataset, PoseSource, scaled};
@@ -132,7 +132,7 @@ impl TrainJob {
         let largest = self.largest(&set, &frames)?;
         let mut networks = self.open_networks(largest)?;
         let gpu = Gpu::open(self.device.as_deref())?;
-        let plan = self.plan(&frames, largest, settings.sh.degree)?;
+        let plan = self.plan(&frames, largest, &settings.sh)?;
         let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::shape_of(&gpu))?;
         report.device = gpu.info().name.clone();
         report.seed = settings.seed;
@@ -203,14 +203,15 @@ impl TrainJob {
     }
 
     /// The largest picture decides; the trainer fits the others in.
-    fn plan(&self, frames: &[usize], (width, height): (u32, u32), sh_degree: u8) -> Result<Plan, CliError> {
+    fn plan(&self, frames: &[usize], (width, height): (u32, u32), sh: &ShSettings) -> Result<Plan, CliError> {
         Ok(Plan::new(&PlanRequest {
             device_mib: self.budget_mib,
             width,
             height,
             views: frames.len() as u32,
-            sh_degree,
+            sh_degree: sh.degree,
             max_gaussians: self.max_gaussians,
+            half_moments: sh.half_moments,
         })?)
     }
 
@@ -307,6 +308,7 @@ impl TrainJob {
                 ("culled", c.culled),
                 ("behind_opaque", c.behind_opaque),
                 ("gradients_not_finite", c.unsound_gradients),
+                ("sh_coefficients", c.sh_missing),
             ] {
                 // The counters run on since `load`.
                 report.skipped.insert(name.to_owned(), count);

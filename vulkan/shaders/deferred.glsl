@@ -7,10 +7,19 @@ void catch_up(inout vec4 p, inout vec4 m, inout vec4 v, vec4 step_sum, vec2 deca
     v *= decay.y;
 }
 
-// Both step counters of a Gaussian in one word: low half geometry, high half SH.
-uint state_geometry(uint s) { return s & 0xFFFFu; }
-uint state_sh(uint s) { return s >> 16; }
+// A Gaussian's state in one word: the steps its geometry (13 bits) and its SH (13 bits) were last moved in, its own SH
+// degree (2 bits), and bit 29, which makes the word an ordinary float: it travels as one, and no device may flush or
+// quiet it on the way. src/trainer/degrees.rs writes it, too.
+const uint STATE_STEPS = 0x1FFFu;
+
+uint state_of(uint geometry, uint sh, uint degree) {
+    return (geometry & STATE_STEPS) | ((sh & STATE_STEPS) << 13) | (degree << 26) | (1u << 29);
+}
+
+uint state_geometry(uint s) { return s & STATE_STEPS; }
+uint state_sh(uint s) { return (s >> 13) & STATE_STEPS; }
+uint state_degree(uint s) { return (s >> 26) & 3u; }
 
 uint steps_behind(uint last, uint now) {
-    return min((now - last) & 0xFFFFu, 511u);
+    return min((now - last) & STATE_STEPS, 511u);
 }

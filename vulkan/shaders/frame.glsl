@@ -4,12 +4,15 @@
 #include "constants.glsl"
 
 // Chosen per device: lanes of a workgroup, columns of SH (vec4) and the highest degree they hold, sorting lanes,
-// lanes of the loops over visible Gaussians.
+// lanes of the loops over visible Gaussians; per job: whether Gaussians have SH
+// degrees of their own, and whether the moments of SH are kept in 16 bits.
 layout(local_size_x_id = 0, local_size_y = 1, local_size_z = 1) in;
 layout(constant_id = 1) const uint SH_COLUMNS = 12;
 layout(constant_id = 2) const uint SH_DEGREE = 3;
 layout(constant_id = 3) const uint SORT_BLOCKS = 32;
 layout(constant_id = 4) const uint LOOP_LANES = 1024;
+layout(constant_id = 5) const bool OWN_DEGREES = false;
+layout(constant_id = 6) const bool HALF_MOMENTS = false;
 
 const uint FLAG_FREEZE_SHAPE = 1u;
 const uint FLAG_DEPTH = 4u;
@@ -23,7 +26,7 @@ const uint FLAG_NO_EARLY_END = 64u;  // tiles are blended to the end, opaque or 
 // words of this block at the same offset for constants too, and compiles and keeps one more kernel for each new value
 // of theirs. With the camera there, that was a kernel and 0.2 MiB per step.
 layout(std140, set = 0, binding = 0) uniform Frame {
-    vec4 adam;             // beta1, beta2, epsilon, -
+    vec4 adam;             // beta1, beta2, epsilon, scale of moments in 16 bits
     vec4 view_row[3];      // world → camera, rotation rows and translation
     vec4 lens;             // fx, fy, cx, cy
     vec4 camera;           // centre in the world; nearest depth

@@ -1,6 +1,8 @@
 // Real spherical harmonics as in 3DGS, and their derivatives by the (unit) direction's components.
 
 const uint COEFFICIENTS = (SH_DEGREE + 1u) * (SH_DEGREE + 1u);
+// Columns (vec4) that hold the coefficients up to each degree: a Gaussian's own degree says how many are read and written.
+const uint COLUMNS_UP_TO[4] = uint[4](1u, 3u, 7u, 12u);
 
 void harmonics(vec3 d, uint degree, out float y[16]) {
     float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;

@@ -7,19 +7,16 @@
 #include "projection.glsl"
 #include "harmonics.glsl"
 #include "deferred.glsl"
+#include "moments.glsl"
 
 // Rows are fetched as texels and written back through buffers; each lane touches only its own rows.
 layout(set = 0, binding = 9) uniform samplerBuffer reduced;
 layout(set = 0, binding = 10) uniform samplerBuffer geometry_rows;
 layout(set = 0, binding = 11) uniform samplerBuffer sh_rows;
-layout(set = 0, binding = 12) uniform samplerBuffer sh_first_rows;
-layout(set = 0, binding = 13) uniform samplerBuffer sh_second_rows;
 layout(std430, set = 0, binding = 1) readonly buffer Order { uint order[]; };
 layout(std430, set = 0, binding = 2) readonly buffer Status { uint status[]; };
 layout(std430, set = 0, binding = 3) writeonly buffer Geometry { vec4 geometry[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer Sh { vec4 sh[]; };
-layout(std430, set = 0, binding = 5) writeonly buffer ShFirst { vec4 sh_first[]; };
-layout(std430, set = 0, binding = 6) writeonly buffer ShSecond { vec4 sh_second[]; };
 layout(std430, set = 0, binding = 7) writeonly buffer Partials { vec4 partials[]; };
 
 void adam(inout vec4 p, inout vec4 m, inout vec4 v, vec4 g, vec4 rate) {
@@ -100,10 +97,15 @@ void main() {
         float distance = max(length(away), 1.0e-12);
         vec3 direction = away / distance;
         float basis[16], weight[16], coefficient[48];
-        harmonics(direction, frame.counts.y, basis);
+        uint own = OWN_DEGREES ? state_degree(floatBitsToUint(p1.w)) : SH_DEGREE, held = COLUMNS_UP_TO[own];
+        uint degree = min(frame.counts.y, own);
+        harmonics(direction, degree, basis);
+        [[unroll]] for (uint i = 0u; i < 48u; i++) coefficient[i] = 0.0;
         [[unroll]] for (uint c = 0u; c < SH_COLUMNS; c++) {
-            vec4 p = texelFetch(sh_rows, int(g * SH_COLUMNS + c));
-            [[unroll]] for (uint j = 0u; j < 4u; j++) coefficient[c * 4u + j] = p[j];
+            if (!OWN_DEGREES || c < held) {
+                vec4 p = texelFetch(sh_rows, int(g * SH_COLUMNS + c));
+                [[unroll]] for (uint j = 0u; j < 4u; j++) coefficient[c * 4u + j] = p[j];
+            }
         }
         vec3 colour = vec3(0.5);
         [[unroll]] for (uint i = 0u; i < COEFFICIENTS; i++) {
@@ -115,7 +117,7 @@ void main() {
         [[unroll]] for (uint i = 1u; i < COEFFICIENTS; i++) {
             weight[i] = dot(gc, vec3(coefficient[i * 3u], coefficient[i * 3u + 1u], coefficient[i * 3u + 2u]));
         }
-        vec3 by_direction = harmonics_gradient(direction, frame.counts.y, weight);
+        vec3 by_direction = harmonics_gradient(direction, degree, weight);
         vec3 by_place = (by_direction - direction * dot(direction, by_direction)) / distance;
 
         // Camera: p' = exp(turn) p + shift; the SH direction sees the centre move by -R' shift.
@@ -146,7 +148,7 @@ void main() {
             m = texelFetch(geometry_rows, row + 4);
             v = texelFetch(geometry_rows, row + 7);
             adam(p1, m, v, g1, vec4(vec3(frame.rates.y), 0.0));
-            p1.w = uintBitsToFloat((frame.step.x & 0xFFFFu) * 0x10001u);
+            p1.w = uintBitsToFloat(state_of(frame.step.x, frame.step.x, own));
             geometry[g * 9 + 4] = m;
             geometry[g * 9 + 7] = v;
             m = texelFetch(geometry_rows, row + 5);
@@ -159,24 +161,26 @@ void main() {
             geometry[g * 9 + 2] = p2;
         }
         [[unroll]] for (uint c = 0u; c < SH_COLUMNS; c++) {
-            vec4 gradient = vec4(0.0), p;
-            [[unroll]] for (uint j = 0u; j < 4u; j++) {
-                uint i = (c * 4u + j) / 3u;
-                if (i < COEFFICIENTS) gradient[j] = basis[i] * gc[(c * 4u + j) % 3u];
-                p[j] = coefficient[c * 4u + j];
-            }
-            gradient = finite(gradient, sound);
-            if (push.mode == 1u) {
-                sh_first[g * SH_COLUMNS + c] = gradient;
-            } else {
-                int at = int(g * SH_COLUMNS + c);
-                vec4 m = texelFetch(sh_first_rows, at), v = texelFetch(sh_second_rows, at);
-                vec4 rate = vec4(frame.rates_more.y);
-                if (c == 0u) rate.xyz = vec3(frame.rates_more.x);
-                adam(p, m, v, gradient, rate);
-                sh[g * SH_COLUMNS + c] = p;
-                sh_first[g * SH_COLUMNS + c] = m;
-                sh_second[g * SH_COLUMNS + c] = v;
+            if (!OWN_DEGREES || c < held) {
+                vec4 gradient = vec4(0.0), p;
+                [[unroll]] for (uint j = 0u; j < 4u; j++) {
+                    uint i = (c * 4u + j) / 3u;
+                    if (i < COEFFICIENTS) gradient[j] = basis[i] * gc[(c * 4u + j) % 3u];
+                    p[j] = coefficient[c * 4u + j];
+                }
+                gradient = finite(gradient, sound);
+                if (push.mode == 1u) {
+                    store_moments(g * SH_COLUMNS + c, gradient, gradient * gradient);
+                } else {
+                    int at = int(g * SH_COLUMNS + c);
+                    vec4 m, v;
+                    fetch_moments(at, m, v);
+                    vec4 rate = vec4(frame.rates_more.y);
+                    if (c == 0u) rate.xyz = vec3(frame.rates_more.x);
+                    adam(p, m, v, gradient, rate);
+                    sh[g * SH_COLUMNS + c] = p;
+                    store_moments(uint(at), m, v);
+                }
             }
         }
         unsound += sound ? 0u : 1u;

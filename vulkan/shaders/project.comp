@@ -30,7 +30,7 @@ void main() {
         catch_up(p0, m0, v0, vec4(vec3(d.x), d.y * frame.rates.w), d.zw);
         catch_up(p1, m1, v1, vec4(vec3(d.y * frame.rates.y), 0.0), d.zw);
         catch_up(p2, m2, v2, vec4(d.y * frame.rates.z), d.zw);
-        state = (state & 0xFFFF0000u) | ((frame.step.x - 1u) & 0xFFFFu);
+        state = state_of(frame.step.x - 1u, state_sh(state), state_degree(state));
         p1.w = uintBitsToFloat(state);
         geometry[g * 9 + 0] = p0;
         geometry[g * 9 + 1] = p1;

@@ -1,22 +1,19 @@
 #version 450
-// Gathers the visible Gaussians in depth order and evaluates their colours, after making up for the SH steps in which
-// they were not seen. Mode 1 makes up for all Gaussians and shades nothing.
+// Gathers the visible Gaussians in depth order and evaluates their colours, each at its own SH degree, after making up
+// for the SH steps in which they were not seen. Mode 1 makes up for all Gaussians and shades nothing.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "harmonics.glsl"
 #include "deferred.glsl"
+#include "moments.glsl"
 
 layout(set = 0, binding = 9) uniform samplerBuffer projected;
 layout(set = 0, binding = 10) uniform samplerBuffer geometry_rows;
 layout(set = 0, binding = 11) uniform samplerBuffer sh_rows;
-layout(set = 0, binding = 12) uniform samplerBuffer sh_first_rows;
-layout(set = 0, binding = 13) uniform samplerBuffer sh_second_rows;
 layout(std430, set = 0, binding = 1) readonly buffer Order { uint order[]; };
 layout(std430, set = 0, binding = 2) readonly buffer Status { uint status[]; };
 layout(std430, set = 0, binding = 3) writeonly buffer Geometry { vec4 geometry[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer Sh { vec4 sh[]; };
-layout(std430, set = 0, binding = 5) writeonly buffer ShFirst { vec4 sh_first[]; };
-layout(std430, set = 0, binding = 6) writeonly buffer ShSecond { vec4 sh_second[]; };
 layout(std430, set = 0, binding = 7) writeonly buffer Shaded { vec4 shaded[]; };
 
 void main() {
@@ -32,25 +29,29 @@ void main() {
         vec4 d = vec4(0.0);
         if (behind > 0u) {
             d = frame.deferred[behind];
-            p1.w = uintBitsToFloat((state & 0xFFFFu) | (((frame.step.x - 1u) & 0xFFFFu) << 16));
+            p1.w = uintBitsToFloat(state_of(state_geometry(state), frame.step.x - 1u, state_degree(state)));
             geometry[g * 9 + 1] = p1;
         }
+        [[unroll]] for (uint i = 0u; i < 48u; i++) coefficient[i] = 0.0;
+        uint own = OWN_DEGREES ? state_degree(state) : SH_DEGREE, held = COLUMNS_UP_TO[own];
         [[unroll]] for (uint c = 0u; c < SH_COLUMNS; c++) {
-            int at = int(g * SH_COLUMNS + c);
-            vec4 p = texelFetch(sh_rows, at);
-            if (behind > 0u) {
-                vec4 m = texelFetch(sh_first_rows, at), v = texelFetch(sh_second_rows, at);
-                vec4 rate = vec4(frame.rates_more.y);
-                if (c == 0u) rate.xyz = vec3(frame.rates_more.x);
-                catch_up(p, m, v, d.y * rate, d.zw);
-                sh[at] = p;
-                sh_first[at] = m;
-                sh_second[at] = v;
+            if (!OWN_DEGREES || c < held) {
+                int at = int(g * SH_COLUMNS + c);
+                vec4 p = texelFetch(sh_rows, at);
+                if (behind > 0u) {
+                    vec4 m, v;
+                    fetch_moments(at, m, v);
+                    vec4 rate = vec4(frame.rates_more.y);
+                    if (c == 0u) rate.xyz = vec3(frame.rates_more.x);
+                    catch_up(p, m, v, d.y * rate, d.zw);
+                    sh[at] = p;
+                    store_moments(uint(at), m, v);
+                }
+                [[unroll]] for (uint k = 0u; k < 4u; k++) coefficient[c * 4u + k] = p[k];
             }
-            [[unroll]] for (uint k = 0u; k < 4u; k++) coefficient[c * 4u + k] = p[k];
         }
         float y[16];
-        harmonics(normalize(p0.xyz - frame.camera.xyz), frame.counts.y, y);
+        harmonics(normalize(p0.xyz - frame.camera.xyz), min(frame.counts.y, own), y);
         vec3 colour = vec3(0.5);
         [[unroll]] for (uint i = 0u; i < COEFFICIENTS; i++) {
             colour += y[i] * vec3(coefficient[i * 3u], coefficient[i * 3u + 1u], coefficient[i * 3u + 2u]);

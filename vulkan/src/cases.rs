@@ -33,6 +33,7 @@ macro_rules! promise_eq {
 
 pub mod device;
 pub mod extremes;
+pub mod half;
 mod list;
 pub mod scenes;
 pub mod twin;

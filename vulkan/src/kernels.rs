@@ -85,8 +85,9 @@ pub(crate) fn fingerprint() -> u64 {
 pub(crate) const FIRST_TEXELS: u32 = 9;
 
 /// What a texel fetch of a section yields.
-pub(crate) fn texel_format(name: &str) -> ash::vk::Format {
+pub(crate) fn texel_format(name: &str, half_moments: bool) -> ash::vk::Format {
     match name {
+        "sh_first_moment" | "sh_second_moment" if half_moments => ash::vk::Format::R16G16B16A16_SFLOAT,
         "instances" | "target" | "slot_ranges" => ash::vk::Format::R32G32_UINT,
         "rows" | "tile_starts" => ash::vk::Format::R32_UINT,
         _ => ash::vk::Format::R32G32B32A32_SFLOAT,

@@ -51,6 +51,8 @@ struct Specialisation {
     sh_degree: u32,
     sort_blocks: u32,
     loop_lanes: u32,
+    own_degrees: u32,
+    half_moments: u32,
 }
 
 fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
@@ -58,7 +60,14 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 }
 
 impl Pipelines {
-    pub fn new(gpu: &Gpu, plan: &Plan, arena: &Arena, shape: KernelShape) -> Result<Self, GpuError> {
+    /// `own_degrees`: whether Gaussians have SH degrees of their own, or all the plan's.
+    pub fn new(
+        gpu: &Gpu,
+        plan: &Plan,
+        arena: &Arena,
+        shape: KernelShape,
+        own_degrees: bool,
+    ) -> Result<Self, GpuError> {
         let limits = &gpu.info().limits;
         limits.check_workgroup(shape.wide.max(shape.narrow).max(SCAN_LANES))?;
         let device = gpu.device();
@@ -112,7 +121,7 @@ impl Pipelines {
                 device.create_pipeline_layout(&layout_info, None).map_err(vulkan("vkCreatePipelineLayout"))?;
             made.pool = device.create_descriptor_pool(&pool_info, None).map_err(vulkan("vkCreateDescriptorPool"))?;
             for index in 0..KERNELS.len() {
-                let pipeline = made.pipeline(index, plan)?;
+                let pipeline = made.pipeline(index, plan, own_degrees)?;
                 made.pipelines.push(pipeline);
             }
             let all = vec![set_layout; set_count as usize];
@@ -131,7 +140,8 @@ impl Pipelines {
                 for (i, name) in kernel.texels.iter().enumerate() {
                     let part = part_of_slots(name, arena.section("slots"), plan.pixels);
                     let section = part.unwrap_or_else(|| arena.section(name));
-                    made.bind_texels(made.sets[index], FIRST_TEXELS + i as u32, arena, section, name)?;
+                    let format = texel_format(name, plan.half_moments);
+                    made.bind_texels(made.sets[index], FIRST_TEXELS + i as u32, arena, section, (name, format))?;
                 }
             }
             Ok(made)
@@ -152,12 +162,12 @@ impl Pipelines {
         binding: u32,
         arena: &Arena,
         section: Section,
-        name: &'static str,
+        (name, format): (&'static str, vk::Format),
     ) -> Result<(), GpuError> {
         // SAFETY: the section lies inside the buffer and the buffer allows texel views; the view is kept and destroyed
         // with the pipelines, before the arena.
         unsafe {
-            let view = self.gpu.texel_view(name, arena.buffer, section, texel_format(name))?;
+            let view = self.gpu.texel_view(name, arena.buffer, section, format)?;
             self.texel_views.push(view);
             let views = [view];
             let write = [vk::WriteDescriptorSet::default()
@@ -184,7 +194,7 @@ impl Pipelines {
 
     /// # Safety
     /// `self.layout` is a valid pipeline layout.
-    unsafe fn pipeline(&self, index: usize, plan: &Plan) -> Result<vk::Pipeline, GpuError> {
+    unsafe fn pipeline(&self, index: usize, plan: &Plan, own_degrees: bool) -> Result<vk::Pipeline, GpuError> {
         let kernel = &KERNELS[index];
         let constants = Specialisation {
             local_size: self.local_size(kernel.group),
@@ -192,8 +202,10 @@ impl Pipelines {
             sh_degree: plan.sh_degree.into(),
             sort_blocks: SORT_BLOCKS as u32,
             loop_lanes: LOOP_LANES as u32,
+            own_degrees: own_degrees.into(),
+            half_moments: plan.half_moments.into(),
         };
-        let entries: [_; 5] = std::array::from_fn(|i| vk::SpecializationMapEntry {
+        let entries: [_; 7] = std::array::from_fn(|i| vk::SpecializationMapEntry {
             constant_id: i as u32,
             offset: 4 * i as u32,
             size: 4,

@@ -6,10 +6,12 @@
 mod bands;
 mod control;
 mod deferred;
+mod degrees;
 mod density;
 mod error;
 pub(crate) mod frame;
 mod gradient;
+mod moments;
 mod pose;
 mod render;
 mod report;
@@ -52,6 +54,7 @@ pub struct Trainer {
     views: Vec<views::Resident>,
     sampler: sampler::Sampler,
     density: density::Scratch,
+    degrees: degrees::Degrees,
     bands: Vec<bands::Band>,
     /// Dispatches that counting and emitting are spread over.
     walk_rounds: u32,
@@ -99,9 +102,9 @@ impl Trainer {
     ) -> Result<Self, TrainError> {
         settings.check()?;
         let arena = Arena::new(gpu, plan)?;
-        let pipelines = Pipelines::new(gpu, plan, &arena, shape)?;
+        let pipelines = Pipelines::new(gpu, plan, &arena, shape, settings.sh.raise_share < 1.0)?;
         let commands = Commands::new(gpu)?;
-        let rows = rows::Rows::new(&arena, plan.sh_degree);
+        let rows = rows::Rows::new(&arena, plan);
         Ok(Self {
             commands,
             pipelines,
@@ -114,6 +117,7 @@ impl Trainer {
             views: Vec::with_capacity(plan.views),
             sampler: sampler::Sampler::new(settings.seed, plan.views),
             density: density::Scratch::new(plan.gaussians),
+            degrees: degrees::Degrees::new(plan.gaussians),
             bands: Vec::with_capacity(plan.tiles),
             walk_rounds: bands::WALK_ROUNDS,
             strategy: Strategy::None,
@@ -142,6 +146,7 @@ impl Trainer {
         self.extent = 0.0;
         self.density.last = 0;
         self.density.last_flush = 0;
+        self.degrees.reset();
         self.commands.clear_times();
     }
 

@@ -2,7 +2,7 @@
 //! promises hold for the twin (`numerical_twin.rs`).
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
-use vulkan::cases::{ELSEWHERE, Outcome, device, extremes};
+use vulkan::cases::{ELSEWHERE, Outcome, device, extremes, half};
 use vulkan::gpu::Gpu;
 
 fn on_device(case: impl Fn(&Gpu) -> Outcome) {
@@ -45,6 +45,11 @@ held! { extremes:
     cameras_far_from_the_origin_see_the_same_picture
     extreme_learning_rates_are_recovered_from_or_refused
     constant_photographs_have_no_negative_variance
+}
+
+held! { half:
+    training_with_half_moments_ends_where_training_with_whole_ones_does
+    tiny_and_huge_gradients_in_half_moments_leave_every_number_finite
 }
 
 #[test]

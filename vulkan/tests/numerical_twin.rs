@@ -1,18 +1,18 @@
 //! Numbers that broke other renderers, through the twin's whole step: one test per case of `vulkan::cases`.
 #![allow(clippy::panic, reason = "a test fails by panicking")]
 
-use vulkan::cases::twin;
+use vulkan::cases::{half, twin};
 
 macro_rules! held {
-    ($($name:ident)*) => {$(
+    ($module:ident: $($name:ident)*) => {$(
         #[test]
         fn $name() {
-            println!("{}", twin::$name().unwrap_or_else(|e| panic!("{e}")));
+            println!("{}", $module::$name().unwrap_or_else(|e| panic!("{e}")));
         }
     )*};
 }
 
-held! {
+held! { twin:
     a_row_with_nan_or_infinity_in_any_slot_is_counted_and_changes_nothing_else
     denormal_and_largest_numbers_in_any_slot_leave_everything_finite
     a_quaternion_of_length_zero_is_not_drawn_and_any_other_length_is_normalised
@@ -28,4 +28,9 @@ held! {
     ssim_of_constant_pictures_has_no_negative_variance
     pearson_of_constant_depth_or_an_empty_mask_has_value_and_gradient_zero
     exposure_against_a_black_photograph_stays_finite
+}
+
+held! { half:
+    second_moments_in_sixteen_bits_are_right_on_average_only_when_rounded_by_chance
+    moments_beyond_sixteen_bits_are_clamped_and_those_below_are_none
 }

@@ -34,7 +34,7 @@ fn trained(gpu: &Gpu, shape: KernelShape, instances: usize, steps: u32) -> (Gaus
     settings.loss.depth = 0.2;
     (settings.refine_poses, settings.refine_exposure) = (true, true);
     let request =
-        PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, sh_degree: 3, max_gaussians: Some(3000) };
+        PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, sh_degree: 3, max_gaussians: Some(3000), half_moments: false };
     let plan = Plan::with_capacities(&request, 3000, instances);
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape).unwrap();
     trainer.load(&cloud(8, 1500, 3)).unwrap();

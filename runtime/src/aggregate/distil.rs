@@ -127,6 +127,7 @@ pub fn distil(
         views: lessons.len() as u32,
         sh_degree: merged.cloud.sh_degree,
         max_gaussians: Some(largest),
+        half_moments: false,
     })?;
     report.over_plan = merged.keep_most_important(plan.gaussians);
     let gpu = Gpu::open(settings.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;

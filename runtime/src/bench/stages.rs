@@ -140,6 +140,7 @@ pub fn measure(
         views: scene.pictures.len() as u32,
         sh_degree: 3,
         max_gaussians: Some(scene.cloud.len()),
+        half_moments: false,
     })?;
     let mut settings = TrainSettings { steps: WARM_UP + steps, ..TrainSettings::default() };
     settings.density.strategy = Strategy::None;

@@ -40,6 +40,9 @@ pub struct Args {
     /// Most Gaussians wanted.
     #[arg(long)]
     pub max_gaussians: Option<usize>,
+    /// Adam's moments of SH in 16 bits each (`training.sh.half_moments`).
+    #[arg(long)]
+    pub half_moments: bool,
     /// JSON instead of a table.
     #[arg(long)]
     pub json: bool,
@@ -63,6 +66,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         views,
         sh_degree: args.sh_degree,
         max_gaussians: args.max_gaussians,
+        half_moments: args.half_moments,
     };
     let plan = Plan::new(&request)?;
     if args.json {

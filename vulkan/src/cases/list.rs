@@ -1,6 +1,6 @@
 //! The table of contents: every case with its promise, and where the cases live that are not the renderer's.
 
-use super::{Case, device, extremes, twin};
+use super::{Case, device, extremes, half, twin};
 
 macro_rules! case {
     ($input:literal, $promise:literal, $device:expr, $twin:expr) => {
@@ -135,6 +135,18 @@ pub const CASES: &[Case] = &[
         "fills the plan and stops there",
         Some(device::growth_fills_the_plan_and_stops_there),
         None
+    ),
+    case!(
+        "f16 storage of moments against f32",
+        "the same loss, the same bytes every time; right on average",
+        Some(half::training_with_half_moments_ends_where_training_with_whole_ones_does),
+        Some(half::second_moments_in_sixteen_bits_are_right_on_average_only_when_rounded_by_chance)
+    ),
+    case!(
+        "gradients beyond and below f16",
+        "clamped or none, every number finite",
+        Some(half::tiny_and_huge_gradients_in_half_moments_leave_every_number_finite),
+        Some(half::moments_beyond_sixteen_bits_are_clamped_and_those_below_are_none)
     ),
 ];
 

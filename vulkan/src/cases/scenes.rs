@@ -116,7 +116,7 @@ pub fn plain() -> TrainSettings {
     TrainSettings {
         steps: 1000,
         density: DensitySettings { strategy: Strategy::None, ..Default::default() },
-        sh: ShSettings { degree: 3, raise_at: [0.0; 3] },
+        sh: ShSettings { degree: 3, raise_at: [0.0; 3], ..Default::default() },
         resolution: ResolutionSettings { quarter_until: 0.0, half_until: 0.0, least_side: 1, ..Default::default() },
         regularise: RegulariseSettings { drop: 0.0, noise: 0.0, opacity_decay: 0.0, background: 0.0 },
         ..Default::default()
@@ -154,6 +154,7 @@ pub fn empty_trainer(
         views: 2,
         sh_degree,
         max_gaussians: Some(capacity),
+        half_moments: false,
     };
     Ok(Trainer::new(gpu, &Plan::new(&request)?, settings)?)
 }

@@ -69,6 +69,7 @@ fn two_buffers(bytes: u64) -> Plan {
         tiles: 0,
         views: 0,
         sh_degree: 0,
+        half_moments: false,
         sections: vec![("source", bytes), ("into", bytes)],
         total_bytes: 2 * bytes,
     }

@@ -67,7 +67,7 @@ impl Gpu {
 fn texel_bytes(format: vk::Format) -> u64 {
     match format {
         vk::Format::R32_UINT => 4,
-        vk::Format::R32G32_UINT => 8,
+        vk::Format::R32G32_UINT | vk::Format::R16G16B16A16_SFLOAT => 8,
         _ => 16,
     }
 }

@@ -31,6 +31,7 @@ impl Trainer {
         }
         self.flush()?;
         self.measure_extent();
+        self.open_degrees();
         self.forget_all();
         self.prepare_frame(index, 1.0);
         self.frame.background = [0.0; 4];
@@ -51,8 +52,8 @@ impl Trainer {
             into.log_scales.push([g[4][0], g[4][1], g[4][2]]);
             into.rotations.push(g[5]);
         }
-        for sh in self.arena.slice::<f32>(rows.sh_first).chunks_exact(rows.columns * 4).take(self.gaussians) {
-            into.sh.extend_from_slice(&sh[..stride]);
+        for row in 0..self.gaussians {
+            into.sh.extend((0..stride).map(|k| rows.sh_first.first(&self.arena, row, k, self.frame.adam[3])));
         }
         self.forget_all();
         let l = sums.loss;

@@ -76,6 +76,11 @@ pub struct Counters {
     pub added: u64,
     /// Gaussians removed.
     pub pruned: u64,
+    /// Times a Gaussian's own SH degree was raised because the residual asked for it.
+    pub sh_raised: u64,
+    /// SH coefficients that were not there to be evaluated and stepped, summed over Gaussians and steps (as of the last
+    /// raise).
+    pub sh_missing: u64,
 }
 
 /// A run.

@@ -1,7 +1,9 @@
 //! Gaussians in and out of the arena: the only place that knows how a row lies in memory.
 
-use super::{TrainError, Trainer};
+use super::moments::MomentRows;
+use super::{TrainError, Trainer, degrees};
 use crate::arena::{Arena, Section};
+use config::plan::Plan;
 use models::cloud::{GaussianCloud, sh_coefficients};
 
 /// vec4 per Gaussian in `geometry`: three of parameters, three of first, three of second moments.
@@ -23,19 +25,21 @@ pub struct LoadReport {
 pub(crate) struct Rows {
     pub geometry: Section,
     pub sh: Section,
-    pub sh_first: Section,
-    pub sh_second: Section,
+    pub sh_first: MomentRows,
+    pub sh_second: MomentRows,
     pub columns: usize,
 }
 
 impl Rows {
-    pub fn new(arena: &Arena, sh_degree: u8) -> Self {
+    pub fn new(arena: &Arena, plan: &Plan) -> Self {
+        let columns = config::plan::sh_columns(plan.sh_degree) as usize;
+        let moments = |name| MomentRows::new(arena.section(name), columns, plan.half_moments);
         Self {
             geometry: arena.section("geometry"),
             sh: arena.section("sh"),
-            sh_first: arena.section("sh_first_moment"),
-            sh_second: arena.section("sh_second_moment"),
-            columns: config::plan::sh_columns(sh_degree) as usize,
+            sh_first: moments("sh_first_moment"),
+            sh_second: moments("sh_second_moment"),
+            columns,
         }
     }
 
@@ -50,12 +54,10 @@ impl Rows {
             geometry[row * GEOMETRY + 3..row * GEOMETRY + 6].fill([0.0; 4]);
         }
         let columns = self.columns;
-        for section in [self.sh, self.sh_second] {
-            arena.slice_mut::<[f32; 4]>(section).copy_within(from * columns..(from + 1) * columns, to * columns);
-        }
-        let first = arena.slice_mut::<[f32; 4]>(self.sh_first);
+        arena.slice_mut::<[f32; 4]>(self.sh).copy_within(from * columns..(from + 1) * columns, to * columns);
+        self.sh_second.copy(arena, from, to);
         for row in [from, to] {
-            first[row * columns..(row + 1) * columns].fill([0.0; 4]);
+            self.sh_first.forget(arena, row);
         }
     }
 
@@ -63,18 +65,18 @@ impl Rows {
     pub fn shift(&self, arena: &mut Arena, from: usize, to: usize) {
         let geometry = arena.slice_mut::<[f32; 4]>(self.geometry);
         geometry.copy_within(from * GEOMETRY..(from + 1) * GEOMETRY, to * GEOMETRY);
-        for section in [self.sh, self.sh_first, self.sh_second] {
-            let columns = self.columns;
-            arena.slice_mut::<[f32; 4]>(section).copy_within(from * columns..(from + 1) * columns, to * columns);
+        let columns = self.columns;
+        arena.slice_mut::<[f32; 4]>(self.sh).copy_within(from * columns..(from + 1) * columns, to * columns);
+        for moments in [self.sh_first, self.sh_second] {
+            moments.copy(arena, from, to);
         }
     }
 
     pub fn forget(&self, arena: &mut Arena, row: usize) {
         let geometry = arena.slice_mut::<[f32; 4]>(self.geometry);
         geometry[row * GEOMETRY + 3..(row + 1) * GEOMETRY].fill([0.0; 4]);
-        let range = row * self.columns..(row + 1) * self.columns;
-        arena.slice_mut::<[f32; 4]>(self.sh_first)[range.clone()].fill([0.0; 4]);
-        arena.slice_mut::<[f32; 4]>(self.sh_second)[range].fill([0.0; 4]);
+        self.sh_first.forget(arena, row);
+        self.sh_second.forget(arena, row);
     }
 }
 
@@ -117,14 +119,15 @@ impl Trainer {
         let stride = cloud.sh_stride();
         let coefficients = sh_coefficients(self.plan.sh_degree.min(cloud.sh_degree)) * 3;
         for (to, &from) in keep.iter().enumerate() {
+            let coefficients = &cloud.sh[from * stride..from * stride + coefficients];
             let (m, s, q) = (cloud.means[from], cloud.log_scales[from], cloud.rotations[from]);
             let geometry = &mut self.arena.slice_mut::<[f32; 4]>(rows.geometry)[to * GEOMETRY..];
             geometry[0] = [m[0], m[1], m[2], cloud.opacity_logits[from]];
-            geometry[1] = [s[0], s[1], s[2], 0.0];
+            geometry[1] = [s[0], s[1], s[2], degrees::state(degrees::degree_in_use(coefficients))];
             geometry[2] = q;
             let sh = &mut self.arena.slice_mut::<f32>(rows.sh)[to * rows.columns * 4..(to + 1) * rows.columns * 4];
             sh.fill(0.0);
-            sh[..coefficients].copy_from_slice(&cloud.sh[from * stride..from * stride + coefficients]);
+            sh[..coefficients.len()].copy_from_slice(coefficients);
             rows.forget(&mut self.arena, to);
         }
         self.gaussians = keep.len();

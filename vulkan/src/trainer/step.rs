@@ -29,6 +29,9 @@ impl Trainer {
         }
         let start = Instant::now();
         self.measure_extent();
+        if self.steps == 0 {
+            self.open_degrees();
+        }
         let progress = self.progress();
         let views = &self.views;
         let index = self.sampler.next(views.len(), self.settings.views.residual_share, |v| views[v].last_loss);
@@ -43,6 +46,7 @@ impl Trainer {
         self.elapsed_s += start.elapsed().as_secs_f64();
         let mut report = self.read_loss(index, counted, divisor, progress);
         self.control_density(progress)?;
+        self.raise_degrees(progress)?;
         if !self.settings.skips.deferred_moments {
             self.flush()?;
         }
@@ -94,7 +98,7 @@ impl Trainer {
         f.rates = [mean / decay, r.log_scale, r.rotation, r.opacity];
         f.rates_more = [r.sh_dc, r.sh_rest, s.regularise.noise * mean, self.extent];
         let t = self.steps + 1;
-        f.adam = [s.adam.beta1, s.adam.beta2, s.adam.epsilon, 0.0];
+        f.adam = [s.adam.beta1, s.adam.beta2, s.adam.epsilon, self.plan.moment_scale()];
         let bias = |beta: f32| (1.0 / (1.0 - f64::from(beta).powi(t as i32))) as f32;
         f.bias = [decay * bias(s.adam.beta1), bias(s.adam.beta2), 0.0, 0.0];
         let seed = (s.seed ^ (s.seed >> 32)) as u32;
@@ -168,6 +172,7 @@ impl Trainer {
         let tiles = self.frame.tiles() as usize;
         let starts = self.arena.slice::<u32>(self.arena.section("tile_starts"));
         let blended: u64 = starts[tiles + 1..2 * tiles + 1].iter().map(|n| u64::from(*n)).sum();
+        let missing = self.missing_coefficients();
         let c = &mut self.totals.counters;
         c.culled += (self.gaussians - counted.visible.min(self.gaussians)) as u64;
         c.instances += counted.instances;
@@ -175,6 +180,7 @@ impl Trainer {
         c.behind_opaque += counted.instances.saturating_sub(blended);
         c.banded_steps += u64::from(self.bands.len() > 1);
         c.unsound_gradients += sums.unsound;
+        c.sh_missing += missing;
 
         let s = &self.settings;
         let view = &mut self.views[index];

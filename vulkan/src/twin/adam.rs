@@ -2,6 +2,8 @@
 //! its moments decay and its parameters still drift along the first moment. The shaders make up for k such steps at
 //! once when the Gaussian is next needed; this twin takes them one by one and is the judge of the shortcut.
 
+use half::f16;
+
 use super::real::Real;
 use crate::constants::{ADAM_BETA1, ADAM_BETA2, ADAM_EPSILON};
 
@@ -37,6 +39,24 @@ pub fn deferred(rates: &[f64], t: u32) -> (f64, f64, f64) {
     let k = rates.len() as i32;
     (sum.sum(), b1.powi(k), b2.powi(k))
 }
+
+/// Moments as 16 bits hold them (`shaders/moments.glsl`): the first one and the root of the second one, both times
+/// `scale`; the root is rounded up with the probability that makes it right on average, `chance` being uniform in 0…8191.
+pub fn half_moments(moments: Moments<f32>, scale: f32, chance: u32) -> Moments<f32> {
+    let most = f32::from(f16::MAX);
+    let root = (moments.second.sqrt() * scale).min(most);
+    let root = f32::from_bits(root.to_bits().wrapping_add(chance & DROPPED_BITS) & !DROPPED_BITS).min(most);
+    if root < LEAST_HALF {
+        return Moments::default();
+    }
+    let first = f16::from_f32((moments.first * scale).clamp(-most, most)).to_f32();
+    Moments { first: first / scale, second: (f16::from_f32(root).to_f32() / scale).powi(2) }
+}
+
+/// Bits of f32's mantissa that f16 has not.
+const DROPPED_BITS: u32 = 0x1FFF;
+/// About the least that 16 bits tell from zero (2⁻²⁴).
+const LEAST_HALF: f32 = 6.0e-8;
 
 #[cfg(test)]
 mod tests {
