@@ -3,7 +3,7 @@
 #   - the Vulkan loader and, where no GPU driver is installed, Mesa's software driver (Debian/Ubuntu packages, needs root);
 #   - ONNX Runtime's shared library, out of its published Python package, into ~/.local/share/dgtr/lib.
 # Ends with 0 when everything is there, with 3 and one line that says what to install when it cannot be.
-# `setup.sh --tests` also brings what only the tests need (a C++ compiler for the shader check).
+# `setup.sh --tests` also brings what only the tests need (a C++ compiler for the shader check, Vulkan's validation layer).
 set -eu
 
 lib="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/lib"
@@ -58,4 +58,6 @@ fi
 
 if [ "${1:-}" = --tests ]; then
     command -v c++ >/dev/null || apt g++
+    # Without it the validation test says that it is skipped.
+    [ -e /usr/share/vulkan/explicit_layer.d/VkLayer_khronos_validation.json ] || (apt vulkan-validationlayers) || true
 fi

@@ -5,11 +5,15 @@
 
 use serde::Serialize;
 
-/// Lanes that sort and emit; each owns one histogram (specialised into the shaders).
+/// Lanes that sort and emit on a processor; each owns one histogram. How many there are says nothing about the result.
 ///
 /// Enough to keep the cores of a small board busy; every lane more is one more histogram to clear, fill and sum (128
-/// lanes: counting and sorting took 1.4 times as long on lavapipe). They say nothing about the result.
-pub const SORT_BLOCKS: u64 = 32;
+/// lanes: counting and sorting took 1.4 times as long on lavapipe).
+pub const SORT_LANES_SOFTWARE: u32 = 32;
+/// The same on a GPU, whose many slow lanes would stand idle (chosen by counting, not yet measured on one).
+pub const SORT_LANES_GPU: u32 = 256;
+/// Bytes of the status section: 4 KiB of counters, and a cursor of 16 bytes for each sorting lane.
+pub const STATUS_BYTES: u64 = (4 << 10) + 16 * SORT_LANES_GPU as u64;
 /// Lanes of the passes that loop over the visible Gaussians; each leaves one partial sum.
 pub const LOOP_LANES: u64 = 1024;
 /// Every binding stays below this (lavapipe's and older V3DV's `maxStorageBufferRange`).
@@ -38,6 +42,24 @@ pub struct PlanRequest {
     pub max_gaussians: Option<usize>,
     /// Adam's moments of SH in 16 bits each.
     pub half_moments: bool,
+    /// Lanes that sort and emit: [`SORT_LANES_SOFTWARE`] or [`SORT_LANES_GPU`].
+    pub sort_lanes: u32,
+}
+
+impl Default for PlanRequest {
+    /// A first guess for `dgtr plan`: 64 pictures of 640 × 480 in 512 MiB, on a processor.
+    fn default() -> Self {
+        Self {
+            device_mib: 512,
+            width: 640,
+            height: 480,
+            views: 64,
+            sh_degree: 3,
+            max_gaussians: None,
+            half_moments: false,
+            sort_lanes: SORT_LANES_SOFTWARE,
+        }
+    }
 }
 
 /// Capacities and the size of every section.
@@ -57,6 +79,8 @@ pub struct Plan {
     pub sh_degree: u8,
     /// Adam's moments of SH take 16 bits each instead of 32.
     pub half_moments: bool,
+    /// Lanes that sort and emit.
+    pub sort_lanes: u32,
     /// Name and bytes of every section, in the order in which they lie in memory.
     pub sections: Vec<(&'static str, u64)>,
     /// Bytes of the one device allocation.
@@ -128,6 +152,7 @@ impl Plan {
         within("pixels", u64::from(r.width) * u64::from(r.height), 1, BINDING_LIMIT / 48)?;
         within("views", r.views.into(), 0, 1 << 20)?;
         within("sh_degree", r.sh_degree.into(), 0, 3)?;
+        within("sort_lanes", r.sort_lanes.into(), SORT_LANES_SOFTWARE.into(), SORT_LANES_GPU.into())?;
         within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, u64::from(u32::MAX) >> 4)?;
         let budget = u64::from(r.device_mib) << 20;
         // Widest column set in one binding: three vec4 of Adam state per geometry column, or all SH columns.
@@ -174,10 +199,11 @@ impl Plan {
         let (across, down) = (u64::from(r.width).div_ceil(TILE_SIDE), u64::from(r.height).div_ceil(TILE_SIDE));
         let tiles = across * down + across.max(down) + 64;
         let sh = 16 * sh_columns(r.sh_degree) * n;
+        let lanes = u64::from(r.sort_lanes);
         let moment = if r.half_moments { sh / 2 } else { sh };
         let sections: Vec<(&'static str, u64)> = [
-            ("frame", 16 << 10), // uniforms and the table of deferred moments
-            ("status", 8 << 10), // counters read back after every step, cursors of the sorting lanes
+            ("frame", 16 << 10),      // uniforms and the table of deferred moments
+            ("status", STATUS_BYTES), // counters read back after every step, cursors of the sorting lanes
             ("partials", 32 * (LOOP_LANES + p.div_ceil(8) + u64::from(r.width) + u64::from(r.height) + 64)),
             ("geometry", 144 * n), // mean+opacity, log scale+state, rotation; each with two Adam moments
             ("sh", sh),
@@ -189,14 +215,14 @@ impl Plan {
             ("rows", 4 * n),       // the visible ones in depth order
             ("keys_other", 4 * n),
             ("rows_other", 4 * n),
-            ("digits", 4 * 256 * SORT_BLOCKS), // per sorting lane: digits of the sort's present pass
-            ("reduced", 48 * n),               // summed gradient slots
-            ("slot_ranges", 8 * n),            // first slot and number of slots
-            ("tiles", 4 * tiles * SORT_BLOCKS), // per sorting lane and tile: instances
-            ("tile_starts", 8 * tiles + 16),   // first instance; Gaussians blended (work counter)
-            ("instances", 8 * m),              // Gaussian and slot
-            ("slots", (48 * m).max(96 * p)),   // gradient slots; SSIM's intermediate maps before those are needed
-            ("image", 16 * p),                 // RGB, depth
+            ("digits", 4 * 256 * lanes), // per sorting lane: digits of the sort's present pass
+            ("reduced", 48 * n),         // summed gradient slots
+            ("slot_ranges", 8 * n),      // first slot and number of slots
+            ("tiles", 4 * tiles * lanes), // per sorting lane and tile: instances
+            ("tile_starts", 8 * tiles + 16), // first instance; Gaussians blended (work counter)
+            ("instances", 8 * m),        // Gaussian and slot
+            ("slots", (48 * m).max(96 * p)), // gradient slots; SSIM's intermediate maps before those are needed
+            ("image", 16 * p),           // RGB, depth
             ("transmittance", 4 * p),
             ("image_gradient", 16 * p),
             ("target", 8 * p), // the step's picture (RGBA8) and depth prior at working size
@@ -214,6 +240,7 @@ impl Plan {
             views: r.views as usize,
             sh_degree: r.sh_degree,
             half_moments: r.half_moments,
+            sort_lanes: r.sort_lanes,
             sections,
             total_bytes: total.next_multiple_of(TOTAL_ALIGNMENT),
         }
@@ -236,7 +263,7 @@ mod tests {
     use super::*;
 
     fn request(device_mib: u32) -> PlanRequest {
-        PlanRequest { device_mib, width: 640, height: 480, views: 50, sh_degree: 3, max_gaussians: None, half_moments: false }
+        PlanRequest { device_mib, views: 50, ..Default::default() }
     }
 
     #[test]
@@ -249,6 +276,16 @@ mod tests {
             assert!(p.instances >= p.gaussians);
             last = p.gaussians;
         }
+    }
+
+    #[test]
+    fn a_gpu_s_plan_differs_from_a_processor_s_by_its_sorting_lanes_alone() {
+        let [few, many] = [SORT_LANES_SOFTWARE, SORT_LANES_GPU]
+            .map(|sort_lanes| Plan::with_capacities(&PlanRequest { sort_lanes, ..request(512) }, 1000, 10_000));
+        for (a, b) in few.sections.iter().zip(&many.sections) {
+            assert_eq!(a.1 == b.1, !["digits", "tiles"].contains(&a.0), "{}", a.0);
+        }
+        assert!(Plan::new(&PlanRequest { sort_lanes: 512, ..request(512) }).is_err());
     }
 
     #[test]

@@ -76,7 +76,7 @@ impl Preset {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plan::{Plan, PlanRequest};
+    use crate::plan::{Plan, PlanRequest, SORT_LANES_GPU};
 
     #[test]
     fn every_preset_has_a_plan_for_forty_eight_photographs() {
@@ -91,7 +91,9 @@ mod tests {
                 views: 48,
                 sh_degree: 3,
                 max_gaussians: Some(v.max_gaussians as usize),
-                half_moments: false,
+                // The more of the two.
+                sort_lanes: SORT_LANES_GPU,
+                ..Default::default()
             });
             let plan = plan.unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(plan.gaussians, v.max_gaussians as usize, "{name}: the budget does not hold its Gaussians");

@@ -27,7 +27,8 @@ pub fn open(device: Option<&str>, cloud: &GaussianCloud, width: u32, height: u32
         views: 0,
         sh_degree: cloud.sh_degree,
         max_gaussians: Some(cloud.len()),
-        half_moments: false,
+        sort_lanes: gpu.info().sort_lanes(),
+        ..Default::default()
     };
     let pixels = width as usize * height as usize;
     let plan = Plan::with_capacities(&request, cloud.len(), cloud.len() + INSTANCES_PER_PIXEL * pixels);

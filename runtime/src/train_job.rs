@@ -132,7 +132,7 @@ impl TrainJob {
         let largest = self.largest(&set, &frames)?;
         let mut networks = self.open_networks(largest)?;
         let gpu = Gpu::open(self.device.as_deref())?;
-        let plan = self.plan(&frames, largest, &settings.sh)?;
+        let plan = self.plan(&gpu, &frames, largest, &settings.sh)?;
         let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::shape_of(&gpu))?;
         report.device = gpu.info().name.clone();
         report.seed = settings.seed;
@@ -203,7 +203,13 @@ impl TrainJob {
     }
 
     /// The largest picture decides; the trainer fits the others in.
-    fn plan(&self, frames: &[usize], (width, height): (u32, u32), sh: &ShSettings) -> Result<Plan, CliError> {
+    fn plan(
+        &self,
+        gpu: &Gpu,
+        frames: &[usize],
+        (width, height): (u32, u32),
+        sh: &ShSettings,
+    ) -> Result<Plan, CliError> {
         Ok(Plan::new(&PlanRequest {
             device_mib: self.budget_mib,
             width,
@@ -212,6 +218,7 @@ impl TrainJob {
             sh_degree: sh.degree,
             max_gaussians: self.max_gaussians,
             half_moments: sh.half_moments,
+            sort_lanes: gpu.info().sort_lanes(),
         })?)
     }
 

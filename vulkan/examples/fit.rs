@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         views: train.len() as u32,
         sh_degree: 3,
         max_gaussians: Some(capacity),
-        half_moments: false,
+        ..Default::default()
     };
     let plan = Plan::new(&request)?;
     let mut settings = TrainSettings { steps: steps as u32, ..TrainSettings::default() };

@@ -13,7 +13,7 @@ layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
-    if (lane >= SORT_BLOCKS) return;
+    if (lane >= SORT_LANES) return;
     uint tile_count = frame.window.z * frame.window.w, total = 0u, base = lane * tile_count;
     uint cursor = WALK_CURSORS + lane * 4u;
     Walk w = walk_begin(lane, status[0]);

@@ -16,7 +16,7 @@ layout(std430, set = 0, binding = 4) writeonly buffer SlotRanges { uvec2 slot_ra
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
-    if (lane >= SORT_BLOCKS) return;
+    if (lane >= SORT_LANES) return;
     uint tile_count = frame.window.z * frame.window.w, base = lane * tile_count, origin = texelFetch(starts, int(push.first)).x;
     uint cursor = WALK_CURSORS + lane * 4u, slot = 0u, begin;
     Walk w = walk_begin(lane, status[0]);

@@ -9,7 +9,7 @@
 layout(local_size_x_id = 0, local_size_y = 1, local_size_z = 1) in;
 layout(constant_id = 1) const uint SH_COLUMNS = 12;
 layout(constant_id = 2) const uint SH_DEGREE = 3;
-layout(constant_id = 3) const uint SORT_BLOCKS = 32;
+layout(constant_id = 3) const uint SORT_LANES = 32;
 layout(constant_id = 4) const uint LOOP_LANES = 1024;
 layout(constant_id = 5) const bool OWN_DEGREES = false;
 layout(constant_id = 6) const bool HALF_MOMENTS = false;

@@ -10,9 +10,9 @@ layout(std430, set = 0, binding = 3) readonly buffer Status { uint status[]; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
-    if (lane >= SORT_BLOCKS) return;
+    if (lane >= SORT_LANES) return;
     uint n = push.pass == 0u ? frame.counts.x : status[0];
-    uint share = (n + SORT_BLOCKS - 1u) / SORT_BLOCKS;
+    uint share = (n + SORT_LANES - 1u) / SORT_LANES;
     uint i = lane * share, end = min(i + share, n), shift = push.pass * 8u;
     for (uint d = 0u; d < 256u; d++) histogram[lane * 256u + d] = 0u;
     for (; i < end; i++) {

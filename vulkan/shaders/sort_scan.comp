@@ -11,7 +11,7 @@ shared uint totals[256];
 void main() {
     uint digit = gl_LocalInvocationID.x;
     uint sum = 0u;
-    for (uint b = 0u; b < SORT_BLOCKS; b++) {
+    for (uint b = 0u; b < SORT_LANES; b++) {
         uint count = histogram[b * 256u + digit];
         histogram[b * 256u + digit] = sum;
         sum += count;
@@ -29,5 +29,5 @@ void main() {
     }
     barrier();
     uint base = totals[digit];
-    for (uint b = 0u; b < SORT_BLOCKS; b++) histogram[b * 256u + digit] += base;
+    for (uint b = 0u; b < SORT_LANES; b++) histogram[b * 256u + digit] += base;
 }

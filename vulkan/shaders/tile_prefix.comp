@@ -10,7 +10,7 @@ void main() {
     uint t = gl_GlobalInvocationID.x, tile_count = frame.window.z * frame.window.w;
     if (t >= tile_count) return;
     uint sum = 0u;
-    for (uint b = 0u; b < SORT_BLOCKS; b++) {
+    for (uint b = 0u; b < SORT_LANES; b++) {
         uint count = tiles[b * tile_count + t];
         tiles[b * tile_count + t] = sum;
         sum += count;

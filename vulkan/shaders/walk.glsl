@@ -12,7 +12,7 @@ struct Walk {
 };
 
 Walk walk_begin(uint lane, uint n) {
-    uint share = (n + SORT_BLOCKS - 1u) / SORT_BLOCKS;
+    uint share = (n + SORT_LANES - 1u) / SORT_LANES;
     Walk w;
     w.i = min(lane * share, n);
     w.end = min(w.i + share, n);

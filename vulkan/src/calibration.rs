@@ -124,7 +124,8 @@ fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
         views: 1,
         sh_degree: 3,
         max_gaussians: Some(GAUSSIANS),
-        half_moments: false,
+        sort_lanes: gpu.info().sort_lanes(),
+        ..Default::default()
     };
     let plan = Plan::with_capacities(&request, GAUSSIANS, INSTANCES * GAUSSIANS);
     let mut trainer = Trainer::with_shape(gpu, &plan, &plain(), shape)?;

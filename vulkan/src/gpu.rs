@@ -9,6 +9,7 @@ pub use error::GpuError;
 pub use limits::DeviceLimits;
 
 use ash::{Device, Entry, Instance, vk};
+use config::plan::{SORT_LANES_GPU, SORT_LANES_SOFTWARE};
 use std::ffi::CStr;
 use std::sync::Arc;
 
@@ -31,6 +32,13 @@ pub struct GpuInfo {
     pub driver_version: u32,
     /// What the device refuses beyond.
     pub limits: DeviceLimits,
+}
+
+impl GpuInfo {
+    /// Lanes that sort and emit on this device: what a plan for it asks for.
+    pub fn sort_lanes(&self) -> u32 {
+        if self.is_cpu { SORT_LANES_SOFTWARE } else { SORT_LANES_GPU }
+    }
 }
 
 /// An opened device with its one compute queue. Cheap to clone; closed when the last clone is dropped.

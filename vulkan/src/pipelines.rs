@@ -5,7 +5,7 @@ use crate::gpu::{Gpu, GpuError};
 use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_of_slots, texel_format};
 use crate::shape::KernelShape;
 use ash::vk;
-use config::plan::{LOOP_LANES, Plan, SORT_BLOCKS, sh_columns};
+use config::plan::{LOOP_LANES, Plan, sh_columns};
 
 /// Storage buffers a kernel may bind (V3DV allows eight per stage).
 const STORAGE_BINDINGS: u32 = 8;
@@ -49,7 +49,7 @@ struct Specialisation {
     local_size: u32,
     sh_columns: u32,
     sh_degree: u32,
-    sort_blocks: u32,
+    sort_lanes: u32,
     loop_lanes: u32,
     own_degrees: u32,
     half_moments: u32,
@@ -61,13 +61,7 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 
 impl Pipelines {
     /// `own_degrees`: whether Gaussians have SH degrees of their own, or all the plan's.
-    pub fn new(
-        gpu: &Gpu,
-        plan: &Plan,
-        arena: &Arena,
-        shape: KernelShape,
-        own_degrees: bool,
-    ) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Gpu, plan: &Plan, arena: &Arena, shape: KernelShape, own_degrees: bool) -> Result<Self, GpuError> {
         let limits = &gpu.info().limits;
         limits.check_workgroup(shape.wide.max(shape.narrow).max(SCAN_LANES))?;
         let device = gpu.device();
@@ -200,7 +194,7 @@ impl Pipelines {
             local_size: self.local_size(kernel.group),
             sh_columns: sh_columns(plan.sh_degree) as u32,
             sh_degree: plan.sh_degree.into(),
-            sort_blocks: SORT_BLOCKS as u32,
+            sort_lanes: plan.sort_lanes,
             loop_lanes: LOOP_LANES as u32,
             own_degrees: own_degrees.into(),
             half_moments: plan.half_moments.into(),

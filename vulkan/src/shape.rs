@@ -14,7 +14,7 @@ pub struct KernelShape {
 }
 
 /// Sizes worth trying. All divide the lanes that the looping kernels are written for (`config::plan::LOOP_LANES` and
-/// `SORT_BLOCKS`), so that no lane runs beyond them.
+/// `SORT_LANES_*`), so that no lane runs beyond them.
 const WIDE: [u32; 4] = [32, 64, 128, 256];
 const NARROW: [u32; 3] = [8, 16, 32];
 
@@ -57,7 +57,7 @@ fn candidates(sizes: &[u32], standard: u32, info: &GpuInfo) -> Vec<u32> {
 mod tests {
     use super::*;
     use crate::gpu::DeviceLimits;
-    use config::plan::{LOOP_LANES, SORT_BLOCKS};
+    use config::plan::{LOOP_LANES, SORT_LANES_GPU, SORT_LANES_SOFTWARE};
 
     fn device(is_cpu: bool, subgroup_size: u32, workgroup_lanes: u32) -> GpuInfo {
         GpuInfo {
@@ -91,7 +91,8 @@ mod tests {
             let (wide, narrow) = (KernelShape::wide_candidates(&info), KernelShape::narrow_candidates(&info));
             for (wide, narrow) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
                 assert!(KernelShape { wide, narrow }.fits(&info));
-                assert_eq!((LOOP_LANES % u64::from(wide), SORT_BLOCKS % u64::from(narrow)), (0, 0));
+                assert_eq!(LOOP_LANES % u64::from(wide), 0);
+                assert_eq!((SORT_LANES_GPU % narrow, SORT_LANES_SOFTWARE % narrow), (0, 0));
             }
         }
         let info = device(false, 32, 128);

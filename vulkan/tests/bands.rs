@@ -16,8 +16,15 @@ const SIZE: [u32; 2] = [96, 70];
 /// Picture, cloud after ten steps, and the most bands a step needed.
 fn train(gpu: &Gpu, instances: usize) -> (Rendering, GaussianCloud, usize) {
     let v = view(SIZE[0], SIZE[1]);
-    let request =
-        PlanRequest { device_mib: 64, width: SIZE[0], height: SIZE[1], views: 2, sh_degree: 2, max_gaussians: None, half_moments: false };
+    let request = PlanRequest {
+        device_mib: 64,
+        width: SIZE[0],
+        height: SIZE[1],
+        views: 2,
+        sh_degree: 2,
+        max_gaussians: None,
+        ..Default::default()
+    };
     let plan = Plan::with_capacities(&request, 300, instances);
     let mut t = Trainer::new(gpu, &plan, &plain()).unwrap();
     t.load(&cloud(21, 300, 2)).unwrap();

@@ -20,6 +20,7 @@ fn request(half_moments: bool) -> PlanRequest {
         sh_degree: 3,
         max_gaussians: Some(512),
         half_moments,
+        ..Default::default()
     }
 }
 

@@ -37,7 +37,7 @@ fn a_view_of_a_hundred_and_twenty_thousand_gaussians_has_no_holes() {
         views: 0,
         sh_degree: 0,
         max_gaussians: Some(cloud.len()),
-        half_moments: false,
+        ..Default::default()
     };
     let mut settings = TrainSettings::default();
     settings.sh.degree = 0;

@@ -43,7 +43,15 @@ fn the_validation_layer_has_nothing_to_say() {
 fn work() {
     let gpu = Gpu::open(None).unwrap();
     let v = view(64, 48);
-    let request = PlanRequest { device_mib: 64, width: 64, height: 48, views: 2, sh_degree: 3, max_gaussians: None, half_moments: false };
+    let request = PlanRequest {
+        device_mib: 64,
+        width: 64,
+        height: 48,
+        views: 2,
+        sh_degree: 3,
+        max_gaussians: None,
+        ..Default::default()
+    };
     for instances in [1 << 16, 400] {
         let plan = Plan::with_capacities(&request, 300, instances);
         let mut settings = plain();

@@ -24,8 +24,15 @@ fn every_tile_of_every_giant_is_counted_and_emitted() {
         let z = 4.0 + i as f32 * 1e-3;
         cloud.push([0.0, 0.0, z], [3.0; 3], [1.0, 0.0, 0.0, 0.0], -4.6, &[grey(i as f32 / count as f32); 3]);
     }
-    let request =
-        PlanRequest { device_mib: 64, width: side, height: side, views: 1, sh_degree: 0, max_gaussians: None, half_moments: false };
+    let request = PlanRequest {
+        device_mib: 64,
+        width: side,
+        height: side,
+        views: 1,
+        sh_degree: 0,
+        max_gaussians: None,
+        ..Default::default()
+    };
     let mut pictures = Vec::new();
     for instances in [1 << 19, 2_796_202] {
         let mut t = Trainer::new(&gpu, &Plan::with_capacities(&request, count, instances), &plain()).unwrap();

@@ -119,6 +119,7 @@ pub fn distil(
         return Ok(report);
     }
     report.used = lessons.len();
+    let gpu = Gpu::open(settings.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
     let largest = models.iter().map(|m| m.cloud.len()).max().unwrap_or(0).max(merged.cloud.len());
     let plan = Plan::new(&PlanRequest {
         device_mib: settings.device_mib,
@@ -127,10 +128,10 @@ pub fn distil(
         views: lessons.len() as u32,
         sh_degree: merged.cloud.sh_degree,
         max_gaussians: Some(largest),
-        half_moments: false,
+        sort_lanes: gpu.info().sort_lanes(),
+        ..Default::default()
     })?;
     report.over_plan = merged.keep_most_important(plan.gaussians);
-    let gpu = Gpu::open(settings.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
     report.device = gpu.info().name.clone();
     let steps = settings.epochs.saturating_mul(lessons.len() as u32);
     let mut trainer = Trainer::new(&gpu, &plan, &recipe(settings, merged.cloud.sh_degree, steps))?;

@@ -140,7 +140,8 @@ pub fn measure(
         views: scene.pictures.len() as u32,
         sh_degree: 3,
         max_gaussians: Some(scene.cloud.len()),
-        half_moments: false,
+        sort_lanes: gpu.info().sort_lanes(),
+        ..Default::default()
     })?;
     let mut settings = TrainSettings { steps: WARM_UP + steps, ..TrainSettings::default() };
     settings.density.strategy = Strategy::None;

@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
-use config::plan::{Plan, PlanRequest};
+use config::plan::{Plan, PlanRequest, SORT_LANES_SOFTWARE};
 use models::dataset::{Dataset, scaled};
+use vulkan::gpu::Gpu;
 
 use super::CliError;
 
@@ -43,6 +44,9 @@ pub struct Args {
     /// Adam's moments of SH in 16 bits each (`training.sh.half_moments`).
     #[arg(long)]
     pub half_moments: bool,
+    /// Vulkan device whose name contains this; without one the plan is a processor's.
+    #[arg(long)]
+    pub device: Option<String>,
     /// JSON instead of a table.
     #[arg(long)]
     pub json: bool,
@@ -59,6 +63,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
             (w, h, chosen.len() as u32)
         }
     };
+    // As a job here would be planned; without a device, as for a processor.
+    let sort_lanes = Gpu::open(args.device.as_deref()).map_or(SORT_LANES_SOFTWARE, |gpu| gpu.info().sort_lanes());
     let request = PlanRequest {
         device_mib: args.budget_mib,
         width,
@@ -67,6 +73,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         sh_degree: args.sh_degree,
         max_gaussians: args.max_gaussians,
         half_moments: args.half_moments,
+        sort_lanes,
     };
     let plan = Plan::new(&request)?;
     if args.json {
@@ -79,8 +86,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         plan.views, plan.sh_degree, args.budget_mib
     );
     println!(
-        "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n",
-        plan.gaussians, plan.instances, plan.tiles
+        "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n  sort lanes{:>10}\n",
+        plan.gaussians, plan.instances, plan.tiles, plan.sort_lanes
     );
     for (name, bytes) in &plan.sections {
         println!("  {name:<18} {:>9.2} MiB", mib(*bytes));

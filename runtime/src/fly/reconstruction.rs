@@ -94,6 +94,7 @@ impl Reconstruction {
             sh_degree: mission.training.sh.degree,
             max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
             half_moments: mission.training.sh.half_moments,
+            sort_lanes: gpu.info().sort_lanes(),
         })?;
         // Before capture begins: measuring takes a second or two.
         let trainer = Trainer::with_shape(&gpu, &plan, &mission.training, kernels::shape_of(&gpu))?;

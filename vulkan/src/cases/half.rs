@@ -24,6 +24,7 @@ fn train(gpu: &Gpu, half_moments: bool, c: &GaussianCloud, steps: u32) -> Result
         sh_degree: 3,
         max_gaussians: Some(512),
         half_moments,
+        ..Default::default()
     };
     let mut t = Trainer::new(gpu, &Plan::new(&request)?, &TrainSettings { seed: 3, ..plain() })?;
     t.load(c)?;

@@ -154,7 +154,7 @@ pub fn empty_trainer(
         views: 2,
         sh_degree,
         max_gaussians: Some(capacity),
-        half_moments: false,
+        ..Default::default()
     };
     Ok(Trainer::new(gpu, &Plan::new(&request)?, settings)?)
 }

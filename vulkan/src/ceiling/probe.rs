@@ -70,6 +70,7 @@ fn two_buffers(bytes: u64) -> Plan {
         views: 0,
         sh_degree: 0,
         half_moments: false,
+        sort_lanes: 0,
         sections: vec![("source", bytes), ("into", bytes)],
         total_bytes: 2 * bytes,
     }

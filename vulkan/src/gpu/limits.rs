@@ -48,8 +48,15 @@ mod tests {
             println!("skipped: no Vulkan device");
             return None;
         };
-        let request =
-            PlanRequest { device_mib: 64, width: 64, height: 48, views: 1, sh_degree: 3, max_gaussians: Some(10_000), half_moments: false };
+        let request = PlanRequest {
+            device_mib: 64,
+            width: 64,
+            height: 48,
+            views: 1,
+            sh_degree: 3,
+            max_gaussians: Some(10_000),
+            ..Default::default()
+        };
         let plan = Plan::new(&request).unwrap();
         Some(Trainer::new(&gpu.limited(limits), &plan, &TrainSettings::default()))
     }

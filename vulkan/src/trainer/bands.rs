@@ -4,7 +4,7 @@ use super::{TrainError, Trainer};
 use crate::commands::{Push, Recording};
 use crate::kernels::Kernel;
 use crate::stages::Stage;
-use config::plan::{LOOP_LANES, SORT_BLOCKS};
+use config::plan::LOOP_LANES;
 
 /// Where the sorting lanes leave their cursors in `status` (`shaders/walk.glsl`).
 const WALK_CURSORS: usize = 1024;
@@ -29,7 +29,7 @@ impl Trainer {
     /// Depth sort, colours, instances per tile; everything up to where the number of instances is needed.
     pub(super) fn record_counting(&self, recording: &Recording<'_>) {
         recording.run(Kernel::Project, self.gaussians, Push::default());
-        let blocks = SORT_BLOCKS as usize;
+        let blocks = self.plan.sort_lanes as usize;
         for pass in 0..4 {
             let push = Push { pass, ..Push::default() };
             let (count, scatter) = if pass % 2 == 0 {
@@ -49,9 +49,9 @@ impl Trainer {
     pub(super) fn record_tiles(&self, recording: &Recording<'_>) {
         let tiles = self.frame.tiles();
         let all = Push { first: 0, last: tiles, ..Push::default() };
-        let bytes = 4 * u64::from(tiles) * SORT_BLOCKS;
+        let bytes = 4 * u64::from(tiles) * u64::from(self.plan.sort_lanes);
         recording.clear(&self.arena, self.arena.section("tiles"), bytes, Stage::Count);
-        recording.run_rounds(Kernel::Count, SORT_BLOCKS as usize, all, self.walk_rounds);
+        recording.run_rounds(Kernel::Count, self.plan.sort_lanes as usize, all, self.walk_rounds);
         recording.run(Kernel::TilePrefix, tiles as usize, all);
         recording.run(Kernel::TileScan, 256, all);
     }
@@ -60,9 +60,9 @@ impl Trainer {
     pub(super) fn record_emit(&self, recording: &Recording<'_>, band: Band, single: bool) {
         let push = Push { first: band.first, last: band.last, mode: 1, pass: 0 };
         if !single {
-            recording.run_rounds(Kernel::Count, SORT_BLOCKS as usize, push, self.walk_rounds);
+            recording.run_rounds(Kernel::Count, self.plan.sort_lanes as usize, push, self.walk_rounds);
         }
-        recording.run_rounds(Kernel::Emit, SORT_BLOCKS as usize, push, self.walk_rounds);
+        recording.run_rounds(Kernel::Emit, self.plan.sort_lanes as usize, push, self.walk_rounds);
     }
 
     pub(super) fn record_blend(&self, recording: &Recording<'_>, band: Band) {
@@ -105,6 +105,6 @@ impl Trainer {
 
     fn walk_is_complete(&self) -> bool {
         let status = self.arena.slice::<u32>(self.arena.section("status"));
-        (0..SORT_BLOCKS as usize).all(|lane| status[WALK_CURSORS + 4 * lane + 3] == 1)
+        (0..self.plan.sort_lanes as usize).all(|lane| status[WALK_CURSORS + 4 * lane + 3] == 1)
     }
 }

@@ -159,7 +159,10 @@ mod tests {
             degree_in_use(&c)
         };
         assert_eq!(degree_in_use(&[0.0; 48]), 0);
-        assert_eq!([with(0), with(2), with(3), with(11), with(12), with(26), with(27), with(47)], [0, 0, 1, 1, 2, 2, 3, 3]);
+        assert_eq!(
+            [with(0), with(2), with(3), with(11), with(12), with(26), with(27), with(47)],
+            [0, 0, 1, 1, 2, 2, 3, 3]
+        );
         assert_eq!(degree_in_use(&[f32::NAN; 3]), 0);
     }
 }
