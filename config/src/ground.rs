@@ -12,8 +12,8 @@ pub struct GroundSettings {
     pub device_mib: u32,
     /// Upper bound of the global model; None = as many as the memory holds.
     pub max_gaussians: Option<usize>,
-    /// Passes over the distillation views. 0 = merge only. Fed3DGS uses 5; sheffield_cross merged: 25.45 dB with 5, 25.65 with
-    /// 15, and its best aircraft's own views lose 0.31 and 0.12 dB.
+    /// Passes over the distillation views. 0 = merge only. Fed3DGS uses 5; sheffield_cross merged: 25.45 dB with 5, 25.63 with
+    /// 15, and its best aircraft's own views lose 0.31 and 0.07 dB.
     pub epochs: u32,
     /// Seconds for distillation at most; None = all epochs.
     pub seconds: Option<f64>,

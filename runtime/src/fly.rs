@@ -18,6 +18,7 @@ mod handover;
 mod health;
 mod intake;
 mod job;
+mod reconstruct;
 mod reconstruction;
 mod shortage;
 

@@ -103,6 +103,8 @@ pub struct Run {
     pub evaluations: u64,
     /// Pairs that were not sent to the network.
     pub pairs: u64,
+    /// SH coefficients of all steps that no Gaussian had.
+    pub sh_coefficients: u64,
     /// Held-out PSNR, dB.
     pub psnr: f64,
 }
@@ -140,6 +142,7 @@ pub fn train(
         instances: work("instances"),
         evaluations: work("evaluations"),
         pairs: report.skipped.get("pairs").copied().unwrap_or(0),
+        sh_coefficients: report.skipped.get("sh_coefficients").copied().unwrap_or(0),
         psnr,
     })
 }
@@ -172,6 +175,7 @@ pub fn mean(runs: &[Run]) -> Option<Run> {
     first.instances = sum(|r| r.instances as f64) as u64;
     first.evaluations = sum(|r| r.evaluations as f64) as u64;
     first.pairs = sum(|r| r.pairs as f64) as u64;
+    first.sh_coefficients = sum(|r| r.sh_coefficients as f64) as u64;
     Some(first)
 }
 
@@ -199,6 +203,7 @@ pub fn table(none: &Run, runs: &[Run]) -> Table {
             less(r.instances, none.instances),
             less(r.evaluations, none.evaluations),
             r.pairs.to_string(),
+            format!("{:.1}", r.sh_coefficients as f64 * 1e-6),
             short(r.seconds),
             short(none.seconds - r.seconds),
             format!("{:+.1} %", 100.0 * saved),
@@ -208,10 +213,10 @@ pub fn table(none: &Run, runs: &[Run]) -> Table {
         ]
     };
     let mut rows = vec![row(none)];
-    rows[0][10] = "what the others are held against".into();
+    rows[0][11] = "what the others are held against".into();
     rows.extend(runs.iter().map(row));
     if let Some(last) = rows.last_mut().filter(|_| !runs.is_empty()) {
-        last[10] = "all of them".into();
+        last[11] = "all of them".into();
     }
     let head = [
         "skips on",
@@ -219,6 +224,7 @@ pub fn table(none: &Run, runs: &[Run]) -> Table {
         "instances",
         "evaluations",
         "pairs left out",
+        "M SH coefficients left out",
         "s",
         "saved s",
         "saved",

@@ -8,14 +8,14 @@ use std::time::Duration;
 use hal::failsafe::{self, Action};
 use hal::mavlink::dialect::MavSeverity;
 use hal::traits::Clock;
-use models::camera::PosedImage;
 use vulkan::trainer::{RunBudget, StepReport};
 
 use super::flight::FlightCounters;
 use super::handover::Handover;
 use super::health::Health;
+use super::reconstruct::Reconstruct;
 use super::shortage::likely_cause;
-use super::{FlyError, Reconstruction, model_path};
+use super::{FlyError, model_path};
 use crate::interrupt::Interrupt;
 use crate::upload::Offerer;
 
@@ -27,53 +27,6 @@ const SAY_EVERY_NS: u64 = 10_000_000_000;
 /// nothing to do at all.
 const FOR_A_FRAME: Duration = Duration::from_millis(200);
 const IDLE: Duration = Duration::from_millis(50);
-
-/// What makes a model out of key frames.
-pub trait Reconstruct {
-    /// Takes in a new key frame.
-    ///
-    /// # Errors
-    /// It cannot be stored.
-    fn add(&mut self, frame: &PosedImage) -> Result<(), FlyError>;
-    /// Number of key frames.
-    fn keyframes(&self) -> usize;
-    /// Whether enough key frames came since the last build; with `last`, whether any did.
-    fn wants_build(&self, last: bool) -> bool;
-    /// Whether there is a model to train.
-    fn has_model(&self) -> bool;
-    /// (Re)builds the model from all key frames.
-    ///
-    /// # Errors
-    /// The network or the device fails; the pictures give no depth.
-    fn build(&mut self) -> Result<(), FlyError>;
-    /// Whether the schedule of `budget` is over.
-    fn is_done(&self, budget: &RunBudget) -> bool;
-    /// Steps taken since the last build.
-    fn steps(&self) -> u32;
-    /// Trains until the budget, the schedule, or `each` says stop.
-    ///
-    /// # Errors
-    /// The device fails; the last checkpoint stays valid.
-    fn train(
-        &mut self,
-        budget: &RunBudget,
-        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
-    ) -> Result<(), FlyError>;
-    /// Trains at half the size, or as scheduled again.
-    fn halve_resolution(&mut self, on: bool);
-    /// Gives up the least useful Gaussians.
-    ///
-    /// # Errors
-    /// The device fails.
-    fn shrink(&mut self) -> Result<(), FlyError>;
-    /// Gaussians of the model as it is now.
-    fn gaussians(&self) -> usize;
-    /// Writes the model as it is now; returns its path and its number of Gaussians.
-    ///
-    /// # Errors
-    /// The disk cannot be written; the file written before stays.
-    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), FlyError>;
-}
 
 /// One flight's job.
 pub(super) struct Job<R, K> {
@@ -344,59 +297,5 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     #[cfg(test)]
     pub(super) fn failsafe(&self) -> failsafe::State {
         self.failsafe
-    }
-}
-
-impl Reconstruct for Reconstruction {
-    fn add(&mut self, frame: &PosedImage) -> Result<(), FlyError> {
-        Self::add(self, frame)
-    }
-
-    fn keyframes(&self) -> usize {
-        Self::keyframes(self)
-    }
-
-    fn wants_build(&self, last: bool) -> bool {
-        Self::wants_build(self, last)
-    }
-
-    fn has_model(&self) -> bool {
-        Self::has_model(self)
-    }
-
-    fn build(&mut self) -> Result<(), FlyError> {
-        Self::build(self)
-    }
-
-    fn is_done(&self, budget: &RunBudget) -> bool {
-        Self::is_done(self, budget)
-    }
-
-    fn steps(&self) -> u32 {
-        self.trainer().steps()
-    }
-
-    fn train(
-        &mut self,
-        budget: &RunBudget,
-        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
-    ) -> Result<(), FlyError> {
-        Self::train(self, budget, each)
-    }
-
-    fn halve_resolution(&mut self, on: bool) {
-        Self::halve_resolution(self, on);
-    }
-
-    fn shrink(&mut self) -> Result<(), FlyError> {
-        Self::shrink(self)
-    }
-
-    fn gaussians(&self) -> usize {
-        self.trainer().gaussians()
-    }
-
-    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), FlyError> {
-        Self::checkpoint(self, out, finished)
     }
 }

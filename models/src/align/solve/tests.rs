@@ -171,3 +171,61 @@ fn nan_points_wrong_sizes_and_no_edges_are_survived() {
     let none = align(&views, &[], 500);
     assert!(none.sigma.is_empty() && none.maps.iter().all(Option::is_none));
 }
+
+/// The paper's way: Adam over log σ and log depth on the same objective from the same start, rate falling by a cosine as in
+/// DUSt3R. Returns σ.
+fn gradient_descent(views: &[View], edges: &[Edge], steps: usize, rate: f64) -> DVector<f64> {
+    let usable = vec![true; edges.len()];
+    let (terms, pixels) = gather(views, edges, &usable);
+    let (sigma, alive) = start::sigma(&terms, &pixels, &usable, edges.len());
+    let reference: Vec<f64> = pixels.iter().map(|p| start::depth(&terms, p, &sigma, &alive)).collect();
+    let mut parameters: Vec<f64> = sigma.iter().chain(&reference).map(|v| v.ln()).collect();
+    let mut moments = vec![[0.0f64; 2]; parameters.len()];
+    for t in 0..steps {
+        let mut gradient = vec![0.0; parameters.len()];
+        for (p, pixel) in pixels.iter().enumerate() {
+            let depth = parameters[edges.len() + p].exp();
+            for term in &terms[pixel.terms.clone()] {
+                let sigma = parameters[term.edge].exp();
+                let r = pixel.ray * depth - term.b - term.a * sigma;
+                let slope = r * (term.confidence / (r.length().max(1e-9) * reference[p]));
+                gradient[term.edge] -= slope.dot(term.a) * sigma;
+                gradient[edges.len() + p] += slope.dot(pixel.ray) * depth;
+            }
+        }
+        let now = rate * 0.5 * (1.0 + (std::f64::consts::PI * t as f64 / steps as f64).cos());
+        for ((x, m), g) in parameters.iter_mut().zip(&mut moments).zip(gradient) {
+            *m = [0.9 * m[0] + 0.1 * g, 0.999 * m[1] + 0.001 * g * g];
+            let unbiased = [m[0] / (1.0 - 0.9f64.powi(t as i32 + 1)), m[1] / (1.0 - 0.999f64.powi(t as i32 + 1))];
+            *x -= now * unbiased[0] / (unbiased[1].sqrt() + 1e-12);
+        }
+    }
+    DVector::from_iterator(edges.len(), parameters[..edges.len()].iter().map(|v| v.exp()))
+}
+
+/// Why the steps are closed ones: with a fifth of outliers, what a few of them reach, 500 steps of gradient descent do
+/// not, at any of four rates.
+#[test]
+fn closed_steps_come_closer_to_the_truth_than_five_hundred_gradient_steps() {
+    let mut rng = Pcg64Mcg::seed_from_u64(9);
+    let views: Vec<View> = (0..6).map(|i| view(12.0 * i as f64, (i % 2) as f64 * 5.0, 0.05 * i as f64)).collect();
+    let pairs: Vec<(usize, usize)> = (0..6).flat_map(|i| (i + 1..(i + 3).min(6)).map(move |j| (i, j))).collect();
+    let truth: Vec<f64> = pairs.iter().map(|_| rng.random_range(5.0..80.0)).collect();
+    let edges: Vec<Edge> =
+        pairs.iter().zip(&truth).map(|((i, j), s)| edge(&views, *i, *j, *s, 0.2, 0.01, &mut rng)).collect();
+    let off = |sigma: &DVector<f64>| sigma.iter().zip(&truth).map(|(s, t)| (s / t - 1.0).abs()).fold(0.0, f64::max);
+    let clock = std::time::Instant::now();
+    let closed = align(&views, &edges, 500);
+    let closed_ms = clock.elapsed().as_secs_f64() * 1e3;
+    let clock = std::time::Instant::now();
+    let descended = [0.1, 0.03, 0.01, 0.003].map(|rate| off(&gradient_descent(&views, &edges, 500, rate)));
+    let descent_ms = clock.elapsed().as_secs_f64() * 1e3 / 4.0;
+    let least = descended.iter().copied().fold(f64::INFINITY, f64::min);
+    println!(
+        "σ off by {:.5} after {} closed steps in {closed_ms:.1} ms; by {least:.5} at the best of four rates after 500 of \
+         gradient descent in {descent_ms:.1} ms",
+        error(&closed, &truth),
+        closed.steps
+    );
+    assert!(descended.iter().all(|d| error(&closed, &truth) < *d), "{descended:?} against {}", error(&closed, &truth));
+}
