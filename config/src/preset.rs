@@ -67,7 +67,7 @@ impl Preset {
             Self::Orin => row(512, 100_000, 1.0, 160.0),
             // The same with --seconds 300: 25.00 dB, 306 s; the ground has mains power.
             Self::Ground => row(512, 100_000, 1.0, 300.0),
-            // --scale 0.5 --budgets-mib 96 --max-gaussians 12000 --seconds 10: @@CI@@
+            // --scale 0.5 --budgets-mib 96 --max-gaussians 12000 --seconds 10: 23.88 dB, 12.3 s.
             Self::Ci => row(96, 12_000, 0.5, 10.0),
         }
     }
