@@ -13,7 +13,7 @@ use crate::run_json::RunReport;
 pub struct Ended {
     /// Its report; none when it failed.
     pub report: Option<RunReport>,
-    /// The last line it said, without the program's name.
+    /// The last line it said but for notes, without the program's name.
     pub last_line: String,
     /// Seconds from its start to its end.
     pub seconds: f64,
@@ -33,14 +33,15 @@ pub fn run(arguments: &[String], out: &Path, limit_mib: Option<u64>) -> Result<E
         command.args(["--limit-mib", &mib.to_string()]);
     }
     command.args(arguments).arg("--out").arg(out);
-    // An allocation beyond the bound ends the child with one line; with a trace behind it, that line would not be the last.
+    // An allocation beyond the bound ends the child with one line, and a note on how to get a trace.
     command.env("RUST_BACKTRACE", "0");
     command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(File::create(&log).map_err(failed)?);
     let start = Instant::now();
     let status = command.status().map_err(failed)?;
     let seconds = start.elapsed().as_secs_f64();
     let said = std::fs::read_to_string(&log).unwrap_or_default();
-    let last_line = said.lines().last().unwrap_or_default().trim_start_matches("dgtr: ").to_owned();
+    let last_line =
+        said.lines().rfind(|l| !l.starts_with("note: ")).unwrap_or_default().trim_start_matches("dgtr: ").to_owned();
     match status.code() {
         Some(0) => Ok(Ended { report: Some(RunReport::read(out)?), last_line, seconds }),
         Some(3) => Err(CliError::device(last_line)),
