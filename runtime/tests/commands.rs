@@ -13,7 +13,7 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms::pose_to_opengl;
 
-/// `dgtr`, which measures no workgroup sizes and leaves the user's cache folder alone.
+/// `dgtr`, which measures no kernels and leaves the user's cache folder alone.
 fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_dgtr"));
     command.env(config::kernels::VARIABLE, "default");
@@ -94,9 +94,11 @@ fn a_device_that_is_not_there_is_exit_code_3() {
     data_set(dir.path());
     let set = dir.path().to_string_lossy().into_owned();
     let out = dir.path().join("out").to_string_lossy().into_owned();
-    let output = dgtr(&["train", &set, "--out", &out, "--device", "no such device"]);
-    assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
-    error_line(&output);
+    for arguments in [&["train", &set, "--out", &out][..], &["plan"]] {
+        let output = dgtr(&[arguments, &["--device", "no such device"]].concat());
+        assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
+        error_line(&output);
+    }
 }
 
 #[test]

@@ -44,7 +44,7 @@ pub struct Args {
     /// Adam's moments of SH in 16 bits each (`training.sh.half_moments`).
     #[arg(long)]
     pub half_moments: bool,
-    /// Vulkan device whose name contains this; without one the plan is a processor's.
+    /// Vulkan device whose name contains this; without it the plan is the first device's, or a processor's.
     #[arg(long)]
     pub device: Option<String>,
     /// JSON instead of a table.
@@ -63,8 +63,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
             (w, h, chosen.len() as u32)
         }
     };
-    // As a job here would be planned; without a device, as for a processor.
-    let sort_lanes = Gpu::open(args.device.as_deref()).map_or(SORT_LANES_SOFTWARE, |gpu| gpu.info().sort_lanes());
+    // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
+    let sort_lanes = match (Gpu::open(args.device.as_deref()), &args.device) {
+        (Ok(gpu), _) => gpu.info().sort_lanes(),
+        (Err(_), None) => SORT_LANES_SOFTWARE,
+        (Err(e), Some(_)) => return Err(e.into()),
+    };
     let request = PlanRequest {
         device_mib: args.budget_mib,
         width,
