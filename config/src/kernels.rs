@@ -1,9 +1,10 @@
-//! Who decides the workgroup sizes of the kernels. They belong to a device and not to a mission, which many devices share,
-//! so they are given by the environment variable [`VARIABLE`]. The trained model's bytes do not depend on them.
+//! Who decides the shape of the kernels: their workgroup sizes, and how many lanes share a tile. It belongs to a device and
+//! not to a mission, which many devices share, so it is given by the environment variable [`VARIABLE`]. The trained
+//! model's bytes do not depend on it.
 
 use std::str::FromStr;
 
-/// `auto` (or not set), `default`, or `WIDExNARROW` such as `64x8`.
+/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxROWS` such as `64x8x1x8x1`.
 pub const VARIABLE: &str = "DGTR_KERNELS";
 
 /// Who decides.
@@ -14,18 +15,24 @@ pub enum KernelChoice {
     Calibrated,
     /// `default`: the built-in sizes; nothing is measured, nothing is read or written.
     Standard,
-    /// `WIDExNARROW`: these.
+    /// `WIDExNARROWxSHARExTILESxROWS`: these.
     Fixed {
         /// Lanes of a workgroup of the plain loops over Gaussians or pixels.
         wide: u32,
-        /// Lanes of a workgroup of the kernels with much state.
+        /// Lanes of a workgroup of the kernels that sort, count and emit.
         narrow: u32,
+        /// Lanes that work on a share of the Gaussians: 1, or `narrow`.
+        share_lanes: u32,
+        /// Tiles of a workgroup of the blend.
+        tiles: u32,
+        /// Lanes that blend a tile: 1, or 4.
+        tile_lanes: u32,
     },
 }
 
 /// A value that is none of the three.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROW (such as 64x8)")]
+#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxROWS (such as 64x8x1x8x1)")]
 pub struct KernelChoiceError(String);
 
 impl FromStr for KernelChoice {
@@ -35,12 +42,22 @@ impl FromStr for KernelChoice {
         match text {
             "" | "auto" => Ok(Self::Calibrated),
             "default" => Ok(Self::Standard),
-            other => other
-                .split_once('x')
-                .and_then(|(wide, narrow)| Some(Self::Fixed { wide: wide.parse().ok()?, narrow: narrow.parse().ok()? }))
-                .ok_or_else(|| KernelChoiceError(other.chars().take(40).collect())),
+            other => fixed(other).ok_or_else(|| KernelChoiceError(other.chars().take(40).collect())),
         }
     }
+}
+
+fn fixed(text: &str) -> Option<KernelChoice> {
+    let mut numbers = text.split('x').map(|n| n.parse().ok());
+    let [wide, narrow, share_lanes, tiles, tile_lanes] = [(); 5].map(|()| numbers.next().flatten());
+    let none_left = numbers.next().is_none();
+    none_left.then_some(KernelChoice::Fixed {
+        wide: wide?,
+        narrow: narrow?,
+        share_lanes: share_lanes?,
+        tiles: tiles?,
+        tile_lanes: tile_lanes?,
+    })
 }
 
 impl KernelChoice {
@@ -62,8 +79,10 @@ mod tests {
         assert_eq!("".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("auto".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("default".parse(), Ok(KernelChoice::Standard));
-        assert_eq!("128x16".parse(), Ok(KernelChoice::Fixed { wide: 128, narrow: 16 }));
-        for bad in ["off", "64", "64x", "x8", "64x-8", "99999999999x8"] {
+        let fixed = KernelChoice::Fixed { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4 };
+        assert_eq!("128x16x16x8x4".parse(), Ok(fixed));
+        for bad in ["off", "64", "64x8", "64x8x1x8x", "x8x1x8x1", "64x-8x1x8x1", "99999999999x8x1x8x1", "64x8x1x8x1x1"]
+        {
             let refused = bad.parse::<KernelChoice>().unwrap_err().to_string();
             assert!(refused.contains(VARIABLE) && refused.contains(bad), "{refused}");
         }

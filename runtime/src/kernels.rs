@@ -1,5 +1,5 @@
-//! Which workgroup sizes this process trains with: those the user fixed, those measured earlier on this device with this
-//! driver and these kernels, or those measured now. Whatever goes wrong on the way costs a warning and some speed, never
+//! Which shape of the kernels this process trains with: the one the user fixed, the one measured earlier on this device with this
+//! driver and these kernels, or the one measured now. Whatever goes wrong on the way costs a warning and some speed, never
 //! the run; and since the shape changes no bit of the model, it needs no place in it.
 
 use std::path::PathBuf;
@@ -49,12 +49,12 @@ fn found(info: &GpuInfo, choice: KernelChoice) -> (KernelShape, Source) {
     let standard = (KernelShape::standard(info), Source::Standard);
     match choice {
         KernelChoice::Standard => standard,
-        KernelChoice::Fixed { wide, narrow } => {
-            let fixed = KernelShape { wide, narrow };
+        KernelChoice::Fixed { wide, narrow, share_lanes, tiles, tile_lanes } => {
+            let fixed = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes };
             if fixed.fits(info) {
                 return (fixed, Source::Fixed);
             }
-            tracing::warn!("{VARIABLE}: {} cannot run {wide}x{narrow}; the default is used", info.name);
+            tracing::warn!("{VARIABLE}: {} cannot run {fixed}; the default is used", info.name);
             standard
         }
         KernelChoice::Calibrated => kept(info, cache::path()).unwrap_or(standard),
@@ -86,24 +86,26 @@ fn kept(info: &GpuInfo, path: Option<PathBuf>) -> Option<(KernelShape, Source)> 
 
 fn measured(gpu: &Gpu, path: Option<PathBuf>, limit: Option<Duration>) -> Option<(KernelShape, Source)> {
     let name = &gpu.info().name;
-    tracing::info!("{name}: measuring which workgroup sizes are the fastest (once)");
+    tracing::info!("{name}: measuring which shape of the kernels is the fastest (once)");
     let found = match calibrate(gpu, limit) {
         Ok(found) => found,
         Err(e) => {
-            tracing::warn!("{name}: workgroup sizes could not be measured, the default is used: {e}");
+            tracing::warn!("{name}: kernels could not be measured, the default shape is used: {e}");
             return None;
         }
     };
-    let KernelShape { wide, narrow } = found.shape;
-    tracing::info!("{name}: wide {wide}, narrow {narrow}, measured in {:.1} s", found.seconds);
+    for shape in &found.refused {
+        tracing::warn!("{name}: kernels of shape {shape} compute something else here and are never used");
+    }
+    tracing::info!("{name}: kernels of shape {}, measured in {:.1} s", found.shape, found.seconds);
     let Some(path) = path else {
-        tracing::warn!("neither XDG_CACHE_HOME nor HOME is set: workgroup sizes are measured anew next time");
+        tracing::warn!("neither XDG_CACHE_HOME nor HOME is set: kernels are measured anew next time");
         return Some((found.shape, Source::Measured));
     };
     match cache::write(&path, gpu.info(), found.shape) {
         Ok(()) => Some((found.shape, Source::Kept(path))),
         Err(e) => {
-            tracing::warn!("workgroup sizes are not kept and will be measured anew next time: {e}");
+            tracing::warn!("the kernels' shape is not kept and will be measured anew next time: {e}");
             Some((found.shape, Source::Measured))
         }
     }

@@ -7,6 +7,7 @@ use vulkan::gpu::Gpu;
 use vulkan::trainer::Trainer;
 
 use crate::cli::CliError;
+use crate::kernels;
 
 /// Gaussian–tile instances held at once, per pixel; pictures with more are rendered in bands.
 const INSTANCES_PER_PIXEL: usize = 8;
@@ -34,7 +35,7 @@ pub fn open(device: Option<&str>, cloud: &GaussianCloud, width: u32, height: u32
     let plan = Plan::with_capacities(&request, cloud.len(), cloud.len() + INSTANCES_PER_PIXEL * pixels);
     let mut settings = TrainSettings::default();
     settings.sh.degree = cloud.sh_degree;
-    let mut trainer = Trainer::new(&gpu, &plan, &settings)?;
+    let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?;
     trainer.load(cloud)?;
     Ok(trainer)
 }

@@ -9,12 +9,15 @@ layout(set = 0, binding = 11) uniform samplerBuffer image;
 layout(set = 0, binding = 12) uniform samplerBuffer image_gradient;
 layout(std430, set = 0, binding = 2) writeonly buffer Slots { vec4 slots[]; };
 
+const int AT_ONCE = 16;
+
 void main() {
     uint t = tile_of_lane();
     if (t >= push.last) return;
     uint base = starts[push.first], first = starts[t] - base, end = starts[t + 1u] - base;
-    ivec2 origin = tile_origin(t);
-    vec2 corner = vec2(origin) + 0.5;
+    int own_row = row_of_lane();
+    ivec2 corner_pixel = tile_origin(t), origin = corner_pixel + ivec2(0, own_row);
+    vec2 corner = vec2(corner_pixel) + 0.5;
     float T[PIXELS];
     float behind[PIXELS];        // dL/d(pixel) · what is still to come
     vec3 gradient[PIXELS];
@@ -37,78 +40,89 @@ void main() {
     }
     uint i = first;
     bool live = true;
-    while (i < end && live) {
-        uvec2 instance = texelFetch(instances, int(i)).xy;
-        int r = int(instance.x) * 3;
-        vec4 s0 = texelFetch(shaded, r), s1 = texelFetch(shaded, r + 1), s2 = texelFetch(shaded, r + 2);
-        vec2 d = corner - s0.xy;
-        float most = -1.0, total = 0.0, depth = 0.0;
-        vec3 colour = vec3(0.0);
-        float q = 0.0, qx = 0.0, qy = 0.0, qxx = 0.0, qxy = 0.0, qyy = 0.0;
-        [[unroll]] for (int y = 0; y < TILE_HEIGHT; y++) {
-            float dy = d.y + float(y), along = s1.y * dy, rest = fma(s1.z * dy, dy, s0.w);
-            float row = 0.0, row_x = 0.0, row_xx = 0.0;
+    WHILE (i < end && live) {
+        uint slot = 0u;
+        float most = -1.0;
+        // What a slot holds: q and its first moments, total weight; second moments, depth; colour.
+        vec4 line = vec4(0.0), square = vec4(0.0), colour = vec4(0.0);
+        IF (i < end && live) {
+            uvec2 instance = texelFetch(instances, int(i)).xy;
+            int r = int(instance.x) * 3;
+            slot = instance.y * 3u;
+            vec4 s0 = texelFetch(shaded, r), s1 = texelFetch(shaded, r + 1), s2 = texelFetch(shaded, r + 2);
+            vec2 d = corner - s0.xy;
+            [[unroll]] for (int y = 0; y < ROWS; y++) {
+                float dy = d.y + float(own_row + y), along = s1.y * dy, rest = fma(s1.z * dy, dy, s0.w);
+                float row = 0.0, row_x = 0.0, row_xx = 0.0, row_total = 0.0, row_depth = 0.0;
+                vec3 row_colour = vec3(0.0);
 #ifdef DEPTH
-            float shape = 0.0, shape_x = 0.0;
+                float shape = 0.0, shape_x = 0.0;
 #endif
-            [[unroll]] for (int x = 0; x < TILE_WIDTH; x++) {
-                int k = y * TILE_WIDTH + x;
-                float dx = d.x + float(x);
-                float raw = exp2(min(fma(dx, fma(s1.x, dx, along), rest), s0.w));
-                float alpha = min(raw, ALPHA_MAX);
-                alpha = alpha >= ALPHA_MIN ? alpha : 0.0;
-                float weight = alpha * T[k];
-                float next = T[k] - weight;
-                bool taken = next >= TRANSMITTANCE_MIN;
-                weight = taken ? weight : 0.0;
-                // alpha/(1-alpha), only where alpha itself follows the parameters.
-                float odds = taken && raw <= ALPHA_MAX ? alpha / (1.0 - alpha) : 0.0;
-                float own = raw <= ALPHA_MAX ? weight : 0.0;
-                T[k] = taken ? next : -abs(T[k]);
-                float value = dot(s2.xyz, gradient[k]);
-                behind[k] -= weight * value;
-                float term = own * value - odds * behind[k];
-                colour += weight * gradient[k];
+                [[unroll]] for (int x = 0; x < TILE_WIDTH; x++) {
+                    int k = y * TILE_WIDTH + x;
+                    float dx = d.x + float(x);
+                    float raw = exp2(min(fma(dx, fma(s1.x, dx, along), rest), s0.w));
+                    float alpha = min(raw, ALPHA_MAX);
+                    alpha = alpha >= ALPHA_MIN ? alpha : 0.0;
+                    float weight = alpha * T[k];
+                    float next = T[k] - weight;
+                    bool taken = next >= TRANSMITTANCE_MIN;
+                    weight = taken ? weight : 0.0;
+                    // alpha/(1-alpha), only where alpha itself follows the parameters.
+                    float odds = taken && raw <= ALPHA_MAX ? alpha / (1.0 - alpha) : 0.0;
+                    float own = raw <= ALPHA_MAX ? weight : 0.0;
+                    T[k] = taken ? next : -abs(T[k]);
+                    float value = dot(s2.xyz, gradient[k]);
+                    behind[k] -= weight * value;
+                    float term = own * value - odds * behind[k];
+                    row_colour += weight * gradient[k];
 #ifdef DEPTH
-                float z_value = s0.z * depth_gradient[k];
-                depth_behind[k] -= weight * z_value;
-                float z_term = own * z_value - odds * depth_behind[k];
-                depth += weight * depth_gradient[k];
-                float shape_term = term + thaw * z_term;
-                term += z_term;
-                shape += shape_term;
-                shape_x += shape_term * dx;
-                row_xx += shape_term * dx * dx;
+                    float z_value = s0.z * depth_gradient[k];
+                    depth_behind[k] -= weight * z_value;
+                    float z_term = own * z_value - odds * depth_behind[k];
+                    row_depth += weight * depth_gradient[k];
+                    float shape_term = term + thaw * z_term;
+                    term += z_term;
+                    shape += shape_term;
+                    shape_x += shape_term * dx;
+                    row_xx += shape_term * dx * dx;
 #else
-                row_xx += term * dx * dx;
+                    row_xx += term * dx * dx;
 #endif
-                row += term;
-                row_x += term * dx;
-                total += weight;
-                most = max(most, T[k]);
+                    row += term;
+                    row_x += term * dx;
+                    row_total += weight;
+                    most = max(most, T[k]);
+                }
+#ifndef DEPTH
+                float shape = row, shape_x = row_x;
+#endif
+                line += vec4(row, row_x, row * dy, row_total);
+                square += vec4(row_xx, shape_x * dy, shape * dy * dy, row_depth);
+                colour += vec4(row_colour, 0.0);
             }
-            q += row;
-            qx += row_x;
-            qy += row * dy;
-            qxx += row_xx;
-#ifdef DEPTH
-            qxy += shape_x * dy;
-            qyy += shape * dy * dy;
-#else
-            qxy += row_x * dy;
-            qyy += row * dy * dy;
-#endif
         }
-        uint slot = instance.y * 3u;
-        slots[slot] = vec4(q, qx, qy, total);
-        slots[slot + 1u] = vec4(qxx, qxy, qyy, depth);
-        slots[slot + 2u] = vec4(colour, 0.0);
-        live = most > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
-        i++;
+        line = sum_of_tile(line);
+        square = sum_of_tile(square);
+        colour = sum_of_tile(colour);
+        IF (i < end && live) {
+#ifdef LANE_PER_ROW
+            if (own_row < 3) slots[slot + uint(own_row)] = own_row == 0 ? line : own_row == 1 ? square : colour;
+#else
+            slots[slot] = line;
+            slots[slot + 1u] = square;
+            slots[slot + 2u] = colour;
+#endif
+            i++;
+        }
+        live = most_of_tile(most) > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
     }
-    // Slots behind an opaque tile: a total of zero says that the other two vectors were not written.
-    while (i < end) {
-        slots[texelFetch(instances, int(i)).y * 3u] = vec4(0.0);
-        i++;
+    // Slots behind an opaque tile: a total of zero says that the other two vectors were not written. Many in a turn,
+    // because llvmpipe ends the loops of an invocation after 65,535 turns in all.
+    for (; i < end; i += uint(AT_ONCE * LANES)) {
+        [[unroll]] for (int j = 0; j < AT_ONCE; j++) {
+            uint at = i + uint(j * LANES + own_row);
+            if (at < end) slots[texelFetch(instances, int(at)).y * 3u] = vec4(0.0);
+        }
     }
 }

@@ -1,18 +1,22 @@
 //! Which shape is the fastest on a device: a few training steps of one small scene with each.
 //!
-//! Timestamps tell the wide kernels' time from the narrow ones', so that one trial judges a wide and a narrow size at once;
+//! Timestamps tell the time of one kind of kernel from another's, so that one trial judges one size of each kind at once;
 //! without timestamps each size is tried by itself on the wall clock. The trials take turns, so that whatever else the
 //! machine does meanwhile slows all alike, and each keeps its best time.
+//!
+//! A shape must also compute what the standard one does, to the bit: one whose gradients are others on this device (a
+//! compiler that contracts or a subgroup that runs otherwise than it says) is left out, however fast it is.
 //!
 //! Every shape's kernels are compiled first, which can take longer than all steps together (lavapipe: seconds per shape),
 //! so the standard shape comes first and no further one is begun once the given time is over.
 
 use crate::cases::scenes::{cloud, photo, plain, posed, view};
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, GpuInfo};
 use crate::kernels::Group;
 use crate::shape::KernelShape;
 use crate::trainer::{TrainError, Trainer};
 use config::plan::{Plan, PlanRequest};
+use models::cloud::GaussianCloud;
 use std::time::{Duration, Instant};
 
 /// Enough tiles for every lane of the looping kernels, and still a few milliseconds per step in software.
@@ -30,10 +34,9 @@ const MARGIN: f64 = 0.03;
 pub struct Trial {
     /// The shape.
     pub shape: KernelShape,
-    /// Milliseconds of its wide kernels per step (of the whole step where the device has no timestamps).
-    pub wide_ms: f64,
-    /// Milliseconds of its narrow kernels per step (of the whole step where the device has no timestamps).
-    pub narrow_ms: f64,
+    /// Milliseconds per step of its wide, its narrow and its blending kernels (of the whole step, three times, where the
+    /// device has no timestamps).
+    pub ms: [f64; 3],
 }
 
 /// What was measured, and what follows from it.
@@ -43,6 +46,8 @@ pub struct Calibration {
     pub shape: KernelShape,
     /// Every trial.
     pub trials: Vec<Trial>,
+    /// Shapes that compute something else than the standard one here.
+    pub refused: Vec<KernelShape>,
     /// Seconds it took.
     pub seconds: f64,
 }
@@ -55,59 +60,114 @@ pub fn calibrate(gpu: &Gpu, limit: Option<Duration>) -> Result<Calibration, Trai
     let start = Instant::now();
     let timed = gpu.timestamp_ns() > 0.0;
     let standard = KernelShape::standard(gpu.info());
-    let (wide, narrow) = (KernelShape::wide_candidates(gpu.info()), KernelShape::narrow_candidates(gpu.info()));
-    let shapes = shapes(&wide, &narrow, standard, timed);
-    let (mut trials, mut trainers) = (Vec::new(), Vec::new());
-    for shape in shapes {
+    let (mut trials, mut trainers, mut refused) = (Vec::new(), Vec::new(), Vec::new());
+    let mut expected = None;
+    for shape in shapes(&Candidates::of(gpu.info()), standard, timed) {
         if !trials.is_empty() && limit.is_some_and(|limit| start.elapsed() >= limit) {
             break;
         }
         let mut trainer = trainer(gpu, shape)?;
-        // The first step compiles; its time says nothing.
+        // The first pass compiles; its time says nothing.
+        let mut gradient = GaussianCloud::default();
+        trainer.gradient(0, &mut gradient)?;
+        if *expected.get_or_insert_with(|| gradient.clone()) != gradient {
+            refused.push(shape);
+            continue;
+        }
         step(&mut trainer, timed)?;
         trainers.push(trainer);
-        trials.push(Trial { shape, wide_ms: f64::MAX, narrow_ms: f64::MAX });
+        trials.push(Trial { shape, ms: [f64::MAX; 3] });
     }
     for _ in 0..REPEATS {
         for (trainer, trial) in trainers.iter_mut().zip(&mut trials) {
-            let [wide_ms, narrow_ms] = step(trainer, timed)?;
-            trial.wide_ms = trial.wide_ms.min(wide_ms);
-            trial.narrow_ms = trial.narrow_ms.min(narrow_ms);
+            let ms = step(trainer, timed)?;
+            trial.ms = std::array::from_fn(|k| trial.ms[k].min(ms[k]));
         }
     }
     let shape = fastest(&trials, standard, timed);
-    Ok(Calibration { shape, trials, seconds: start.elapsed().as_secs_f64() })
+    Ok(Calibration { shape, trials, refused, seconds: start.elapsed().as_secs_f64() })
 }
+
+/// What to try, by kind of kernel.
+struct Candidates {
+    wide: Vec<u32>,
+    narrow: Vec<(u32, u32)>,
+    tiles: Vec<(u32, u32)>,
+}
+
+impl Candidates {
+    fn of(info: &GpuInfo) -> Self {
+        Self {
+            wide: KernelShape::wide_candidates(info),
+            narrow: KernelShape::narrow_candidates(info),
+            tiles: KernelShape::tile_candidates(info),
+        }
+    }
+}
+
+/// What a shape says about each kind of kernel.
+fn wide(shape: KernelShape) -> (u32, u32) {
+    (shape.wide, 1)
+}
+
+fn narrow(shape: KernelShape) -> (u32, u32) {
+    (shape.narrow, shape.share_lanes)
+}
+
+fn with_narrow(shape: KernelShape, (narrow, share_lanes): (u32, u32)) -> KernelShape {
+    KernelShape { narrow, share_lanes, ..shape }
+}
+
+fn tiles(shape: KernelShape) -> (u32, u32) {
+    (shape.tiles, shape.tile_lanes)
+}
+
+fn with_tiles(shape: KernelShape, (tiles, tile_lanes): (u32, u32)) -> KernelShape {
+    KernelShape { tiles, tile_lanes, ..shape }
+}
+
+const KINDS: [fn(KernelShape) -> (u32, u32); 3] = [wide, narrow, tiles];
 
 /// The shapes to try, the standard one first.
-fn shapes(wide: &[u32], narrow: &[u32], standard: KernelShape, timed: bool) -> Vec<KernelShape> {
-    let others = |list: &[u32], own: u32| list.iter().copied().filter(|n| *n != own).collect::<Vec<_>>();
-    let (wide, narrow) = (others(wide, standard.wide), others(narrow, standard.narrow));
-    let mut all = vec![standard];
+fn shapes(all: &Candidates, standard: KernelShape, timed: bool) -> Vec<KernelShape> {
+    let wide = all.wide.iter().copied().filter(|w| *w != standard.wide);
+    // Several lanes per tile or share promise more than another size: they come first.
+    let others = |list: &[(u32, u32)], own: (u32, u32)| {
+        let mut others: Vec<_> = list.iter().copied().filter(|c| *c != own).collect();
+        others.sort_by_key(|c| std::cmp::Reverse(c.1));
+        others
+    };
+    let kinds = [
+        wide.map(|wide| KernelShape { wide, ..standard }).collect::<Vec<_>>(),
+        others(&all.narrow, narrow(standard)).into_iter().map(|n| with_narrow(standard, n)).collect(),
+        others(&all.tiles, tiles(standard)).into_iter().map(|t| with_tiles(standard, t)).collect(),
+    ];
+    let mut shapes = vec![standard];
     if timed {
-        let size = |list: &[u32], i: usize, own: u32| list.get(i).copied().unwrap_or(own);
-        let both = |i| KernelShape { wide: size(&wide, i, standard.wide), narrow: size(&narrow, i, standard.narrow) };
-        all.extend((0..wide.len().max(narrow.len())).map(both));
+        for i in 0..kinds.iter().map(Vec::len).max().unwrap_or(0) {
+            let [of_wide, of_narrow, of_tiles] = [0, 1, 2].map(|k| kinds[k].get(i).copied().unwrap_or(standard));
+            let shape = KernelShape { wide: of_wide.wide, ..standard };
+            shapes.push(with_tiles(with_narrow(shape, narrow(of_narrow)), tiles(of_tiles)));
+        }
     } else {
-        all.extend(wide.iter().map(|w| KernelShape { wide: *w, ..standard }));
-        all.extend(narrow.iter().map(|n| KernelShape { narrow: *n, ..standard }));
+        shapes.extend(kinds.into_iter().rev().flatten());
     }
-    all
+    shapes
 }
 
-/// Without timestamps only trials that differ from the standard in one size judge that size.
+/// Each kind's best size. Without timestamps only trials that are standard otherwise judge a kind.
 fn fastest(trials: &[Trial], standard: KernelShape, timed: bool) -> KernelShape {
-    let wide = trials.iter().filter(|t| timed || t.shape.narrow == standard.narrow);
-    let narrow = trials.iter().filter(|t| timed || t.shape.wide == standard.wide);
-    KernelShape {
-        wide: least(wide.map(|t| (t.shape.wide, t.wide_ms)), standard.wide),
-        narrow: least(narrow.map(|t| (t.shape.narrow, t.narrow_ms)), standard.narrow),
-    }
+    let [(wide, _), (narrow, share_lanes), (tiles, tile_lanes)] = std::array::from_fn(|k| {
+        let standard_otherwise = |t: &&Trial| (0..3).all(|o| o == k || KINDS[o](t.shape) == KINDS[o](standard));
+        let judges = trials.iter().filter(|t| timed || standard_otherwise(t));
+        least(judges.map(|t| (KINDS[k](t.shape), t.ms[k])), KINDS[k](standard))
+    });
+    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes }
 }
 
 /// The size with the least time, the standard one preferred.
-fn least(times: impl Iterator<Item = (u32, f64)>, standard: u32) -> u32 {
-    let handicap = |size: u32| if size == standard { 1.0 - MARGIN } else { 1.0 };
+fn least(times: impl Iterator<Item = ((u32, u32), f64)>, standard: (u32, u32)) -> (u32, u32) {
+    let handicap = |size: (u32, u32)| if size == standard { 1.0 - MARGIN } else { 1.0 };
     times.min_by(|a, b| (a.1 * handicap(a.0)).total_cmp(&(b.1 * handicap(b.0)))).map_or(standard, |t| t.0)
 }
 
@@ -134,51 +194,67 @@ fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
     Ok(trainer)
 }
 
-/// One step: milliseconds of its wide and of its narrow kernels.
-fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 2], TrainError> {
+/// One step: milliseconds of each kind of its kernels.
+fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 3], TrainError> {
     let (start, before) = (Instant::now(), trainer.group_ms());
     trainer.step()?;
     if !timed {
-        return Ok([start.elapsed().as_secs_f64() * 1e3; 2]);
+        return Ok([start.elapsed().as_secs_f64() * 1e3; 3]);
     }
     let after = trainer.group_ms();
-    Ok([Group::Wide, Group::Narrow].map(|g| after[g as usize] - before[g as usize]))
+    let of = |group: Group| after[group as usize] - before[group as usize];
+    Ok([of(Group::Wide), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)])
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const STANDARD: KernelShape = KernelShape { wide: 64, narrow: 32 };
+    const STANDARD: KernelShape = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1 };
 
-    fn trial(wide: u32, narrow: u32, wide_ms: f64, narrow_ms: f64) -> Trial {
-        Trial { shape: KernelShape { wide, narrow }, wide_ms, narrow_ms }
+    fn trial(wide: u32, narrow: (u32, u32), tiles: (u32, u32), ms: [f64; 3]) -> Trial {
+        Trial { shape: with_tiles(with_narrow(KernelShape { wide, ..STANDARD }, narrow), tiles), ms }
     }
 
     #[test]
-    fn every_size_is_tried_and_with_timestamps_two_at_once() {
-        let (wide, narrow) = ([32, 64, 128, 256], [16, 32, 64]);
-        for (timed, count) in [(true, 4), (false, 6)] {
-            let all = shapes(&wide, &narrow, STANDARD, timed);
-            assert_eq!((all.len(), all[0]), (count, STANDARD));
-            assert!(wide.iter().all(|w| all.iter().any(|s| s.wide == *w)));
-            assert!(narrow.iter().all(|n| all.iter().any(|s| s.narrow == *n)));
+    fn every_size_is_tried_and_with_timestamps_one_of_each_kind_at_once() {
+        let all = Candidates {
+            wide: vec![32, 64, 128, 256],
+            narrow: vec![(16, 1), (32, 1), (16, 16), (32, 32)],
+            tiles: vec![(16, 1), (32, 1), (8, 4), (16, 4), (32, 4)],
+        };
+        for (timed, count) in [(true, 5), (false, 11)] {
+            let tried = shapes(&all, STANDARD, timed);
+            assert_eq!((tried.len(), tried[0]), (count, STANDARD));
+            assert!(all.wide.iter().all(|w| tried.iter().any(|s| s.wide == *w)));
+            assert!(all.narrow.iter().all(|n| tried.iter().any(|s| narrow(*s) == *n)));
+            assert!(all.tiles.iter().all(|t| tried.iter().any(|s| tiles(*s) == *t)));
+            assert_eq!(tried[1].tile_lanes, 4);
         }
     }
 
     #[test]
-    fn the_two_sizes_are_judged_apart() {
-        let timed = [trial(32, 16, 9.0, 1.0), trial(64, 32, 5.0, 5.0), trial(128, 64, 2.0, 7.0)];
-        assert_eq!(fastest(&timed, STANDARD, true), KernelShape { wide: 128, narrow: 16 });
-        // Whole steps: (128, 32) says nothing about narrow sizes.
-        let whole = [trial(64, 32, 5.0, 5.0), trial(128, 32, 2.0, 2.0), trial(64, 16, 4.0, 4.0)];
-        assert_eq!(fastest(&whole, STANDARD, false), KernelShape { wide: 128, narrow: 16 });
+    fn the_kinds_are_judged_apart() {
+        let timed = [
+            trial(32, (16, 1), (8, 4), [9.0, 1.0, 4.0]),
+            trial(64, (32, 1), (32, 1), [5.0, 5.0, 5.0]),
+            trial(128, (32, 32), (16, 4), [2.0, 7.0, 3.0]),
+        ];
+        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4");
+        // Whole steps: (128, …, (8, 4)) says nothing about narrow sizes, nor about tiles.
+        let whole = [
+            trial(64, (32, 1), (32, 1), [5.0; 3]),
+            trial(128, (32, 1), (8, 4), [1.0; 3]),
+            trial(64, (16, 16), (32, 1), [4.0; 3]),
+            trial(64, (32, 1), (8, 4), [3.0; 3]),
+        ];
+        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4");
     }
 
     #[test]
     fn a_gain_within_the_noise_changes_nothing() {
-        let close = [trial(64, 32, 10.0, 10.0), trial(128, 64, 9.8, 9.6)];
-        assert_eq!(fastest(&close, STANDARD, true), KernelShape { wide: 64, narrow: 64 });
+        let close = [trial(64, (32, 1), (32, 1), [10.0; 3]), trial(128, (32, 32), (8, 4), [9.8, 9.6, 9.8])];
+        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1");
         assert_eq!(fastest(&[], STANDARD, true), STANDARD);
     }
 }

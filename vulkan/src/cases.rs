@@ -34,6 +34,7 @@ macro_rules! promise_eq {
 pub mod device;
 pub mod extremes;
 pub mod half;
+pub mod instances;
 mod list;
 pub mod scenes;
 pub mod twin;

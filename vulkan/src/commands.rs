@@ -3,7 +3,7 @@
 
 use crate::arena::{Arena, Section};
 use crate::gpu::{Gpu, GpuError};
-use crate::kernels::{Group, KERNELS, Kernel};
+use crate::kernels::{GROUPS, Group, KERNELS, Kernel};
 use crate::pipelines::Pipelines;
 use crate::stages::{STAGE_NAMES, Stage};
 use ash::vk;
@@ -35,7 +35,7 @@ pub(crate) struct Commands {
     stage_ms: Cell<[f64; STAGE_NAMES.len()]>,
     /// What ran up to each timestamp; none where no kernel did.
     groups: [Cell<Option<Group>>; STAMPS],
-    group_ms: Cell<[f64; 3]>,
+    group_ms: Cell<[f64; GROUPS]>,
 }
 
 impl Drop for Commands {
@@ -74,7 +74,7 @@ impl Commands {
                 stages: [const { Cell::new(Stage::Target) }; STAMPS],
                 stage_ms: Cell::new([0.0; STAGE_NAMES.len()]),
                 groups: [const { Cell::new(None) }; STAMPS],
-                group_ms: Cell::new([0.0; 3]),
+                group_ms: Cell::new([0.0; GROUPS]),
             };
             let allocate = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
             made.buffer = device.allocate_command_buffers(&allocate).map_err(vulkan("vkAllocateCommandBuffers"))?[0];
@@ -89,13 +89,13 @@ impl Commands {
         self.stage_ms.get()
     }
 
-    /// Milliseconds that wide, narrow and scanning kernels took since they were last cleared (by `Group as usize`).
-    pub fn group_ms(&self) -> [f64; 3] {
+    /// Milliseconds that each kind of kernel took since they were last cleared (by `Group as usize`).
+    pub fn group_ms(&self) -> [f64; GROUPS] {
         self.group_ms.get()
     }
 
     pub fn clear_times(&self) {
-        self.group_ms.set([0.0; 3]);
+        self.group_ms.set([0.0; GROUPS]);
         self.stage_ms.set([0.0; STAGE_NAMES.len()]);
     }
 

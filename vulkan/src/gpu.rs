@@ -24,6 +24,8 @@ pub struct GpuInfo {
     pub is_cpu: bool,
     /// Invocations that run in lockstep.
     pub subgroup_size: u32,
+    /// Whether a kernel's lanes can read each other's registers (shuffle and vote, at least four lanes in lockstep).
+    pub shuffles: bool,
     /// Bytes of the largest device-local heap.
     pub heap_bytes: u64,
     /// Vulkan's numbers of the vendor and of the device.
@@ -40,6 +42,11 @@ impl GpuInfo {
         if self.is_cpu { SORT_LANES_SOFTWARE } else { SORT_LANES_GPU }
     }
 }
+
+/// What the kernels with several lanes per tile ask of a subgroup.
+const SHUFFLES: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::from_raw(
+    vk::SubgroupFeatureFlags::SHUFFLE.as_raw() | vk::SubgroupFeatureFlags::VOTE.as_raw(),
+);
 
 /// An opened device with its one compute queue. Cheap to clone; closed when the last clone is dropped.
 #[derive(Clone)]
@@ -196,6 +203,9 @@ fn devices(instance: &Instance) -> Result<Vec<Found>, GpuError> {
             version: (vk::api_version_major(p.api_version), vk::api_version_minor(p.api_version)),
             is_cpu: p.device_type == vk::PhysicalDeviceType::CPU,
             subgroup_size: subgroup.subgroup_size,
+            shuffles: subgroup.subgroup_size >= 4
+                && subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE)
+                && subgroup.supported_operations.contains(SHUFFLES),
             heap_bytes: heaps.map(|h| h.size).max().unwrap_or(0),
             ids: (p.vendor_id, p.device_id),
             driver_version: p.driver_version,

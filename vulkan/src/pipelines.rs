@@ -63,7 +63,7 @@ impl Pipelines {
     /// `own_degrees`: whether Gaussians have SH degrees of their own, or all the plan's.
     pub fn new(gpu: &Gpu, plan: &Plan, arena: &Arena, shape: KernelShape, own_degrees: bool) -> Result<Self, GpuError> {
         let limits = &gpu.info().limits;
-        limits.check_workgroup(shape.wide.max(shape.narrow).max(SCAN_LANES))?;
+        limits.check_workgroup(shape.largest_workgroup().max(SCAN_LANES))?;
         let device = gpu.device();
         let binding = |i: u32| {
             let kind = match i {
@@ -205,21 +205,33 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
+        let more_lanes = kernel.more_lanes.filter(|_| match kernel.group {
+            Group::Sort | Group::Walk => self.shape.share_lanes > 1,
+            _ => self.shape.tile_lanes > 1,
+        });
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` declares.
-        unsafe { self.gpu.compute_pipeline(kernel.name, kernel.spirv, self.layout, &special) }
+        unsafe { self.gpu.compute_pipeline(kernel.name, more_lanes.unwrap_or(kernel.spirv), self.layout, &special) }
     }
 
     fn local_size(&self, group: Group) -> u32 {
+        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes } = self.shape;
         match group {
-            Group::Wide => self.shape.wide,
-            Group::Narrow => self.shape.narrow,
+            Group::Wide => wide,
+            Group::Sort if share_lanes > 1 => SCAN_LANES,
+            Group::Sort | Group::Walk => narrow,
+            Group::Tiles => tiles * tile_lanes,
             Group::Scan => SCAN_LANES,
         }
     }
 
-    /// Workgroups that give `kernel` at least `lanes` lanes.
-    pub fn groups(&self, kernel: Kernel, lanes: usize) -> u32 {
-        (lanes as u32).div_ceil(self.local_size(KERNELS[kernel as usize].group)).max(1)
+    /// Workgroups that give `kernel` at least `count` lanes, tiles or shares, whichever it is dispatched over.
+    pub fn groups(&self, kernel: Kernel, count: usize) -> u32 {
+        let each = match KERNELS[kernel as usize].group {
+            Group::Tiles => self.shape.tiles,
+            Group::Sort | Group::Walk if self.shape.share_lanes > 1 => 1,
+            group => self.local_size(group),
+        };
+        (count as u32).div_ceil(each).max(1)
     }
 
     pub fn pipeline_of(&self, kernel: Kernel) -> vk::Pipeline {

@@ -1,44 +1,83 @@
-//! The workgroup sizes of the kernels: the one thing about them that is chosen per device. Every kernel works with any of
-//! the sizes here and leaves the same bits with each (`tests/shapes.rs`); only the time differs, and
-//! [`calibration`](crate::calibration) measures which is the fastest.
+//! The shape of the kernels: what about them is chosen per device. Every kernel works with any of the shapes here and leaves
+//! the same bits with each (`tests/shapes.rs`); only the time differs, and [`calibration`](crate::calibration) measures
+//! which is the fastest.
 
+use crate::constants::TILE_HEIGHT;
 use crate::gpu::GpuInfo;
+use std::fmt;
 
-/// Lanes of a workgroup, by kind of kernel. The two are independent: no kernel knows both.
+/// Sizes of workgroups, by kind of kernel, and who blends a tile. No kernel knows two of the kinds, so that each is chosen
+/// by itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct KernelShape {
-    /// Plain loops over Gaussians or pixels.
+    /// Lanes of a workgroup: plain loops over Gaussians or pixels.
     pub wide: u32,
-    /// Kernels whose lanes hold much state (a tile's pixels, a sorting lane's cursor) or are few.
+    /// Lanes of a workgroup: the kernels that sort, count and emit, each lane or workgroup its share of the Gaussians.
     pub narrow: u32,
+    /// Lanes that work on a share: 1, without a barrier, or all of a workgroup (sorting kernels then take 256).
+    pub share_lanes: u32,
+    /// Tiles of a workgroup: the blend and its gradient.
+    pub tiles: u32,
+    /// Lanes that share a tile: 1, with all its pixels in registers, or one per row.
+    pub tile_lanes: u32,
 }
 
 /// Sizes worth trying. All divide the lanes that the looping kernels are written for (`config::plan::LOOP_LANES` and
 /// `SORT_LANES_*`), so that no lane runs beyond them.
 const WIDE: [u32; 4] = [32, 64, 128, 256];
 const NARROW: [u32; 3] = [8, 16, 32];
+const TILES: [u32; 3] = [8, 16, 32];
 
 impl KernelShape {
     /// What is used where nothing was measured.
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
-        Self { wide: 64, narrow: if info.is_cpu { 8 } else { 32 } }
+        let few = if info.is_cpu { 8 } else { 32 };
+        Self { wide: 64, narrow: few, share_lanes: 1, tiles: few, tile_lanes: 1 }
     }
 
     /// Sizes of wide workgroups that this device can run and that fill its subgroups, the standard one among them.
     pub fn wide_candidates(info: &GpuInfo) -> Vec<u32> {
-        candidates(&WIDE, Self::standard(info).wide, info)
+        candidates(&WIDE, Self::standard(info).wide, 1, info)
     }
 
-    /// The same for narrow workgroups.
-    pub fn narrow_candidates(info: &GpuInfo) -> Vec<u32> {
-        candidates(&NARROW, Self::standard(info).narrow, info)
+    /// Narrow workgroups and lanes of a share, under the same conditions; those with one lane per share first.
+    pub fn narrow_candidates(info: &GpuInfo) -> Vec<(u32, u32)> {
+        let sizes = candidates(&NARROW, Self::standard(info).narrow, 1, info);
+        // Not in software: barriers cost more there than lanes are worth, and llvmpipe bounds the turns of a loop.
+        let groups = sizes.clone().into_iter().filter(|_| !info.is_cpu);
+        sizes.into_iter().map(|n| (n, 1)).chain(groups.map(|n| (n, n))).collect()
     }
 
-    /// Whether the kernels are written for these sizes and the device can run them.
+    /// Tiles of a workgroup and lanes of a tile, under the same conditions; those with one lane per tile first.
+    pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32)> {
+        let standard = Self::standard(info).tiles;
+        let mut all: Vec<_> = candidates(&TILES, standard, 1, info).into_iter().map(|n| (n, 1)).collect();
+        if info.shuffles {
+            all.extend(candidates(&TILES, 0, TILE_HEIGHT, info).into_iter().map(|n| (n, TILE_HEIGHT)));
+        }
+        all
+    }
+
+    /// Whether the kernels are written for this shape and the device can run it.
     pub fn fits(&self, info: &GpuInfo) -> bool {
-        let limit = info.limits.workgroup_lanes;
-        WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && self.wide.max(self.narrow) <= limit
+        let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && TILES.contains(&self.tiles);
+        let rows = self.tile_lanes == 1 || (self.tile_lanes == TILE_HEIGHT && info.shuffles);
+        let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
+        sizes && rows && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
+    }
+
+    /// Lanes of its largest workgroup.
+    pub(crate) fn largest_workgroup(&self) -> u32 {
+        self.wide.max(self.narrow).max(self.tiles.saturating_mul(self.tile_lanes))
+    }
+}
+
+/// As `config::kernels::VARIABLE` takes it.
+impl fmt::Display for KernelShape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes } = self;
+        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}")
     }
 }
 
@@ -47,9 +86,9 @@ pub fn kernels_fingerprint() -> u64 {
     crate::kernels::fingerprint()
 }
 
-/// Less than a subgroup leaves lanes idle.
-fn candidates(sizes: &[u32], standard: u32, info: &GpuInfo) -> Vec<u32> {
-    let usable = |n: u32| n <= info.limits.workgroup_lanes && n >= info.subgroup_size;
+/// Sizes whose workgroups of `lanes` each the device can run; less than a subgroup leaves lanes idle.
+fn candidates(sizes: &[u32], standard: u32, lanes: u32, info: &GpuInfo) -> Vec<u32> {
+    let usable = |n: u32| n * lanes <= info.limits.workgroup_lanes && n * lanes >= info.subgroup_size;
     sizes.iter().copied().filter(|n| *n == standard || usable(*n)).collect()
 }
 
@@ -65,6 +104,7 @@ mod tests {
             version: (1, 1),
             is_cpu,
             subgroup_size,
+            shuffles: subgroup_size >= 16,
             heap_bytes: 1 << 30,
             ids: (1, 2),
             driver_version: 3,
@@ -76,28 +116,47 @@ mod tests {
     fn candidates_respect_the_limits_and_fill_subgroups() {
         let lavapipe = device(true, 8, 1024);
         assert_eq!(KernelShape::wide_candidates(&lavapipe), WIDE);
-        assert_eq!(KernelShape::narrow_candidates(&lavapipe), NARROW);
+        assert_eq!(KernelShape::narrow_candidates(&lavapipe), NARROW.map(|n| (n, 1)));
         let pi5 = device(false, 16, 256);
-        assert_eq!(KernelShape::narrow_candidates(&pi5), [16, 32]);
+        assert_eq!(KernelShape::narrow_candidates(&pi5), [(16, 1), (32, 1), (16, 16), (32, 32)]);
         let turnip = device(false, 128, 1024);
         assert_eq!(KernelShape::wide_candidates(&turnip), [64, 128, 256]);
-        assert_eq!(KernelShape::narrow_candidates(&turnip), [32], "the standard one remains");
+        assert_eq!(KernelShape::narrow_candidates(&turnip), [(32, 1), (32, 32)], "the standard one remains");
         assert_eq!(KernelShape::wide_candidates(&device(false, 32, 128)), [32, 64, 128]);
+    }
+
+    #[test]
+    fn several_lanes_per_tile_are_tried_only_where_lanes_can_read_each_other() {
+        assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1), (16, 1), (32, 1)]);
+        let pi5 = device(false, 16, 256);
+        assert_eq!(KernelShape::tile_candidates(&pi5), [(16, 1), (32, 1), (8, 4), (16, 4), (32, 4)]);
+        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [(32, 1), (16, 4), (32, 4)]);
+        let rows = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 4 };
+        assert!(rows.fits(&pi5) && !rows.fits(&device(false, 8, 256)));
+        assert!(!KernelShape { tile_lanes: 2, ..rows }.fits(&pi5));
+        assert!(!KernelShape { share_lanes: 16, ..rows }.fits(&pi5));
+        assert_eq!(rows.to_string(), "64x32x32x8x4");
     }
 
     #[test]
     fn every_candidate_fits_and_divides_the_lanes_of_the_loops() {
         for info in [device(true, 8, 1024), device(false, 64, 256), device(false, 4, 128)] {
             let (wide, narrow) = (KernelShape::wide_candidates(&info), KernelShape::narrow_candidates(&info));
-            for (wide, narrow) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
-                assert!(KernelShape { wide, narrow }.fits(&info));
+            let tiles = KernelShape::tile_candidates(&info);
+            for (wide, (narrow, share_lanes)) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
+                assert!(tiles.iter().all(|(tiles, tile_lanes)| {
+                    KernelShape { wide, narrow, share_lanes, tiles: *tiles, tile_lanes: *tile_lanes }.fits(&info)
+                }));
                 assert_eq!(LOOP_LANES % u64::from(wide), 0);
                 assert_eq!((SORT_LANES_GPU % narrow, SORT_LANES_SOFTWARE % narrow), (0, 0));
             }
         }
         let info = device(false, 32, 128);
-        for (wide, narrow) in [(256, 32), (64, 0), (48, 32), (64, 64), (0, 8)] {
-            assert!(!KernelShape { wide, narrow }.fits(&info), "{wide} {narrow}");
+        for (wide, narrow, tiles) in
+            [(256, 32, 8), (64, 0, 8), (48, 32, 8), (64, 64, 8), (0, 8, 8), (64, 8, 9), (64, 8, 0), (64, 8, u32::MAX)]
+        {
+            let shape = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1 };
+            assert!(!shape.fits(&info), "{shape}");
         }
     }
 }

@@ -29,7 +29,7 @@ pub use rows::LoadReport;
 use crate::arena::Arena;
 use crate::commands::{Commands, Push, Recording};
 use crate::gpu::Gpu;
-use crate::kernels::Kernel;
+use crate::kernels::{GROUPS, Kernel};
 use crate::pipelines::Pipelines;
 use crate::shape::KernelShape;
 use crate::stages::STAGE_NAMES;
@@ -240,8 +240,8 @@ impl Trainer {
         std::array::from_fn(|i| (STAGE_NAMES[i], ms[i]))
     }
 
-    /// Device milliseconds of the wide, the narrow and the scanning kernels since `load`; zeros without timestamps.
-    pub(crate) fn group_ms(&self) -> [f64; 3] {
+    /// Device milliseconds of each kind of kernel since `load` (by `Group as usize`); zeros without timestamps.
+    pub(crate) fn group_ms(&self) -> [f64; GROUPS] {
         self.commands.group_ms()
     }
 

@@ -4,25 +4,13 @@
 
 mod scenes;
 
-use config::plan::{Plan, PlanRequest, sh_columns};
+use config::plan::{Plan, sh_columns};
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
+use vulkan::cases::half::request;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::Trainer;
-
-fn request(half_moments: bool) -> PlanRequest {
-    PlanRequest {
-        device_mib: 64,
-        width: 64,
-        height: 48,
-        views: 2,
-        sh_degree: 3,
-        max_gaussians: Some(512),
-        half_moments,
-        ..Default::default()
-    }
-}
 
 fn open() -> Option<Gpu> {
     Gpu::open(None).map_err(|e| println!("skipped: {e}")).ok()

@@ -2,7 +2,7 @@
 //! promises hold for the twin (`numerical_twin.rs`).
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
-use vulkan::cases::{ELSEWHERE, Outcome, device, extremes, half};
+use vulkan::cases::{ELSEWHERE, Outcome, device, extremes, half, instances};
 use vulkan::gpu::Gpu;
 
 fn on_device(case: impl Fn(&Gpu) -> Outcome) {
@@ -50,6 +50,20 @@ held! { extremes:
 held! { half:
     training_with_half_moments_ends_where_training_with_whole_ones_does
     tiny_and_huge_gradients_in_half_moments_leave_every_number_finite
+}
+
+held! { instances:
+    more_tiles_than_instances_leave_the_other_tiles_empty
+    every_shape_emits_exactly_the_instances_it_was_counted_for
+    a_tile_with_more_gaussians_than_a_loop_may_turn_leaves_those_behind_alone
+    a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient
+    light_and_contributions_below_sixteen_bits_are_still_summed
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn more_instances_than_thirty_two_bits_count_are_drawn() {
+    on_device(instances::more_instances_than_thirty_two_bits_count);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Numbers that broke other renderers, through the twin's whole step: one test per case of `vulkan::cases`.
 #![allow(clippy::panic, reason = "a test fails by panicking")]
 
-use vulkan::cases::{half, twin};
+use vulkan::cases::{half, instances, twin};
 
 macro_rules! held {
     ($module:ident: $($name:ident)*) => {$(
@@ -33,4 +33,9 @@ held! { twin:
 held! { half:
     second_moments_in_sixteen_bits_are_right_on_average_only_when_rounded_by_chance
     moments_beyond_sixteen_bits_are_clamped_and_those_below_are_none
+}
+
+held! { instances:
+    more_tiles_than_instances_leave_the_other_tiles_empty_in_the_twin
+    light_and_contributions_below_sixteen_bits_are_still_summed_in_the_twin
 }

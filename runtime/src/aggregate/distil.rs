@@ -21,6 +21,7 @@ use vulkan::trainer::{Rendering, RunBudget, Trainer};
 use super::merge::{Merged, opacity};
 use super::seam::Seams;
 use super::{AggregateError, LocalModel};
+use crate::kernels;
 
 /// Views of each aircraft kept as pictures for the report.
 const SAMPLES_PER_MODEL: usize = 1;
@@ -134,7 +135,8 @@ pub fn distil(
     report.over_plan = merged.keep_most_important(plan.gaussians);
     report.device = gpu.info().name.clone();
     let steps = settings.epochs.saturating_mul(lessons.len() as u32);
-    let mut trainer = Trainer::new(&gpu, &plan, &recipe(settings, merged.cloud.sh_degree, steps))?;
+    let mut trainer =
+        Trainer::with_shape(&gpu, &plan, &recipe(settings, merged.cloud.sh_degree, steps), kernels::shape_of(&gpu))?;
     report.device_bytes = [plan.total_bytes, trainer.device_bytes()];
 
     let start = Instant::now();

@@ -16,8 +16,8 @@ pub struct Args {
     /// Also check this network manifest (may be given more than once).
     #[arg(long, value_name = "FILE")]
     pub model: Vec<PathBuf>,
-    /// Measure anew which workgroup sizes are the fastest on each Vulkan device, and remember them. Hardware is measured at
-    /// its first training anyway, software renderers only here.
+    /// Measure anew which shape of the kernels is the fastest on each Vulkan device, and remember it. Hardware is measured
+    /// at its first training anyway, software renderers only here.
     #[arg(long)]
     pub calibrate: bool,
 }
@@ -55,7 +55,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 let text =
                     format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
                 tell("vulkan", Finding::Ok(text));
-                tell("kernels", workgroups(&d, args.calibrate));
+                tell("kernels", kernel_shape(&d, args.calibrate));
             }
         }
     }
@@ -104,14 +104,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
 }
 
-/// Which workgroup sizes are in use on a device, and why.
-fn workgroups(info: &GpuInfo, calibrate: bool) -> Finding {
+/// Which shape of the kernels is in use on a device, and why.
+fn kernel_shape(info: &GpuInfo, calibrate: bool) -> Finding {
     let measured = match calibrate {
         true => Gpu::open(Some(&info.name)).ok().and_then(|gpu| kernels::measure(&gpu)),
         false => None,
     };
     if calibrate && measured.is_none() {
-        return Finding::Note("workgroup sizes could not be measured; the default is used".to_owned());
+        return Finding::Note("kernels could not be measured; the default shape is used".to_owned());
     }
     let (shape, source) = measured.unwrap_or_else(|| kernels::known(info));
     let why = match source {
@@ -119,12 +119,14 @@ fn workgroups(info: &GpuInfo, calibrate: bool) -> Finding {
         Source::Kept(path) => format!("measured, kept in {}", path.display()),
         Source::Measured => "measured, not kept".to_owned(),
         Source::Standard if KernelChoice::from_environment() == Ok(KernelChoice::Calibrated) => match info.is_cpu {
-            true => "default; dgtr doctor --calibrate measures them, in a minute or so".to_owned(),
-            false => "default until the first training or dgtr doctor --calibrate measures them".to_owned(),
+            true => "default; dgtr doctor --calibrate measures it, in minutes".to_owned(),
+            false => "default until the first training or dgtr doctor --calibrate measures it".to_owned(),
         },
         Source::Standard => format!("default, by {VARIABLE}"),
     };
-    Finding::Ok(format!("workgroups of {} and {} lanes ({why})", shape.wide, shape.narrow))
+    let lanes = |n: u32| if n == 1 { "one lane" } else { "several" };
+    let (share, tile) = (lanes(shape.share_lanes), lanes(shape.tile_lanes));
+    Finding::Ok(format!("shape {shape}: {share} per share of the Gaussians, {tile} per tile ({why})"))
 }
 
 /// Ports an autopilot may hang on, and whether this user may open them.

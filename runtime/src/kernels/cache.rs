@@ -33,6 +33,9 @@ struct Entry {
     kernels: String,
     wide: u32,
     narrow: u32,
+    share_lanes: u32,
+    tiles: u32,
+    tile_lanes: u32,
 }
 
 impl Entry {
@@ -45,11 +48,15 @@ impl Entry {
             kernels: format!("{:016x}", kernels_fingerprint()),
             wide: shape.wide,
             narrow: shape.narrow,
+            share_lanes: shape.share_lanes,
+            tiles: shape.tiles,
+            tile_lanes: shape.tile_lanes,
         }
     }
 
     fn shape(&self) -> KernelShape {
-        KernelShape { wide: self.wide, narrow: self.narrow }
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, .. } = *self;
+        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes }
     }
 
     fn is_device(&self, other: &Self) -> bool {
@@ -74,7 +81,7 @@ pub(super) fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, F
     let found = kept.device.iter().rev().find(|e| **e == Entry::of(info, e.shape()));
     match found.map(Entry::shape) {
         Some(shape) if !shape.fits(info) => {
-            let what = format!("{}: {}x{} is no shape this device can run", info.name, shape.wide, shape.narrow);
+            let what = format!("{}: {shape} is no shape this device can run", info.name);
             Err(FormatError::Invalid { path: path.into(), what })
         }
         shape => Ok(shape),
@@ -94,7 +101,7 @@ pub(super) fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(
     kept.device.drain(..over);
     let text = toml::to_string(&kept).map_err(|e| FormatError::Invalid { path: path.into(), what: e.to_string() })?;
     write_atomic(path, |out| {
-        writeln!(out, "# Workgroup sizes measured by dgtr (`dgtr doctor --calibrate`); may be deleted.")?;
+        writeln!(out, "# Shapes of kernels measured by dgtr (`dgtr doctor --calibrate`); may be deleted.")?;
         out.write_all(text.as_bytes())
     })
 }
@@ -114,7 +121,8 @@ mod tests {
     use super::*;
     use vulkan::gpu::DeviceLimits;
 
-    const SHAPE: KernelShape = KernelShape { wide: 128, narrow: 16 };
+    const SHAPE: KernelShape = KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4 };
+    const OTHER: KernelShape = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1 };
 
     fn device(name: &str) -> GpuInfo {
         GpuInfo {
@@ -122,6 +130,7 @@ mod tests {
             version: (1, 3),
             is_cpu: false,
             subgroup_size: 16,
+            shuffles: true,
             heap_bytes: 1 << 30,
             ids: (0x14e4, 42),
             driver_version: 7,
@@ -136,9 +145,9 @@ mod tests {
         let (a, b) = (device("V3D \"7.1\""), device("llvmpipe"));
         assert_eq!(read(&path, &a).unwrap(), None);
         write(&path, &a, SHAPE).unwrap();
-        write(&path, &b, KernelShape { wide: 32, narrow: 8 }).unwrap();
+        write(&path, &b, OTHER).unwrap();
         assert_eq!(read(&path, &a).unwrap(), Some(SHAPE));
-        assert_eq!(read(&path, &b).unwrap(), Some(KernelShape { wide: 32, narrow: 8 }));
+        assert_eq!(read(&path, &b).unwrap(), Some(OTHER));
     }
 
     #[test]
@@ -149,8 +158,8 @@ mod tests {
         let new = GpuInfo { driver_version: 8, ..old.clone() };
         write(&path, &old, SHAPE).unwrap();
         assert_eq!(read(&path, &new).unwrap(), None);
-        write(&path, &new, KernelShape { wide: 64, narrow: 32 }).unwrap();
-        assert_eq!(read(&path, &new).unwrap(), Some(KernelShape { wide: 64, narrow: 32 }));
+        write(&path, &new, OTHER).unwrap();
+        assert_eq!(read(&path, &new).unwrap(), Some(OTHER));
         assert_eq!(read(&path, &old).unwrap(), None);
         let fingerprint = format!("{:016x}", kernels_fingerprint());
         let text = std::fs::read_to_string(&path).unwrap();

@@ -13,10 +13,9 @@ use config::training::TrainSettings;
 use models::cloud::GaussianCloud;
 use rand::{Rng, SeedableRng};
 
-/// Loss and Gaussians after `steps` steps on two photographs of noise.
-fn train(gpu: &Gpu, half_moments: bool, c: &GaussianCloud, steps: u32) -> Result<(f32, GaussianCloud), Broken> {
-    let v = view(64, 48);
-    let request = PlanRequest {
+/// Room for 512 Gaussians and two pictures of 64×48.
+pub fn request(half_moments: bool) -> PlanRequest {
+    PlanRequest {
         device_mib: 64,
         width: 64,
         height: 48,
@@ -25,8 +24,13 @@ fn train(gpu: &Gpu, half_moments: bool, c: &GaussianCloud, steps: u32) -> Result
         max_gaussians: Some(512),
         half_moments,
         ..Default::default()
-    };
-    let mut t = Trainer::new(gpu, &Plan::new(&request)?, &TrainSettings { seed: 3, ..plain() })?;
+    }
+}
+
+/// Loss and Gaussians after `steps` steps on two photographs of noise.
+fn train(gpu: &Gpu, half_moments: bool, c: &GaussianCloud, steps: u32) -> Result<(f32, GaussianCloud), Broken> {
+    let v = view(64, 48);
+    let mut t = Trainer::new(gpu, &Plan::new(&request(half_moments))?, &TrainSettings { seed: 3, ..plain() })?;
     t.load(c)?;
     let mut turned = posed(&v, &photo(2, &v));
     turned.view.pose.rotation = glam::DQuat::from_rotation_y(0.2);

@@ -1,6 +1,6 @@
 //! The table of contents: every case with its promise, and where the cases live that are not the renderer's.
 
-use super::{Case, device, extremes, half, twin};
+use super::{Case, device, extremes, half, instances, twin};
 
 macro_rules! case {
     ($input:literal, $promise:literal, $device:expr, $twin:expr) => {
@@ -137,6 +137,36 @@ pub const CASES: &[Case] = &[
         None
     ),
     case!(
+        "more tiles than instances",
+        "the other tiles stay empty",
+        Some(instances::more_tiles_than_instances_leave_the_other_tiles_empty),
+        Some(instances::more_tiles_than_instances_leave_the_other_tiles_empty_in_the_twin)
+    ),
+    case!(
+        "count pass ≠ emit pass",
+        "a plan for exactly the counted instances holds them",
+        Some(instances::every_shape_emits_exactly_the_instances_it_was_counted_for),
+        None
+    ),
+    case!(
+        "70,000 Gaussians in one tile",
+        "those behind the opaque ones stay as they are",
+        Some(instances::a_tile_with_more_gaussians_than_a_loop_may_turn_leaves_those_behind_alone),
+        None
+    ),
+    case!(
+        "one Gaussian over 70,400 tiles",
+        "its gradient is the sum over all",
+        Some(instances::a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient),
+        None
+    ),
+    case!(
+        "T·α below f16",
+        "summed: transmittance is kept in 32 bits",
+        Some(instances::light_and_contributions_below_sixteen_bits_are_still_summed),
+        Some(instances::light_and_contributions_below_sixteen_bits_are_still_summed_in_the_twin)
+    ),
+    case!(
         "f16 storage of moments against f32",
         "the same loss, the same bytes every time; right on average",
         Some(half::training_with_half_moments_ends_where_training_with_whole_ones_does),
@@ -157,6 +187,21 @@ pub const ELSEWHERE: &[(&str, &str, &str)] = &[
         "more instances than the buffer",
         "vulkan/tests/bands.rs",
         "instances_beyond_the_plan_are_blended_in_bands_with_identical_bits",
+    ),
+    (
+        "more than 2³¹ and 2³² instances: cutting",
+        "vulkan/src/trainer/bands.rs",
+        "more_than_two_to_the_thirty_second_instances_are_counted_and_cut_without_wrapping",
+    ),
+    (
+        "more than 2³² instances: a whole step",
+        "vulkan/tests/numerical_gpu.rs",
+        "more_instances_than_thirty_two_bits_count_are_drawn",
+    ),
+    (
+        "(L−min)/(max−min) = 0/0",
+        "vulkan/src/trainer/sampler.rs",
+        "views_of_equal_or_unknown_loss_are_ranked_never_divided",
     ),
     (
         "more loop turns than the driver allows",

@@ -15,6 +15,7 @@ use crate::twin::gaussian::Gaussian;
 use crate::twin::loss::{Exposure, Target};
 use crate::twin::project::{Culled, Limits};
 use crate::twin::rasterise::Pixel;
+use crate::twin::real::Real;
 use crate::twin::step::{ViewGradient, backward, forward};
 use config::plan::{Plan, PlanRequest};
 use config::training::{
@@ -60,18 +61,18 @@ pub fn photo(seed: u64, view: &View) -> Vec<[f32; 3]> {
 }
 
 /// What the twin makes of a scene.
-pub struct Answer {
+pub struct Answer<R = f32> {
     /// The picture, row by row.
-    pub picture: Vec<Pixel<f32>>,
+    pub picture: Vec<Pixel<R>>,
     /// Gaussian–tile instances.
     pub instances: usize,
     /// Why each Gaussian was not drawn.
     pub culled: Vec<Option<Culled>>,
     /// Loss and every gradient.
-    pub gradient: ViewGradient<f32>,
+    pub gradient: ViewGradient<R>,
 }
 
-impl Answer {
+impl<R: Real> Answer<R> {
     /// How many Gaussians were not drawn for this reason.
     pub fn count(&self, why: Culled) -> usize {
         self.culled.iter().filter(|c| **c == Some(why)).count()
@@ -94,13 +95,24 @@ impl Answer {
 
 /// The twin's full step before the optimiser, in f32, with the shaders' limits.
 pub fn answer(cloud: &GaussianCloud, view: &View, photo: &[[f32; 3]], settings: &LossSettings) -> Answer {
-    let gaussians = Gaussian::<f32>::of_cloud(cloud);
-    let camera = Camera::<f32>::of(view);
+    answer_in(cloud, view, photo, settings)
+}
+
+/// The same in the arithmetic of choice.
+pub fn answer_in<R: Real>(
+    cloud: &GaussianCloud,
+    view: &View,
+    photo: &[[f32; 3]],
+    settings: &LossSettings,
+) -> Answer<R> {
+    let gaussians = Gaussian::<R>::of_cloud(cloud);
+    let camera = Camera::<R>::of(view);
     let limits = Limits::default();
-    let all = |_: usize| 1.0;
+    let all = |_: usize| R::ONE;
     let degree = |_: usize| cloud.sh_degree;
     let rendered = forward(&gaussians, &camera, degree, all, &limits);
-    let target = Target { width: view.intrinsics.width as usize, rgb: photo, depth: None, background: [0.0; 3] };
+    let rgb: Vec<_> = photo.iter().map(|p| p.map(|v| R::of(v.into()))).collect();
+    let target = Target { width: view.intrinsics.width as usize, rgb: &rgb, depth: None, background: [R::ZERO; 3] };
     let exposure = Exposure::default();
     let gradient = backward(&gaussians, &camera, degree, all, &limits, &rendered, &target, &exposure, settings);
     Answer {

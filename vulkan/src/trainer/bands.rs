@@ -79,32 +79,79 @@ impl Trainer {
             self.record_tiles(&recording);
             recording.submit()?;
         }
-        let tiles = self.frame.tiles();
         let status = self.arena.slice::<u32>(self.arena.section("status"));
         let (visible, total) = (status[0] as usize, status[1]);
-        self.bands.clear();
-        if total as usize <= self.plan.instances && total != u32::MAX {
-            self.bands.push(Band { first: 0, last: tiles });
-            return Ok(Counted { visible, instances: total.into() });
-        }
         let starts = self.arena.slice::<u32>(self.arena.section("tile_starts"));
-        let (mut first, mut held, mut instances) = (0u32, 0usize, 0u64);
-        for t in 0..tiles {
-            // Starts wrap at 2^32; a single tile's count does not.
-            let count = starts[t as usize + 1].wrapping_sub(starts[t as usize]) as usize;
-            instances += count as u64;
-            if held + count > self.plan.instances && t > first {
-                self.bands.push(Band { first, last: t });
-                (first, held) = (t, 0);
-            }
-            held += count;
-        }
-        self.bands.push(Band { first, last: tiles });
-        Ok(Counted { visible, instances })
+        let starts = &starts[..=self.frame.tiles() as usize];
+        Ok(Counted { visible, instances: cut(starts, total, self.plan.instances, &mut self.bands) })
     }
 
     fn walk_is_complete(&self) -> bool {
         let status = self.arena.slice::<u32>(self.arena.section("status"));
         (0..self.plan.sort_lanes as usize).all(|lane| status[WALK_CURSORS + 4 * lane + 3] == 1)
+    }
+}
+
+/// Consecutive tiles with at most `capacity` instances each (or one tile alone), and how many instances there are in all.
+/// `starts`: the first instance of every tile, and the end, modulo 2^32; `total`: their number, 2^32 - 1 when it is more.
+fn cut(starts: &[u32], total: u32, capacity: usize, bands: &mut Vec<Band>) -> u64 {
+    let tiles = starts.len() as u32 - 1;
+    bands.clear();
+    if total as usize <= capacity && total != u32::MAX {
+        bands.push(Band { first: 0, last: tiles });
+        return total.into();
+    }
+    let (mut first, mut held, mut instances) = (0u32, 0usize, 0u64);
+    for (t, ends) in (0u32..).zip(starts.windows(2)) {
+        // A single tile's count does not wrap: there are fewer Gaussians than 2^32.
+        let count = ends[1].wrapping_sub(ends[0]) as usize;
+        instances += count as u64;
+        if held + count > capacity && t > first {
+            bands.push(Band { first, last: t });
+            (first, held) = (t, 0);
+        }
+        held += count;
+    }
+    bands.push(Band { first, last: tiles });
+    instances
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Starts modulo 2^32 and the saturated total, as `tile_scan` leaves them.
+    fn scanned(counts: &[u32]) -> (Vec<u32>, u32) {
+        let mut starts = vec![0u32];
+        counts.iter().for_each(|c| starts.push(starts[starts.len() - 1].wrapping_add(*c)));
+        (starts, counts.iter().fold(0, |sum: u32, c| sum.saturating_add(*c)))
+    }
+
+    #[test]
+    fn every_tile_is_in_one_band_and_no_band_holds_more_than_the_plan() {
+        for (counts, capacity, expected) in [
+            (vec![3, 0, 4, 5], 100, vec![(0, 4)]),
+            (vec![3, 0, 4, 5], 12, vec![(0, 4)]),
+            (vec![3, 0, 4, 5], 7, vec![(0, 3), (3, 4)]),
+            (vec![3, 0, 4, 5], 5, vec![(0, 2), (2, 3), (3, 4)]),
+            (vec![0; 3], 5, vec![(0, 3)]),
+        ] {
+            let (starts, total) = scanned(&counts);
+            let mut bands = Vec::new();
+            assert_eq!(cut(&starts, total, capacity, &mut bands), u64::from(counts.iter().sum::<u32>()));
+            assert_eq!(bands, expected.into_iter().map(|(first, last)| Band { first, last }).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn more_than_two_to_the_thirty_second_instances_are_counted_and_cut_without_wrapping() {
+        // 2^31 + 1, then 2^32 and a bit more than that, which modulo 2^32 looks like little.
+        for (tiles, of_each) in [(2049, 1 << 20), (4096, 1 << 20), (4097, 1 << 20), (3, u32::MAX / 2 + 1)] {
+            let (starts, total) = scanned(&vec![of_each; tiles]);
+            let mut bands = Vec::new();
+            let counted = cut(&starts, total, of_each as usize, &mut bands);
+            assert_eq!(counted, tiles as u64 * u64::from(of_each));
+            assert!(bands.len() == tiles && bands.iter().all(|b| b.last == b.first + 1));
+        }
     }
 }

@@ -53,3 +53,30 @@ impl Sampler {
         self.order.pop().map_or(0, |v| v as usize)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Visits to each of `views` in one epoch with half as many extra visits.
+    fn visits(views: usize, loss: impl Fn(usize) -> f32 + Copy) -> Vec<usize> {
+        let mut sampler = Sampler::new(7, views);
+        let mut visits = vec![0; views];
+        (0..views + views / 2).for_each(|_| visits[sampler.next(views, 0.5, loss)] += 1);
+        visits
+    }
+
+    #[test]
+    fn views_of_equal_or_unknown_loss_are_ranked_never_divided() {
+        // (L - min) / (max - min) would be 0/0: the extra visits go to the first views, each of which is there once anyway.
+        for loss in [0.0, 0.25, f32::INFINITY, f32::NAN] {
+            assert_eq!(visits(4, |_| loss), [2, 2, 1, 1], "{loss}");
+        }
+        assert_eq!(visits(1, |_| 0.0), [1]);
+    }
+
+    #[test]
+    fn extra_visits_go_to_the_largest_losses() {
+        assert_eq!(visits(4, |v| [0.1, 0.4, 0.2, 0.3][v]), [1, 2, 1, 2]);
+    }
+}

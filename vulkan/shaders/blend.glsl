@@ -1,0 +1,62 @@
+// Blends colour and depth front to back: C = sum c a T + T_end background, D = sum z a T (paper, depth equation).
+
+layout(set = 0, binding = 9) uniform samplerBuffer shaded;
+layout(set = 0, binding = 10) uniform usamplerBuffer instances;
+layout(std430, set = 0, binding = 1) buffer Starts { uint starts[]; };
+layout(std430, set = 0, binding = 2) writeonly buffer Image { vec4 image[]; };
+layout(std430, set = 0, binding = 3) writeonly buffer Transmittance { float transmittance[]; };
+
+void main() {
+    uint t = tile_of_lane();
+    if (t >= push.last) return;
+    uint base = starts[push.first], first = starts[t] - base, end = starts[t + 1u] - base;
+    int own_row = row_of_lane();
+    ivec2 corner_pixel = tile_origin(t), origin = corner_pixel + ivec2(0, own_row);
+    vec2 corner = vec2(corner_pixel) + 0.5;
+    float T[PIXELS];
+    vec4 sum[PIXELS];
+    // A negative transmittance marks a finished pixel.
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        T[k] = pixel_inside(origin, k) ? 1.0 : -1.0;
+        sum[k] = vec4(0.0);
+    }
+    uint i = first;
+    bool live = true;
+    WHILE (i < end && live) {
+        float most = -1.0;
+        IF (i < end && live) {
+            int r = int(texelFetch(instances, int(i)).x) * 3;
+            vec4 s0 = texelFetch(shaded, r), s1 = texelFetch(shaded, r + 1), s2 = texelFetch(shaded, r + 2);
+            vec4 value = vec4(s2.xyz, s0.z);
+            vec2 d = corner - s0.xy;
+            [[unroll]] for (int y = 0; y < ROWS; y++) {
+                float dy = d.y + float(own_row + y), along = s1.y * dy, rest = fma(s1.z * dy, dy, s0.w);
+                [[unroll]] for (int x = 0; x < TILE_WIDTH; x++) {
+                    int k = y * TILE_WIDTH + x;
+                    float dx = d.x + float(x);
+                    float alpha = min(exp2(min(fma(dx, fma(s1.x, dx, along), rest), s0.w)), ALPHA_MAX);
+                    alpha = alpha >= ALPHA_MIN ? alpha : 0.0;
+                    float weight = alpha * T[k];
+                    float next = T[k] - weight;
+                    bool taken = next >= TRANSMITTANCE_MIN;
+                    weight = taken ? weight : 0.0;
+                    T[k] = taken ? next : -abs(T[k]);
+                    sum[k] += weight * value;
+                    most = max(most, T[k]);
+                }
+            }
+            i++;
+        }
+        live = most_of_tile(most) > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
+    }
+    // Counted work: how many Gaussians were blended before the tile was opaque.
+    if (own_row == 0) starts[frame.window.z * frame.window.w + 1u + t] = i - first;
+    [[unroll]] for (int k = 0; k < PIXELS; k++) {
+        if (pixel_inside(origin, k)) {
+            uint at = pixel_index(origin, k);
+            float left = abs(T[k]);
+            image[at] = sum[k] + vec4(left * frame.background.xyz, 0.0);
+            transmittance[at] = left;
+        }
+    }
+}

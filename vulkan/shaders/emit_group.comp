@@ -1,0 +1,54 @@
+#version 450
+// As emit.comp, with a workgroup instead of a lane for each share of the Gaussians: one Gaussian after another, in depth
+// order, and of each a row of tiles per lane, so that every instance gets the place and the slot it always gets.
+#extension GL_GOOGLE_include_directive : require
+#include "frame.glsl"
+#include "spans.glsl"
+#include "walk.glsl"
+
+layout(set = 0, binding = 9) uniform samplerBuffer projected;
+layout(set = 0, binding = 10) uniform usamplerBuffer order;
+layout(set = 0, binding = 11) uniform usamplerBuffer starts;
+// Coherent: the lane that meets a tile next may be another one.
+layout(std430, set = 0, binding = 1) coherent buffer Tiles { uint tiles[]; };
+layout(std430, set = 0, binding = 2) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 3) writeonly buffer Instances { uvec2 instances[]; };
+layout(std430, set = 0, binding = 4) writeonly buffer SlotRanges { uvec2 slot_ranges[]; };
+
+const uint MOST_LANES = 32u;
+
+shared uint widths[MOST_LANES];
+
+void main() {
+    // Everything is done in the first round.
+    if (push.pass > 0u) return;
+    uint own = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
+    uint base = own * frame.window.z * frame.window.w, origin = texelFetch(starts, int(push.first)).x, slot = 0u;
+    Walk w = walk_begin(own, status[0]);
+    for (uint b = 0u; b < own; b++) slot += status[16u + b];
+    for (uint i = w.i; i < w.end; i++) {
+        int at = int(texelFetch(order, int(i)).x) * 3;
+        Spans s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+        uint begin = slot;
+        for (int top = s.row; top <= s.last_row; top += int(lanes)) {
+            int row = top + int(lane);
+            ivec2 span = ivec2(0, -1);
+            if (row <= s.last_row) span = span_in_band(s, row);
+            widths[lane] = uint(max(span.y - span.x + 1, 0));
+            barrier();
+            uint before = slot;
+            for (uint b = 0u; b < lanes; b++) {
+                before += b < lane ? widths[b] : 0u;
+                slot += widths[b];
+            }
+            for (int x = span.x; x <= span.y; x++) {
+                uint t = uint(row) * frame.window.z + uint(x), rank = tiles[base + t];
+                tiles[base + t] = rank + 1u;
+                instances[texelFetch(starts, int(t)).x - origin + rank] = uvec2(i, before + uint(x - span.x));
+            }
+            memoryBarrierBuffer();
+            barrier();
+        }
+        if (lane == 0u) slot_ranges[i] = uvec2(begin, slot - begin);
+    }
+}
