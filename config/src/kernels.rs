@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxROWS` such as `64x8x1x8x1`.
+/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxROWSxFETCHED` such as `64x8x1x8x1x1`.
 pub const VARIABLE: &str = "DGTR_KERNELS";
 
 /// Who decides.
@@ -15,7 +15,7 @@ pub enum KernelChoice {
     Calibrated,
     /// `default`: the built-in sizes; nothing is measured, nothing is read or written.
     Standard,
-    /// `WIDExNARROWxSHARExTILESxROWS`: these.
+    /// `WIDExNARROWxSHARExTILESxROWSxFETCHED`: these.
     Fixed {
         /// Lanes of a workgroup of the plain loops over Gaussians or pixels.
         wide: u32,
@@ -27,12 +27,14 @@ pub enum KernelChoice {
         tiles: u32,
         /// Lanes that blend a tile: 1, or 4.
         tile_lanes: u32,
+        /// Gaussians that the lanes of a tile fetch at once: 1, or `tile_lanes`.
+        fetched: u32,
     },
 }
 
 /// A value that is none of the three.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxROWS (such as 64x8x1x8x1)")]
+#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxROWSxFETCHED (such as 64x8x1x8x1x1)")]
 pub struct KernelChoiceError(String);
 
 impl FromStr for KernelChoice {
@@ -49,7 +51,7 @@ impl FromStr for KernelChoice {
 
 fn fixed(text: &str) -> Option<KernelChoice> {
     let mut numbers = text.split('x').map(|n| n.parse().ok());
-    let [wide, narrow, share_lanes, tiles, tile_lanes] = [(); 5].map(|()| numbers.next().flatten());
+    let [wide, narrow, share_lanes, tiles, tile_lanes, fetched] = [(); 6].map(|()| numbers.next().flatten());
     let none_left = numbers.next().is_none();
     none_left.then_some(KernelChoice::Fixed {
         wide: wide?,
@@ -57,6 +59,7 @@ fn fixed(text: &str) -> Option<KernelChoice> {
         share_lanes: share_lanes?,
         tiles: tiles?,
         tile_lanes: tile_lanes?,
+        fetched: fetched?,
     })
 }
 
@@ -79,10 +82,10 @@ mod tests {
         assert_eq!("".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("auto".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("default".parse(), Ok(KernelChoice::Standard));
-        let fixed = KernelChoice::Fixed { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4 };
-        assert_eq!("128x16x16x8x4".parse(), Ok(fixed));
-        for bad in ["off", "64", "64x8", "64x8x1x8x", "x8x1x8x1", "64x-8x1x8x1", "99999999999x8x1x8x1", "64x8x1x8x1x1"]
-        {
+        let fixed = KernelChoice::Fixed { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4, fetched: 1 };
+        assert_eq!("128x16x16x8x4x1".parse(), Ok(fixed));
+        let bad = "off 64 64x8 64x8x1x8x1 64x8x1x8x1x x8x1x8x1x1 64x-8x1x8x1x1 99999999999x8x1x8x1x1 64x8x1x8x1x1x1";
+        for bad in bad.split(' ') {
             let refused = bad.parse::<KernelChoice>().unwrap_err().to_string();
             assert!(refused.contains(VARIABLE) && refused.contains(bad), "{refused}");
         }

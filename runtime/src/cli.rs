@@ -36,7 +36,7 @@ pub use error::CliError;
 #[command(subcommand_required = true, arg_required_else_help = true)]
 #[command(
     after_help = "Exit codes: 0 done, 1 failed, 2 usage or bad input, 3 device or driver missing, 4 interrupted with a \
-                  valid checkpoint.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxROWS: shape of the kernels; auto \
+                  valid checkpoint.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxROWSxFETCHED: shape of the kernels; auto \
                   measures it once per hardware device and driver (dgtr doctor shows it), default measures nothing. \
                   Models do not depend on it."
 )]

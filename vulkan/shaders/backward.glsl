@@ -3,8 +3,6 @@
 // With DEPTH, colour and depth are carried apart, so that the shape can be frozen against the depth loss.
 
 layout(std430, set = 0, binding = 1) readonly buffer Starts { uint starts[]; };
-layout(set = 0, binding = 9) uniform samplerBuffer shaded;
-layout(set = 0, binding = 10) uniform usamplerBuffer instances;
 layout(set = 0, binding = 11) uniform samplerBuffer image;
 layout(set = 0, binding = 12) uniform samplerBuffer image_gradient;
 layout(std430, set = 0, binding = 2) writeonly buffer Slots { vec4 slots[]; };
@@ -40,16 +38,16 @@ void main() {
     }
     uint i = first;
     bool live = true;
+    Splat held;
     WHILE (i < end && live) {
         uint slot = 0u;
         float most = -1.0;
         // What a slot holds: q and its first moments, total weight; second moments, depth; colour.
         vec4 line = vec4(0.0), square = vec4(0.0), colour = vec4(0.0);
         IF (i < end && live) {
-            uvec2 instance = texelFetch(instances, int(i)).xy;
-            int r = int(instance.x) * 3;
-            slot = instance.y * 3u;
-            vec4 s0 = texelFetch(shaded, r), s1 = texelFetch(shaded, r + 1), s2 = texelFetch(shaded, r + 2);
+            Splat splat = next_splat(i, first, end, held);
+            vec4 s0 = splat.s0, s1 = splat.s1, s2 = splat.s2;
+            slot = splat.slot;
             vec2 d = corner - s0.xy;
             [[unroll]] for (int y = 0; y < ROWS; y++) {
                 float dy = d.y + float(own_row + y), along = s1.y * dy, rest = fma(s1.z * dy, dy, s0.w);

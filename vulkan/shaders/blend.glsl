@@ -1,7 +1,5 @@
 // Blends colour and depth front to back: C = sum c a T + T_end background, D = sum z a T (paper, depth equation).
 
-layout(set = 0, binding = 9) uniform samplerBuffer shaded;
-layout(set = 0, binding = 10) uniform usamplerBuffer instances;
 layout(std430, set = 0, binding = 1) buffer Starts { uint starts[]; };
 layout(std430, set = 0, binding = 2) writeonly buffer Image { vec4 image[]; };
 layout(std430, set = 0, binding = 3) writeonly buffer Transmittance { float transmittance[]; };
@@ -22,11 +20,12 @@ void main() {
     }
     uint i = first;
     bool live = true;
+    Splat held;
     WHILE (i < end && live) {
         float most = -1.0;
         IF (i < end && live) {
-            int r = int(texelFetch(instances, int(i)).x) * 3;
-            vec4 s0 = texelFetch(shaded, r), s1 = texelFetch(shaded, r + 1), s2 = texelFetch(shaded, r + 2);
+            Splat splat = next_splat(i, first, end, held);
+            vec4 s0 = splat.s0, s1 = splat.s1, s2 = splat.s2;
             vec4 value = vec4(s2.xyz, s0.z);
             vec2 d = corner - s0.xy;
             [[unroll]] for (int y = 0; y < ROWS; y++) {

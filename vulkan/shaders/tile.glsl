@@ -3,6 +3,9 @@
 // quarter of the registers and has four times the lanes, for devices that have many lanes and few registers each. Sums over
 // a tile are taken over each row first and then over the rows, in order, so that both leave the same bits.
 
+layout(set = 0, binding = 9) uniform samplerBuffer shaded;
+layout(set = 0, binding = 10) uniform usamplerBuffer instances;
+
 #ifdef LANE_PER_ROW
 const int LANES = TILE_HEIGHT, ROWS = 1;
 #else
@@ -39,6 +42,18 @@ uint pixel_index(ivec2 origin, int k) {
     return p.y * frame.region.z + p.x;
 }
 
+// An instance: what `shade` left of its Gaussian, and its gradient slot.
+struct Splat {
+    vec4 s0, s1, s2;
+    uint slot;
+};
+
+Splat fetch(uint i) {
+    uvec2 instance = texelFetch(instances, int(i)).xy;
+    int r = int(instance.x) * 3;
+    return Splat(texelFetch(shaded, r), texelFetch(shaded, r + 1), texelFetch(shaded, r + 2), instance.y * 3u);
+}
+
 #ifdef LANE_PER_ROW
 // The lanes of a subgroup turn together, whether their tiles have ended or not: a shuffle reads lanes that are there.
 #define WHILE(working) while (subgroupAny(working))
@@ -59,6 +74,20 @@ vec4 sum_of_tile(vec4 own) {
     [[unroll]] for (uint row = 1u; row < uint(LANES); row++) sum += subgroupShuffle(own, first_row() + row);
     return sum;
 }
+
+layout(constant_id = 7) const bool STAGED = false;
+
+// Instance i of those from `first` to `end`, asked for in turn. Staged, every lane fetches one of the next four into
+// `held` and shows it to the others in its turn: a quarter of the fetches, each of which waits for the one before it.
+Splat next_splat(uint i, uint first, uint end, inout Splat held) {
+    if (!STAGED) return fetch(i);
+    uint turn = (i - first) % uint(LANES);
+    if (turn == 0u) held = fetch(min(i + uint(row_of_lane()), end - 1u));
+    uint lane = first_row() + turn;
+    return Splat(
+        subgroupShuffle(held.s0, lane), subgroupShuffle(held.s1, lane), subgroupShuffle(held.s2, lane),
+        subgroupShuffle(held.slot, lane));
+}
 #else
 #define WHILE(working) while (working)
 #define IF(working)
@@ -69,5 +98,9 @@ float most_of_tile(float own) {
 
 vec4 sum_of_tile(vec4 own) {
     return own;
+}
+
+Splat next_splat(uint i, uint first, uint end, inout Splat held) {
+    return fetch(i);
 }
 #endif

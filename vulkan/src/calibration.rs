@@ -92,7 +92,7 @@ pub fn calibrate(gpu: &Gpu, limit: Option<Duration>) -> Result<Calibration, Trai
 struct Candidates {
     wide: Vec<u32>,
     narrow: Vec<(u32, u32)>,
-    tiles: Vec<(u32, u32)>,
+    tiles: Vec<Sizes>,
 }
 
 impl Candidates {
@@ -105,69 +105,69 @@ impl Candidates {
     }
 }
 
-/// What a shape says about each kind of kernel.
-fn wide(shape: KernelShape) -> (u32, u32) {
-    (shape.wide, 1)
+/// What a shape says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched at once.
+type Sizes = (u32, u32, u32);
+
+fn wide(shape: KernelShape) -> Sizes {
+    (shape.wide, 1, 1)
 }
 
-fn narrow(shape: KernelShape) -> (u32, u32) {
-    (shape.narrow, shape.share_lanes)
+fn narrow(shape: KernelShape) -> Sizes {
+    (shape.narrow, shape.share_lanes, 1)
 }
 
-fn with_narrow(shape: KernelShape, (narrow, share_lanes): (u32, u32)) -> KernelShape {
-    KernelShape { narrow, share_lanes, ..shape }
+fn tiles(shape: KernelShape) -> Sizes {
+    (shape.tiles, shape.tile_lanes, shape.fetched)
 }
 
-fn tiles(shape: KernelShape) -> (u32, u32) {
-    (shape.tiles, shape.tile_lanes)
-}
+const KINDS: [fn(KernelShape) -> Sizes; 3] = [wide, narrow, tiles];
 
-fn with_tiles(shape: KernelShape, (tiles, tile_lanes): (u32, u32)) -> KernelShape {
-    KernelShape { tiles, tile_lanes, ..shape }
+/// The shape with these sizes, by kind.
+fn with_sizes([of_wide, of_narrow, of_tiles]: [Sizes; 3]) -> KernelShape {
+    let ((wide, ..), (narrow, share_lanes, _), (tiles, tile_lanes, fetched)) = (of_wide, of_narrow, of_tiles);
+    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }
 }
-
-const KINDS: [fn(KernelShape) -> (u32, u32); 3] = [wide, narrow, tiles];
 
 /// The shapes to try, the standard one first.
 fn shapes(all: &Candidates, standard: KernelShape, timed: bool) -> Vec<KernelShape> {
-    let wide = all.wide.iter().copied().filter(|w| *w != standard.wide);
-    // Several lanes per tile or share promise more than another size: they come first.
-    let others = |list: &[(u32, u32)], own: (u32, u32)| {
-        let mut others: Vec<_> = list.iter().copied().filter(|c| *c != own).collect();
-        others.sort_by_key(|c| std::cmp::Reverse(c.1));
-        others
-    };
-    let kinds = [
-        wide.map(|wide| KernelShape { wide, ..standard }).collect::<Vec<_>>(),
-        others(&all.narrow, narrow(standard)).into_iter().map(|n| with_narrow(standard, n)).collect(),
-        others(&all.tiles, tiles(standard)).into_iter().map(|t| with_tiles(standard, t)).collect(),
+    let own = KINDS.map(|kind| kind(standard));
+    let listed = [
+        all.wide.iter().map(|n| (*n, 1, 1)).collect::<Vec<_>>(),
+        all.narrow.iter().map(|(n, lanes)| (*n, *lanes, 1)).collect(),
+        all.tiles.clone(),
     ];
+    let others: [Vec<Sizes>; 3] = std::array::from_fn(|k| {
+        let mut others: Vec<_> = listed[k].iter().copied().filter(|sizes| *sizes != own[k]).collect();
+        // Several lanes per tile or share promise more than another size: they come first.
+        others.sort_by_key(|sizes| std::cmp::Reverse(sizes.1));
+        others
+    });
     let mut shapes = vec![standard];
     if timed {
-        for i in 0..kinds.iter().map(Vec::len).max().unwrap_or(0) {
-            let [of_wide, of_narrow, of_tiles] = [0, 1, 2].map(|k| kinds[k].get(i).copied().unwrap_or(standard));
-            let shape = KernelShape { wide: of_wide.wide, ..standard };
-            shapes.push(with_tiles(with_narrow(shape, narrow(of_narrow)), tiles(of_tiles)));
+        for i in 0..others.iter().map(Vec::len).max().unwrap_or(0) {
+            shapes.push(with_sizes(std::array::from_fn(|k| others[k].get(i).copied().unwrap_or(own[k]))));
         }
     } else {
-        shapes.extend(kinds.into_iter().rev().flatten());
+        for k in (0..3).rev() {
+            let but_one = |sizes: &Sizes| with_sizes(std::array::from_fn(|o| if o == k { *sizes } else { own[o] }));
+            shapes.extend(others[k].iter().map(but_one));
+        }
     }
     shapes
 }
 
 /// Each kind's best size. Without timestamps only trials that are standard otherwise judge a kind.
 fn fastest(trials: &[Trial], standard: KernelShape, timed: bool) -> KernelShape {
-    let [(wide, _), (narrow, share_lanes), (tiles, tile_lanes)] = std::array::from_fn(|k| {
+    with_sizes(std::array::from_fn(|k| {
         let standard_otherwise = |t: &&Trial| (0..3).all(|o| o == k || KINDS[o](t.shape) == KINDS[o](standard));
         let judges = trials.iter().filter(|t| timed || standard_otherwise(t));
         least(judges.map(|t| (KINDS[k](t.shape), t.ms[k])), KINDS[k](standard))
-    });
-    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes }
+    }))
 }
 
 /// The size with the least time, the standard one preferred.
-fn least(times: impl Iterator<Item = ((u32, u32), f64)>, standard: (u32, u32)) -> (u32, u32) {
-    let handicap = |size: (u32, u32)| if size == standard { 1.0 - MARGIN } else { 1.0 };
+fn least(times: impl Iterator<Item = (Sizes, f64)>, standard: Sizes) -> Sizes {
+    let handicap = |size: Sizes| if size == standard { 1.0 - MARGIN } else { 1.0 };
     times.min_by(|a, b| (a.1 * handicap(a.0)).total_cmp(&(b.1 * handicap(b.0)))).map_or(standard, |t| t.0)
 }
 
@@ -210,10 +210,11 @@ fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 3], TrainError> {
 mod tests {
     use super::*;
 
-    const STANDARD: KernelShape = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1 };
+    const STANDARD: KernelShape =
+        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
 
-    fn trial(wide: u32, narrow: (u32, u32), tiles: (u32, u32), ms: [f64; 3]) -> Trial {
-        Trial { shape: with_tiles(with_narrow(KernelShape { wide, ..STANDARD }, narrow), tiles), ms }
+    fn trial(wide: u32, narrow: (u32, u32), tiles: Sizes, ms: [f64; 3]) -> Trial {
+        Trial { shape: with_sizes([(wide, 1, 1), (narrow.0, narrow.1, 1), tiles]), ms }
     }
 
     #[test]
@@ -221,13 +222,13 @@ mod tests {
         let all = Candidates {
             wide: vec![32, 64, 128, 256],
             narrow: vec![(16, 1), (32, 1), (16, 16), (32, 32)],
-            tiles: vec![(16, 1), (32, 1), (8, 4), (16, 4), (32, 4)],
+            tiles: vec![(16, 1, 1), (32, 1, 1), (8, 4, 1), (8, 4, 4), (16, 4, 1), (16, 4, 4)],
         };
-        for (timed, count) in [(true, 5), (false, 11)] {
+        for (timed, count) in [(true, 6), (false, 12)] {
             let tried = shapes(&all, STANDARD, timed);
             assert_eq!((tried.len(), tried[0]), (count, STANDARD));
             assert!(all.wide.iter().all(|w| tried.iter().any(|s| s.wide == *w)));
-            assert!(all.narrow.iter().all(|n| tried.iter().any(|s| narrow(*s) == *n)));
+            assert!(all.narrow.iter().all(|n| tried.iter().any(|s| (s.narrow, s.share_lanes) == *n)));
             assert!(all.tiles.iter().all(|t| tried.iter().any(|s| tiles(*s) == *t)));
             assert_eq!(tried[1].tile_lanes, 4);
         }
@@ -236,25 +237,25 @@ mod tests {
     #[test]
     fn the_kinds_are_judged_apart() {
         let timed = [
-            trial(32, (16, 1), (8, 4), [9.0, 1.0, 4.0]),
-            trial(64, (32, 1), (32, 1), [5.0, 5.0, 5.0]),
-            trial(128, (32, 32), (16, 4), [2.0, 7.0, 3.0]),
+            trial(32, (16, 1), (8, 4, 1), [9.0, 1.0, 4.0]),
+            trial(64, (32, 1), (32, 1, 1), [5.0, 5.0, 5.0]),
+            trial(128, (32, 32), (16, 4, 1), [2.0, 7.0, 3.0]),
         ];
-        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4");
-        // Whole steps: (128, …, (8, 4)) says nothing about narrow sizes, nor about tiles.
+        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4x1");
+        // Whole steps: (128, …, (8, 4, 1)) says nothing about narrow sizes, nor about tiles.
         let whole = [
-            trial(64, (32, 1), (32, 1), [5.0; 3]),
-            trial(128, (32, 1), (8, 4), [1.0; 3]),
-            trial(64, (16, 16), (32, 1), [4.0; 3]),
-            trial(64, (32, 1), (8, 4), [3.0; 3]),
+            trial(64, (32, 1), (32, 1, 1), [5.0; 3]),
+            trial(128, (32, 1), (8, 4, 1), [1.0; 3]),
+            trial(64, (16, 16), (32, 1, 1), [4.0; 3]),
+            trial(64, (32, 1), (8, 4, 1), [3.0; 3]),
         ];
-        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4");
+        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4x1");
     }
 
     #[test]
     fn a_gain_within_the_noise_changes_nothing() {
-        let close = [trial(64, (32, 1), (32, 1), [10.0; 3]), trial(128, (32, 32), (8, 4), [9.8, 9.6, 9.8])];
-        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1");
+        let close = [trial(64, (32, 1), (32, 1, 1), [10.0; 3]), trial(128, (32, 32), (8, 4, 1), [9.8, 9.6, 9.8])];
+        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1x1");
         assert_eq!(fastest(&[], STANDARD, true), STANDARD);
     }
 }

@@ -53,6 +53,7 @@ struct Specialisation {
     loop_lanes: u32,
     own_degrees: u32,
     half_moments: u32,
+    staged: u32,
 }
 
 fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
@@ -198,8 +199,9 @@ impl Pipelines {
             loop_lanes: LOOP_LANES as u32,
             own_degrees: own_degrees.into(),
             half_moments: plan.half_moments.into(),
+            staged: (self.shape.fetched > 1).into(),
         };
-        let entries: [_; 7] = std::array::from_fn(|i| vk::SpecializationMapEntry {
+        let entries: [_; 8] = std::array::from_fn(|i| vk::SpecializationMapEntry {
             constant_id: i as u32,
             offset: 4 * i as u32,
             size: 4,
@@ -209,12 +211,12 @@ impl Pipelines {
             Group::Sort | Group::Walk => self.shape.share_lanes > 1,
             _ => self.shape.tile_lanes > 1,
         });
-        // SAFETY: by this function's contract; the constants are those that `frame.glsl` declares.
+        // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
         unsafe { self.gpu.compute_pipeline(kernel.name, more_lanes.unwrap_or(kernel.spirv), self.layout, &special) }
     }
 
     fn local_size(&self, group: Group) -> u32 {
-        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes } = self.shape;
+        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, .. } = self.shape;
         match group {
             Group::Wide => wide,
             Group::Sort if share_lanes > 1 => SCAN_LANES,

@@ -20,6 +20,8 @@ pub struct KernelShape {
     pub tiles: u32,
     /// Lanes that share a tile: 1, with all its pixels in registers, or one per row.
     pub tile_lanes: u32,
+    /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
+    pub fetched: u32,
 }
 
 /// Sizes worth trying. All divide the lanes that the looping kernels are written for (`config::plan::LOOP_LANES` and
@@ -33,7 +35,7 @@ impl KernelShape {
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
         let few = if info.is_cpu { 8 } else { 32 };
-        Self { wide: 64, narrow: few, share_lanes: 1, tiles: few, tile_lanes: 1 }
+        Self { wide: 64, narrow: few, share_lanes: 1, tiles: few, tile_lanes: 1, fetched: 1 }
     }
 
     /// Sizes of wide workgroups that this device can run and that fill its subgroups, the standard one among them.
@@ -49,12 +51,15 @@ impl KernelShape {
         sizes.into_iter().map(|n| (n, 1)).chain(groups.map(|n| (n, n))).collect()
     }
 
-    /// Tiles of a workgroup and lanes of a tile, under the same conditions; those with one lane per tile first.
-    pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32)> {
+    /// Tiles of a workgroup, lanes of a tile and Gaussians they fetch at once, under the same conditions; those with one
+    /// lane per tile first.
+    pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32, u32)> {
         let standard = Self::standard(info).tiles;
-        let mut all: Vec<_> = candidates(&TILES, standard, 1, info).into_iter().map(|n| (n, 1)).collect();
+        let mut all: Vec<_> = candidates(&TILES, standard, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
         if info.shuffles {
-            all.extend(candidates(&TILES, 0, TILE_HEIGHT, info).into_iter().map(|n| (n, TILE_HEIGHT)));
+            for tiles in candidates(&TILES, 0, TILE_HEIGHT, info) {
+                all.extend([1, TILE_HEIGHT].map(|fetched| (tiles, TILE_HEIGHT, fetched)));
+            }
         }
         all
     }
@@ -63,8 +68,9 @@ impl KernelShape {
     pub fn fits(&self, info: &GpuInfo) -> bool {
         let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && TILES.contains(&self.tiles);
         let rows = self.tile_lanes == 1 || (self.tile_lanes == TILE_HEIGHT && info.shuffles);
+        let fetched = self.fetched == 1 || self.fetched == self.tile_lanes;
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
-        sizes && rows && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
+        sizes && rows && fetched && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
     }
 
     /// Lanes of its largest workgroup.
@@ -76,8 +82,8 @@ impl KernelShape {
 /// As `config::kernels::VARIABLE` takes it.
 impl fmt::Display for KernelShape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { wide, narrow, share_lanes, tiles, tile_lanes } = self;
-        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}")
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched } = self;
+        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}x{fetched}")
     }
 }
 
@@ -127,15 +133,18 @@ mod tests {
 
     #[test]
     fn several_lanes_per_tile_are_tried_only_where_lanes_can_read_each_other() {
-        assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1), (16, 1), (32, 1)]);
+        assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1), (16, 1, 1), (32, 1, 1)]);
         let pi5 = device(false, 16, 256);
-        assert_eq!(KernelShape::tile_candidates(&pi5), [(16, 1), (32, 1), (8, 4), (16, 4), (32, 4)]);
-        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [(32, 1), (16, 4), (32, 4)]);
-        let rows = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 4 };
+        let staged = [(8, 4, 1), (8, 4, 4), (16, 4, 1), (16, 4, 4), (32, 4, 1), (32, 4, 4)];
+        assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1), (32, 1, 1)], &staged[..]].concat());
+        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[2..]].concat());
+        let rows = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 4, fetched: 4 };
         assert!(rows.fits(&pi5) && !rows.fits(&device(false, 8, 256)));
         assert!(!KernelShape { tile_lanes: 2, ..rows }.fits(&pi5));
+        assert!(!KernelShape { fetched: 2, ..rows }.fits(&pi5));
+        assert!(!KernelShape { tile_lanes: 1, ..rows }.fits(&pi5), "nobody to fetch for");
         assert!(!KernelShape { share_lanes: 16, ..rows }.fits(&pi5));
-        assert_eq!(rows.to_string(), "64x32x32x8x4");
+        assert_eq!(rows.to_string(), "64x32x32x8x4x4");
     }
 
     #[test]
@@ -144,8 +153,8 @@ mod tests {
             let (wide, narrow) = (KernelShape::wide_candidates(&info), KernelShape::narrow_candidates(&info));
             let tiles = KernelShape::tile_candidates(&info);
             for (wide, (narrow, share_lanes)) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
-                assert!(tiles.iter().all(|(tiles, tile_lanes)| {
-                    KernelShape { wide, narrow, share_lanes, tiles: *tiles, tile_lanes: *tile_lanes }.fits(&info)
+                assert!(tiles.iter().copied().all(|(tiles, tile_lanes, fetched)| {
+                    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }.fits(&info)
                 }));
                 assert_eq!(LOOP_LANES % u64::from(wide), 0);
                 assert_eq!((SORT_LANES_GPU % narrow, SORT_LANES_SOFTWARE % narrow), (0, 0));
@@ -155,7 +164,7 @@ mod tests {
         for (wide, narrow, tiles) in
             [(256, 32, 8), (64, 0, 8), (48, 32, 8), (64, 64, 8), (0, 8, 8), (64, 8, 9), (64, 8, 0), (64, 8, u32::MAX)]
         {
-            let shape = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1 };
+            let shape = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1 };
             assert!(!shape.fits(&info), "{shape}");
         }
     }

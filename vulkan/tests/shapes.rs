@@ -71,18 +71,27 @@ fn bits(model: &GaussianCloud) -> Vec<u32> {
 }
 
 /// Together with the standard shape: the smallest and the largest of each size, with one lane per tile and share and with
-/// several, where the device can (each shape costs a compilation).
-fn shapes(gpu: &Gpu) -> [KernelShape; 2] {
+/// several, fetching for themselves and for each other, where the device can (each shape costs a compilation).
+fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
     let info = gpu.info();
     let wide = KernelShape::wide_candidates(info);
     let tiles = KernelShape::tile_candidates(info);
     if !info.shuffles {
         println!("skipped: four lanes per tile ({} has no shuffles)", info.name);
     }
-    let of =
-        |wide, narrow, share_lanes, (tiles, tile_lanes)| KernelShape { wide, narrow, share_lanes, tiles, tile_lanes };
+    let of = |wide, narrow, share_lanes, (tiles, tile_lanes, fetched)| KernelShape {
+        wide,
+        narrow,
+        share_lanes,
+        tiles,
+        tile_lanes,
+        fetched,
+    };
+    let direct = tiles.iter().rev().find(|t| t.1 > 1 && t.2 == 1);
     // A workgroup per share is never chosen in software, but does the same there, too.
-    [of(wide[0], 32, 32, tiles[tiles.len() - 1]), of(wide[wide.len() - 1], 16, 1, tiles[0])]
+    let mut all = vec![of(wide[0], 32, 32, tiles[tiles.len() - 1]), of(wide[wide.len() - 1], 16, 1, tiles[0])];
+    all.extend(direct.map(|t| of(64, 32, 1, *t)));
+    all
 }
 
 #[test]

@@ -126,7 +126,8 @@ fn kernel_shape(info: &GpuInfo, calibrate: bool) -> Finding {
     };
     let lanes = |n: u32| if n == 1 { "one lane" } else { "several" };
     let (share, tile) = (lanes(shape.share_lanes), lanes(shape.tile_lanes));
-    Finding::Ok(format!("shape {shape}: {share} per share of the Gaussians, {tile} per tile ({why})"))
+    let staged = if shape.fetched > 1 { ", which fetch for each other" } else { "" };
+    Finding::Ok(format!("shape {shape}: {share} per share of the Gaussians, {tile} per tile{staged} ({why})"))
 }
 
 /// Ports an autopilot may hang on, and whether this user may open them.

@@ -36,6 +36,7 @@ struct Entry {
     share_lanes: u32,
     tiles: u32,
     tile_lanes: u32,
+    fetched: u32,
 }
 
 impl Entry {
@@ -51,12 +52,13 @@ impl Entry {
             share_lanes: shape.share_lanes,
             tiles: shape.tiles,
             tile_lanes: shape.tile_lanes,
+            fetched: shape.fetched,
         }
     }
 
     fn shape(&self) -> KernelShape {
-        let Self { wide, narrow, share_lanes, tiles, tile_lanes, .. } = *self;
-        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes }
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, .. } = *self;
+        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }
     }
 
     fn is_device(&self, other: &Self) -> bool {
@@ -121,8 +123,10 @@ mod tests {
     use super::*;
     use vulkan::gpu::DeviceLimits;
 
-    const SHAPE: KernelShape = KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4 };
-    const OTHER: KernelShape = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1 };
+    const SHAPE: KernelShape =
+        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4, fetched: 4 };
+    const OTHER: KernelShape =
+        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
 
     fn device(name: &str) -> GpuInfo {
         GpuInfo {
