@@ -11,6 +11,7 @@ use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::process::Command;
 use vulkan::gpu::Gpu;
+use vulkan::shape::KernelShape;
 use vulkan::trainer::{Rendering, Trainer};
 
 const CHILD: &str = "DGTR_VALIDATION_CHILD";
@@ -52,12 +53,17 @@ fn work() {
         max_gaussians: None,
         ..Default::default()
     };
-    for instances in [1 << 16, 400] {
+    let standard = KernelShape::standard(gpu.info());
+    // Every kernel with several lanes that the device can run.
+    let tiles = KernelShape::tile_candidates(gpu.info());
+    let (tiles, tile_lanes, fetched) = tiles[tiles.len() - 1];
+    let several = KernelShape { narrow: 32, share_lanes: 32, tiles, tile_lanes, fetched, ..standard };
+    for (instances, shape) in [(1 << 16, standard), (400, standard), (1 << 16, several), (400, several)] {
         let plan = Plan::with_capacities(&request, 300, instances);
         let mut settings = plain();
         settings.refine_poses = true;
         settings.refine_exposure = true;
-        let mut t = Trainer::new(&gpu, &plan, &settings).unwrap();
+        let mut t = Trainer::with_shape(&gpu, &plan, &settings, shape).unwrap();
         t.load(&cloud(3, 200, 3)).unwrap();
         let depth: Vec<f32> = (0..64 * 48).map(|i| (i % 64) as f32).collect();
         let prior = DepthPrior { width: 64, height: 48, confidence: vec![1.0; depth.len()], depth };
