@@ -1,7 +1,7 @@
 //! Numbers that broke other renderers, through the twin's whole step: one test per case of `vulkan::cases`.
 #![allow(clippy::panic, reason = "a test fails by panicking")]
 
-use vulkan::cases::{half, instances, twin};
+use vulkan::cases::{extremes, half, instances, twin};
 
 macro_rules! held {
     ($module:ident: $($name:ident)*) => {$(
@@ -30,6 +30,12 @@ held! { twin:
     exposure_against_a_black_photograph_stays_finite
 }
 
+held! { extremes:
+    scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_twin
+    cameras_far_from_the_origin_see_the_same_picture_in_the_twin
+    extreme_learning_rates_are_recovered_from_by_the_twin
+}
+
 held! { half:
     second_moments_in_sixteen_bits_are_right_on_average_only_when_rounded_by_chance
     moments_beyond_sixteen_bits_are_clamped_and_those_below_are_none
@@ -38,4 +44,6 @@ held! { half:
 held! { instances:
     more_tiles_than_instances_leave_the_other_tiles_empty_in_the_twin
     light_and_contributions_below_sixteen_bits_are_still_summed_in_the_twin
+    a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin
+    a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_twin
 }

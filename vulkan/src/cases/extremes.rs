@@ -1,12 +1,18 @@
 //! Scenes of any size and place, rates beyond reason, and very long runs.
 
 use super::device::{ready, survive};
-use super::scenes::{cloud, empty_trainer, photo, plain, posed, view};
+use super::scenes::{Answer, cloud, empty_trainer, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
 use crate::gpu::Gpu;
 use crate::trainer::{Rendering, TrainError};
+use crate::twin::camera::Camera;
+use crate::twin::gaussian::{Gaussian, PARAMETERS};
+use crate::twin::loss::Target;
+use crate::twin::project::Limits;
+use crate::twin::trainer::TwinTrainer;
 use config::training::{RateSettings, Strategy, TrainSettings};
 use glam::DVec3;
+use models::camera::View;
 use models::cloud::GaussianCloud;
 
 /// One grey level and a bit: a contribution at the cut-off may fall on the other side.
@@ -20,6 +26,46 @@ fn scaled(base: &GaussianCloud, scale: f32) -> GaussianCloud {
     c
 }
 
+/// Scenes of other sizes than metres.
+const SIZES: [(&str, f32); 2] = [("a centimetre", 0.0052), ("a hundred kilometres", 1.25e4)];
+
+/// The same scene and its camera with the camera at `center`, both in f32 as far as they are given so.
+fn moved(base: &GaussianCloud, at_origin: &View, metres: f64) -> (GaussianCloud, View) {
+    let (mut c, mut v) = (base.clone(), *at_origin);
+    v.pose.center = DVec3::new(metres, -metres, 0.1 * metres);
+    for m in &mut c.means {
+        *m = std::array::from_fn(|k| (f64::from(m[k]) + v.pose.center[k]) as f32);
+    }
+    (c, v)
+}
+
+/// Every rate `factor` times the usual one.
+fn wild(factor: f32) -> RateSettings {
+    let sane = RateSettings::default();
+    RateSettings {
+        mean_start: sane.mean_start * factor,
+        mean_end: sane.mean_end * factor,
+        log_scale: sane.log_scale * factor,
+        rotation: sane.rotation * factor,
+        opacity: sane.opacity * factor,
+        sh_dc: sane.sh_dc * factor,
+        sh_rest: sane.sh_rest * factor,
+        ..sane
+    }
+}
+
+/// Largest difference of transmittance between two pictures of the twin.
+fn apart(a: &Answer, b: &Answer) -> f32 {
+    let pairs = a.picture.iter().zip(&b.picture);
+    pairs.map(|(a, b)| (a.transmittance - b.transmittance).abs()).fold(0.0, f32::max)
+}
+
+/// Steps of the twin: their losses.
+fn twin_losses(t: &mut TwinTrainer<f32>, v: &View, photo: &[[f32; 3]], steps: usize) -> Vec<f32> {
+    let target = Target { width: v.intrinsics.width as usize, rgb: photo, depth: None, background: [0.0; 3] };
+    (0..steps).map(|_| t.step(&Camera::of(v), &target, 0.0).loss.total).collect()
+}
+
 /// Scenes 1 cm and 100 km across train as one of metres does, as long as nothing is nearer than the near plane of 1 cm.
 pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike(gpu: &Gpu) -> Outcome {
     let mut counted = Tally::default();
@@ -27,12 +73,33 @@ pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike(gpu: &Gpu
     let mut t = ready(gpu, 0, &v, &plain())?;
     let base = cloud(13, 20, 0);
     let (expected, report) = survive(&mut counted, &mut t, &base, &v, "metres")?;
-    for (case, scale) in [("a centimetre", 0.0052f32), ("a hundred kilometres", 1.25e4)] {
+    for (case, scale) in SIZES {
         let (got, r) = survive(&mut counted, &mut t, &scaled(&base, scale), &v, case)?;
         for (a, b) in got.transmittance.iter().zip(&expected.transmittance) {
             promise!((a - b).abs() < GREY_LEVEL, "{case}: {a} instead of {b}");
         }
         promise!((r.loss - report.loss).abs() < 0.02 * report.loss, "{case}: loss {} against {}", r.loss, report.loss);
+    }
+    Ok(counted.said())
+}
+
+/// The same on the twin, three steps each.
+pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_twin() -> Outcome {
+    let mut counted = Tally::default();
+    let v = view(21, 17);
+    let (base, photo) = (cloud(13, 20, 0), photo(1, &v));
+    let train = |c: &GaussianCloud, extent: f32| {
+        let mut t = TwinTrainer::new(Gaussian::of_cloud(c), plain(), extent, Limits::default());
+        twin_losses(&mut t, &v, &photo, 3)[2]
+    };
+    let (expected, loss) = (counted.ask(&base, &v, &photo, &Default::default()), train(&base, 5.0));
+    for (case, scale) in SIZES {
+        let c = scaled(&base, scale);
+        let got = counted.ask(&c, &v, &photo, &Default::default());
+        got.check_finite(case)?;
+        promise!(apart(&got, &expected) < GREY_LEVEL, "{case}: {} apart", apart(&got, &expected));
+        let its_loss = train(&c, 5.0 * scale);
+        promise!((its_loss - loss).abs() < 0.02 * loss, "{case}: loss {its_loss} against {loss}");
     }
     Ok(counted.said())
 }
@@ -45,16 +112,27 @@ pub fn cameras_far_from_the_origin_see_the_same_picture(gpu: &Gpu) -> Outcome {
     let mut t = ready(gpu, 0, &at_origin, &plain())?;
     let (expected, _) = survive(&mut counted, &mut t, &base, &at_origin, "origin")?;
     for (metres, same) in [(1e4, true), (6.378e6, false)] {
-        let mut v = at_origin;
-        v.pose.center = DVec3::new(metres, -metres, 0.1 * metres);
-        let mut c = base.clone();
-        for m in &mut c.means {
-            *m = std::array::from_fn(|k| (f64::from(m[k]) + v.pose.center[k]) as f32);
-        }
+        let (c, v) = moved(&base, &at_origin, metres);
         let mut t = ready(gpu, 0, &v, &plain())?;
         let (got, _) = survive(&mut counted, &mut t, &c, &v, &format!("{metres} m"))?;
         let worst = got.transmittance.iter().zip(&expected.transmittance).map(|(a, b)| (a - b).abs());
         let worst = worst.fold(0.0, f32::max);
+        promise!(!same || worst < 5.0 * GREY_LEVEL, "{metres} m from the origin: {worst} apart");
+    }
+    Ok(counted.said())
+}
+
+/// The same on the twin.
+pub fn cameras_far_from_the_origin_see_the_same_picture_in_the_twin() -> Outcome {
+    let mut counted = Tally::default();
+    let at_origin = view(21, 17);
+    let (base, photo) = (cloud(14, 20, 0), photo(1, &at_origin));
+    let expected = counted.ask(&base, &at_origin, &photo, &Default::default());
+    for (metres, same) in [(1e4, true), (6.378e6, false)] {
+        let (c, v) = moved(&base, &at_origin, metres);
+        let got = counted.ask(&c, &v, &photo, &Default::default());
+        got.check_finite(&format!("{metres} m"))?;
+        let worst = apart(&got, &expected);
         promise!(!same || worst < 5.0 * GREY_LEVEL, "{metres} m from the origin: {worst} apart");
     }
     Ok(counted.said())
@@ -69,17 +147,7 @@ pub fn extreme_learning_rates_are_recovered_from_or_refused(gpu: &Gpu) -> Outcom
     for factor in [1e3f32, 1e6] {
         let mut t = ready(gpu, 1, &v, &plain())?;
         t.load(&cloud(15, 30, 1))?;
-        let wild = RateSettings {
-            mean_start: sane.mean_start * factor,
-            mean_end: sane.mean_end * factor,
-            log_scale: sane.log_scale * factor,
-            rotation: sane.rotation * factor,
-            opacity: sane.opacity * factor,
-            sh_dc: sane.sh_dc * factor,
-            sh_rest: sane.sh_rest * factor,
-            ..sane
-        };
-        t.set_rates(&wild)?;
+        t.set_rates(&wild(factor))?;
         for step in 0..10 {
             let r = t.step()?;
             promise!(r.loss.is_finite(), "rates × {factor}, step {step}: loss {}", r.loss);
@@ -105,6 +173,27 @@ pub fn extreme_learning_rates_are_recovered_from_or_refused(gpu: &Gpu) -> Outcom
         );
     }
     Ok(counted.said())
+}
+
+/// The twin's optimiser is thrown as far, stays finite, and finds back.
+pub fn extreme_learning_rates_are_recovered_from_by_the_twin() -> Outcome {
+    let v = view(21, 17);
+    let photo = photo(1, &v);
+    let mut said = String::new();
+    for factor in [1e3f32, 1e6] {
+        let mut settings = plain();
+        settings.rates = wild(factor);
+        let mut t = TwinTrainer::new(Gaussian::<f32>::of_cloud(&cloud(15, 30, 1)), settings, 5.0, Limits::default());
+        let losses = twin_losses(&mut t, &v, &photo, 10);
+        promise!(losses.iter().all(|l| l.is_finite()), "rates × {factor}: losses {losses:?}");
+        t.settings.rates = RateSettings::default();
+        let losses = twin_losses(&mut t, &v, &photo, 30);
+        promise!(losses[29] <= losses[0], "rates × {factor}: the loss rose from {} to {}", losses[0], losses[29]);
+        let finite = t.cloud.iter_mut().all(|g| (0..PARAMETERS).all(|k| g.parameter(k).is_finite()));
+        promise!(finite, "rates × {factor}: a row went bad");
+        said = format!("× {factor:.0e}: loss {:.3} → {:.3}", losses[0], losses[29]);
+    }
+    Ok(said)
 }
 
 /// Identical Gaussians are drawn in the order of their rows, and training keeps them finite.

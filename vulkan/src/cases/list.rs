@@ -8,7 +8,8 @@ macro_rules! case {
     };
 }
 
-/// Every case of the renderer and the trainer.
+/// Every case of the renderer and the trainer. There is no twin where the host does the work for both (it refuses poses,
+/// moves and adds rows), nor of counting and emitting, which the twin does in one function.
 pub const CASES: &[Case] = &[
     case!(
         "NaN or infinity in any parameter",
@@ -86,19 +87,19 @@ pub const CASES: &[Case] = &[
         "scenes of 1 cm and of 100 km",
         "train alike",
         Some(extremes::scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike),
-        None
+        Some(extremes::scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_twin)
     ),
     case!(
         "10 km and 6,378 km from the origin",
         "the same picture at 10 km, finite beyond",
         Some(extremes::cameras_far_from_the_origin_see_the_same_picture),
-        None
+        Some(extremes::cameras_far_from_the_origin_see_the_same_picture_in_the_twin)
     ),
     case!(
         "rates × 10³ and × 10⁶, NaN, negative",
         "recovered from, or refused by name",
         Some(extremes::extreme_learning_rates_are_recovered_from_or_refused),
-        None
+        Some(extremes::extreme_learning_rates_are_recovered_from_by_the_twin)
     ),
     case!(
         "pictures of one colour",
@@ -152,13 +153,13 @@ pub const CASES: &[Case] = &[
         "70,000 Gaussians in one tile",
         "those behind the opaque ones stay as they are",
         Some(instances::a_tile_with_more_gaussians_than_a_loop_may_turn_leaves_those_behind_alone),
-        None
+        Some(instances::a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin)
     ),
     case!(
         "one Gaussian over 70,400 tiles",
         "its gradient is the sum over all",
         Some(instances::a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient),
-        None
+        Some(instances::a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_twin)
     ),
     case!(
         "T·α below f16",

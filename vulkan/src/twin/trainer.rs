@@ -19,7 +19,8 @@ pub struct TwinTrainer<R> {
     pub cloud: Vec<Gaussian<R>>,
     moments: Vec<[Moments<R>; PARAMETERS]>,
     step: u32,
-    settings: TrainSettings,
+    /// May be changed between steps.
+    pub settings: TrainSettings,
     extent: f32,
     limits: Limits,
 }
