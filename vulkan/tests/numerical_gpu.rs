@@ -61,7 +61,7 @@ held! { instances:
 }
 
 #[test]
-#[ignore = "takes a quarter of an hour"]
+#[ignore = "takes up to half an hour"]
 fn more_instances_than_thirty_two_bits_count_are_drawn() {
     on_device(instances::more_instances_than_thirty_two_bits_count);
 }

@@ -251,7 +251,7 @@ pub fn a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient(gp
 }
 
 /// 2^32 and a few million instances through a whole step: the loss is that of the four opaque Gaussians in front, they
-/// learn what they learn alone, and those behind do not move. A quarter of an hour on two cores.
+/// learn what they learn alone, and those behind do not move. Up to half an hour on two cores.
 pub fn more_instances_than_thirty_two_bits_count(gpu: &Gpu) -> Outcome {
     let mut counted = Tally::default();
     let (v, n, tiles) = (view(1448, 1448), 32_800, 362 * 362);
