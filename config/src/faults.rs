@@ -1,95 +1,66 @@
 //! Faults of a simulated aircraft, all off by default: fields of the mission file's `[faults]` table and, under the
 //! names of ArduPilot's SIM_ parameters where those exist, live parameters of the simulator's MAVLink link.
 
-use serde::{Deserialize, Serialize};
+use crate::settings::{SettingError, table};
 
-/// What goes wrong, how often, and when. Percentages are of single events (bytes, frames, messages, pictures), each
-/// decided on its own by the mission's seed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct FaultSettings {
-    /// Faults act from this second of the flight on.
-    pub start_s: f32,
-    /// And for this long; 0 = to the end.
-    pub length_s: f32,
-    /// Bytes lost on the line, percent.
-    pub byte_loss_pct: f32,
-    /// Bytes with one bit flipped, percent.
-    pub bit_flip_pct: f32,
-    /// Whole frames lost, percent.
-    pub frame_loss_pct: f32,
-    /// 1: the line is silent in both directions.
-    pub link_pause: f32,
-    /// 0: the GPS has no fix and the position drifts away.
-    pub gps_enable: f32,
-    /// Shift of the reported latitude, degrees.
-    pub gps_glitch_lat_deg: f32,
-    /// Shift of the reported longitude, degrees.
-    pub gps_glitch_lon_deg: f32,
-    /// Shift of the reported altitude, metres.
-    pub gps_glitch_alt_m: f32,
-    /// Attitude messages with a false attitude, percent.
-    pub attitude_spike_pct: f32,
-    /// By how much, degrees.
-    pub attitude_spike_deg: f32,
-    /// Attitude and gimbal messages with NaN in a field, percent.
-    pub nan_pct: f32,
-    /// Shift of the autopilot's boot clock, seconds (a reboot or a clock that was set).
-    pub clock_jump_s: f32,
-    /// 1: SYSTEM_TIME carries Unix time 0, as before the first GPS fix.
-    pub unix_time_lost: f32,
-    /// 1: CAMERA_FEEDBACK carries 32-bit boot µs instead of Unix µs, as with a feedback pin.
-    pub feedback_boot_time: f32,
-    /// Triggers that are not announced, percent.
-    pub trigger_loss_pct: f32,
-    /// Pictures that never arrive, percent.
-    pub picture_loss_pct: f32,
-    /// Pictures that arrive twice (the second one under another name), percent.
-    pub picture_twice_pct: f32,
-    /// Pictures that arrive late, percent.
-    pub picture_late_pct: f32,
-    /// How late, seconds.
-    pub picture_late_s: f32,
-    /// Black pictures, percent.
-    pub picture_black_pct: f32,
-    /// Overexposed pictures, percent.
-    pub picture_over_pct: f32,
-    /// Picture files that end in the middle, percent.
-    pub picture_cut_pct: f32,
-    /// 1: frames are signed with another key.
-    pub signing_key_wrong: f32,
-}
-
-impl Default for FaultSettings {
-    fn default() -> Self {
-        Self {
-            start_s: 0.0,
-            length_s: 0.0,
-            byte_loss_pct: 0.0,
-            bit_flip_pct: 0.0,
-            frame_loss_pct: 0.0,
-            link_pause: 0.0,
-            gps_enable: 1.0,
-            gps_glitch_lat_deg: 0.0,
-            gps_glitch_lon_deg: 0.0,
-            gps_glitch_alt_m: 0.0,
-            attitude_spike_pct: 0.0,
-            attitude_spike_deg: 30.0,
-            nan_pct: 0.0,
-            clock_jump_s: 0.0,
-            unix_time_lost: 0.0,
-            feedback_boot_time: 0.0,
-            trigger_loss_pct: 0.0,
-            picture_loss_pct: 0.0,
-            picture_twice_pct: 0.0,
-            picture_late_pct: 0.0,
-            picture_late_s: 5.0,
-            picture_black_pct: 0.0,
-            picture_over_pct: 0.0,
-            picture_cut_pct: 0.0,
-            signing_key_wrong: 0.0,
-        }
-    }
+table! {
+    /// What goes wrong, how often, and when. Percentages are of single events (bytes, frames, messages, pictures), each
+    /// decided on its own by the mission's seed.
+    #[derive(Copy)]
+    pub struct FaultSettings {
+        /// Faults act from this second of the flight on.
+        pub start_s: f32 = 0.0;
+        /// And for this long; 0 = to the end.
+        pub length_s: f32 = 0.0;
+        /// Bytes lost on the line.
+        pub byte_loss_pct: f32 = 0.0;
+        /// Bytes with one bit flipped.
+        pub bit_flip_pct: f32 = 0.0;
+        /// Whole frames lost.
+        pub frame_loss_pct: f32 = 0.0;
+        /// 1: the line is silent in both directions.
+        pub link_pause: f32 = 0.0;
+        /// 0: the GPS has no fix and the position drifts away.
+        pub gps_enable: f32 = 1.0;
+        /// Shift of the reported latitude.
+        pub gps_glitch_lat_deg: f32 = 0.0;
+        /// Shift of the reported longitude.
+        pub gps_glitch_lon_deg: f32 = 0.0;
+        /// Shift of the reported altitude.
+        pub gps_glitch_alt_m: f32 = 0.0;
+        /// Attitude messages with a false attitude.
+        pub attitude_spike_pct: f32 = 0.0;
+        /// By how much.
+        pub attitude_spike_deg: f32 = 30.0;
+        /// Attitude and gimbal messages with NaN in a field.
+        pub nan_pct: f32 = 0.0;
+        /// Shift of the autopilot's boot clock, seconds (a reboot or a clock that was set).
+        pub clock_jump_s: f32 = 0.0;
+        /// 1: SYSTEM_TIME carries Unix time 0, as before the first GPS fix.
+        pub unix_time_lost: f32 = 0.0;
+        /// 1: CAMERA_FEEDBACK carries 32-bit boot µs instead of Unix µs, as with a feedback pin.
+        pub feedback_boot_time: f32 = 0.0;
+        /// Triggers that are not announced.
+        pub trigger_loss_pct: f32 = 0.0;
+        /// Pictures that never arrive.
+        pub picture_loss_pct: f32 = 0.0;
+        /// Pictures that arrive twice (the second one under another name).
+        pub picture_twice_pct: f32 = 0.0;
+        /// Pictures that arrive late.
+        pub picture_late_pct: f32 = 0.0;
+        /// How late.
+        pub picture_late_s: f32 = 5.0;
+        /// Black pictures.
+        pub picture_black_pct: f32 = 0.0;
+        /// Overexposed pictures.
+        pub picture_over_pct: f32 = 0.0;
+        /// Picture files that end in the middle.
+        pub picture_cut_pct: f32 = 0.0;
+        /// 1: frames are signed with another key.
+        pub signing_key_wrong: f32 = 0.0;
+        /// 1: somebody with the autopilot's ids says twice a second that it is disarmed.
+        pub forged_disarm: f32 = 0.0;
+    } where Self::in_range
 }
 
 /// One fault as a MAVLink parameter.
@@ -101,18 +72,25 @@ pub struct FaultParameter {
     pub ardupilot: bool,
     /// Smallest and largest value accepted.
     pub range: (f32, f32),
+    setting: &'static str,
     field: fn(&mut FaultSettings) -> &mut f32,
 }
 
 macro_rules! parameter {
     ($name:literal, $ardupilot:literal, $low:literal..=$high:literal, $field:ident) => {
-        FaultParameter { name: $name, ardupilot: $ardupilot, range: ($low, $high), field: |s| &mut s.$field }
+        FaultParameter {
+            name: $name,
+            ardupilot: $ardupilot,
+            range: ($low, $high),
+            setting: stringify!($field),
+            field: |s| &mut s.$field,
+        }
     };
 }
 
 impl FaultSettings {
     /// Every parameter, in the order of PARAM_VALUE's index.
-    pub const PARAMETERS: [FaultParameter; 25] = [
+    pub const PARAMETERS: [FaultParameter; 26] = [
         parameter!("SIM_FLT_START", false, 0.0..=1e6, start_s),
         parameter!("SIM_FLT_LENGTH", false, 0.0..=1e6, length_s),
         parameter!("SIM_UART_LOSS", true, 0.0..=100.0, byte_loss_pct),
@@ -138,6 +116,7 @@ impl FaultSettings {
         parameter!("SIM_PIC_OVER", false, 0.0..=100.0, picture_over_pct),
         parameter!("SIM_PIC_CUT", false, 0.0..=100.0, picture_cut_pct),
         parameter!("SIM_SIGN_BAD", false, 0.0..=1.0, signing_key_wrong),
+        parameter!("SIM_FORGE_DISARM", false, 0.0..=1.0, forged_disarm),
     ];
 
     /// Value of the parameter at an index of [`FaultSettings::PARAMETERS`].
@@ -163,15 +142,12 @@ impl FaultSettings {
         if since >= 0.0 && (self.length_s <= 0.0 || since < f64::from(self.length_s)) { *self } else { Self::default() }
     }
 
-    /// For the mission file's check.
-    ///
-    /// # Errors
-    /// One line on the first field that is out of its range or not a number.
-    pub fn check(&self) -> Result<(), String> {
+    fn in_range(&self) -> Result<(), SettingError> {
         for (index, p) in Self::PARAMETERS.iter().enumerate() {
             let v = self.value(index).unwrap_or(f32::NAN);
             if !(p.range.0..=p.range.1).contains(&v) {
-                return Err(format!("{} is {v}, must be within {}..={}", p.name, p.range.0, p.range.1));
+                let wanted = format!("{} to {} ({})", p.range.0, p.range.1, p.name);
+                return Err(SettingError::new(p.setting, &v, wanted));
             }
         }
         Ok(())
@@ -205,7 +181,7 @@ mod tests {
         assert_eq!(s.acting(15.0), FaultSettings::default());
         assert!(s.check().is_ok());
         let bad: FaultSettings = toml::from_str("nan_pct = 120.0").expect("toml");
-        assert!(bad.check().is_err_and(|e| e.contains("SIM_NAN_PCT")));
+        assert!(bad.check().is_err_and(|e| e.field == "nan_pct" && e.wanted.contains("SIM_NAN_PCT")));
         assert!(toml::from_str::<FaultSettings>("byte_los = 1.0").is_err());
         let mut s = FaultSettings::default();
         assert_eq!((s.set("SIM_UART_LOSS", f32::NAN), s.set("NO_SUCH", 1.0)), (None, None));

@@ -1,111 +1,81 @@
 //! `[init]`: how pictures become the first Gaussians.
 
-use serde::{Deserialize, Serialize};
+use crate::settings::{Limits, SettingError, table};
 
-/// Settings of the initialisation; the defaults are what the figures in the README were measured with.
-#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct InitSettings {
-    /// Threads of ONNX Runtime, 1…64.
-    pub threads: usize,
-    /// Most key frames the job will see; host memory is planned for them.
-    pub max_pictures: usize,
-    /// Sliding window: picture i is paired with i+1 … i+window.
-    pub window: usize,
-    /// Further co-visible pictures (other flight lines) that may be sources of one picture.
-    pub covisible: usize,
-    /// Least share of a picture's ground that its source must see.
-    pub min_overlap: f32,
-    /// Baseline divided by depth: pairs outside give no depth (pure rotation) or no matches.
-    pub baseline: [f32; 2],
-    /// Largest angle between two optical axes, degrees.
-    pub max_angle_deg: f32,
-    /// Nearest and farthest depth, metres; absent = measured from matched features.
-    pub depth_m: Option<[f32; 2]>,
-    /// Depths of lower confidence make no Gaussian.
-    pub min_confidence: f32,
-    /// Longest side of the pictures given to a network of any size, pixels.
-    pub max_side: u32,
-    /// Every how many pixels (of the network's picture) a Gaussian is proposed.
-    pub stride: u32,
-    /// Resolve conflicting depths by multi-view consistency.
-    pub consistency: bool,
-    /// Continue the ground where no second picture looks (the rim of the region); needs `consistency`.
-    pub fill: bool,
-    /// Depths of two views agree when they differ by less than this share.
-    pub depth_tolerance: f32,
-    /// sᵍ: bring the Gaussians' extent to the scale of the poses (off only for the paper's ablation).
-    pub global_scale: bool,
-    /// sˡ: set the Gaussians' extent from the distance to their neighbours (off only for the paper's ablation).
-    pub local_scale: bool,
-    /// Gaussians longer than this many median extents are abnormal and removed.
-    pub max_scale_ratio: f32,
-    /// Opacity of a Gaussian of full confidence.
-    pub opacity: f32,
-    /// Most steps of the global alignment (the paper: 500).
-    pub align_steps: usize,
-    /// Seed of everything random here.
-    pub seed: u64,
+table! {
+    /// How pictures become the first Gaussians.
+    pub struct InitSettings {
+        /// Threads of ONNX Runtime.
+        pub threads: usize = 2, in Limits::within(1.0, 64.0);
+        /// Most key frames the job will see; host memory is planned for them.
+        pub max_pictures: usize = 300, in Limits::within(2.0, 100_000.0);
+        /// Sliding window: picture i is paired with i+1 … i+window.
+        pub window: usize = 2, in Limits::within(1.0, 16.0), from "the paper, step 2";
+        /// Further co-visible pictures (other flight lines) that may be sources of one picture.
+        pub covisible: usize = 2, in Limits::within(0.0, 16.0);
+        /// Least share of a picture's ground that its source must see.
+        pub min_overlap: f32 = 0.35, in Limits::within(0.0, 1.0);
+        /// Baseline divided by depth, least and greatest: pairs outside give no depth (pure rotation) or no matches.
+        pub baseline: [f32; 2] = [0.03, 0.9], in Limits::within(0.0, 10.0);
+        /// Largest angle between two optical axes.
+        pub max_angle_deg: f32 = 45.0, in Limits::above(0.0).up_to(120.0);
+        /// Nearest and farthest depth; absent = measured from matched features.
+        pub depth_m: Option<[f32; 2]> = None, in Limits::above(0.0);
+        /// Depths of lower confidence make no Gaussian.
+        pub min_confidence: f32 = 0.005, in Limits::within(0.0, 1.0);
+        /// Longest side of the pictures given to a network of any size.
+        pub max_side: u32 = 640, in Limits::within(64.0, 8192.0), unit "pixels";
+        /// Every how many pixels (of the network's picture) a Gaussian is proposed.
+        pub stride: u32 = 2, in Limits::within(1.0, 16.0), unit "pixels";
+        /// Resolve conflicting depths by multi-view consistency.
+        pub consistency: bool = true;
+        /// Continue the ground where no second picture looks (the rim of the region); needs `consistency`.
+        pub fill: bool = true;
+        /// Depths of two views agree when they differ by less than this share.
+        pub depth_tolerance: f32 = 0.005, in Limits::above(0.0).below(0.5);
+        /// sᵍ: bring the Gaussians' extent to the scale of the poses (off only for the paper's ablation).
+        pub global_scale: bool = true, from "the paper";
+        /// sˡ: set the Gaussians' extent from the distance to their neighbours (off only for the paper's ablation).
+        pub local_scale: bool = true, from "the paper";
+        /// Gaussians longer than this many median extents are abnormal and removed.
+        pub max_scale_ratio: f32 = 8.0, in Limits::above(1.0);
+        /// Opacity of a Gaussian of full confidence.
+        pub opacity: f32 = 0.9, in Limits::within(0.0, 1.0);
+        /// Most steps of the global alignment.
+        pub align_steps: usize = 500, in Limits::within(1.0, 10_000.0), from "the paper";
+    } where Self::ranges_grow
 }
 
-impl Default for InitSettings {
-    fn default() -> Self {
-        Self {
-            threads: 2,
-            max_pictures: 300,
-            window: 2,
-            covisible: 2,
-            min_overlap: 0.35,
-            baseline: [0.03, 0.9],
-            max_angle_deg: 45.0,
-            depth_m: None,
-            min_confidence: 0.005,
-            max_side: 640,
-            stride: 2,
-            consistency: true,
-            fill: true,
-            depth_tolerance: 0.005,
-            global_scale: true,
-            local_scale: true,
-            max_scale_ratio: 8.0,
-            opacity: 0.9,
-            align_steps: 500,
-            seed: 0,
+impl InitSettings {
+    fn ranges_grow(&self) -> Result<(), SettingError> {
+        let grows = |[low, high]: &[f32; 2]| low < high;
+        match &self.depth_m {
+            Some(depth) if !grows(depth) => Err(SettingError::new("depth_m", depth, "two growing numbers")),
+            _ if !grows(&self.baseline) => Err(SettingError::new("baseline", &self.baseline, "two growing numbers")),
+            _ => Ok(()),
         }
     }
 }
 
-impl InitSettings {
-    /// Checks every number; the error names the field.
-    ///
-    /// # Errors
-    /// A field and what it must be.
-    pub fn check(&self) -> Result<(), (&'static str, &'static str)> {
-        let share = |v: f32| (0.0..=1.0).contains(&v);
-        let rules: [(bool, &'static str, &'static str); 14] = [
-            ((1..=64).contains(&self.threads), "threads", "must be within 1…64"),
-            ((2..=100_000).contains(&self.max_pictures), "max_pictures", "must be within 2…100000"),
-            ((1..=16).contains(&self.window), "window", "must be within 1…16"),
-            (self.covisible <= 16, "covisible", "must be at most 16"),
-            (share(self.min_overlap), "min_overlap", "must be within 0…1"),
-            (
-                self.baseline[0] >= 0.0 && self.baseline[0] < self.baseline[1] && self.baseline[1] <= 10.0,
-                "baseline",
-                "must be two growing numbers within 0…10",
-            ),
-            (self.max_angle_deg > 0.0 && self.max_angle_deg <= 120.0, "max_angle_deg", "must be within 0…120"),
-            (
-                self.depth_m.is_none_or(|[n, f]| n > 0.0 && f > n && f.is_finite()),
-                "depth_m",
-                "must be two growing positive numbers",
-            ),
-            (share(self.min_confidence) && share(self.opacity), "min_confidence, opacity", "must be within 0…1"),
-            ((64..=8192).contains(&self.max_side), "max_side", "must be within 64…8192"),
-            ((1..=16).contains(&self.stride), "stride", "must be within 1…16"),
-            (self.depth_tolerance > 0.0 && self.depth_tolerance < 0.5, "depth_tolerance", "must be within 0…0.5"),
-            (self.max_scale_ratio > 1.0, "max_scale_ratio", "must be above 1"),
-            ((1..=10_000).contains(&self.align_steps), "align_steps", "must be within 1…10000"),
-        ];
-        rules.into_iter().find(|r| !r.0).map_or(Ok(()), |r| Err((r.1, r.2)))
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_must_grow_and_numbers_be_numbers() {
+        assert_eq!(InitSettings::default().check(), Ok(()));
+        for bad in [
+            "baseline = [0.9, 0.03]",
+            "baseline = [0.1, nan]",
+            "depth_m = [5.0, 5.0]",
+            "depth_m = [0.0, 5.0]",
+            "depth_tolerance = 0.5",
+            "max_scale_ratio = inf",
+            "threads = 0",
+        ] {
+            let field = bad.split(' ').next().expect("a name");
+            let refused = toml::from_str::<InitSettings>(bad).expect("TOML").check().expect_err(bad);
+            assert!(refused.field.starts_with(field), "{refused}");
+        }
     }
 }

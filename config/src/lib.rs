@@ -1,9 +1,14 @@
 //! What every part of `dgtr` must agree on before the first frame: the mission file, presets, geodesy and
 //! the fixed memory plan. Depends on nothing else of the project.
 //!
-//! Without the `std` feature only [`geodesy`] remains; the `no_std` core of `hal` uses it.
+//! Without the `std` feature only [`error`] and [`geodesy`] remain; the `no_std` core of `hal` uses it.
 #![cfg_attr(not(feature = "std"), no_std)]
 
+#[cfg(feature = "std")]
+pub mod disk;
+pub mod error;
+#[cfg(feature = "std")]
+pub mod failsafe;
 #[cfg(feature = "std")]
 pub mod faults;
 pub mod geodesy;
@@ -14,6 +19,8 @@ pub mod ground;
 pub mod init;
 #[cfg(feature = "std")]
 pub mod kernels;
+#[cfg(feature = "std")]
+pub mod keys;
 #[cfg(feature = "std")]
 pub mod lens;
 #[cfg(feature = "std")]
@@ -26,6 +33,8 @@ pub mod plan;
 pub mod preset;
 #[cfg(feature = "std")]
 pub mod refine;
+#[cfg(feature = "std")]
+pub mod settings;
 #[cfg(feature = "std")]
 pub mod training;
 #[cfg(feature = "std")]

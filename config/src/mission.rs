@@ -6,172 +6,114 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
-
+use crate::failsafe::FailsafeSettings;
 use crate::faults::FaultSettings;
 use crate::geodesy::{EnuFrame, Geodetic};
 use crate::ground::GroundSettings;
 use crate::init::InitSettings;
+use crate::keys::PublicKey;
 use crate::link::LinkSettings;
 use crate::preset::Preset;
 use crate::refine::RefineSettings;
+use crate::settings::{Limits, SettingError, record, table};
 use crate::training::TrainSettings;
 use crate::upload::UploadSettings;
 
+mod camera;
+mod draft;
 mod error;
 mod memory;
+mod origin;
+mod reference;
 mod validate;
 
+pub use camera::{CameraSettings, CameraSource, MountAttitude, MountSettings};
+pub use draft::Draft;
 pub use error::MissionError;
 pub use memory::MemorySettings;
+pub use reference::reference;
 
 /// A mission file larger than this is refused before it is parsed.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// What all aircraft and the ground share.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-#[serde(deny_unknown_fields)]
-pub struct Mission {
-    /// Short name, part of every key on the wire: `[A-Za-z0-9_-]`, at most 32 characters.
-    pub name: String,
-    /// Seed of everything random: simulators, training, faults.
-    #[serde(default)]
-    pub seed: u64,
-    /// Origin of the local East-North-Up frame.
-    pub origin: Geodetic,
-    /// The lens, as calibrated.
-    pub camera: CameraSettings,
-    /// How the camera sits on the aircraft.
-    #[serde(default)]
-    pub mount: MountSettings,
-    /// The link to the autopilot, signing, and how pictures are matched.
-    #[serde(default)]
-    pub link: LinkSettings,
-    /// When a picture becomes a key frame.
-    #[serde(default)]
-    pub keyframes: KeyframeSettings,
-    /// The budgets everything is planned from.
-    #[serde(default)]
-    pub memory: MemorySettings,
-    /// Manifests of the user's own networks.
-    #[serde(default)]
-    pub network: NetworkSettings,
-    /// How models reach the ground.
-    #[serde(default)]
-    pub upload: UploadSettings,
-    /// How the ground merges and distils them.
-    #[serde(default)]
-    pub ground: GroundSettings,
-    /// How pictures become the first Gaussians.
-    #[serde(default)]
-    pub init: InitSettings,
-    /// How telemetry's poses are refined.
-    #[serde(default)]
-    pub refine: RefineSettings,
-    /// The training recipe.
-    #[serde(default)]
-    pub training: TrainSettings,
-    /// What goes wrong in the simulators; off by default.
-    #[serde(default)]
-    pub faults: FaultSettings,
-    /// Who flies, and where.
-    pub aircraft: Vec<Aircraft>,
+record! {
+    /// What all aircraft and the ground share.
+    pub struct Mission {
+        /// Short name, part of every key on the wire: `[A-Za-z0-9_-]`, at most 32 characters.
+        pub name: String;
+        /// Seed of everything random: simulators, training, faults.
+        #[serde(default)]
+        pub seed: u64 = 0;
+        /// Origin of the local East-North-Up frame.
+        pub origin: Geodetic;
+        /// Calibration of the camera, pixels of the full picture; the centre of the top-left pixel is at (0.5, 0.5).
+        pub camera: CameraSettings;
+        /// How the camera sits on the aircraft.
+        #[serde(default)]
+        pub mount: MountSettings = MountSettings::default();
+        /// The link to the autopilot, signing, and how pictures are matched.
+        #[serde(default)]
+        pub link: LinkSettings = LinkSettings::default();
+        /// When a picture becomes a key frame: it moved more than `t_min_m` or turned more than `r_max_deg`.
+        #[serde(default)]
+        pub keyframes: KeyframeSettings = KeyframeSettings::default();
+        /// The budgets everything is planned from.
+        #[serde(default)]
+        pub memory: MemorySettings = MemorySettings::default();
+        /// Manifests of the user's own networks.
+        #[serde(default)]
+        pub network: NetworkSettings = NetworkSettings::default();
+        /// How models travel from the aircraft to the ground.
+        #[serde(default)]
+        pub upload: UploadSettings = UploadSettings::default();
+        /// How the ground merges and distils them.
+        #[serde(default)]
+        pub ground: GroundSettings = GroundSettings::default();
+        /// How pictures become the first Gaussians.
+        #[serde(default)]
+        pub init: InitSettings = InitSettings::default();
+        /// How telemetry's poses are refined.
+        #[serde(default)]
+        pub refine: RefineSettings = RefineSettings::default();
+        /// The training recipe.
+        #[serde(default)]
+        pub training: TrainSettings = TrainSettings::default();
+        /// When a flight counts as in trouble.
+        #[serde(default)]
+        pub failsafe: FailsafeSettings = FailsafeSettings::default();
+        /// What goes wrong in the simulators; off by default.
+        #[serde(default)]
+        pub faults: FaultSettings = FaultSettings::default();
+        /// Who flies, and where.
+        pub aircraft: Vec<Aircraft>;
+    } where Self::fits_together
 }
 
-/// Calibration of the camera, pixels of the full picture; centre of the top-left pixel at (0.5, 0.5).
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
-#[serde(deny_unknown_fields)]
-pub struct CameraSettings {
-    /// Picture width, pixels.
-    pub width: u32,
-    /// Picture height, pixels.
-    pub height: u32,
-    /// Focal length along x.
-    pub fx: f32,
-    /// Focal length along y.
-    pub fy: f32,
-    /// Principal point x.
-    pub cx: f32,
-    /// Principal point y.
-    pub cy: f32,
-    /// Brown–Conrady k1, k2, p1, p2 (OpenCV's order); zeros for pictures that are already undistorted.
-    #[serde(default)]
-    pub distortion: [f32; 4],
-    /// From the trigger's time stamp (of a video device, the driver's) to the middle of the exposure, milliseconds; most
-    /// drivers stamp the end of a picture, so that it is negative there.
-    #[serde(default)]
-    pub exposure_delay_ms: f32,
-}
-
-/// Where the camera's attitude comes from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum MountAttitude {
-    /// The autopilot reports it (GIMBAL_DEVICE_ATTITUDE_STATUS).
-    #[default]
-    Gimbal,
-    /// Bolted to the airframe at `rotation_deg`.
-    Fixed,
-}
-
-/// How the camera sits on the aircraft.
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MountSettings {
-    /// Where the camera's attitude comes from.
-    pub attitude: MountAttitude,
-    /// Roll, pitch, yaw of the optical axis against the airframe for a fixed mount, degrees; pitch −90 looks down. For a
-    /// gimbal the pitch it is set to, only for `max_tilt_deg`; zeros = not known.
-    pub rotation_deg: [f32; 3],
-    /// Camera centre in the body, metres forward, left, up of the position the autopilot reports.
-    pub lever_arm_m: [f32; 3],
-    /// Exposures are left out when the optical axis is further than this from where the mount points it on a level airframe,
-    /// degrees (ArduPilot's "trigger immediately" fires in turns); 180 = never.
-    pub max_tilt_deg: f32,
-}
-
-impl Default for MountSettings {
-    fn default() -> Self {
-        Self {
-            attitude: MountAttitude::Gimbal,
-            rotation_deg: [0.0; 3],
-            lever_arm_m: [0.0; 3],
-            // Beyond what an autopilot flies on purpose: ArduPlane's ROLL_LIMIT_DEG is 45, ArduCopter's ANGLE_MAX 30.
-            max_tilt_deg: 50.0,
-        }
+table! {
+    /// The key-frame rule of the paper (after NeuralRecon): moved more than `t_min_m` **or** turned more than `r_max_deg`.
+    #[derive(Copy)]
+    pub struct KeyframeSettings {
+        /// Least translation from the last key frame.
+        pub t_min_m: f32 = 5.0, in Limits::at_least(0.0);
+        /// Or least rotation from it.
+        pub r_max_deg: f32 = 15.0, in Limits::above(0.0).up_to(180.0), from "NeuralRecon";
+        /// Most key frames of one aircraft: the size of the rings and of the resident views.
+        pub max: u32 = 128, in Limits::within(2.0, 4096.0);
+        /// Leave out pictures from where an earlier key frame already stood.
+        pub skip_covered: bool = true;
     }
 }
 
-/// The key-frame rule of the paper (after NeuralRecon): moved more than `t_min_m` **or** turned more than `r_max_deg`.
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct KeyframeSettings {
-    /// Least translation from the last key frame, metres.
-    pub t_min_m: f32,
-    /// Or least rotation from it, degrees (15, NeuralRecon).
-    pub r_max_deg: f32,
-    /// Most key frames of one aircraft: the size of the rings and of the resident views.
-    pub max: u32,
-    /// Leave out pictures from where an earlier key frame already stood.
-    pub skip_covered: bool,
-}
-
-impl Default for KeyframeSettings {
-    fn default() -> Self {
-        Self { t_min_m: 5.0, r_max_deg: 15.0, max: 128, skip_covered: true }
+table! {
+    /// Manifests (TOML) of the user's own networks.
+    pub struct NetworkSettings {
+        /// A `pair` network; absent = the embedded plane sweep.
+        pub pair: Option<PathBuf> = None;
+        /// A monocular `depth` network for the depth loss; absent = the pair network's depth × confidence.
+        pub depth: Option<PathBuf> = None;
+        /// A perceptual `metric` for held-out pictures; absent = PSNR and SSIM only.
+        pub metric: Option<PathBuf> = None;
     }
-}
-
-/// Manifests (TOML) of the user's own networks.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct NetworkSettings {
-    /// A `pair` network; absent = the embedded plane sweep.
-    pub pair: Option<PathBuf>,
-    /// A monocular `depth` network for the depth loss; absent = the pair network's depth × confidence.
-    pub depth: Option<PathBuf>,
-    /// A perceptual `metric` for held-out pictures; absent = PSNR and SSIM only.
-    pub metric: Option<PathBuf>,
 }
 
 impl NetworkSettings {
@@ -185,40 +127,33 @@ impl NetworkSettings {
     }
 }
 
-/// Where an aircraft's pictures come from.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum CameraSource {
-    /// A folder that another program writes JPEG or PNG files into.
-    Folder(PathBuf),
-    /// A program that writes an MJPEG stream to its standard output, with its arguments.
-    Command(Vec<String>),
-    /// A video device of the kernel, e.g. `/dev/video0`; only in programs built with the feature `v4l2`.
-    V4l2(PathBuf),
-}
-
-/// One aircraft and its region.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-#[serde(deny_unknown_fields)]
-pub struct Aircraft {
-    /// Short name, `[A-Za-z0-9_-]`, at most 32 characters.
-    pub id: String,
-    /// MAVLink system id of its autopilot; messages of others are ignored and counted.
-    #[serde(default = "one")]
-    pub system_id: u8,
-    /// Link to the autopilot, e.g. `serial:/dev/ttyAMA0:921600`, `udpin:127.0.0.1:14550`.
-    pub link: String,
-    /// Where the pictures come from.
-    pub camera: CameraSource,
-    /// Corners of the region, degrees latitude and longitude. Give this or `region_enu`.
-    #[serde(default)]
-    pub region_wgs84: Vec<[f64; 2]>,
-    /// Corners of the region, metres east and north of the origin.
-    #[serde(default)]
-    pub region_enu: Vec<[f64; 2]>,
-    /// Vulkan device by (part of) its name; absent = the best one.
-    #[serde(default)]
-    pub device: Option<String>,
+record! {
+    /// One aircraft and its region.
+    pub struct Aircraft {
+        /// Short name, `[A-Za-z0-9_-]`, at most 32 characters.
+        pub id: String;
+        // 0 is MAVLink's broadcast.
+        /// MAVLink system id of its autopilot; messages of others are ignored and counted.
+        #[serde(default = "one")]
+        pub system_id: u8 = 1, in Limits::within(1.0, 255.0);
+        /// Link to the autopilot, e.g. `serial:/dev/ttyAMA0:921600`, `udpin:127.0.0.1:14550`.
+        pub link: String;
+        /// Where the pictures come from: `{ folder = "…" }`, `{ command = ["rpicam-vid", …] }` or, in programs built with the
+        /// feature v4l2, `{ v4l2 = "/dev/video0" }`.
+        pub camera: CameraSource;
+        /// Corners of the region, latitude and longitude. Give this or `region_enu`.
+        #[serde(default)]
+        pub region_wgs84: Vec<[f64; 2]> = Vec::new(), unit "degrees";
+        /// Corners of the region, east and north of the origin.
+        #[serde(default)]
+        pub region_enu: Vec<[f64; 2]> = Vec::new(), unit "metres";
+        /// Vulkan device by (part of) its name; absent = the best one.
+        #[serde(default)]
+        pub device: Option<String> = None;
+        /// Who may offer this aircraft's models, as `dgtr keys` prints it.
+        #[serde(default)]
+        pub public_key: Option<PublicKey> = None;
+    } where Self::named_and_placed
 }
 
 fn one() -> u8 {
@@ -242,16 +177,22 @@ impl Mission {
     }
 
     /// As [`Mission::read`], from text; relative paths are taken from `folder`.
+    ///
+    /// # Errors
+    /// The first line that is not TOML, the first setting that is unknown or cannot be worked with.
     pub fn parse(text: &str, folder: &Path) -> Result<Self, MissionError> {
-        let mut mission: Self = toml::from_str(text).map_err(|e| MissionError::syntax(text, &e))?;
+        let mut mission: Self = crate::settings::parse(text)?;
         mission.anchor_paths(folder);
         let preset = mission.memory.preset.map(Preset::values);
         mission.training.seconds = mission.training.seconds.or(preset.map(|p| p.seconds));
-        validate::check(&mission)?;
+        mission.check()?;
         Ok(mission)
     }
 
     /// The aircraft called `id`; without an id, the only one there is.
+    ///
+    /// # Errors
+    /// None of that name, or several and none chosen.
     pub fn aircraft(&self, id: Option<&str>) -> Result<&Aircraft, MissionError> {
         let known = || self.aircraft.iter().map(|a| a.id.as_str()).collect::<Vec<_>>().join(", ");
         match id {
@@ -278,6 +219,28 @@ impl Mission {
         aircraft.region_wgs84.iter().map(corner).collect()
     }
 
+    /// Whether offers and receipts are signed, that is, whether the ground and every aircraft have a key.
+    ///
+    /// # Errors
+    /// Only some have one; nobody has, and an endpoint of `[upload]` lies beyond this machine without `insecure = true`.
+    pub fn check_trust(&self) -> Result<bool, SettingError> {
+        let ground = ("ground".to_owned(), self.ground.public_key);
+        let aircraft = self.aircraft.iter().enumerate().map(|(i, a)| (format!("aircraft[{i}]"), a.public_key));
+        let (with, without): (Vec<_>, Vec<_>) = aircraft.chain([ground]).partition(|k| k.1.is_some());
+        if let (Some((known, _)), Some((unknown, key))) = (with.first(), without.first()) {
+            let wanted = format!("given as {known} has one, too; `dgtr keys` makes it");
+            return Err(SettingError::new("public_key", key, wanted).at(unknown));
+        }
+        match self.upload.exposed() {
+            Some((field, endpoint)) if !self.upload.insecure && with.is_empty() => {
+                let wanted = "on this machine while nothing is signed; make keys with `dgtr keys`, or say insecure = true \
+                              in [upload]";
+                Err(SettingError::new(field, endpoint, wanted).at("upload"))
+            }
+            _ => Ok(!with.is_empty()),
+        }
+    }
+
     fn anchor_paths(&mut self, folder: &Path) {
         let anchor = |p: &mut PathBuf| {
             if p.is_relative() {
@@ -288,6 +251,7 @@ impl Mission {
         if let Some(p) = &mut self.upload.folder {
             anchor(p);
         }
+        anchor(&mut self.upload.keys);
         if let Some(p) = &mut self.link.signing_key {
             anchor(p);
         }
@@ -335,13 +299,39 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
 
     #[test]
     fn wrong_missions_are_refused_with_field_and_remedy() {
-        assert!(refused("name = \"park\"", "name = \"a/b\"").contains("name: 'a/b'"));
+        assert!(refused("name = \"park\"", "name = \"a/b\"").contains("name = \"a/b\""));
         assert!(refused("name = \"park\"", "name = 3").starts_with("line 2"));
-        assert!(refused("fx = 385.0", "fx = nan").contains("fx and fy"));
-        assert!(refused("link =", "lnik =").contains("lnik"));
+        assert!(refused("fx = 385.0", "fx = nan").contains("camera.fx = nan"));
+        assert!(refused("link =", "lnik =").contains("line 7: unknown setting `lnik`; did you mean `link`?"));
         assert!(refused("[10.0, 10.0]", "[20.0, 0.0]").contains("area"));
         assert!(refused("lat_deg = 28.0", "lat_deg = 280.0").contains("origin"));
         assert!(refused("id = \"a1\"", "id = \"a1\"\nsystem_id = 0").contains("system_id"));
+    }
+
+    /// `[link]` was read but never checked: with NaN, and with 0, the link counted as lost for ever.
+    #[test]
+    fn every_table_is_checked_and_the_setting_is_named_by_its_path() {
+        for (table, path) in [
+            ("link = { heartbeat_timeout_s = nan }", "link.heartbeat_timeout_s = nan: must be 0.1 to 3600"),
+            ("link = { heartbeat_timeout_s = 0.0 }", "link.heartbeat_timeout_s"),
+            ("mount = { max_tilt_deg = 0.0 }", "mount.max_tilt_deg"),
+            ("keyframes = { max = 1 }", "keyframes.max"),
+            ("memory = { image_scale = 1.5 }", "memory.image_scale"),
+            ("upload = { poll_s = 0.0 }", "upload.poll_s"),
+            ("ground = { scale = nan }", "ground.scale"),
+            ("init = { stride = 0 }", "init.stride"),
+            ("refine = { max_pairs = 0 }", "refine.max_pairs"),
+            ("training = { rates = { opacity = -1.0 } }", "training.rates.opacity"),
+            ("faults = { nan_pct = 120.0 }", "faults.nan_pct"),
+        ] {
+            let told = refused("name = \"park\"", &format!("name = \"park\"\n{table}"));
+            assert!(told.starts_with(path), "{told}");
+        }
+        assert!(refused("fx = 385.0", "fx = 0.0").starts_with("camera.fx"));
+        assert!(
+            refused("link = \"udpin:127.0.0.1:14550\"", "link = \"\"\nsystem_id = 0")
+                .starts_with("aircraft[0].system_id")
+        );
     }
 
     #[test]
@@ -355,12 +345,44 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
     #[test]
     fn a_preset_gives_seconds_unless_the_mission_does() {
         let seconds = |more: &str| {
-            let table = format!("name = \"park\"\nmemory = {{ preset = \"ci\" }}\n{more}");
+            let table = format!("name = \"park\"\nmemory = {{ preset = \"tiny\" }}\n{more}");
             let text = GOOD.replace("name = \"park\"", &table);
             Mission::parse(&text, Path::new("/m")).expect("parses").training.seconds
         };
-        assert_eq!(seconds(""), Some(Preset::Ci.values().seconds));
+        assert_eq!(seconds(""), Some(Preset::Tiny.values().seconds));
         assert_eq!(seconds("training = { seconds = 7.0 }"), Some(7.0));
+    }
+
+    #[test]
+    fn an_endpoint_beyond_this_machine_needs_keys_or_the_word_insecure() {
+        let key = |n: u8| format!("public_key = \"{}\"", PublicKey([n; 32]));
+        let trust = |upload: &str, ground: &str, aircraft: &str| {
+            let tables = format!("name = \"park\"\nupload = {{ {upload} }}\nground = {{ {ground} }}");
+            let id = format!("id = \"a1\"\n{aircraft}");
+            let text = GOOD.replace("name = \"park\"", &tables).replace("id = \"a1\"", &id);
+            let mission = Mission::parse(&text, Path::new("/m")).expect("parses");
+            mission.check_trust().map_err(|e| e.to_string())
+        };
+        let outside = "listen = [\"tcp/0.0.0.0:7447\"]";
+        assert!(
+            trust(outside, "", "")
+                .is_err_and(|e| e.contains("upload.listen = \"tcp/0.0.0.0") && e.contains("dgtr keys"))
+        );
+        assert_eq!(trust(&format!("{outside}, insecure = true"), "", ""), Ok(false));
+        assert_eq!(trust("listen = [\"tcp/127.0.0.1:7447\"]", "", ""), Ok(false));
+        assert_eq!(trust(outside, &key(1), &key(2)), Ok(true));
+        // Half of the keys protect nobody, even here.
+        assert!(trust("", &key(1), "").is_err_and(|e| e.starts_with("aircraft[0].public_key = absent")));
+        assert!(trust("", "", &key(2)).is_err_and(|e| e.starts_with("ground.public_key = absent")));
+    }
+
+    #[test]
+    fn a_key_of_two_owners_or_of_an_aircraft_called_ground_is_refused() {
+        let key = |n: u8| format!("public_key = \"{}\"", PublicKey([n; 32]));
+        let twice = format!("ground = {{ {} }}\n[[aircraft]]\n{}", key(3), key(3));
+        assert!(refused("[[aircraft]]", &twice).contains("nobody else's"));
+        assert!(refused("id = \"a1\"", &format!("id = \"ground\"\n{}", key(4))).contains("ground.key"));
+        assert!(refused("id = \"a1\"", "id = \"a1\"\npublic_key = \"abc\"").contains("64 hexadecimal digits"));
     }
 
     #[test]

@@ -16,12 +16,16 @@ pub const SORT_LANES_GPU: u32 = 256;
 pub const STATUS_BYTES: u64 = (4 << 10) + 16 * SORT_LANES_GPU as u64;
 /// Lanes of the passes that loop over the visible Gaussians; each leaves one partial sum.
 pub const LOOP_LANES: u64 = 1024;
+/// A partial sum of 32 bytes for each of them.
+pub const LANE_SUMS_BYTES: u64 = 32 * LOOP_LANES;
 /// Every binding stays below this (lavapipe's and older V3DV's `maxStorageBufferRange`).
 pub const BINDING_LIMIT: u64 = 128 << 20;
 /// Sections start at multiples of this, the largest `minStorageBufferOffsetAlignment` Vulkan allows.
 pub const SECTION_ALIGNMENT: u64 = 256;
-/// The whole is a multiple of this, so that no driver rounds it up.
+/// The whole is a multiple of this.
 pub const TOTAL_ALIGNMENT: u64 = 64 << 10;
+/// What a driver may want beyond the bytes of the one buffer (V3DV: 256 more for storage and uniform buffers; others round up).
+pub const DRIVER_ROOM: u64 = 64 << 10;
 /// Pixels along the side of a tile.
 pub const TILE_SIDE: u64 = 4;
 
@@ -204,7 +208,8 @@ impl Plan {
         let sections: Vec<(&'static str, u64)> = [
             ("frame", 16 << 10),      // uniforms and the table of deferred moments
             ("status", STATUS_BYTES), // counters read back after every step, cursors of the sorting lanes
-            ("partials", 32 * (LOOP_LANES + p.div_ceil(8) + u64::from(r.width) + u64::from(r.height) + 64)),
+            ("lane_sums", LANE_SUMS_BYTES),
+            ("strip_sums", 32 * (p.div_ceil(8) + u64::from(r.width) + u64::from(r.height) + 64)),
             ("geometry", 144 * n), // mean+opacity, log scale+state, rotation; each with two Adam moments
             ("sh", sh),
             ("sh_first_moment", moment),
@@ -212,9 +217,9 @@ impl Plan {
             ("projected", 48 * n), // centre, conic, span data
             ("shaded", 48 * n),    // the visible ones in depth order, with colour
             ("keys", 4 * n),       // depths of all, and of the visible ones while sorting
-            ("rows", 4 * n),       // the visible ones in depth order
+            ("order", 4 * n),      // the visible ones in depth order
             ("keys_other", 4 * n),
-            ("rows_other", 4 * n),
+            ("order_other", 4 * n),
             ("digits", 4 * 256 * lanes), // per sorting lane: digits of the sort's present pass
             ("reduced", 48 * n),         // summed gradient slots
             ("slot_ranges", 8 * n),      // first slot and number of slots
@@ -227,6 +232,7 @@ impl Plan {
             ("image_gradient", 16 * p),
             ("target", 8 * p), // the step's picture (RGBA8) and depth prior at working size
             ("views", view_bytes(p) * u64::from(r.views)),
+            ("driver_room", DRIVER_ROOM), // behind the buffer, for what the driver adds to it
         ]
         .into_iter()
         .map(|(name, bytes): (&'static str, u64)| (name, bytes.max(16).next_multiple_of(SECTION_ALIGNMENT)))
@@ -244,6 +250,11 @@ impl Plan {
             sections,
             total_bytes: total.next_multiple_of(TOTAL_ALIGNMENT),
         }
+    }
+
+    /// Bytes of the one buffer: all but the room that is left for the driver.
+    pub fn buffer_bytes(&self) -> u64 {
+        self.total_bytes - DRIVER_ROOM
     }
 
     /// What moments in 16 bits are multiplied by: gradients of a mean over the pixels of three channels come to the size of
@@ -295,6 +306,17 @@ mod tests {
         assert_eq!(p.total_bytes, sum.next_multiple_of(TOTAL_ALIGNMENT));
         for (name, bytes) in &p.sections {
             assert!(*name == "views" || *bytes <= BINDING_LIMIT + (1 << 20), "{name}: {bytes}");
+        }
+    }
+
+    #[test]
+    fn every_section_lies_in_the_buffer_and_the_room_for_the_driver_behind_it() {
+        for mib in [200, 333, 1024] {
+            let p = Plan::new(&request(mib)).unwrap();
+            let (last, bytes) = p.sections[p.sections.len() - 1];
+            assert_eq!((last, bytes), ("driver_room", DRIVER_ROOM));
+            let held: u64 = p.sections.iter().map(|s| s.1).sum::<u64>() - bytes;
+            assert!(held <= p.buffer_bytes() && p.buffer_bytes() + DRIVER_ROOM == p.total_bytes);
         }
     }
 

@@ -14,64 +14,42 @@ pub use rates::{AdamSettings, RateSettings};
 pub use schedule::{ResolutionSettings, ShSettings, StopSettings, ViewSettings};
 pub use skips::SkipSettings;
 
-use serde::{Deserialize, Serialize};
+use crate::settings::{Limits, table};
 
-/// The training recipe. `TrainSettings::default()` is what the figures in the README were measured with.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TrainSettings {
-    /// Seeds view order, noise, relocation and DropGaussian; same seed, same bytes.
-    pub seed: u64,
-    /// Length of the schedule in steps. The paper trains each device for 10,000 steps.
-    pub steps: u32,
-    /// Length of the schedule in seconds of wall clock; when given, progress is the larger of the two
-    /// fractions, so that training ends at whichever comes first.
-    pub seconds: Option<f64>,
-    /// What is minimised.
-    pub loss: LossSettings,
-    /// Step size of every parameter group.
-    pub rates: RateSettings,
-    /// Adam's own constants.
-    pub adam: AdamSettings,
-    /// Relocation, growth and pruning.
-    pub density: DensitySettings,
-    /// Spherical harmonics.
-    pub sh: ShSettings,
-    /// Coarse to fine.
-    pub resolution: ResolutionSettings,
-    /// Which view comes next.
-    pub views: ViewSettings,
-    /// When to end before the schedule does.
-    pub stop: StopSettings,
-    /// Regularisers that act on the parameters or on the rendering.
-    pub regularise: RegulariseSettings,
-    /// Work that is left out because it changes nothing.
-    pub skips: SkipSettings,
-    /// Optimise a 6-vector per view (rotation and translation of world → camera) together with the cloud.
-    pub refine_poses: bool,
-    /// Optimise six scalars per view: log gain and offset of each channel.
-    pub refine_exposure: bool,
-}
-
-impl Default for TrainSettings {
-    fn default() -> Self {
-        Self {
-            seed: 1,
-            steps: 10_000, // paper §4.1: 10,000 steps per device
-            seconds: None,
-            loss: LossSettings::default(),
-            rates: RateSettings::default(),
-            adam: AdamSettings::default(),
-            density: DensitySettings::default(),
-            sh: ShSettings::default(),
-            resolution: ResolutionSettings::default(),
-            views: ViewSettings::default(),
-            stop: StopSettings::default(),
-            regularise: RegulariseSettings::default(),
-            skips: SkipSettings::default(),
-            refine_poses: false,
-            refine_exposure: false,
-        }
+table! {
+    /// The training recipe. Its defaults are what the measured tables of `tests/BENCHMARKS.md` were measured with.
+    pub struct TrainSettings {
+        /// Seeds view order, noise, relocation and DropGaussian; same seed, same bytes.
+        pub seed: u64 = 1;
+        /// Length of the schedule.
+        pub steps: u32 = 10_000, in Limits::within(1.0, 1e9), unit "steps", from "the paper, 4.1: 10,000 steps per device";
+        /// Length of the schedule by wall clock; when given, progress is the larger of the two fractions, so that training
+        /// ends at whichever comes first.
+        pub seconds: Option<f64> = None, in Limits::within(1e-3, 1e9);
+        /// What is minimised.
+        pub loss: LossSettings = LossSettings::default();
+        /// Step size of every parameter group.
+        pub rates: RateSettings = RateSettings::default();
+        /// Adam's own constants.
+        pub adam: AdamSettings = AdamSettings::default();
+        /// Relocation, growth and pruning.
+        pub density: DensitySettings = DensitySettings::default();
+        /// Spherical harmonics.
+        pub sh: ShSettings = ShSettings::default();
+        /// Coarse to fine.
+        pub resolution: ResolutionSettings = ResolutionSettings::default();
+        /// Which view comes next.
+        pub views: ViewSettings = ViewSettings::default();
+        /// When to end before the schedule does.
+        pub stop: StopSettings = StopSettings::default();
+        /// Regularisers that act on the parameters or on the rendering.
+        pub regularise: RegulariseSettings = RegulariseSettings::default();
+        /// Work that is left out because it changes nothing.
+        pub skips: SkipSettings = SkipSettings::default();
+        /// Optimise a 6-vector per view (rotation and translation of world → camera) together with the cloud.
+        pub refine_poses: bool = false;
+        /// Optimise six scalars per view: log gain and offset of each channel.
+        pub refine_exposure: bool = false;
     }
 }
 
@@ -82,125 +60,40 @@ impl TrainSettings {
         let by_time = self.seconds.map_or(0.0, |s| elapsed_s / s.max(1e-3));
         by_steps.max(by_time).clamp(0.0, 1.0) as f32
     }
+}
 
-    /// Says which field is outside its range, if any.
-    ///
-    /// # Errors
-    /// One line naming the field, its value and the range.
-    pub fn check(&self) -> Result<(), TrainSettingsError> {
-        let r = &self.rates;
-        let a = &self.adam;
-        let l = &self.loss;
-        let non_negative = [
-            ("loss.l1", l.l1),
-            ("loss.ssim", l.ssim),
-            ("loss.depth", l.depth),
-            ("rates.mean_start", r.mean_start),
-            ("rates.mean_end", r.mean_end),
-            ("rates.log_scale", r.log_scale),
-            ("rates.rotation", r.rotation),
-            ("rates.opacity", r.opacity),
-            ("rates.sh_dc", r.sh_dc),
-            ("rates.sh_rest", r.sh_rest),
-            ("rates.pose_rotation", r.pose_rotation),
-            ("rates.pose_translation", r.pose_translation),
-            ("rates.exposure", r.exposure),
-            ("regularise.noise", self.regularise.noise),
-            ("regularise.opacity_decay", self.regularise.opacity_decay),
-            ("density.growth", self.density.growth),
-            ("density.spread", self.density.spread),
-        ];
-        for (name, value) in non_negative {
-            within(name, value, 0.0, f32::MAX)?;
-        }
-        within("rates.final_share", r.final_share, 1e-6, 1.0)?;
-        within("adam.beta1", a.beta1, 0.0, 0.999_999)?;
-        within("adam.beta2", a.beta2, 0.0, 0.999_999)?;
-        within("adam.epsilon", a.epsilon, f32::MIN_POSITIVE, 1.0)?;
-        within("loss.depth_confidence", l.depth_confidence, 0.0, 1.0)?;
-        within("regularise.drop", self.regularise.drop, 0.0, 0.9)?;
-        within("regularise.background", self.regularise.background, 0.0, 1.0)?;
-        within("density.dead_opacity", self.density.dead_opacity, 0.0, 0.5)?;
-        within("views.residual_share", self.views.residual_share, 0.0, 1.0)?;
-        within("sh.degree", f32::from(self.sh.degree), 0.0, 3.0)?;
-        within("sh.raise_share", self.sh.raise_share, 0.0, 1.0)?;
-        within("steps", self.steps as f32, 1.0, 1e9)?;
-        within("seconds", self.seconds.unwrap_or(1.0) as f32, 1e-3, 1e9)
+table! {
+    /// `l1·L1 + ssim·(1 − SSIM) + depth·(1 − ρ(D, D_est))` (paper, total loss; the paper prints ρ itself).
+    #[derive(Copy)]
+    pub struct LossSettings {
+        /// λ₁.
+        pub l1: f32 = 0.8, in Limits::at_least(0.0), from "3DGS: 1 − λ_dssim";
+        /// λ₂.
+        pub ssim: f32 = 0.2, in Limits::at_least(0.0), from "3DGS: λ_dssim = 0.2";
+        /// λ₃; only views that came with a depth prior pay it.
+        pub depth: f32 = 0.05, in Limits::at_least(0.0), from "FSGS' weight of its Pearson loss, which the paper adopts";
+        /// Depth prior pixels with less confidence than this do not take part.
+        pub depth_confidence: f32 = 0.1, in Limits::within(0.0, 1.0), from "coverage matters more than purity";
+        /// Shape freezing: depth gradients reach means and opacities but not scales and rotations.
+        pub freeze_shape: bool = true, from "the paper, table 4: 21.53 → 21.72 dB";
     }
 }
 
-fn within(field: &'static str, value: f32, low: f32, high: f32) -> Result<(), TrainSettingsError> {
-    // Written so that NaN fails.
-    if value >= low && value <= high { Ok(()) } else { Err(TrainSettingsError { field, value, low, high }) }
-}
-
-/// A field of `[training]` is outside its range.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("[training] {field} = {value} is outside {low}…{high}; mend it in the mission file")]
-pub struct TrainSettingsError {
-    /// Dotted name of the field below `[training]`.
-    pub field: &'static str,
-    /// What it was.
-    pub value: f32,
-    /// Least allowed value.
-    pub low: f32,
-    /// Greatest allowed value.
-    pub high: f32,
-}
-
-/// `l1·L1 + ssim·(1 − SSIM) + depth·(1 − ρ(D, D_est))` (paper, total loss; the paper prints ρ itself).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct LossSettings {
-    /// λ₁.
-    pub l1: f32,
-    /// λ₂.
-    pub ssim: f32,
-    /// λ₃; only views that came with a depth prior pay it.
-    pub depth: f32,
-    /// Depth prior pixels with less confidence than this do not take part.
-    pub depth_confidence: f32,
-    /// Shape freezing: depth gradients reach means and opacities but not scales and rotations.
-    pub freeze_shape: bool,
-}
-
-impl Default for LossSettings {
-    fn default() -> Self {
-        Self {
-            l1: 0.8,               // 3DGS: 1 − λ_dssim
-            ssim: 0.2,             // 3DGS: λ_dssim = 0.2
-            depth: 0.05,           // FSGS' weight of its Pearson loss, which the paper adopts
-            depth_confidence: 0.1, // findings.md: coverage matters more than purity
-            freeze_shape: true,    // paper table 4: 21.53 → 21.72 dB
-        }
-    }
-}
-
-/// Regularisers. Zero switches each of them off.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct RegulariseSettings {
-    /// DropGaussian's γ: by the end of training this share of the Gaussians is left out of each step and the
-    /// others' opacities are raised by 1/(1 − γ). For sparse views (≈ 3…12); harmful with many.
-    pub drop: f32,
-    /// Noise on the means of nearly transparent Gaussians, in units of the means' learning rate; weighted
-    /// by (1 − opacity)^150 and clamped to the extent (Brush).
-    pub noise: f32,
-    /// Opacity subtracted at every densification, fading to nothing at the end (Brush).
-    pub opacity_decay: f32,
-    /// Half-width of the random background colour around `0.5·background`, 0 = black. Keeps the cloud from using black
-    /// holes as dark paint (Brush).
-    pub background: f32,
-}
-
-impl Default for RegulariseSettings {
-    fn default() -> Self {
-        Self {
-            drop: 0.0,            // DropGaussian (CVPR 2025) uses 0.2 on three views
-            noise: 2.0,           // Brush: 50 at a 25 × smaller rate of the means
-            opacity_decay: 0.004, // Brush opac_decay
-            background: 0.0,
-        }
+table! {
+    /// Regularisers that act on the parameters or on the rendering. Zero switches each of them off.
+    #[derive(Copy)]
+    pub struct RegulariseSettings {
+        /// DropGaussian's γ: by the end of training this share of the Gaussians is left out of each step and the
+        /// others' opacities are raised by 1/(1 − γ). For sparse views (≈ 3…12); harmful with many.
+        pub drop: f32 = 0.0, in Limits::within(0.0, 0.9), from "DropGaussian (CVPR 2025) uses 0.2 on three views";
+        /// Noise on the means of nearly transparent Gaussians, in units of the means' learning rate; weighted
+        /// by (1 − opacity)^150 and clamped to the extent.
+        pub noise: f32 = 2.0, in Limits::at_least(0.0), from "Brush: 50 at a 25 × smaller rate of the means";
+        /// Opacity subtracted at every densification, fading to nothing at the end.
+        pub opacity_decay: f32 = 0.004, in Limits::at_least(0.0), from "Brush opac_decay";
+        /// Half-width of the random background colour around `0.5·background`, 0 = black. Keeps the cloud from using black
+        /// holes as dark paint (Brush).
+        pub background: f32 = 0.0, in Limits::within(0.0, 1.0);
     }
 }
 

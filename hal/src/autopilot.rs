@@ -1,6 +1,7 @@
 //! One autopilot as heard on its link: a state machine fed with frames, which keeps the clocks, the track and the announced
 //! exposures. No I/O and no allocation; [`crate::vehicle`] feeds it.
 
+pub mod landing;
 mod motion;
 mod timing;
 mod triggers;
@@ -12,8 +13,9 @@ use crate::mavlink::Frame;
 use crate::mavlink::MessageData;
 use crate::mavlink::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_TRIGGER_DATA,
-    GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_GLOBAL_ORIGIN_DATA, GPS_RAW_INT_DATA,
-    HEARTBEAT_DATA, MavAutopilot, MavModeFlag, ODOMETRY_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA, TIMESYNC_DATA,
+    EXTENDED_SYS_STATE_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_GLOBAL_ORIGIN_DATA,
+    GPS_RAW_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, ODOMETRY_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA,
+    TIMESYNC_DATA,
 };
 use crate::pose::track::Track;
 use crate::pose::{BodyPose, PoseError};
@@ -23,6 +25,7 @@ use crate::time::unix::UnixMap;
 use crate::traits::{PoseSource, TriggerSource};
 use crate::trigger::Trigger;
 
+use landing::Landing;
 use motion::Motion;
 use triggers::Announcements;
 
@@ -44,7 +47,7 @@ pub struct Ids {
 
 /// What a frame was.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum Handled {
     /// Another system's: ignored.
     Foreign,
     /// A position was added to the track.
@@ -62,6 +65,8 @@ pub struct AutopilotState {
     pub heartbeat_ns: Option<u64>,
     /// Motors may turn.
     pub armed: bool,
+    /// It flew and is down again: several signs have agreed for seconds.
+    pub landed: bool,
     /// GPS fix type as MAVLink counts it: 3 = 3D, 6 = RTK fixed; `None` before the first GPS_RAW_INT.
     pub gps_fix: Option<u8>,
     /// Remaining battery, percent.
@@ -81,6 +86,7 @@ pub struct Autopilot {
     answers: Deque<TIMESYNC_DATA, ANSWERS>,
     sequences: LinearMap<u8, u8, SENDERS>,
     state: AutopilotState,
+    landing: Landing,
     counters: HalCounters,
 }
 
@@ -99,6 +105,7 @@ impl Autopilot {
             answers: Deque::new(),
             sequences: LinearMap::new(),
             state: AutopilotState::default(),
+            landing: Landing::default(),
             counters: HalCounters::default(),
         }
     }
@@ -109,7 +116,7 @@ impl Autopilot {
     }
 
     /// Takes a frame received at `now_ns` of the companion's clock.
-    pub fn hear(&mut self, frame: &Frame<'_>, now_ns: u64) -> Heard {
+    pub fn handle(&mut self, frame: &Frame<'_>, now_ns: u64) -> Handled {
         let heartbeat = frame.message::<HEARTBEAT_DATA>();
         let is_autopilot = |h: &HEARTBEAT_DATA| h.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID;
         if self.ids.system == 0 && heartbeat.as_ref().is_some_and(is_autopilot) {
@@ -118,7 +125,7 @@ impl Autopilot {
         }
         if frame.system() != self.ids.system || frame.component() == self.ids.own_component {
             self.counters.foreign += 1;
-            return Heard::Foreign;
+            return Handled::Foreign;
         }
         self.watch_sequence(frame);
         // Cameras and gimbals have components of their own; everything else is believed from the autopilot only.
@@ -133,7 +140,8 @@ impl Autopilot {
                 if let Some(h) = heartbeat.filter(is_autopilot) {
                     self.state.heartbeat_ns = Some(now_ns);
                     self.state.armed = h.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
-                    return Heard::Heartbeat;
+                    self.landing.on_heartbeat(self.state.armed, now_ns);
+                    return Handled::Heartbeat;
                 }
             }
             GLOBAL_POSITION_INT_DATA::ID => return self.on_global_position(frame, now_ns),
@@ -143,6 +151,11 @@ impl Autopilot {
             GPS_RAW_INT_DATA::ID => self.on_gps(frame),
             GPS_GLOBAL_ORIGIN_DATA::ID => self.on_origin(frame),
             SYSTEM_TIME_DATA::ID => self.on_system_time(frame, now_ns),
+            EXTENDED_SYS_STATE_DATA::ID => {
+                if let Some(m) = frame.message::<EXTENDED_SYS_STATE_DATA>() {
+                    self.landing.on_landed_state(m.landed_state, now_ns);
+                }
+            }
             SYS_STATUS_DATA::ID => {
                 if let Some(s) = frame.message::<SYS_STATUS_DATA>() {
                     self.state.battery_percent = u8::try_from(s.battery_remaining).ok().filter(|p| *p <= 100);
@@ -150,12 +163,12 @@ impl Autopilot {
             }
             _ => {}
         }
-        Heard::Other
+        Handled::Other
     }
 
-    /// What the autopilot says about itself.
-    pub fn state(&self) -> AutopilotState {
-        self.state
+    /// What the autopilot says about itself, as it counts at `now_ns`.
+    pub fn state(&self, now_ns: u64) -> AutopilotState {
+        AutopilotState { landed: self.landing.is_down(now_ns), ..self.state }
     }
 
     /// The clock mapping.
@@ -195,6 +208,12 @@ impl Autopilot {
             // A ninth sender goes unwatched.
             None => drop(self.sequences.insert(frame.component(), sequence)),
         }
+    }
+
+    /// What was taken so far came from somebody else.
+    pub fn start_afresh(&mut self) {
+        let (ids, counters) = (self.ids, self.counters);
+        *self = Self { counters, ..Self::new(ids) };
     }
 
     /// The boot clock restarted: what was known on the old one means nothing any more.

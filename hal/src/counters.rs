@@ -16,6 +16,8 @@ pub struct HalCounters {
     pub lost: u64,
     /// Frames of other systems.
     pub foreign: u64,
+    /// Frames of peers that are not the pinned autopilot.
+    pub refused_peers: u64,
     /// Unsigned frames refused.
     pub unsigned: u64,
     /// Frames refused for a wrong signature.
@@ -74,6 +76,8 @@ pub struct HalCounters {
     pub pictures_unmatched: u64,
     /// Pictures that came out of order or late.
     pub pictures_late: u64,
+    /// Pictures that found their exposure only when all were compared with all.
+    pub pictures_reconciled: u64,
     /// Exposures left out because the camera was tilted beyond `mount.max_tilt_deg`.
     pub exposures_tilted: u64,
     /// Exposures or pictures without a usable pose.

@@ -116,22 +116,36 @@ mod with_std {
             /// The file.
             path: PathBuf,
             /// What is wrong with its light.
-            blank: crate::camera::Blank,
+            blank: crate::blank::Blank,
         },
+    }
+
+    impl config::error::Error for HalError {
+        fn kind(&self) -> config::error::ErrorKind {
+            use config::error::ErrorKind as Kind;
+            match self {
+                Self::Open { source, .. } => config::error::Error::kind(source),
+                Self::Address { .. }
+                | Self::Signing { .. }
+                | Self::Camera { .. }
+                | Self::Video { kind: ErrorKind::Invalid, .. }
+                | Self::Picture { .. }
+                | Self::Blank { .. } => Kind::Input,
+                Self::Video { .. } => Kind::Device,
+                Self::Closed { .. } | Self::Full { .. } | Self::Link { .. } => Kind::Failed,
+            }
+        }
     }
 
     impl Error for HalError {
         fn kind(&self) -> ErrorKind {
             match self {
                 Self::Address { .. } | Self::Signing { .. } => ErrorKind::Invalid,
-                Self::Closed { .. } => ErrorKind::Closed,
+                // The folder or program may come back.
+                Self::Closed { .. } | Self::Camera { .. } => ErrorKind::Closed,
                 Self::Full { .. } => ErrorKind::Busy,
                 Self::Video { kind, .. } => *kind,
-                Self::Open { .. }
-                | Self::Link { .. }
-                | Self::Camera { .. }
-                | Self::Picture { .. }
-                | Self::Blank { .. } => ErrorKind::Device,
+                Self::Open { .. } | Self::Link { .. } | Self::Picture { .. } | Self::Blank { .. } => ErrorKind::Device,
             }
         }
     }

@@ -8,8 +8,10 @@ mod reconnect;
 mod serial;
 mod tcp;
 mod udp;
+#[cfg(any(test, feature = "lab"))]
 mod wire;
 
+use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
@@ -20,6 +22,7 @@ pub use reconnect::Reconnecting;
 pub use serial::SerialLink;
 pub use tcp::TcpLink;
 pub use udp::UdpLink;
+#[cfg(any(test, feature = "lab"))]
 pub use wire::WireLink;
 
 use crate::error::HalError;
@@ -86,6 +89,18 @@ impl Link for AnyLink {
         }
     }
 
+    fn pin(&mut self, peer: SocketAddr) {
+        if let Self::Udp(link) = self {
+            link.pin(peer);
+        }
+    }
+
+    fn dismiss(&mut self) {
+        if let Self::Tcp(link) = self {
+            link.dismiss();
+        }
+    }
+
     fn write(&mut self, frame: &[u8]) -> Result<(), HalError> {
         match self {
             Self::Serial(link) => link.write(frame),
@@ -98,7 +113,7 @@ impl Link for AnyLink {
 }
 
 /// Nothing came in time: not an error on a live link.
-const NOTHING: Received = Received { bytes: 0, time_ns: None };
+const NOTHING: Received = Received { bytes: 0, time_ns: None, peer: None };
 
 fn is_timeout(e: &std::io::Error) -> bool {
     use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};

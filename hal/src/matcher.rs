@@ -6,6 +6,8 @@
 //! returned with the reason, never dropped silently.
 
 mod clues;
+#[cfg(feature = "std")]
+pub mod reconcile;
 
 use heapless::{Deque, HistoryBuf};
 
@@ -19,6 +21,8 @@ const TRIGGERS: usize = 64;
 const PICTURES: usize = 32;
 /// Numbers of matched pictures remembered, to know a duplicate.
 const REMEMBERED: usize = 64;
+/// Before anything is learnt: so many older exposures without a picture mean that pictures may be late by any time.
+const UNSURE: usize = 3;
 
 /// What the matcher may assume.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -61,6 +65,8 @@ pub enum Outcome<P> {
         trigger: Trigger,
         /// The picture.
         picture: P,
+        /// Its clues.
+        clues: PictureClues,
         /// The picture came after one of a later exposure.
         late: bool,
     },
@@ -121,16 +127,6 @@ impl<P> Matcher<P> {
             newest_matched: None,
             given_up: None,
         }
-    }
-
-    /// Exposures still waiting.
-    pub fn triggers_waiting(&self) -> usize {
-        self.triggers.len()
-    }
-
-    /// Pictures still waiting.
-    pub fn pictures_waiting(&self) -> usize {
-        self.pictures.len()
     }
 
     /// Adds an announced exposure; returns the oldest one when there is no more room.
@@ -204,6 +200,12 @@ impl<P> Matcher<P> {
         }
         let age = now_ns.saturating_sub(clues.arrived_ns);
         match self.learnt.choose(clues, &self.triggers, self.settings.patience_ns) {
+            Choice::Exposure { index, certain: false }
+                if self.learnt.is_new() && (index >= UNSURE || self.given_up.is_some()) =>
+            {
+                // Taken for the newest exposure's, a late picture would shift all that follow.
+                if age >= self.settings.settle_ns { Decision::Alone(Reason::NoTrigger) } else { Decision::Wait }
+            }
             Choice::Exposure { index, certain } if certain || age >= self.settings.settle_ns => Decision::Match(index),
             Choice::Exposure { .. } => Decision::Wait,
             Choice::Contradiction { by_number, by_time, shift } => {
@@ -264,7 +266,7 @@ impl<P> Matcher<P> {
             self.numbers.write(number);
         }
         self.learnt.learn(&waiting.clues, &trigger, late);
-        Outcome::Matched { trigger, picture: waiting.picture, late }
+        Outcome::Matched { trigger, picture: waiting.picture, clues: waiting.clues, late }
     }
 }
 

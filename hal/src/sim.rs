@@ -4,11 +4,11 @@
 pub mod aircraft;
 pub mod autopilot;
 pub mod axes;
-mod dice;
 mod error;
 pub mod faulty_link;
 mod messages;
 pub mod photographer;
+mod random;
 pub mod reference;
 pub mod rehearsal;
 pub mod session;
@@ -153,6 +153,6 @@ pub(crate) fn camera_over(
 }
 
 #[cfg(test)]
-pub(crate) mod listener;
+pub(crate) mod companion;
 #[cfg(test)]
 mod tests;

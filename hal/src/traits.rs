@@ -1,6 +1,7 @@
 //! The five seams of the HAL, small and fallible, in the spirit of embedded-hal. [`crate::vehicle`] is the generic
 //! driver over all of them; nothing above it knows which implementation it talks to.
 
+use core::net::SocketAddr;
 use core::time::Duration;
 
 use crate::error::Error;
@@ -20,6 +21,8 @@ pub struct Received {
     pub bytes: usize,
     /// When they were received, for recordings, which carry their own clock; `None` on live links (= now).
     pub time_ns: Option<u64>,
+    /// Who sent them, on links where anybody may.
+    pub peer: Option<SocketAddr>,
 }
 
 /// Whether a link is open.
@@ -50,6 +53,14 @@ pub trait Link {
     /// # Errors
     /// `ErrorKind::Busy` when the other end does not read; the frame is then dropped, never half written.
     fn write(&mut self, frame: &[u8]) -> Result<(), Self::Error>;
+
+    /// From now on answers go to this peer, whoever else speaks, on links where anybody may.
+    fn pin(&mut self, peer: SocketAddr) {
+        let _ = peer;
+    }
+
+    /// Ends the connection of a peer that has proved nothing, on links that serve one at a time.
+    fn dismiss(&mut self) {}
 
     /// Whether it is open; links that do not reconnect are always up and report their end as an error.
     fn state(&self) -> LinkState {
@@ -86,6 +97,8 @@ pub struct PictureClues {
     pub camera_ns: Option<u64>,
     /// Resolution of `camera_ns`, ns (1 s for EXIF without sub-seconds).
     pub camera_resolution_ns: u64,
+    /// When its file was written, on the wall clock, ns since 1970.
+    pub written_ns: Option<u64>,
 }
 
 /// A source of pictures.

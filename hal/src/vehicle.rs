@@ -12,13 +12,13 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use config::geodesy::EnuFrame;
-use heapless::Deque;
 
-pub use event::{CameraPose, Event, Frame, PoseReport, Unmatched, UnmatchedReason};
+pub use event::{CameraPose, Event, PoseReport, PosedPicture, Unmatched, UnmatchedReason};
 pub use settings::VehicleSettings;
 
-use crate::autopilot::{Autopilot, AutopilotState, Heard, Ids};
-use crate::camera::{AnyCamera, Blank, Picture, blank, undistort};
+use crate::autopilot::{Autopilot, AutopilotState, Handled, Ids};
+use crate::blank::{Blank, blank};
+use crate::camera::{AnyCamera, Picture, undistort};
 use crate::counters::HalCounters;
 use crate::error::HalError;
 use crate::failsafe::Flags;
@@ -26,25 +26,19 @@ use crate::link::Reconnecting;
 use crate::matcher::{Matcher, MatcherSettings};
 use crate::mavlink::channel::Channel;
 use crate::mavlink::dialect::MavSeverity;
+use crate::peer::{Peers, Verdict};
 use crate::time::MonotonicClock;
 use crate::traits::{Camera, Clock, Link, LinkState, TriggerSource};
-use exposures::{Exposures, PendingFrame};
+use exposures::{Exposures, PendingPicture};
 use mount::Mount;
 use service::Service;
 
 /// Events kept for a runtime that is busy; beyond it the oldest is dropped, counted.
 const EVENTS: usize = 256;
-/// Matched pictures waiting for their pose.
+/// Matched pictures that wait for their pose at the same time, as a rule.
 const PENDING: usize = 32;
 /// The link is read in slices of this, so that pictures and timers are served while it is silent.
 const SLICE: Duration = Duration::from_millis(20);
-
-/// A position worse than this does not place a picture, m; that many exposures in a row without a picture, or pictures
-/// that show nothing, mean that the camera needs somebody; and ArduPilot's customary low battery, percent.
-const POOR_SIGMA_M: f64 = 20.0;
-const SILENT_CAMERA: u32 = 3;
-const POOR_PICTURES: u32 = 3;
-const LOW_BATTERY: u8 = 20;
 
 /// The driver. `Vehicle` alone means the real thing: any link, any camera, the monotonic clock.
 pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
@@ -52,10 +46,12 @@ pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
     camera: C,
     clock: K,
     recorded_ns: Option<u64>,
+    peers: Peers,
     autopilot: Autopilot,
     matcher: Matcher<Picture>,
     exposures: Exposures,
-    pending: Deque<PendingFrame, PENDING>,
+    /// Matched pictures waiting for their pose.
+    pending: VecDeque<PendingPicture>,
     mount: Mount,
     service: Service,
     settings: VehicleSettings,
@@ -63,7 +59,7 @@ pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
     lost: bool,
     link_losses: u64,
     texts: u16,
-    /// Exposures in a row without a picture.
+    /// Exposures given up since the last picture came.
     pictureless: u32,
     /// Pictures in a row that showed nothing or could not be decoded.
     poor: u32,
@@ -118,10 +114,11 @@ where
             camera,
             clock,
             recorded_ns: None,
+            peers: Peers::new(ids.system),
             autopilot: Autopilot::new(ids),
             matcher: Matcher::new(matching),
             exposures: Exposures::default(),
-            pending: Deque::new(),
+            pending: VecDeque::with_capacity(PENDING),
             mount: Mount::new(&settings.mount, EnuFrame::new(settings.origin)),
             service,
             settings: settings.clone(),
@@ -152,8 +149,12 @@ where
             self.look_at_link();
             let now_ns = self.now_ns();
             self.serve(now_ns);
-            self.take_pictures(now_ns);
-            self.settle(now_ns);
+            if self.finished {
+                self.hand_out(true);
+            } else {
+                self.take_pictures(now_ns);
+                self.settle(now_ns);
+            }
             if self.events.is_empty() && (left.is_zero() || self.finished) {
                 return Ok(None);
             }
@@ -167,7 +168,17 @@ where
 
     /// True once a recording is at its end and every picture and exposure is accounted for.
     pub fn is_finished(&self) -> bool {
-        self.finished && self.events.is_empty()
+        self.finished && self.events.is_empty() && self.pending.is_empty() && self.exposures.is_closed()
+    }
+
+    /// True while pictures of announced exposures have not come.
+    pub fn awaits_pictures(&self) -> bool {
+        self.exposures.await_pictures()
+    }
+
+    /// Complete pictures seen so far.
+    pub fn pictures(&self) -> u64 {
+        self.counters.pictures
     }
 
     /// True while the autopilot is silent or the link closed.
@@ -177,14 +188,15 @@ where
 
     /// What this side knows for the failsafe ladder: link, position, camera, battery. The runtime adds its own.
     pub fn flags(&self) -> Flags {
-        let state = self.autopilot.state();
+        let (state, limits) = (self.autopilot(), &self.settings.failsafe);
         let sigma = self.autopilot.track().newest_position().map(|p| p.sigma_m.max_element());
         Flags {
             link_lost: self.lost && state.heartbeat_ns.is_some(),
-            position_poor: state.gps_fix.is_some_and(|fix| fix < 3) || sigma.is_some_and(|s| s > POOR_SIGMA_M),
-            camera_silent: self.pictureless >= SILENT_CAMERA,
-            pictures_poor: self.poor >= POOR_PICTURES,
-            battery_low: state.battery_percent.is_some_and(|p| p <= LOW_BATTERY),
+            position_poor: state.gps_fix.is_some_and(|fix| fix < 3)
+                || sigma.is_some_and(|s| s > f64::from(limits.position_sigma_m)),
+            camera_silent: self.pictureless >= limits.silent_exposures,
+            pictures_poor: self.poor >= limits.poor_pictures,
+            battery_low: state.battery_percent.is_some_and(|p| p <= limits.battery_low_pct),
             ..Flags::default()
         }
     }
@@ -196,7 +208,7 @@ where
 
     /// What the autopilot says about itself.
     pub fn autopilot(&self) -> AutopilotState {
-        self.autopilot.state()
+        self.autopilot.state(self.now_ns())
     }
 
     /// Undistorted pixels of a frame. One that shows nothing is counted and the ground control station told: once when they
@@ -204,7 +216,7 @@ where
     ///
     /// # Errors
     /// [`HalError::Picture`] when it cannot be decoded or has the wrong size, [`HalError::Blank`] when it shows nothing.
-    pub fn load(&mut self, frame: &Frame) -> Result<image::RgbImage, HalError> {
+    pub fn load(&mut self, frame: &PosedPicture) -> Result<image::RgbImage, HalError> {
         let decoded = frame.picture.decode(&self.settings.lens);
         let blank = decoded.as_ref().ok().and_then(blank);
         if blank.is_none() && decoded.is_ok() {
@@ -219,7 +231,7 @@ where
                 Blank::Overexposed => &mut self.counters.pictures_overexposed,
                 Blank::Constant => &mut self.counters.pictures_constant,
             } += 1;
-            if !self.poor_told && self.service.may_complain(self.now_ns()) {
+            if !self.poor_told && self.service.may_warn(self.now_ns()) {
                 self.poor_told = true;
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &format!("dgtr: {name} is {blank}, left out"));
@@ -247,6 +259,7 @@ where
             damaged: wire.frames.damaged,
             skipped_bytes: wire.frames.skipped_bytes,
             unknown: wire.frames.unknown + wire.frames.unsupported,
+            refused_peers: own.refused_peers,
             unsigned: wire.unsigned,
             wrong_key: wire.wrong_key,
             replayed: wire.replayed,
@@ -263,6 +276,7 @@ where
             picture_duplicates: own.picture_duplicates,
             pictures_unmatched: own.pictures_unmatched,
             pictures_late: own.pictures_late,
+            pictures_reconciled: own.pictures_reconciled,
             poseless: own.poseless,
             posed_frames: own.posed_frames,
             exif_poses: own.exif_poses,
@@ -278,24 +292,37 @@ where
         if self.channel.link().state() == LinkState::Ended {
             self.channel.end();
         }
-        self.hear();
+        self.take_frames();
         Ok(())
     }
 
-    fn hear(&mut self) {
-        let now_ns = self.now_ns();
+    fn take_frames(&mut self) {
+        let (now_ns, peer) = (self.now_ns(), self.channel.peer());
         while let Some(frame) = self.channel.next_frame() {
-            self.service.component.hear(&frame, self.autopilot.ids().system, now_ns);
-            if self.autopilot.hear(&frame, now_ns) == Heard::Position {
+            match self.peers.judge(peer, &frame, now_ns) {
+                Verdict::Refuse => {
+                    self.counters.refused_peers += 1;
+                    continue;
+                }
+                Verdict::TakeAfresh => self.autopilot.start_afresh(),
+                Verdict::Take => {}
+            }
+            self.service.component.handle(&frame, self.autopilot.ids().system, now_ns);
+            if self.autopilot.handle(&frame, now_ns) == Handled::Position {
                 let report = self.mount.report(&self.autopilot, now_ns);
                 self.counters.events_dropped += push(&mut self.events, report.map(Event::Pose));
             }
+        }
+        match self.peers.address() {
+            Some(pinned) if peer == Some(pinned) => self.channel.link_mut().pin(pinned),
+            _ if peer.is_some() && self.peers.is_idle(peer, now_ns) => self.channel.link_mut().dismiss(),
+            _ => {}
         }
     }
 
     fn look_at_link(&mut self) {
         let state = self.channel.link().state();
-        let silent = self.autopilot.state().heartbeat_ns.is_some_and(|t| {
+        let silent = self.autopilot().heartbeat_ns.is_some_and(|t| {
             let limit_ns = (f64::from(self.settings.link.heartbeat_timeout_s) * 1e9) as u64;
             self.now_ns().saturating_sub(t) > limit_ns
         });
@@ -321,12 +348,16 @@ where
     fn take_triggers(&mut self, now_ns: u64) {
         while let Some(trigger) = self.autopilot.next_trigger() {
             let delay_ns = (f64::from(self.settings.lens.exposure_delay_ms) * 1e6) as i64;
-            self.exposures.push(trigger, trigger.boot_ns.saturating_add_signed(delay_ns), now_ns);
+            let (mid_boot_ns, awaited) = (trigger.boot_ns.saturating_add_signed(delay_ns), !self.is_free_running());
+            if let Some(oldest) = self.exposures.push(trigger, mid_boot_ns, now_ns, awaited) {
+                self.counters.triggers_unmatched += 1;
+                tracing::warn!("exposure {}: no picture came", oldest.sequence);
+            }
             self.emit(Event::Trigger(trigger));
             if self.is_free_running() {
-                self.service.hurry();
+                self.service.make_due();
             } else if let Some(outcome) = self.matcher.push_trigger(trigger) {
-                self.take_outcome(outcome, now_ns);
+                self.take_outcome(outcome);
             }
         }
     }

@@ -65,6 +65,7 @@ fn talk(python: &Path, signing: Signing, peer_key: Option<&str>) -> (serde_json:
         patient: false,
         system_id: 1,
         link: LinkSettings { signing, signing_key: Some(key), ..LinkSettings::default() },
+        failsafe: config::failsafe::FailsafeSettings::default(),
         camera: None,
         pictures_since: None,
         lens: CameraSettings {

@@ -15,7 +15,7 @@ use hal::mavlink::Signer;
 use hal::mavlink::channel::Channel;
 use hal::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot};
 use hal::replay::{Playlist, PlaylistItem, ReplaySettings, play};
-use hal::vehicle::{Event, Frame, Vehicle, VehicleSettings};
+use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 
 const LENS: CameraSettings = CameraSettings {
     width: 640,
@@ -75,7 +75,7 @@ fn every_real_photograph_gets_its_own_pose() {
     let mut settings = ReplaySettings::default();
     (settings.session.speed, settings.session.settle_s, settings.session.linger_s) = (40.0, 3.0, 1.5);
     let (stop, (tell, told)) = (AtomicBool::new(false), channel());
-    let frames: Vec<Frame> = std::thread::scope(|scope| {
+    let frames: Vec<PosedPicture> = std::thread::scope(|scope| {
         let playing = scope.spawn(|| {
             let ready = &mut |path: Option<&Path>| tell.send(path.expect("a pty").to_path_buf()).expect("told");
             play(&playlist, &settings, &LinkAddress::Pty(None), Some(camera.path()), &stop, ready)
@@ -86,6 +86,7 @@ fn every_real_photograph_gets_its_own_pose() {
             patient: false,
             system_id: 1,
             link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
+            failsafe: config::failsafe::FailsafeSettings::default(),
             camera: Some(CameraSource::Folder(camera.path().into())),
             pictures_since: None,
             lens: LENS,
@@ -96,7 +97,7 @@ fn every_real_photograph_gets_its_own_pose() {
         let mut frames = Vec::new();
         while !playing.is_finished() {
             match vehicle.poll(Duration::from_millis(20)).expect("a link") {
-                Some(Event::Frame(frame)) => frames.push(frame),
+                Some(Event::Posed(frame)) => frames.push(frame),
                 Some(Event::Unmatched(unmatched)) => println!("{unmatched}"),
                 _ => {}
             }
@@ -144,6 +145,7 @@ fn a_pulled_cable_is_reported_and_plugged_in_again() {
         patient: true,
         system_id: 1,
         link: LinkSettings { heartbeat_timeout_s: 2.0, ..LinkSettings::default() },
+        failsafe: config::failsafe::FailsafeSettings::default(),
         camera: None,
         pictures_since: None,
         lens: LENS,

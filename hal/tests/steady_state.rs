@@ -20,10 +20,10 @@ use hal::traits::{Link, PictureClues};
 use hal::vehicle::{Vehicle, VehicleSettings};
 use mavlink::Message;
 
-#[path = "../fuzz/src/victim.rs"]
-mod victim;
+#[path = "../fuzz/src/targets.rs"]
+mod targets;
 
-use victim::Victim;
+use targets::CaptureLoop;
 
 struct Counting;
 
@@ -65,6 +65,7 @@ fn settings() -> VehicleSettings {
         patient: false,
         system_id: 1,
         link: LinkSettings::default(),
+        failsafe: config::failsafe::FailsafeSettings::default(),
         camera: None,
         pictures_since: None,
         lens: CameraSettings {
@@ -192,7 +193,7 @@ fn damage(frame: &mut Vec<u8>, random: &mut Random) {
 fn ten_million_hostile_bytes_neither_panic_nor_allocate() {
     let frames = flight();
     let mut random = Random(11);
-    let mut victim = Victim::new();
+    let mut capture = CaptureLoop::new();
     let mut scratch = Vec::with_capacity(4096);
     let (mut bytes, mut now_ns, mut index) = (0usize, 1_000_000_000u64, 0usize);
     let before = allocations();
@@ -213,19 +214,19 @@ fn ten_million_hostile_bytes_neither_panic_nor_allocate() {
         if random.one_in(5000) {
             now_ns = now_ns.wrapping_add(u64::from(random.next()) << 20);
         }
-        victim.hear(&scratch, now_ns, || {
+        capture.handle(&scratch, now_ns, || {
             let wild = random.one_in(3);
             PictureClues {
                 arrived_ns: if wild { u64::from(random.next()) << (random.next() % 33) } else { now_ns },
                 number: (!random.one_in(4)).then(|| u64::from(random.next() % 100)),
                 camera_ns: (random.one_in(4)).then(|| u64::from(random.next()) << 31),
-                stamped_ns: None,
                 camera_resolution_ns: 1_000_000_000,
+                ..PictureClues::default()
             }
         });
     }
     let allocated = allocations() - before;
-    let Victim { framer, autopilot, outcomes, poses, .. } = &victim;
+    let CaptureLoop { framer, autopilot, outcomes, poses, .. } = &capture;
     println!("{:?} {:?} {outcomes} outcomes {poses} poses", framer.counters(), autopilot.counters());
     assert_eq!(allocated, 0);
     assert!(autopilot.counters().positions > 1000 && autopilot.counters().impossible > 100 && *outcomes > 100);
@@ -236,8 +237,8 @@ fn what_the_fuzz_targets_run_survives_seeded_input() {
     let (mut random, frames) = (Random(5), flight());
     for round in 0..2000usize {
         let noise: Vec<u8> = (0..random.next() % 1200).map(|_| random.next() as u8).collect();
-        victim::parse(&noise);
-        victim::match_up(&noise);
+        targets::parse(&noise);
+        targets::match_up(&noise);
         // Real frames, each in a piece of its own, some damaged.
         let mut line = Vec::new();
         for frame in frames.iter().cycle().skip(round * 20).take(20) {
@@ -248,6 +249,6 @@ fn what_the_fuzz_targets_run_survives_seeded_input() {
             line.push(u8::try_from(frame.len()).unwrap_or(u8::MAX));
             line.extend_from_slice(&frame);
         }
-        victim::parse(&line);
+        targets::parse(&line);
     }
 }

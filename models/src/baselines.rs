@@ -1,11 +1,11 @@
 //! What a picture of the scene costs nothing to guess: the nearest training picture laid onto flat ground, and one
 //! colour everywhere. A model that does not clearly beat both has learnt nothing.
 
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use image::RgbImage;
 use rayon::prelude::*;
 
-use crate::camera::{PosedImage, View};
+use crate::camera::{Pinhole, PosedImage, View};
 
 /// Mean colour of pictures, 0…1: accumulate with [`MeanColor::add`].
 #[derive(Clone, Copy, Debug, Default)]
@@ -50,61 +50,35 @@ pub fn nearest_view(target: &View, views: &[View]) -> Option<usize> {
 pub fn warp_over_ground(source: &PosedImage, target: &View, elsewhere: [f32; 3]) -> Vec<f32> {
     let (width, height) = (target.intrinsics.width as usize, target.intrinsics.height as usize);
     let mut out = vec![0.0; 3 * width * height];
-    let ray = Ray::of(target);
-    let to_source = source.view.pose.rotation.conjugate();
+    let (from, to) = (Pinhole::from(target), Pinhole::from(&source.view));
     out.par_chunks_mut(3 * width.max(1)).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
-            let ground = ray.at_ground(x as f64 + 0.5, y as f64 + 0.5);
-            let color = ground.and_then(|p| sample(source, to_source * (p - source.view.pose.center)));
+            let ground = at_ground(&from, [x as f32 + 0.5, y as f32 + 0.5]);
+            let color = ground.and_then(|p| sample(source, &to, p));
             pixel.copy_from_slice(&color.unwrap_or(elsewhere));
         }
     });
     out
 }
 
-struct Ray {
-    rotation: DQuat,
-    center: DVec3,
-    focal: (f64, f64),
-    principal: (f64, f64),
+/// Where a pixel's ray meets z = 0; `None` for rays that are level or point away from the ground.
+fn at_ground(camera: &Pinhole, pixel: [f32; 2]) -> Option<DVec3> {
+    let ray = camera.world_ray(pixel);
+    let t = -camera.pose.center.z / ray.z;
+    (t > 0.0 && t.is_finite()).then(|| camera.pose.center + ray * t)
 }
 
-impl Ray {
-    fn of(view: &View) -> Self {
-        let k = &view.intrinsics;
-        Self {
-            rotation: view.pose.rotation,
-            center: view.pose.center,
-            focal: (k.fx.into(), k.fy.into()),
-            principal: (k.cx.into(), k.cy.into()),
-        }
-    }
-
-    fn at_ground(&self, u: f64, v: f64) -> Option<DVec3> {
-        let camera = DVec3::new((u - self.principal.0) / self.focal.0, (v - self.principal.1) / self.focal.1, 1.0);
-        let direction = self.rotation * camera;
-        let t = -self.center.z / direction.z;
-        // Level rays give an infinite t, rays away from the ground a negative one.
-        (t > 0.0 && t.is_finite()).then(|| self.center + direction * t)
-    }
-}
-
-/// Bilinear colour of the source at a point in its camera's frame.
-fn sample(source: &PosedImage, p: DVec3) -> Option<[f32; 3]> {
-    let k = &source.view.intrinsics;
-    if p.z <= 0.0 {
-        return None;
-    }
-    let u = f64::from(k.fx) * p.x / p.z + f64::from(k.cx);
-    let v = f64::from(k.fy) * p.y / p.z + f64::from(k.cy);
-    let inside = u >= 0.0 && v >= 0.0 && u <= f64::from(k.width) && v <= f64::from(k.height);
-    inside.then(|| crate::undistort::sample_bilinear(&source.image, u as f32, v as f32).0.map(|c| f32::from(c) / 255.0))
+/// Bilinear colour of the source at a place on the ground.
+fn sample(source: &PosedImage, camera: &Pinhole, p: DVec3) -> Option<[f32; 3]> {
+    let q = camera.project(p).filter(|q| source.view.intrinsics.contains(*q))?.as_vec2();
+    Some(crate::undistort::sample_bilinear(&source.image, q.x, q.y).0.map(|c| f32::from(c) / 255.0))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::camera::{Intrinsics, Pose, PoseSigma};
+    use glam::DQuat;
     use image::Rgb;
 
     fn nadir(east: f64, north: f64, yaw: f64) -> View {
@@ -117,9 +91,9 @@ mod tests {
 
     /// Flat ground with a colour ramp of 4 per metre: at 35 m one pixel sees one metre.
     fn ground(view: View) -> PosedImage {
-        let ray = Ray::of(&view);
+        let camera = Pinhole::from(&view);
         let image = RgbImage::from_fn(40, 30, |x, y| {
-            let p = ray.at_ground(f64::from(x) + 0.5, f64::from(y) + 0.5).unwrap();
+            let p = at_ground(&camera, [x as f32 + 0.5, y as f32 + 0.5]).unwrap();
             Rgb([(100.0 + 2.0 * p.x).round() as u8, (100.0 + 2.0 * p.y).round() as u8, 50])
         });
         let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };

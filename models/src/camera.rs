@@ -1,7 +1,16 @@
 //! Pinhole cameras and posed pictures, in OpenCV axes and COLMAP's pixel convention.
 
-use glam::{DQuat, DVec3, Mat4, Quat, Vec3};
+use glam::{DQuat, DVec2, DVec3, Mat4, Quat, Vec3};
 use serde::{Deserialize, Serialize};
+
+mod projection;
+
+pub use projection::{Pinhole, Projector, Unprojector};
+
+/// Longest edge of a picture taken, pixels.
+pub const MAX_EDGE: u32 = 16_384;
+/// Most pixels of a picture taken: the largest sensors that fly have 61 million.
+pub const MAX_PIXELS: usize = 1 << 26;
 
 /// A pinhole camera without distortion (pictures are undistorted on ingest). Lengths in pixels; the centre of
 /// the top-left pixel is (0.5, 0.5).
@@ -27,6 +36,11 @@ impl Intrinsics {
         let sx = width as f32 / self.width as f32;
         let sy = height as f32 / self.height as f32;
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
+    }
+
+    /// Whether a pixel position lies in the picture.
+    pub fn contains(&self, p: DVec2) -> bool {
+        p.x >= 0.0 && p.y >= 0.0 && p.x < f64::from(self.width) && p.y < f64::from(self.height)
     }
 
     /// Number of pixels.
@@ -72,6 +86,22 @@ pub struct View {
     pub pose: Pose,
 }
 
+impl View {
+    /// Whether a picture of this size exists, the lens and the pose are finite numbers and the rotation has a direction:
+    /// what a view from another machine must be before anything is sized or drawn by it.
+    pub fn is_usable(&self) -> bool {
+        let (k, p) = (&self.intrinsics, &self.pose);
+        (1..=MAX_EDGE).contains(&k.width)
+            && (1..=MAX_EDGE).contains(&k.height)
+            && k.pixels() <= MAX_PIXELS
+            && [k.fx, k.fy].iter().all(|f| f.is_finite() && *f > 0.0)
+            && [k.cx, k.cy].iter().all(|c| c.is_finite())
+            && p.center.is_finite()
+            && p.rotation.is_finite()
+            && (0.5..2.0).contains(&p.rotation.length())
+    }
+}
+
 /// How far a pose may be wrong, one standard deviation; infinite where nothing is known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseSigma {
@@ -79,6 +109,17 @@ pub struct PoseSigma {
     pub position_m: [f32; 3],
     /// Rotation about the camera's x, y, z axes, radians.
     pub rotation_rad: [f32; 3],
+}
+
+/// What is known of a pose before the pictures are asked: where it came from is the reader's business.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PosePrior {
+    /// The pose.
+    pub pose: Pose,
+    /// What it is worth.
+    pub sigma: PoseSigma,
+    /// Exposure on the camera's own clock, nanoseconds since 1970 were it UTC; 0 where not recorded.
+    pub time_ns: u64,
 }
 
 /// One picture with its pose.

@@ -71,7 +71,7 @@ impl GaussianCloud {
     }
 
     /// Whether row `i` holds only finite numbers and a quaternion that can be normalised.
-    pub fn row_is_sound(&self, i: usize) -> bool {
+    pub fn is_valid(&self, i: usize) -> bool {
         let stride = self.sh_stride();
         let q = self.rotations[i];
         let q2: f32 = q.iter().map(|v| v * v).sum();
@@ -104,10 +104,10 @@ impl GaussianCloud {
         n - to
     }
 
-    /// Drops every row that is not [sound](Self::row_is_sound); returns how many.
-    pub fn drop_unsound(&mut self) -> usize {
-        let sound: Vec<bool> = (0..self.len()).map(|i| self.row_is_sound(i)).collect();
-        self.retain(|i| sound[i])
+    /// Drops every row that is not [valid](Self::is_valid); returns how many.
+    pub fn drop_invalid(&mut self) -> usize {
+        let valid: Vec<bool> = (0..self.len()).map(|i| self.is_valid(i)).collect();
+        self.retain(|i| valid[i])
     }
 
     /// Appends another cloud; the lower SH degree is padded with zeros.
@@ -171,7 +171,7 @@ mod tests {
         a.extend(&one(2.0, 0));
         a.rotations[2] = [0.0; 4];
         a.extend(&one(3.0, 0));
-        assert_eq!(a.drop_unsound(), 2);
+        assert_eq!(a.drop_invalid(), 2);
         assert_eq!(a.means, vec![[1.0; 3], [3.0; 3]]);
     }
 }

@@ -1,5 +1,6 @@
-//! A folder of posed pictures: nerfstudio `transforms.json` or a COLMAP model, with the split, the sparse points
-//! and the aircraft's own telemetry when they are there. Opening reads the small files only; pictures are decoded
+//! Posed pictures: nerfstudio `transforms.json`, a COLMAP model or an OpenDroneMap reconstruction, with the split, the
+//! sparse points and the aircraft's own telemetry when they are there; or a card, whose pictures have only what they say
+//! of themselves. Opening reads the small files only; pictures are decoded
 //! one at a time, so that a thousand of them need no more memory than one.
 
 use std::collections::{BTreeMap, HashMap};
@@ -8,70 +9,28 @@ use std::path::{Path, PathBuf};
 use config::geodesy::Geodetic;
 use image::imageops;
 
-use crate::camera::{Intrinsics, PoseSigma, PosedImage, View};
-use crate::formats::telemetry::{self, Telemetry};
-use crate::formats::{FormatError, colmap, split};
+use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use crate::card::{Card, CardOptions};
+use crate::formats::reconstruction::{LensDescription, Reconstruction, Shot};
+use crate::formats::{FormatError, colmap, opensfm, split, telemetry};
+use crate::picture::{PictureError, decode_at_least};
 use crate::undistort::undistort;
-use config::lens::Distortion;
 
+mod ahead;
+mod error;
+mod frame;
 mod sources;
 
-pub use sources::decode;
-use sources::{file_name, from_colmap, from_transforms};
+pub use error::DatasetError;
+pub use frame::DatasetFrame;
+use sources::{file_name, frames, reconstruction};
 
 /// Without a `split.json` every eighth picture is held out, as 3DGS and its successors do.
 const TEST_EVERY: usize = 8;
+/// Sparse points held at most (some 100 bytes each); initialisation needs far fewer.
+const MAX_POINTS: usize = 2_000_000;
 /// What a pose from bundle adjustment is worth: never exact, but far better than any GPS.
 const RECONSTRUCTED_SIGMA: PoseSigma = PoseSigma { position_m: [0.02; 3], rotation_rad: [5e-4; 3] };
-
-/// Why a data set cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum DatasetError {
-    /// One of its files is missing or wrong.
-    #[error(transparent)]
-    Format(#[from] FormatError),
-    /// Not a data set at all.
-    #[error("{}: neither transforms.json nor sparse/0/images.bin is there; give the folder that holds one of them", .0.display())]
-    NotADataset(PathBuf),
-    /// A picture is missing, unreadable or not what its description says.
-    #[error("{}: {what}", path.display())]
-    Picture {
-        /// The picture.
-        path: PathBuf,
-        /// What is wrong.
-        what: String,
-    },
-    /// A split, region or picture of this name does not exist.
-    #[error("{}: no {kind} named {name:?}; there are: {known}", root.display())]
-    Unknown {
-        /// The data set.
-        root: PathBuf,
-        /// `split`, `region` or `picture`.
-        kind: &'static str,
-        /// What was asked for.
-        name: String,
-        /// What exists.
-        known: String,
-    },
-    /// The caller asked for something impossible.
-    #[error("{0}")]
-    Request(String),
-}
-
-/// One picture of the set.
-#[derive(Clone, Debug)]
-pub struct DatasetFrame {
-    /// File name (with its folder only where names would repeat).
-    pub name: String,
-    /// Where the picture lies.
-    pub path: PathBuf,
-    /// Lens (undistorted, full size) and reconstructed pose.
-    pub view: View,
-    /// What is taken out of the picture on loading.
-    pub distortion: Distortion,
-    /// GPS and gimbal angles, where recorded.
-    pub telemetry: Option<Telemetry>,
-}
 
 /// An area flown by one aircraft.
 #[derive(Clone, Debug)]
@@ -126,18 +85,36 @@ pub struct Dataset {
     pub split: Split,
     /// WGS-84 origin of the world frame, when known.
     pub origin: Option<Geodetic>,
+    /// What is to be known about a card: its poses are priors only, which the pictures must settle. `None` for a
+    /// reconstruction.
+    pub card: Option<CardNotes>,
+}
+
+/// What reading a card left behind.
+#[derive(Clone, Debug, Default)]
+pub struct CardNotes {
+    /// One line each: what was left out or changed, and why.
+    pub lines: Vec<String>,
+    /// Relative standard deviation of the focal lengths that the pictures state (the largest of the cameras').
+    pub focal_sigma: f64,
+    /// Files that were found.
+    pub found: usize,
 }
 
 impl Dataset {
-    /// Reads the descriptions in `root`.
+    /// Reads the descriptions in `root`; without any, what its pictures say of themselves.
+    ///
+    /// # Errors
+    /// A description is damaged or describes nothing, or there is neither one nor a picture with a position.
     pub fn open(root: &Path) -> Result<Self, DatasetError> {
-        let (mut frames, origin) = if root.join("transforms.json").is_file() {
-            from_transforms(root)?
-        } else if root.join("sparse/0/images.bin").is_file() {
-            (from_colmap(root)?, None)
-        } else {
-            return Err(DatasetError::NotADataset(root.to_owned()));
+        let Some(found) = reconstruction(root)? else {
+            return match root.is_dir() && Card::has_pictures(root) {
+                true => Self::open_card(&[root.to_owned()], &CardOptions::default()),
+                false => Err(DatasetError::NotADataset(root.to_owned())),
+            };
         };
+        let origin = found.origin;
+        let mut frames = frames(root, found)?;
         if frames.is_empty() {
             return Err(DatasetError::Request(format!("{}: describes no pictures", root.display())));
         }
@@ -146,12 +123,76 @@ impl Dataset {
             let mut rows = telemetry::read(&gps, origin)?;
             for frame in &mut frames {
                 frame.telemetry = rows.remove(&frame.name);
+                frame.prior = frame.telemetry.map(|t| t.prior);
             }
         }
-        let mut dataset = Self { root: root.to_owned(), frames, split: Split::default(), origin };
-        let file = root.join("split.json");
-        dataset.split = if file.is_file() { dataset.resolve(&file)? } else { dataset.every_eighth() };
-        Ok(dataset)
+        Self { root: root.to_owned(), frames, split: Split::default(), origin, card: None }.with_split()
+    }
+
+    /// Reads the pictures below `folders` by what they say of themselves, whatever reconstruction lies beside them.
+    ///
+    /// # Errors
+    /// See [`Card::open`].
+    pub fn open_card(folders: &[PathBuf], options: &CardOptions) -> Result<Self, DatasetError> {
+        let card = Card::open(folders, options)?;
+        let focal_sigma = card.pictures.iter().map(|p| p.focal_sigma).fold(0.0, f64::max);
+        let notes = CardNotes { lines: card.notes, focal_sigma, found: card.found };
+        let frames = card.pictures.into_iter().map(|p| {
+            let size = p.lens.size.unwrap_or((1, 1));
+            let view = View { intrinsics: p.lens.intrinsics(size), pose: p.prior.pose };
+            let (distortion, orientation) = (p.lens.distortion, p.orientation);
+            DatasetFrame {
+                name: p.name,
+                path: p.path,
+                view,
+                distortion,
+                orientation,
+                prior: Some(p.prior),
+                telemetry: None,
+            }
+        });
+        let root = folders.first().cloned().unwrap_or_default();
+        let frames = frames.collect();
+        Self { root, frames, split: Split::default(), origin: Some(card.origin), card: Some(notes) }.with_split()
+    }
+
+    /// Takes poses that the pictures have settled on, and what they say of the focal length, in place of a card's priors;
+    /// pictures that are not among them (they could not be decoded) are left out of the set.
+    pub fn settle(&mut self, settled: &HashMap<String, View>) {
+        let mut number = vec![None; self.frames.len()];
+        let mut frames = Vec::with_capacity(settled.len());
+        for (i, mut frame) in std::mem::take(&mut self.frames).into_iter().enumerate() {
+            let Some(view) = settled.get(&frame.name) else { continue };
+            // The pictures may have been smaller when they were asked.
+            let full = &frame.view.intrinsics;
+            frame.view = View { intrinsics: view.intrinsics.resized(full.width, full.height), pose: view.pose };
+            number[i] = Some(frames.len());
+            frames.push(frame);
+        }
+        self.frames = frames;
+        let regions = self.split.regions.iter_mut().flat_map(|r| r.lists.values_mut());
+        for list in self.split.lists.values_mut().chain(regions) {
+            *list = list.iter().filter_map(|i| number[*i]).collect();
+        }
+        self.card = None;
+    }
+
+    /// Lenses and poses of the pictures as they are stored, for other programs.
+    pub fn reconstruction(&self) -> Reconstruction {
+        let shots = self.frames.iter().map(|f| {
+            let back = f.orientation.inverse();
+            let lens = back.of_lens(&LensDescription::new(&f.view.intrinsics, f.distortion));
+            let pose = Pose { rotation: back.of_rotation(f.view.pose.rotation), center: f.view.pose.center };
+            let path = std::path::absolute(&f.path).unwrap_or_else(|_| f.path.clone());
+            Shot { path: path.to_string_lossy().into_owned(), lens, pose }
+        });
+        Reconstruction { shots: shots.collect(), origin: self.origin }
+    }
+
+    fn with_split(mut self) -> Result<Self, DatasetError> {
+        let file = self.root.join("split.json");
+        self.split = if file.is_file() { self.resolve(&file)? } else { self.every_eighth() };
+        Ok(self)
     }
 
     /// The frames of a split, restricted to a region's when one is named; `all` is always a split.
@@ -190,48 +231,70 @@ impl Dataset {
         self.split.regions.iter().find(|r| r.name == name)
     }
 
-    /// Decodes frame `i`, undistorts it and scales it (Lanczos over the source area; `scale` in 0…1), with the
-    /// reconstructed pose.
-    pub fn load(&self, i: usize, scale: f64) -> Result<PosedImage, DatasetError> {
-        self.load_posed(i, scale, PoseSource::Dataset)
-    }
-
-    /// As [`Dataset::load`], with the pose from `source`.
-    pub fn load_posed(&self, i: usize, scale: f64, source: PoseSource) -> Result<PosedImage, DatasetError> {
-        let frame = self.frames.get(i).ok_or_else(|| {
+    fn frame(&self, i: usize) -> Result<&DatasetFrame, DatasetError> {
+        self.frames.get(i).ok_or_else(|| {
             DatasetError::Request(format!(
                 "{}: has {} pictures, number {i} was asked for",
                 self.root.display(),
                 self.frames.len()
             ))
-        })?;
-        let intrinsics = scaled(&frame.view.intrinsics, scale)?;
-        let (pose, sigma) = match (source, frame.telemetry) {
-            (PoseSource::Dataset, _) => (frame.view.pose, RECONSTRUCTED_SIGMA),
-            (PoseSource::Telemetry, Some(t)) => (t.pose, t.sigma),
-            (PoseSource::Telemetry, None) => {
+        })
+    }
+
+    /// Pose of frame `i` and how far it may be wrong, without a look at its picture.
+    ///
+    /// # Errors
+    /// There is no such frame, or `source` does not know it.
+    pub fn pose(&self, i: usize, source: PoseSource) -> Result<(Pose, PoseSigma), DatasetError> {
+        let frame = self.frame(i)?;
+        match (source, frame.prior) {
+            (PoseSource::Dataset, _) if self.card.is_none() => Ok((frame.view.pose, RECONSTRUCTED_SIGMA)),
+            (_, Some(prior)) => Ok((prior.pose, prior.sigma)),
+            (_, None) => {
                 let what = format!(
                     "{}: no GPS and gimbal angles for {}; use the data set's poses",
                     self.root.join("gps.csv").display(),
                     frame.name
                 );
-                return Err(DatasetError::Request(what));
+                Err(DatasetError::Request(what))
             }
-        };
-        let bad = |what: &str| DatasetError::Picture { path: frame.path.clone(), what: what.to_owned() };
-        let mut image = decode(&frame.path)?;
+        }
+    }
+
+    /// Decodes frame `i`, undistorts it and scales it (Lanczos over the source area; `scale` in 0…1), with the
+    /// reconstructed pose.
+    ///
+    /// # Errors
+    /// There is no such picture, it is damaged or not what its description says, or the scale makes no sense.
+    pub fn load(&self, i: usize, scale: f64) -> Result<PosedImage, DatasetError> {
+        self.load_posed(i, scale, PoseSource::Dataset)
+    }
+
+    /// As [`Dataset::load`], with the pose from `source`. A picture much larger than what is wanted of it is reduced
+    /// while it is decoded.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`]; the picture has no telemetry.
+    pub fn load_posed(&self, i: usize, scale: f64, source: PoseSource) -> Result<PosedImage, DatasetError> {
+        let frame = self.frame(i)?;
+        let intrinsics = scaled(&frame.view.intrinsics, scale)?;
+        let (pose, sigma) = self.pose(i, source)?;
+        let (w, h) = (intrinsics.width, intrinsics.height);
+        let stored = decode_at_least(&frame.path, if frame.orientation.swaps() { (h, w) } else { (w, h) })?;
+        let mut image = frame.orientation.apply(stored);
         let full = &frame.view.intrinsics;
         // A description may speak of the full size while the folder holds a copy scaled down evenly.
         let aspect =
             f64::from(image.width()) * f64::from(full.height) / (f64::from(image.height()) * f64::from(full.width));
         if (aspect - 1.0).abs() > 0.01 {
-            return Err(bad(&format!(
+            let what = format!(
                 "is {} x {}, its description says {} x {}",
                 image.width(),
                 image.height(),
                 full.width,
                 full.height
-            )));
+            );
+            return Err(PictureError { path: frame.path.clone(), what }.into());
         }
         if !frame.distortion.is_none() {
             let k = full.resized(image.width(), image.height());
@@ -240,47 +303,75 @@ impl Dataset {
         if (image.width(), image.height()) != (intrinsics.width, intrinsics.height) {
             image = imageops::resize(&image, intrinsics.width, intrinsics.height, imageops::FilterType::Lanczos3);
         }
-        let time_ns = frame.telemetry.map_or(0, |t| t.time_ns);
+        let time_ns = frame.prior.map_or(0, |p| p.time_ns);
         Ok(PosedImage { name: frame.name.clone(), time_ns, image, view: View { intrinsics, pose }, sigma })
     }
 
-    /// The coloured sparse points of `sparse/0/points3D.bin`; none when the file is not there.
+    /// The coloured sparse points of the reconstruction; none where it has no file of them.
+    ///
+    /// # Errors
+    /// A file of the reconstruction is damaged.
     pub fn sparse_points(&self) -> Result<Vec<SparsePoint>, DatasetError> {
-        let folder = self.root.join("sparse/0");
-        if !folder.join("points3D.bin").is_file() {
-            return Ok(Vec::new());
-        }
-        let (points, dropped) = colmap::read_points(&folder.join("points3D.bin"))?;
-        if dropped > 0 {
-            tracing::warn!("{}: {dropped} points are not at a finite position and were left out", folder.display());
-        }
-        let by_name: HashMap<&str, u32> =
-            self.frames.iter().enumerate().map(|(i, f)| (f.name.as_str(), i as u32)).collect();
-        let images = if folder.join("images.bin").is_file() {
-            colmap::read_images(&folder.join("images.bin"))?
-        } else {
-            Vec::new()
-        };
-        let by_id: HashMap<u32, u32> = images
-            .iter()
-            .filter_map(|m| Some((m.id, *by_name.get(m.name.as_str()).or_else(|| by_name.get(file_name(&m.name)))?)))
-            .collect();
-        Ok(points
-            .into_iter()
-            .map(|p| {
-                let mut frames: Vec<u32> = p.images.iter().filter_map(|id| by_id.get(id).copied()).collect();
-                frames.sort_unstable();
-                SparsePoint { position: p.position.to_array(), color: p.color, error_px: p.error, frames }
-            })
-            .collect())
+        self.points_where(&|_| true)
     }
 
     /// The points that at least two of `frames` saw: what a strict held-out test may start from. Points without
     /// tracks (some writers leave them out) are kept.
+    ///
+    /// # Errors
+    /// As [`Dataset::sparse_points`].
     pub fn sparse_points_of(&self, frames: &[usize]) -> Result<Vec<SparsePoint>, DatasetError> {
         let chosen: std::collections::HashSet<u32> = frames.iter().map(|&i| i as u32).collect();
-        let mut points = self.sparse_points()?;
-        points.retain(|p| p.frames.is_empty() || p.frames.iter().filter(|f| chosen.contains(f)).count() >= 2);
+        self.points_where(&|p| p.frames.is_empty() || p.frames.iter().filter(|f| chosen.contains(f)).count() >= 2)
+    }
+
+    /// Whatever the size of the file, at most [`MAX_POINTS`] points are held: every second is let go each time the room is
+    /// full, so that what remains is an even sample.
+    fn points_where(&self, wanted: &dyn Fn(&SparsePoint) -> bool) -> Result<Vec<SparsePoint>, DatasetError> {
+        let (mut points, mut seen, mut every) = (Vec::new(), 0u64, 1u64);
+        let mut take = |point: SparsePoint| {
+            if !wanted(&point) {
+                return;
+            }
+            if seen.is_multiple_of(every) {
+                if points.len() == MAX_POINTS {
+                    let mut number = 0;
+                    points.retain(|_| {
+                        number += 1;
+                        number % 2 == 1
+                    });
+                    every *= 2;
+                }
+                if seen.is_multiple_of(every) {
+                    points.push(point);
+                }
+            }
+            seen += 1;
+        };
+        if let Some(model) = colmap::Model::find(&self.root) {
+            let by_name: HashMap<&str, u32> =
+                self.frames.iter().enumerate().map(|(i, f)| (f.name.as_str(), i as u32)).collect();
+            let number = |name: &str| by_name.get(name).or_else(|| by_name.get(file_name(name))).copied();
+            let by_id: HashMap<u32, u32> =
+                model.images()?.iter().filter_map(|m| Some((m.id, number(&m.name)?))).collect();
+            let dropped = model.points(&mut |p| {
+                let mut frames: Vec<u32> = p.images.iter().filter_map(|id| by_id.get(id).copied()).collect();
+                frames.sort_unstable();
+                let position = p.position.to_array();
+                take(SparsePoint { position, color: p.color, error_px: p.error, frames });
+            })?;
+            if dropped > 0 {
+                let file = model.file("points3D");
+                tracing::warn!("{}: {dropped} points are not at a finite position and were left out", file.display());
+            }
+        } else if let Some(file) = opensfm::find(&self.root) {
+            opensfm::points(&file, &mut |position, color| {
+                take(SparsePoint { position, color, error_px: 0.0, frames: Vec::new() });
+            })?;
+        }
+        if every > 1 {
+            tracing::warn!("{}: of {seen} sparse points every {every}th is kept", self.root.display());
+        }
         Ok(points)
     }
 

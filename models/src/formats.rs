@@ -2,14 +2,20 @@
 //! for it, and every error is one line: which file, what is wrong with it, how to mend it.
 
 use std::fs::File;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
+
+use config::disk::{Disk, DiskError};
+use config::error::{Error, ErrorKind};
 
 pub mod colmap;
 pub mod model;
+pub mod opensfm;
 pub mod ply;
+pub mod reconstruction;
 pub mod split;
 pub mod spz;
+mod stream;
 pub mod telemetry;
 pub mod transforms;
 
@@ -64,6 +70,15 @@ pub enum FormatError {
     },
 }
 
+impl Error for FormatError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Io { source, .. } => Error::kind(source),
+            _ => ErrorKind::Input,
+        }
+    }
+}
+
 impl FormatError {
     pub(crate) fn invalid(path: &Path, what: impl Into<String>) -> Self {
         Self::Invalid { path: path.to_owned(), what: what.into() }
@@ -71,6 +86,16 @@ impl FormatError {
 
     pub(crate) fn io(path: &Path, action: &'static str, source: std::io::Error) -> Self {
         Self::Io { path: path.to_owned(), action, source }
+    }
+
+    /// A durable write that failed.
+    pub fn disk(path: &Path, e: DiskError) -> Self {
+        Self::io(path, e.action, e.source)
+    }
+
+    /// Whether it is the disk's fault and room or a medium that comes back may mend it.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Io { source, .. } if config::disk::may_pass(source))
     }
 
     /// The file the error is about.
@@ -87,6 +112,9 @@ impl FormatError {
 
 /// The whole of a file of at most `limit` bytes. The bound holds also for files that grow while being read and
 /// for pipes, whose length is not known beforehand.
+///
+/// # Errors
+/// [`FormatError::TooLarge`], else the operating system's.
 pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
@@ -102,104 +130,10 @@ pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     Ok(bytes)
 }
 
-/// Writes a file so that a reader, a full disc or a power cut never sees half of it: to a temporary name in the
-/// same folder, synced, renamed, and the folder synced.
-pub fn write_atomic(
-    path: &Path,
-    fill: impl FnOnce(&mut std::io::BufWriter<&mut File>) -> std::io::Result<()>,
-) -> Result<(), FormatError> {
-    let err = |action| move |e| FormatError::io(path, action, e);
-    let folder = match path.parent() {
-        Some(p) if !p.as_os_str().is_empty() => p,
-        _ => Path::new("."),
-    };
-    std::fs::create_dir_all(folder).map_err(err("making its folder"))?;
-    let mut temporary = tempfile::Builder::new().prefix(".dgtr-").tempfile_in(folder).map_err(err("writing"))?;
-    {
-        let mut out = std::io::BufWriter::with_capacity(1 << 16, temporary.as_file_mut());
-        fill(&mut out).map_err(err("writing"))?;
-        std::io::Write::flush(&mut out).map_err(err("writing"))?;
-    }
-    temporary.as_file().sync_all().map_err(err("syncing"))?;
-    set_readable(temporary.as_file()).map_err(err("writing"))?;
-    temporary.persist(path).map_err(|e| FormatError::io(path, "renaming", e.error))?;
-    // The rename itself is durable only once the folder is.
-    File::open(folder).and_then(|f| f.sync_all()).map_err(err("syncing"))
-}
-
-/// Temporary files are made private; results are for everybody, as any file written by name.
-fn set_readable(file: &File) -> std::io::Result<()> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        file.set_permissions(std::fs::Permissions::from_mode(0o644))?;
-    }
-    #[cfg(not(unix))]
-    let _ = file;
-    Ok(())
-}
-
-/// A cursor over a file's bytes that knows the file's name and never reads past its end.
-pub(crate) struct Bytes<'a> {
-    path: &'a Path,
-    all: &'a [u8],
-    at: usize,
-}
-
-impl<'a> Bytes<'a> {
-    pub(crate) fn new(path: &'a Path, all: &'a [u8]) -> Self {
-        Self { path, all, at: 0 }
-    }
-
-    pub(crate) fn take(&mut self, n: usize, what: &'static str) -> Result<&'a [u8], FormatError> {
-        match self.at.checked_add(n).and_then(|end| self.all.get(self.at..end)) {
-            Some(bytes) => {
-                self.at += n;
-                Ok(bytes)
-            }
-            None => Err(FormatError::Truncated { path: self.path.to_owned(), at: self.all.len() as u64, what }),
-        }
-    }
-
-    fn array<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], FormatError> {
-        let mut out = [0; N];
-        out.copy_from_slice(self.take(N, what)?);
-        Ok(out)
-    }
-
-    pub(crate) fn u8(&mut self, what: &'static str) -> Result<u8, FormatError> {
-        Ok(self.array::<1>(what)?[0])
-    }
-
-    pub(crate) fn u32(&mut self, what: &'static str) -> Result<u32, FormatError> {
-        Ok(u32::from_le_bytes(self.array(what)?))
-    }
-
-    pub(crate) fn u64(&mut self, what: &'static str) -> Result<u64, FormatError> {
-        Ok(u64::from_le_bytes(self.array(what)?))
-    }
-
-    pub(crate) fn f64(&mut self, what: &'static str) -> Result<f64, FormatError> {
-        Ok(f64::from_le_bytes(self.array(what)?))
-    }
-
-    /// A count of items of at least `each` bytes: never more than the rest of the file can hold.
-    pub(crate) fn count(&mut self, each: usize, what: &'static str) -> Result<usize, FormatError> {
-        let size = self.u64(what)?;
-        let limit = ((self.all.len() - self.at) / each) as u64;
-        if size > limit {
-            return Err(FormatError::TooLarge { path: self.path.to_owned(), what, size, limit });
-        }
-        Ok(size as usize)
-    }
-
-    /// Up to the next zero byte.
-    pub(crate) fn c_str(&mut self, what: &'static str) -> Result<&'a str, FormatError> {
-        let rest = &self.all[self.at..];
-        let Some(n) = rest.iter().position(|&b| b == 0) else {
-            return Err(FormatError::Truncated { path: self.path.to_owned(), at: self.all.len() as u64, what });
-        };
-        self.at += n + 1;
-        std::str::from_utf8(&rest[..n]).map_err(|_| FormatError::invalid(self.path, format!("{what} is not UTF-8")))
-    }
+/// Writes a file whole or not at all, see [`Disk::replace`].
+///
+/// # Errors
+/// [`FormatError::Io`] with the step that failed; what the file held before stays.
+pub fn write_atomic(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>) -> Result<(), FormatError> {
+    Disk::default().replace(path, fill).map_err(|e| FormatError::disk(path, e))
 }

@@ -3,9 +3,9 @@
 
 mod baselines;
 mod consistency;
+mod depth_frame;
 mod fill;
 mod finish;
-mod frame;
 mod ground;
 mod initialiser;
 mod merge;
@@ -24,8 +24,10 @@ pub use pairs::SkippedPairs;
 pub use range::mutual_matches;
 pub use report::{InitReport, Initialisation};
 
+use config::error::{Error, ErrorKind};
+
 use crate::onnx::OnnxError;
-use crate::onnx::manifest::Manifest;
+use crate::onnx::network::Network;
 
 /// Why there is no initial cloud.
 #[derive(Debug, thiserror::Error)]
@@ -37,13 +39,8 @@ pub enum InitError {
         given: usize,
     },
     /// A setting is out of range.
-    #[error("[init] {field} {reason}")]
-    Setting {
-        /// The field in the mission file.
-        field: &'static str,
-        /// What it must be.
-        reason: &'static str,
-    },
+    #[error("[init] {0}")]
+    Setting(#[from] config::settings::SettingError),
     /// The plan is for fewer pictures.
     #[error("initialisation: more than {limit} pictures; raise [init] max_pictures")]
     TooMany {
@@ -81,8 +78,16 @@ pub enum InitError {
     Network(#[from] OnnxError),
 }
 
+impl Error for InitError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Network(e) => e.kind(),
+            _ => ErrorKind::Input,
+        }
+    }
+}
+
 /// The network that ships inside the binary: a posed plane sweep without learned weights.
-fn embedded() -> Result<(Manifest, posed::NetworkBytes), OnnxError> {
-    let manifest = Manifest::parse(include_str!("../networks/plane_sweep.toml"), "plane-sweep (embedded)")?;
-    Ok((manifest, posed::NetworkBytes::Embedded(include_bytes!("../networks/plane_sweep.onnx"))))
+fn embedded() -> Result<Network, OnnxError> {
+    Network::embedded(include_str!("../networks/plane_sweep.toml"), include_bytes!("../networks/plane_sweep.onnx"))
 }

@@ -7,11 +7,13 @@
 pub mod align;
 pub mod baselines;
 pub mod camera;
+pub mod card;
 pub mod cloud;
 pub mod dataset;
 pub mod formats;
 pub mod init;
 pub mod metrics;
 pub mod onnx;
+pub mod picture;
 pub mod refine;
 pub mod undistort;

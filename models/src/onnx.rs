@@ -8,12 +8,13 @@ pub mod depth;
 pub mod features;
 pub mod manifest;
 pub mod metric;
-mod named;
 pub mod network;
 pub mod picture;
 pub mod session;
 
-use std::path::PathBuf;
+use crate::formats::FormatError;
+
+use config::error::{Error, ErrorKind};
 
 /// What can be wrong with a network, in one line each.
 #[derive(Debug, thiserror::Error)]
@@ -35,13 +36,8 @@ pub enum OnnxError {
         reason: String,
     },
     /// A file cannot be read.
-    #[error("{}: {reason}", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        reason: String,
-    },
+    #[error(transparent)]
+    File(#[from] FormatError),
     /// The manifest contradicts itself or the network's bytes.
     #[error("network manifest {manifest}: {field}: {reason}")]
     Manifest {
@@ -74,6 +70,16 @@ pub enum OnnxError {
         /// ONNX Runtime's words, one line.
         reason: String,
     },
+}
+
+impl Error for OnnxError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::LibraryMissing { .. } | Self::Library { .. } => ErrorKind::Device,
+            Self::File(e) => e.kind(),
+            _ => ErrorKind::Input,
+        }
+    }
 }
 
 /// ONNX Runtime's messages span lines; ours do not.

@@ -9,13 +9,14 @@
 //! when not.
 
 mod adjust;
-mod frames;
 mod gauge;
+mod grey;
+mod keyframe;
 mod linking;
 mod matching;
 mod motion;
 mod overlap;
-mod polish;
+mod photometric;
 mod problem;
 mod reduced;
 mod report;
@@ -30,15 +31,17 @@ mod upright;
 
 pub use report::{AddReport, RefineReport, RefinedPoint, SharedEstimate};
 
-use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
 use crate::onnx::OnnxError;
 use crate::onnx::features::{FeatureNetwork, Features};
-use config::refine::{RefineSettings, RefineSettingsError};
-use frames::{Camera, DESCRIPTOR, Frame, quantise, spread};
+use config::error::ErrorKind;
+use config::refine::RefineSettings;
+use config::settings::SettingError;
 use glam::DVec3;
+use grey::Grey;
 use image::RgbImage;
+use keyframe::{DESCRIPTOR, KeyFrame, quantise, spread};
 use linking::Pair;
-use polish::Grey;
 use problem::Shared;
 use std::collections::HashMap;
 use std::time::Instant;
@@ -49,8 +52,8 @@ use tracks::Union;
 #[derive(Debug, Error)]
 pub enum RefineError {
     /// A setting is out of range.
-    #[error(transparent)]
-    Settings(#[from] RefineSettingsError),
+    #[error("[refine] {0}")]
+    Settings(#[from] SettingError),
     /// The feature network cannot be opened or run.
     #[error(transparent)]
     Network(#[from] OnnxError),
@@ -78,12 +81,23 @@ pub enum RefineError {
     },
 }
 
+impl config::error::Error for RefineError {
+    /// A refinement needs a library only where its network does.
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Network(e) => e.kind(),
+            Self::NoNetwork => ErrorKind::Failed,
+            Self::Settings(_) | Self::Full { .. } | Self::Duplicate(_) | Self::Invalid { .. } => ErrorKind::Input,
+        }
+    }
+}
+
 /// Refines the poses of key frames; see the module's text.
 pub struct Refiner {
     settings: RefineSettings,
     /// One for pictures as they are, one for pictures on their side: a session is tied to one size.
     networks: Option<[FeatureNetwork; 2]>,
-    frames: Vec<Frame>,
+    frames: Vec<KeyFrame>,
     by_name: HashMap<String, u32>,
     union: Union,
     pairs: Vec<Pair>,
@@ -144,7 +158,7 @@ impl Refiner {
         if (image.image.width(), image.image.height()) != (lens.width, lens.height) {
             return Err(invalid(&image.name, "picture and intrinsics differ in size"));
         }
-        let camera = Camera::new(self.expect(&image.view.pose), &lens, self.shared.log_focal.exp());
+        let camera = Pinhole::new(self.expect(&image.view.pose), &lens, self.shared.log_focal.exp());
         let candidates = self.candidates(&camera, &lens);
         let turns = candidates.first().map_or(0, |a| {
             let frame = &self.frames[*a as usize];
@@ -187,7 +201,7 @@ impl Refiner {
         if features.descriptors.len() != features.keypoints.len() * DESCRIPTOR {
             return Err(invalid(name, "features do not hold 64 values per key point"));
         }
-        let camera = Camera::new(self.expect(&view.pose), &view.intrinsics, self.shared.log_focal.exp());
+        let camera = Pinhole::new(self.expect(&view.pose), &view.intrinsics, self.shared.log_focal.exp());
         let candidates = self.candidates(&camera, &view.intrinsics);
         let mut report = AddReport::default();
         self.insert(name, time_ns, view, sigma);
@@ -314,7 +328,7 @@ impl Refiner {
         let largest = |v: [f32; 3], cap: f64| f64::from(v.iter().fold(0.0f32, |a, b| a.max(*b))).min(cap);
         self.by_name.insert(name.to_owned(), self.frames.len() as u32);
         self.grounds.push(None);
-        self.frames.push(Frame {
+        self.frames.push(KeyFrame {
             name: name.to_owned(),
             time_ns,
             intrinsics: view.intrinsics,
@@ -332,7 +346,7 @@ impl Refiner {
             depths: None,
             keypoints: Vec::new(),
             colors: Vec::new(),
-            polished: Vec::new(),
+            settled: Vec::new(),
             grey: None,
             descriptors: Vec::new(),
             first_node: self.union.grow(0, 0),
@@ -360,7 +374,7 @@ impl Refiner {
                 None => [128; 3],
             })
             .collect();
-        frame.polished = vec![false; count];
+        frame.settled = vec![false; count];
         frame.grey = image.map(|image| Grey::new(image, self.settings.feature_side));
         self.union.shrink(first);
         self.union.grow(newest, count);

@@ -255,7 +255,7 @@ fn reference_telemetry_is_near_the_reconstruction() {
         let set = Dataset::open(&root).unwrap();
         let mut worst = (0.0f64, 0.0f64);
         for frame in &set.frames {
-            let t = frame.telemetry.expect("every picture has its row");
+            let t = frame.prior.expect("every picture has its row");
             worst.0 = worst.0.max(t.pose.center.distance(frame.view.pose.center));
             worst.1 = worst.1.max(t.pose.rotation.angle_between(frame.view.pose.rotation).to_degrees());
         }

@@ -193,3 +193,65 @@ fn a_plain_point_cloud_is_told_from_a_gaussian_model() {
     std::fs::write(&path, "ply\nformat ascii 1.0\nend_header\n").unwrap();
     assert!(ply::read(&path).unwrap_err().to_string().contains("binary_little_endian"));
 }
+
+#[test]
+fn a_header_that_would_size_or_place_nonsense_is_refused_by_reader_and_writer() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.dgtr");
+    let cloud = GaussianCloud::with_capacity(0, 0);
+    let good = header(1);
+    model::write(&path, &good, &cloud).unwrap();
+    // What a stranger may send: the writer's own bytes with another header and a true checksum.
+    let forged = |header: &ModelHeader| {
+        let head = postcard::to_allocvec(header).unwrap();
+        let mut bytes = std::fs::read(&path).unwrap()[..28].to_vec();
+        bytes[12..16].copy_from_slice(&(head.len() as u32).to_le_bytes());
+        bytes.extend(head);
+        bytes.extend_from_slice(blake3::hash(&bytes).as_bytes());
+        let file = dir.path().join("forged.dgtr");
+        std::fs::write(&file, bytes).unwrap();
+        file
+    };
+    assert_eq!(model::read(&forged(&good)).unwrap().0, good);
+    let refuse = |header: ModelHeader, words: &str| {
+        let file = forged(&header);
+        for e in [
+            model::read(&file).unwrap_err(),
+            model::read_header(&file).unwrap_err(),
+            model::write(&dir.path().join("own.dgtr"), &header, &cloud).unwrap_err(),
+        ] {
+            let e = e.to_string();
+            assert!(e.contains(words) && !e.contains('\n'), "{e}");
+        }
+    };
+    let view = |change: fn(&mut View)| {
+        let mut header = good.clone();
+        change(&mut header.views[0].1);
+        header
+    };
+    // This one ended `dgtr serve` with a panic.
+    let huge: u32 = (1 << 31) - 1;
+    refuse(view(|v| (v.intrinsics.width, v.intrinsics.height) = ((1 << 31) - 1, (1 << 31) - 1)), &huge.to_string());
+    refuse(view(|v| (v.intrinsics.width, v.intrinsics.height) = (16_384, 16_384)), "16384 x 16384");
+    refuse(view(|v| v.intrinsics.width = 0), "0 x 48");
+    refuse(view(|v| v.intrinsics.fx = 0.0), "v0.jpg");
+    refuse(view(|v| v.intrinsics.cy = f32::NAN), "v0.jpg");
+    refuse(view(|v| v.pose.center.z = f64::INFINITY), "v0.jpg");
+    refuse(view(|v| v.pose.rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0)), "v0.jpg");
+    refuse(ModelHeader { region: vec![[0.0; 2]; 5000], ..good.clone() }, "5000 corners");
+    refuse(ModelHeader { region: vec![[f64::NAN, 0.0]], ..good.clone() }, "region");
+    let origin = Some(Geodetic { lat_deg: 91.0, lon_deg: 0.0, alt_m: 0.0 });
+    refuse(ModelHeader { origin, ..good.clone() }, "origin");
+}
+
+#[test]
+fn a_ply_whose_numbers_are_bytes_is_refused_rather_than_blown_up() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.ply");
+    ply::write(&path, &GaussianCloud::with_capacity(0, 0), None).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let text = String::from_utf8(bytes).unwrap().replace("property float opacity", "property uchar opacity");
+    std::fs::write(&path, text).unwrap();
+    let e = ply::read(&path).unwrap_err().to_string();
+    assert!(e.contains("\"opacity\" is no float"), "{e}");
+}

@@ -152,3 +152,26 @@ fn damage_is_one_line_that_names_the_file() {
         refuse(why);
     }
 }
+
+#[test]
+fn a_small_file_that_claims_and_holds_millions_of_gaussians_is_refused_before_it_is_unpacked() {
+    // Ten million rows of zeros: 632 kB that became 2.96 GB.
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("bomb.spz");
+    let mut out = GzEncoder::new(std::fs::File::create(&path).unwrap(), flate2::Compression::best());
+    let count = 10_000_000u32;
+    out.write_all(&0x5053_474E_u32.to_le_bytes()).unwrap();
+    out.write_all(&3u32.to_le_bytes()).unwrap();
+    out.write_all(&count.to_le_bytes()).unwrap();
+    out.write_all(&[3, 12, 0, 0]).unwrap();
+    let zeros = vec![0u8; 1 << 20];
+    let body = 65 * count as usize;
+    for at in (0..body).step_by(zeros.len()) {
+        out.write_all(&zeros[..zeros.len().min(body - at)]).unwrap();
+    }
+    out.finish().unwrap();
+    let size = std::fs::metadata(&path).unwrap().len();
+    assert!(size < 1 << 20, "{size}");
+    let e = read(&path).unwrap_err().to_string();
+    assert!(e.contains("10000000") && e.contains(&size.to_string()), "{e}");
+}

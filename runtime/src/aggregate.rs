@@ -6,6 +6,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use config::error::{Error, ErrorKind};
 use config::geodesy::Geodetic;
 use config::ground::GroundSettings;
 use models::cloud::GaussianCloud;
@@ -79,10 +80,13 @@ pub enum AggregateError {
     Train(#[from] TrainError),
 }
 
-impl AggregateError {
-    /// Whether a device or driver is missing (exit code 3).
-    pub fn is_device(&self) -> bool {
-        matches!(self, Self::Train(TrainError::Gpu(_)))
+impl Error for AggregateError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Format(e) => e.kind(),
+            Self::Train(e) => e.kind(),
+            Self::NoModels | Self::NoOrigin(_) | Self::TooFar { .. } | Self::Plan(_) => ErrorKind::Input,
+        }
     }
 }
 
@@ -164,7 +168,6 @@ pub fn run(
     match distil::distil(&models, &mut merged, settings, go_on) {
         Ok(distilled) => {
             outcome.header.steps = u64::from(distilled.steps);
-            outcome.header.train_seconds = distilled.seconds.iter().sum();
             outcome.distilled = Some(distilled);
         }
         Err(e) => outcome.not_distilled = Some(e),

@@ -1,5 +1,5 @@
 //! `dgtr bench`: run time against error, memory, numerical stress and every skip, measured by the program itself, so that
-//! each figure of the README has a command that makes it anew.
+//! each figure of `tests/BENCHMARKS.md` has a command that makes it anew.
 
 pub mod child;
 pub mod figures;

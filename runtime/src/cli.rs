@@ -3,13 +3,15 @@
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
+use config::error::ErrorKind;
 
 use crate::console;
 
 mod aggregate;
+#[cfg(feature = "lab")]
 mod bench;
+#[cfg(feature = "lab")]
 mod demo;
 mod doctor;
 mod error;
@@ -17,14 +19,18 @@ mod eval;
 mod export;
 mod fly;
 mod import;
+mod init;
+mod keys;
 mod plan;
 mod render;
+#[cfg(feature = "lab")]
 mod replay;
 mod serve;
+#[cfg(feature = "lab")]
 mod sim;
 mod train;
 
-pub use error::CliError;
+use error::{CliError, EXIT_CODES, exit_code};
 
 /// Posed aerial pictures to 3D Gaussian Splatting on board, merged on the ground.
 #[derive(Debug, Parser)]
@@ -34,12 +40,7 @@ pub use error::CliError;
     about = "Posed aerial pictures to 3D Gaussian Splatting on board, merged on the ground"
 )]
 #[command(subcommand_required = true, arg_required_else_help = true)]
-#[command(
-    after_help = "Exit codes: 0 done, 1 failed, 2 usage or bad input, 3 device or driver missing, 4 interrupted with a \
-                  valid checkpoint.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxROWSxFETCHED: shape of the kernels; auto \
-                  measures it once per hardware device and driver (dgtr doctor shows it), default measures nothing. \
-                  Models do not depend on it."
-)]
+#[command(after_help = notes())]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -52,6 +53,17 @@ struct Cli {
     /// Warnings and errors only, no progress.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
+}
+
+/// What `--help` ends with.
+fn notes() -> String {
+    let codes: Vec<String> = EXIT_CODES.iter().map(|(_, code, meaning)| format!("{code} {meaning}")).collect();
+    format!(
+        "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxROWSxFETCHED: shape of the kernels; auto \
+         measures it once per hardware device and driver (dgtr doctor shows it), default measures nothing. Models do not \
+         depend on it.",
+        codes.join(", ")
+    )
 }
 
 #[derive(Debug, Subcommand)]
@@ -69,17 +81,25 @@ enum Command {
     /// The onboard job: from MAVLink and pictures to a model, while flying.
     Fly(fly::Args),
     /// The whole system with nothing attached.
+    #[cfg(feature = "lab")]
     Demo(demo::Args),
     /// Recorded pictures or a recorded log as a living aircraft.
+    #[cfg(feature = "lab")]
     Replay(replay::Args),
     /// A simulated aircraft over a ray-cast world.
+    #[cfg(feature = "lab")]
     Sim(sim::Args),
     /// Writes a model in a format that other programs read.
     Export(export::Args),
     /// Makes a model of another program's file.
     Import(import::Args),
     /// Measures run time, memory, error, skips and numerical promises.
+    #[cfg(feature = "lab")]
     Bench(bench::Args),
+    /// Makes the keys of aircraft and ground, and prints the public ones for the mission file.
+    Keys(keys::Args),
+    /// Writes a mission file to start from, or prints the reference of all settings.
+    Init(init::Args),
     /// Prints what a memory budget holds, section by section.
     Plan(plan::Args),
     /// Checks device, driver, ONNX Runtime, ports: what is there, what is missing, how to mend it.
@@ -94,8 +114,8 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Err(e) => {
             // A closed pipe is no reason to fail.
             let _ = e.print();
-            let asked = matches!(e.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
-            return if asked { ExitCode::SUCCESS } else { ExitCode::from(2) };
+            let asked = !e.use_stderr();
+            return if asked { ExitCode::SUCCESS } else { exit_code(ErrorKind::Input) };
         }
     };
     console::install(cli.verbose, cli.quiet);
@@ -103,7 +123,10 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         && let Err(e) = crate::resources::limit_data(mib)
     {
         console::error(&format!("--limit-mib {mib}: {e}"));
-        return ExitCode::from(2);
+        return exit_code(ErrorKind::Input);
+    }
+    if let Err(e) = crate::resources::survive_file_size_limit() {
+        tracing::debug!("SIGXFSZ: {e}");
     }
     let result = match cli.command {
         Command::Train(args) => train::run(*args),
@@ -112,12 +135,18 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Command::Aggregate(args) => aggregate::run(args),
         Command::Serve(args) => serve::run(args),
         Command::Fly(args) => fly::run(args),
+        #[cfg(feature = "lab")]
         Command::Sim(args) => sim::run(args),
+        #[cfg(feature = "lab")]
         Command::Replay(args) => replay::run(args),
+        #[cfg(feature = "lab")]
         Command::Demo(args) => demo::run(args),
         Command::Export(args) => export::run(args),
         Command::Import(args) => import::run(args),
+        #[cfg(feature = "lab")]
         Command::Bench(args) => bench::run(args),
+        Command::Keys(args) => keys::run(args),
+        Command::Init(args) => init::run(args),
         Command::Plan(args) => plan::run(args),
         Command::Doctor(args) => doctor::run(args),
     };

@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use config::error::{Error, ErrorKind};
 use vulkan::gpu::Gpu;
 
 mod evaluate;
@@ -17,6 +18,7 @@ pub use summary::Summary;
 
 use crate::interrupt::Interrupt;
 use crate::kernels;
+use crate::keys::{self, GROUND};
 use processes::Process;
 
 /// What the command line may change.
@@ -66,6 +68,17 @@ pub enum DemoError {
     Interrupted(PathBuf),
 }
 
+impl Error for DemoError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Io { source, .. } => Error::kind(source),
+            Self::Process { .. } | Self::Report(_) => ErrorKind::Failed,
+            Self::Device(_) => ErrorKind::Device,
+            Self::Interrupted(_) => ErrorKind::Interrupted,
+        }
+    }
+}
+
 /// The two aircraft.
 pub(crate) const AIRCRAFT: [&str; 2] = ["west", "east"];
 
@@ -86,7 +99,7 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
     // Links of ports must be absolute; a folder of an earlier demo is begun afresh.
     std::fs::create_dir_all(&options.out).map_err(io(&options.out))?;
     let out = options.out.canonicalize().map_err(io(&options.out))?;
-    for name in AIRCRAFT.into_iter().chain(["ground"]) {
+    for name in AIRCRAFT.into_iter().chain([GROUND, "keys"]) {
         let folder = out.join(name);
         if folder.is_dir() {
             std::fs::remove_dir_all(&folder).map_err(io(&folder))?;
@@ -94,7 +107,10 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
         std::fs::create_dir_all(&folder).map_err(io(&folder))?;
     }
     let mission = out.join("mission.toml");
-    std::fs::write(&mission, mission::text(options)).map_err(io(&mission))?;
+    let key = |id: &str| keys::make(&out.join("keys"), id).map(|k| k.0).map_err(|e| DemoError::Report(e.to_string()));
+    let [west, east] = AIRCRAFT;
+    let text = mission::text(options, [key(GROUND)?, key(west)?, key(east)?]);
+    std::fs::write(&mission, text).map_err(io(&mission))?;
 
     // Once, and before anything else is at work; the jobs find the result. Without a device they say so themselves.
     if let Ok(gpu) = Gpu::open(None) {

@@ -1,6 +1,5 @@
 //! Held-out quality of a model: renders the pictures of a split and compares, next to the two naive baselines.
 
-use std::io::Write;
 use std::path::Path;
 
 use models::baselines::{MeanColor, nearest_view, warp_over_ground};
@@ -12,8 +11,8 @@ use models::onnx::metric::PerceptualMetric;
 use serde::Serialize;
 use vulkan::trainer::{Rendering, Trainer};
 
-use crate::cli::CliError;
-use crate::transfer::PoseTransfer;
+use crate::error::JobError;
+use crate::transfer::{PoseTransfer, stem};
 
 /// PSNR of equal pictures; JSON has no infinity.
 const PSNR_CAP: f64 = 100.0;
@@ -96,7 +95,7 @@ pub fn evaluate(
     transfer: &PoseTransfer,
     mut metric: Option<&mut PerceptualMetric>,
     save: Option<&Path>,
-) -> Result<Scores, CliError> {
+) -> Result<Scores, JobError> {
     let mut rendering = Rendering::default();
     let mut scores = Vec::with_capacity(frames.len());
     for &i in frames {
@@ -104,7 +103,7 @@ pub fn evaluate(
         let view = View { intrinsics: truth.view.intrinsics, pose: transfer.apply(&truth.view.pose) };
         trainer.render(&view, &mut rendering)?;
         let Some(picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
-            return Err(CliError::failed(format!("{}: the rendering has another size than its camera", truth.name)));
+            return Err(JobError::RenderingSize(truth.name));
         };
         if let Some(dir) = save {
             save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
@@ -122,7 +121,7 @@ pub fn evaluate(
 ///
 /// # Errors
 /// A picture cannot be read.
-pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64) -> Result<BaselineScores, CliError> {
+pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64) -> Result<BaselineScores, JobError> {
     let mut mean = MeanColor::default();
     for &i in training {
         mean.add(&set.load(i, scale)?.image);
@@ -156,24 +155,19 @@ fn score(truth: &PosedImage, rgb: &[f32]) -> ViewScore {
 ///
 /// # Errors
 /// The manifest, the network or ONNX Runtime is missing or does not fit.
-pub fn open_metric(manifest: Option<&Path>, size: (u32, u32)) -> Result<Option<PerceptualMetric>, CliError> {
+pub fn open_metric(manifest: Option<&Path>, size: (u32, u32)) -> Result<Option<PerceptualMetric>, JobError> {
     let threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(4));
     Ok(manifest.map(|path| PerceptualMetric::open(path, size, threads)).transpose()?)
-}
-
-/// File name without folder and extension.
-pub fn stem(name: &str) -> String {
-    Path::new(name).file_stem().map_or_else(|| name.to_owned(), |s| s.to_string_lossy().into_owned())
 }
 
 /// Writes an 8-bit RGB PNG, atomically.
 ///
 /// # Errors
 /// The folder cannot be written to.
-pub fn save_png(picture: &image::RgbImage, path: &Path) -> Result<(), CliError> {
+pub fn save_png(picture: &image::RgbImage, path: &Path) -> Result<(), JobError> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     picture
         .write_to(&mut bytes, image::ImageFormat::Png)
-        .map_err(|e| CliError::failed(format!("{}: cannot be encoded: {e}", path.display())))?;
+        .map_err(|source| JobError::Encode { path: path.to_owned(), source })?;
     Ok(write_atomic(path, |out| out.write_all(bytes.get_ref()))?)
 }

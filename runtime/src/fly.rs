@@ -2,41 +2,57 @@
 //! and offers; after landing it finishes the schedule. Ctrl-C at any moment leaves a valid model behind.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, SystemTime};
 
+use config::disk::bounded::{Bounded, bytes_below};
+use config::disk::plan::{DiskPlan, DiskRequest};
+use config::disk::{Disk, System};
 use config::mission::{Aircraft, Mission};
+use hal::failsafe::Timing;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
 use models::camera::Intrinsics;
+use models::formats::model::ModelHeader;
 use vulkan::trainer::RunBudget;
 
-mod carry;
-mod error;
 mod flight;
 mod geotags;
 mod handover;
 mod health;
 mod intake;
 mod job;
-mod reconstruct;
-mod reconstruction;
 mod shortage;
 
 #[cfg(test)]
+#[cfg(feature = "lab")]
 mod fault_table;
 #[cfg(test)]
+#[cfg(feature = "lab")]
+mod killed;
+#[cfg(test)]
+#[cfg(feature = "lab")]
+mod power_cut;
+#[cfg(test)]
+#[cfg(feature = "lab")]
 mod rehearsal;
 
-pub use error::FlyError;
-pub use flight::{EndOfFlight, Ended, FlightCounters};
 pub use handover::Handover;
-pub use reconstruction::{Progress, Reconstruction};
+pub use intake::{EndOfFlight, Ended, FlightCounters};
 
+use crate::engine::device::DeviceRequest;
+use crate::engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path};
+use crate::error::JobError;
 use crate::interrupt::Interrupt;
-use crate::upload::Offerer;
-use flight::{Flight, FlightPlan};
+use crate::keyframe_store::KeyframeStore;
+use crate::resources;
+use crate::run_json::RunReport;
+use crate::upload::{Offerer, Source, UploadError};
+use flight::Flight;
 use geotags::Geotags;
 use health::Health;
+use intake::{DECODED_AHEAD, FlightPlan};
 use job::{Job, JobEnd};
 
 /// How long a finished aircraft keeps its model on offer for the ground to fetch.
@@ -66,16 +82,10 @@ pub struct FlyOutcome {
     pub delivered: bool,
     /// What capture counted.
     pub flight: FlightCounters,
-    /// What reconstruction did.
-    pub progress: Progress,
     /// Key frames used.
     pub keyframes: usize,
-    /// Device bytes planned and allocated.
-    pub device_bytes: [u64; 2],
-    /// Name of the device.
-    pub device: String,
-    /// Device milliseconds by stage.
-    pub stage_ms: Vec<(&'static str, f64)>,
+    /// What reconstruction did and what it took.
+    pub report: RunReport,
 }
 
 /// The lens of the pictures that are trained on.
@@ -95,30 +105,68 @@ pub fn fly(
     aircraft: &Aircraft,
     options: &FlyOptions,
     interrupt: &Interrupt,
-) -> Result<FlyOutcome, FlyError> {
+) -> Result<FlyOutcome, JobError> {
     let intrinsics = training_lens(mission);
-    let reconstruction = Reconstruction::open(mission, aircraft, &intrinsics, &options.out)?;
-    let offerer = Offerer::start(&mission.upload, &mission.name, &aircraft.id)?;
-    let flight = Flight::start(FlightPlan {
+    let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
+    let disk = planned_disk(mission, &intrinsics, &options.out)?;
+    let mut reconstruction = open(mission, aircraft, &intrinsics, &disk)?;
+    let mut store = KeyframeStore::open(&disk, &options.out.join("keyframes"), &intrinsics, mission.origin)?;
+    reconstruction.resume(&options.out)?;
+    while let Some(frame) = store.sound(reconstruction.keyframes()) {
+        reconstruction.add(frame)?;
+    }
+    let offerer = Offerer::start(&mission.upload, source)?;
+    let mut flight = Flight::start(FlightPlan {
         vehicle: VehicleSettings {
             pictures_since: last_saved(&options.out),
             ..VehicleSettings::from_mission(mission, aircraft)?
         },
         intrinsics,
         keyframes: mission.keyframes,
-        earlier: reconstruction.store().poses(),
+        earlier: store.poses(),
+        earlier_names: store.names().collect(),
         end: options.end,
-        geotags: Geotags::open(&options.out, mission.origin).map_err(FlyError::Geotags)?,
+        geotags: Geotags::open(&disk, &options.out, mission.origin)
+            .map_err(JobError::io(&options.out.join(geotags::FILE)))?,
     })?;
+    flight.handover().keep_in(store, model_path(&options.out));
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };
-    let health = Health::new(mission.memory.host_mib);
-    let mut job = Job::new(reconstruction, offerer, &options.out, budget, health, MonotonicClock::default());
+    let health = Health::new(mission.failsafe, mission.memory.host_mib, &options.out);
+    let timing = Timing::from(&mission.failsafe);
+    let mut job = Job::new(reconstruction, offerer, &options.out, budget, health, timing, MonotonicClock::default());
     while job.turn(flight.handover(), interrupt)? {}
-    let (ended, counters) = flight.finish()?;
+    let (mut capture, ended, counters) = flight.finish()?;
     tracing::info!("capture is over ({ended:?}): {} key frames", job.keyframes());
-    let end = job.land(&counters, interrupt)?;
+    let mut end = job.land(&mut capture, &counters, interrupt)?;
+    end.reconstruction.report.skip("key_frames_without_room_on_disk", capture.without_room());
     Ok(outcome(ended, counters, end, interrupt))
+}
+
+/// What a flight may take of the disk.
+fn disk_plan(mission: &Mission, intrinsics: &Intrinsics) -> DiskPlan {
+    let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
+    // At least this much of the device's memory goes with every Gaussian: its floats, their two moments and gradient.
+    let each = 16 * (11 + 3 * (u64::from(sh_degree) + 1).pow(2));
+    let held = (u64::from(memory.device_mib) << 20) / each;
+    let gaussians = memory.max_gaussians.map_or(held, u64::from).min(held) as usize;
+    let Intrinsics { width, height, .. } = *intrinsics;
+    DiskPlan::new(&DiskRequest { width, height, key_frames: mission.keyframes.max, gaussians, sh_degree })
+}
+
+/// The disk a flight writes to, bounded as the mission says; refused when not even a first model would fit.
+fn planned_disk(mission: &Mission, intrinsics: &Intrinsics, out: &Path) -> Result<Disk, JobError> {
+    let plan = disk_plan(mission, intrinsics);
+    let here = bytes_below(out);
+    let free = resources::free_disk_bytes(out).map_or(u64::MAX, |free| free.saturating_add(here));
+    let limit = mission.memory.disk_mib.map_or(u64::MAX, |mib| u64::from(mib) << 20);
+    // A folder that holds more than the least already is a flight that goes on: it climbs the ladder instead.
+    let room = free.min(limit);
+    if here < plan.min_bytes && !plan.fits(room).map_err(|e| JobError::Request(e.to_string()))? {
+        let (room, total) = (room >> 20, plan.total_bytes >> 20);
+        tracing::warn!("disk: {room} MiB for a flight that may take {total} MiB; see dgtr plan for what it is for");
+    }
+    Ok(Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(limit)))))
 }
 
 /// Waits for the ground to have the finished model, then says what became of everything.
@@ -126,29 +174,51 @@ fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, in
     let JobEnd { reconstruction, offerer, model, gaussians, finished } = end;
     let delivered = finished && offerer.wait_delivered(DELIVERY, || !interrupt.requested());
     offerer.shutdown();
-    let trainer = reconstruction.trainer();
-    FlyOutcome {
-        model,
-        gaussians,
-        ended,
-        finished,
-        delivered,
-        flight,
-        keyframes: reconstruction.keyframes(),
-        device_bytes: [trainer.plan().total_bytes, trainer.device_bytes()],
-        device: trainer.gpu().info().name.clone(),
-        stage_ms: trainer.stage_ms().to_vec(),
-        progress: reconstruction.progress().clone(),
-    }
+    let keyframes = reconstruction.keyframes();
+    FlyOutcome { model, gaussians, ended, finished, delivered, flight, keyframes, report: reconstruction.report }
+}
+
+/// The engine for `aircraft`, with everything it will ever need.
+fn open(
+    mission: &Mission,
+    aircraft: &Aircraft,
+    intrinsics: &Intrinsics,
+    disk: &Disk,
+) -> Result<Reconstruction, JobError> {
+    let settings = EngineSettings {
+        disk: disk.clone(),
+        device: DeviceRequest {
+            device: aircraft.device.clone(),
+            device_mib: mission.memory.device_mib,
+            size: (intrinsics.width, intrinsics.height),
+            views: mission.keyframes.max as usize,
+            max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
+        },
+        host_mib: Some(mission.memory.host_mib),
+        camera_pixels: u64::from(mission.camera.width) * u64::from(mission.camera.height),
+        ahead: DECODED_AHEAD + handover::AHEAD,
+        // The capture thread has scaled them already.
+        scale: 1.0,
+        network: mission.network.clone(),
+        training: mission.training.clone(),
+        init: mission.init.clone(),
+        refine: Some(mission.refine.clone()),
+        start: InitKind::FeedForward,
+        incremental: true,
+    };
+    let header = ModelHeader {
+        mission: mission.name.clone(),
+        aircraft: aircraft.id.clone(),
+        origin: Some(mission.origin),
+        region: mission.region(aircraft),
+        seed: mission.training.seed,
+        ..ModelHeader::default()
+    };
+    Reconstruction::open(settings, header, "fly")
 }
 
 /// When an earlier run in `out` last saved a key frame or a model: what the camera wrote since then nobody has seen.
 fn last_saved(out: &Path) -> Option<SystemTime> {
     let saved = [model_path(out), out.join("keyframes/transforms.json")];
     saved.iter().filter_map(|path| path.metadata().ok()?.modified().ok()).max()
-}
-
-/// Where `dgtr fly` puts the model of an aircraft.
-pub fn model_path(out: &Path) -> PathBuf {
-    Reconstruction::model_path(out)
 }

@@ -5,6 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 
+use crate::error::JobError;
+
 /// Whether somebody asked this process to end.
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
@@ -14,12 +16,13 @@ impl Interrupt {
     ///
     /// # Errors
     /// The system refuses to install the handlers.
-    pub fn install() -> std::io::Result<Self> {
+    pub fn install() -> Result<Self, JobError> {
+        let refused = |e| JobError::System(format!("signal handlers: {e}"));
         let flag = Arc::new(AtomicBool::new(false));
         for signal in [SIGINT, SIGTERM] {
             // In this order: the second signal finds the flag set and ends the process; the first only sets it.
-            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag))?;
-            signal_hook::flag::register(signal, Arc::clone(&flag))?;
+            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag)).map_err(refused)?;
+            signal_hook::flag::register(signal, Arc::clone(&flag)).map_err(refused)?;
         }
         Ok(Self(flag))
     }

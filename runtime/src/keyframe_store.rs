@@ -1,19 +1,47 @@
 //! Key frames on disk: what a restarted flight continues from, and a data set that `dgtr train` reads as it is.
 //!
 //! A folder of lossless pictures and one `transforms.json` (nerfstudio), with what only this project needs in a
-//! `dgtr` object per frame. Every file is written aside and renamed, pictures before the list that names them, so
-//! that a power cut loses at most the key frame being written.
+//! `dgtr` object per frame. Pictures are durable before the list that names them, and the list before stays as the older of two
+//! generations. What is damaged all the same is set aside and named; the rest is used.
 
 use std::path::{Path, PathBuf};
 
+use config::disk::{Damaged, Disk, previous};
+use config::error::{Error, ErrorKind};
 use config::geodesy::Geodetic;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
-use models::dataset;
-use models::formats::{FormatError, read_bounded, transforms, write_atomic};
+use models::formats::{FormatError, read_bounded, transforms};
+use models::picture;
 use serde::{Deserialize, Serialize};
 
+/// The list's name, as nerfstudio reads it.
+const LIST: &str = "transforms.json";
 /// 4,096 key frames (the most a mission allows) at 2 KiB each.
 const LIST_LIMIT: u64 = 8 << 20;
+/// Fewer key frames than this are never thinned out: too little to build from.
+const MIN_KEPT: usize = 8;
+
+/// What a full disk costs first, in this order; after it key frames are no longer kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Relief {
+    /// The older of the two generations of checkpoint and list.
+    OldCheckpoints,
+    /// Pictures whose neighbours show the same ground.
+    CoveredPictures,
+}
+
+impl Relief {
+    /// The ladder.
+    pub const LADDER: [Self; 2] = [Self::OldCheckpoints, Self::CoveredPictures];
+
+    /// In words, for messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::OldCheckpoints => "the older checkpoints",
+            Self::CoveredPictures => "pictures of ground that others cover",
+        }
+    }
+}
 
 /// Why a stored key frame could not be used.
 #[derive(Debug, thiserror::Error)]
@@ -21,16 +49,30 @@ pub enum StoreError {
     /// A file could not be read or written.
     #[error(transparent)]
     File(#[from] FormatError),
-    /// A picture could not be decoded or encoded.
-    #[error("key frame {}: {what}; remove {} to start without earlier key frames", path.display(), folder.display())]
+    /// A picture could not be encoded, or the stored ones are of another camera.
+    #[error("key frame {}: {what}", path.display())]
     Picture {
         /// The picture.
         path: PathBuf,
-        /// The store.
-        folder: PathBuf,
-        /// What is wrong.
+        /// What is wrong, and how to mend it.
         what: String,
     },
+}
+
+impl Error for StoreError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::File(e) => e.kind(),
+            Self::Picture { .. } => ErrorKind::Input,
+        }
+    }
+}
+
+impl StoreError {
+    /// Whether room or a medium that comes back may mend it.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::File(e) if e.may_pass())
+    }
 }
 
 #[derive(Serialize, Deserialize)]
@@ -89,17 +131,19 @@ impl Extra {
 
 /// The key frames of one flight.
 pub struct KeyframeStore {
+    disk: Disk,
     folder: PathBuf,
     list: List,
 }
 
 impl KeyframeStore {
-    /// Opens the store in `folder`, or starts one there.
+    /// Opens the store in `folder`, or starts one there. A list that cannot be read is set aside, named in a warning, and the
+    /// generation before it is used.
     ///
     /// # Errors
-    /// An existing list that cannot be read, or one of another camera.
-    pub fn open(folder: &Path, intrinsics: &Intrinsics, origin: Geodetic) -> Result<Self, StoreError> {
-        let path = folder.join("transforms.json");
+    /// A list of another camera; a damaged one that cannot be set aside.
+    pub fn open(disk: &Disk, folder: &Path, intrinsics: &Intrinsics, origin: Geodetic) -> Result<Self, StoreError> {
+        let path = folder.join(LIST);
         let i = intrinsics;
         let mut list = List {
             camera_model: "PINHOLE".into(),
@@ -112,19 +156,22 @@ impl KeyframeStore {
             enu_origin_wgs84: Origin { lat: origin.lat_deg, lon: origin.lon_deg, alt: origin.alt_m },
             frames: Vec::new(),
         };
-        if path.is_file() {
-            let wrong = |what: String| StoreError::Picture { path: path.clone(), folder: folder.into(), what };
-            let bytes = read_bounded(&path, LIST_LIMIT)?;
-            let old: List = serde_json::from_slice(&bytes).map_err(|e| wrong(e.to_string()))?;
+        disk.sweep(folder);
+        disk.sweep(&folder.join("images"));
+        let aside = |e| FormatError::Io { path: path.clone(), action: "setting aside", source: e };
+        let newest = disk.newest(&path, read_list).map_err(aside)?;
+        newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));
+        if let Some(old) = newest.found {
             if (old.w, old.h) != (list.w, list.h) {
-                return Err(wrong(format!(
-                    "holds pictures of {}×{}, the mission says {}×{}",
+                let what = format!(
+                    "holds pictures of {}×{}, the mission says {}×{}; give another --out",
                     old.w, old.h, list.w, list.h
-                )));
+                );
+                return Err(StoreError::Picture { path, what });
             }
             list.frames = old.frames;
         }
-        Ok(Self { folder: folder.into(), list })
+        Ok(Self { disk: disk.clone(), folder: folder.into(), list })
     }
 
     /// Number of stored key frames.
@@ -140,21 +187,28 @@ impl KeyframeStore {
     /// Stores one more key frame; a picture of the same name is replaced.
     ///
     /// # Errors
-    /// When the disk is full or not writable.
+    /// When the disk is full or not writable; what is stored stays as it was.
     pub fn add(&mut self, frame: &PosedImage) -> Result<(), StoreError> {
         let stem = Path::new(&frame.name).file_stem().and_then(|s| s.to_str()).unwrap_or("frame");
         let file_path = format!("images/{stem}.png");
         let path = self.folder.join(&file_path);
         let mut png = Vec::new();
-        frame.image.write_to(&mut std::io::Cursor::new(&mut png), image::ImageFormat::Png).map_err(|e| {
-            StoreError::Picture { path: path.clone(), folder: self.folder.clone(), what: e.to_string() }
-        })?;
-        write_atomic(&path, |out| std::io::Write::write_all(out, &png))?;
+        frame
+            .image
+            .write_to(&mut std::io::Cursor::new(&mut png), image::ImageFormat::Png)
+            .map_err(|e| StoreError::Picture { path: path.clone(), what: e.to_string() })?;
+        self.disk.replace(&path, |out| out.write_all(&png)).map_err(|e| FormatError::disk(&path, e))?;
         let transform_matrix = transforms::pose_to_opengl(&frame.view.pose);
         let entry = Entry { file_path, transform_matrix, dgtr: Extra::new(frame) };
-        self.list.frames.retain(|f| f.file_path != entry.file_path);
+        let at = self.list.frames.iter().position(|f| f.file_path == entry.file_path);
+        let replaced = at.map(|at| self.list.frames.remove(at));
         self.list.frames.push(entry);
-        self.save()
+        if let Err(e) = self.save() {
+            self.list.frames.pop();
+            self.list.frames.extend(replaced);
+            return Err(e);
+        }
+        Ok(())
     }
 
     /// Writes refined poses into the list that other programs read; the poses as captured stay beside them.
@@ -170,6 +224,11 @@ impl KeyframeStore {
         self.save()
     }
 
+    /// Names of all key frames.
+    pub fn names(&self) -> impl Iterator<Item = String> + '_ {
+        self.list.frames.iter().map(|f| name(&f.file_path))
+    }
+
     /// Poses of all key frames, as captured.
     pub fn poses(&self) -> Vec<Pose> {
         self.list.frames.iter().map(|f| f.dgtr.pose).collect()
@@ -182,8 +241,8 @@ impl KeyframeStore {
     pub fn load(&self, i: usize) -> Result<PosedImage, StoreError> {
         let entry = &self.list.frames[i];
         let path = self.folder.join(&entry.file_path);
-        let wrong = |what: String| StoreError::Picture { path: path.clone(), folder: self.folder.clone(), what };
-        let image = dataset::decode(&path).map_err(|e| wrong(e.to_string()))?;
+        let wrong = |what: String| StoreError::Picture { path: path.clone(), what };
+        let image = picture::decode(&path).map_err(|e| wrong(e.to_string()))?;
         if image.dimensions() != (self.list.w, self.list.h) {
             return Err(wrong("has another size than the list says".into()));
         }
@@ -198,15 +257,104 @@ impl KeyframeStore {
         })
     }
 
-    fn save(&self) -> Result<(), StoreError> {
-        let path = self.folder.join("transforms.json");
-        let json = serde_json::to_vec_pretty(&self.list).map_err(|e| StoreError::Picture {
-            path: path.clone(),
-            folder: self.folder.clone(),
-            what: e.to_string(),
-        })?;
-        Ok(write_atomic(&path, |out| std::io::Write::write_all(out, &json))?)
+    /// Key frame `i` if there is one. One whose picture cannot be read is set aside, named in a warning, and the next takes its
+    /// number, so that half a picture never keeps a flight from going on.
+    pub fn sound(&mut self, i: usize) -> Option<PosedImage> {
+        while i < self.len() {
+            match self.load(i) {
+                Ok(frame) => return Some(frame),
+                Err(e) => self.leave_out(i, &e),
+            }
+        }
+        None
     }
+
+    fn leave_out(&mut self, i: usize, why: &StoreError) {
+        let path = self.folder.join(self.list.frames.remove(i).file_path);
+        match self.disk.set_aside(&path) {
+            Ok(aside) => tracing::warn!("{}", Damaged { why: why.to_string(), aside }),
+            Err(e) => tracing::warn!("{why}; left out ({e})"),
+        }
+        if let Err(e) = self.save() {
+            tracing::warn!("{e}; the list is written with the next key frame");
+        }
+    }
+
+    /// Makes room: gives up every picture whose nearest neighbour stands no further from it than neighbours usually do, never
+    /// both of a pair and never the last few. Returns how many.
+    fn thin_out(&mut self) -> usize {
+        let centers: Vec<_> = self.list.frames.iter().map(|f| f.dgtr.pose.center).collect();
+        let nearest = |i: usize, kept: &[bool]| {
+            let others = (0..centers.len()).filter(|&j| j != i && kept[j]);
+            others.map(|j| centers[i].distance(centers[j])).fold(f64::INFINITY, f64::min)
+        };
+        let mut kept = vec![true; centers.len()];
+        let mut spacings: Vec<f64> = (0..centers.len()).map(|i| nearest(i, &kept)).collect();
+        spacings.sort_by(f64::total_cmp);
+        let Some(&usual) = spacings.get(spacings.len() / 2) else { return 0 };
+        for i in 0..centers.len() {
+            let enough = kept.iter().filter(|k| **k).count() > MIN_KEPT;
+            // A millimetre: poses of one line are never equally far to the last bit.
+            kept[i] = !(enough && nearest(i, &kept) <= usual + 1e-3);
+        }
+        // Pictures first: on a full disk the shorter list has no room before. A start leaves out what is listed and gone.
+        let mut gone = 0;
+        let (disk, folder, mut kept) = (&self.disk, &self.folder, kept.into_iter());
+        self.list.frames.retain(|f| {
+            let stays = kept.next() != Some(false) || disk.remove(&folder.join(&f.file_path)).is_err();
+            gone += usize::from(!stays);
+            stays
+        });
+        if gone > 0
+            && let Err(e) = self.save()
+        {
+            tracing::warn!("{e}; the list is written with the next key frame");
+        }
+        gone
+    }
+
+    /// As [`KeyframeStore::add`]; while there is no room, gives up what costs least and tries again.
+    ///
+    /// # Errors
+    /// As [`KeyframeStore::add`], with nothing left to give up.
+    pub fn add_with_relief(&mut self, frame: &PosedImage, model: &Path) -> Result<(), StoreError> {
+        let mut kept = self.add(frame);
+        for relief in Relief::LADDER {
+            if let Err(e) = &kept
+                && e.may_pass()
+                && self.relieve(relief, model)
+            {
+                tracing::warn!("{e}: gave up {}", relief.name());
+                kept = self.add(frame);
+            }
+        }
+        kept
+    }
+
+    /// Makes room; false when there was nothing to give up. `model` is the checkpoint kept beside the key frames.
+    pub fn relieve(&mut self, relief: Relief, model: &Path) -> bool {
+        match relief {
+            Relief::OldCheckpoints => {
+                // Both, whatever becomes of the first; they are kept again from the next writes on.
+                let older = [previous(&self.folder.join(LIST)), previous(model)];
+                older.map(|path| path.is_file() && self.disk.remove(&path).is_ok()).contains(&true)
+            }
+            Relief::CoveredPictures => self.thin_out() > 0,
+        }
+    }
+
+    fn save(&self) -> Result<(), StoreError> {
+        let path = self.folder.join(LIST);
+        let json = serde_json::to_vec_pretty(&self.list)
+            .map_err(|e| StoreError::Picture { path: path.clone(), what: e.to_string() })?;
+        Ok(self.disk.replace_keeping(&path, |out| out.write_all(&json)).map_err(|e| FormatError::disk(&path, e))?)
+    }
+}
+
+fn read_list(path: &Path) -> Result<List, FormatError> {
+    let bytes = read_bounded(path, LIST_LIMIT)?;
+    serde_json::from_slice(&bytes)
+        .map_err(|e| FormatError::Invalid { path: path.into(), what: format!("not a list of key frames: {e}") })
 }
 
 /// Key frames are known by the name of their file.
@@ -215,51 +363,4 @@ fn name(file_path: &str) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::{DQuat, DVec3};
-
-    fn frame(name: &str, x: f64) -> PosedImage {
-        PosedImage {
-            name: name.into(),
-            time_ns: 7,
-            image: image::RgbImage::from_fn(4, 3, |x, y| image::Rgb([x as u8, y as u8, 9])),
-            view: View {
-                intrinsics: Intrinsics { width: 4, height: 3, fx: 3.0, fy: 3.0, cx: 2.0, cy: 1.5 },
-                pose: Pose { rotation: DQuat::from_rotation_x(3.0), center: DVec3::new(x, 2.0, 40.0) },
-            },
-            sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [f32::INFINITY; 3] },
-        }
-    }
-
-    const ORIGIN: Geodetic = Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
-
-    #[test]
-    fn a_restarted_flight_finds_its_key_frames_as_they_were() {
-        let dir = tempfile::tempdir().expect("tempdir");
-        let intrinsics = frame("a.jpg", 0.0).view.intrinsics;
-        let mut store = KeyframeStore::open(dir.path(), &intrinsics, ORIGIN).expect("new");
-        store.add(&frame("a.jpg", 5.0)).expect("add");
-        let again = KeyframeStore::open(dir.path(), &intrinsics, ORIGIN).expect("again").load(0).expect("load");
-        let (stored, first) = (again.view, frame("a.jpg", 5.0));
-        assert_eq!((stored, again.sigma, again.image), (first.view, first.sigma, first.image));
-    }
-
-    #[test]
-    fn the_store_is_a_data_set() {
-        let dir = tempfile::tempdir().expect("tempdir");
-        let intrinsics = frame("a.jpg", 0.0).view.intrinsics;
-        let mut store = KeyframeStore::open(dir.path(), &intrinsics, ORIGIN).expect("new");
-        for i in 0..9 {
-            store.add(&frame(&format!("{i}.jpg"), f64::from(i))).expect("add");
-        }
-        let again = KeyframeStore::open(dir.path(), &intrinsics, ORIGIN).expect("again");
-        assert_eq!(again.len(), 9);
-        let loaded = again.load(3).expect("load");
-        assert_eq!((loaded.name.as_str(), loaded.view.pose.center.x, loaded.time_ns), ("3.png", 3.0, 7));
-        let set = models::dataset::Dataset::open(dir.path()).expect("a data set");
-        assert_eq!(set.frames.len(), 9);
-        assert!((set.frames[3].view.pose.center - loaded.view.pose.center).length() < 1e-9);
-        assert_eq!(set.origin, Some(ORIGIN));
-    }
-}
+mod tests;

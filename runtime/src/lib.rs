@@ -1,21 +1,28 @@
 //! The order of work: capture, initialise, train, checkpoint, upload, aggregate, evaluate. Only this crate knows it.
 
 pub mod aggregate;
+#[cfg(feature = "lab")]
 pub mod bench;
 pub mod capture;
 pub mod cli;
 pub mod console;
+#[cfg(feature = "lab")]
 pub mod demo;
+pub mod engine;
+pub mod error;
 pub mod evaluate;
 pub mod fly;
 pub mod interrupt;
 pub mod kernels;
 pub mod keyframe_store;
-pub mod renderer;
+pub mod keys;
+#[cfg(test)]
+mod power_cut;
 pub mod report;
 pub mod resources;
 pub mod run_json;
 pub mod serve;
+pub mod session;
 pub mod train_job;
 pub mod transfer;
 pub mod upload;

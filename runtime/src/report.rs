@@ -1,9 +1,9 @@
 //! One self-contained HTML file that shows what a mission, a demo or a benchmark came to: map, figures, pictures,
 //! times, what was skipped, what went wrong. No scripts, no network; it opens from a USB stick.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use config::error::{Error, ErrorKind};
 use image::RgbImage;
 use models::formats::{FormatError, write_atomic};
 
@@ -11,8 +11,9 @@ pub mod chart;
 mod html;
 mod map;
 mod picture;
+mod text;
 
-pub use html::{bytes, count, seconds};
+pub use text::{bytes, count, seconds};
 
 /// Everything a report can show; empty parts leave no trace on the page.
 #[derive(Clone, Debug, Default)]
@@ -126,6 +127,15 @@ pub enum ReportError {
     /// The file could not be written.
     #[error(transparent)]
     Write(#[from] FormatError),
+}
+
+impl Error for ReportError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Picture { .. } => ErrorKind::Failed,
+            Self::Write(e) => e.kind(),
+        }
+    }
 }
 
 impl ReportData {

@@ -1,5 +1,8 @@
 //! What the process may use and has used, as the kernel counts it.
 
+use std::path::Path;
+use std::sync::Arc;
+
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 /// Bounds the memory this process may write to (heap, stacks, private mappings) for the rest of its life.
@@ -13,6 +16,15 @@ pub fn limit_data(mib: u64) -> std::io::Result<()> {
     let hard = getrlimit(Resource::Data).maximum;
     setrlimit(Resource::Data, Rlimit { current: Some(bytes), maximum: hard })?;
     Ok(())
+}
+
+/// Makes a file that grows over `RLIMIT_FSIZE` a failed write (EFBIG), as a full disk is one, instead of the end of the process.
+///
+/// # Errors
+/// The system refuses to install the handler.
+pub fn survive_file_size_limit() -> std::io::Result<()> {
+    // Nobody asks the flag: that there is a handler is enough.
+    signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default()).map(drop)
 }
 
 /// One `Name:  N kB` line of /proc/self/status, in bytes; None where there is no procfs.
@@ -39,6 +51,12 @@ pub fn available_bytes() -> Option<u64> {
     line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok().map(|k| k * 1024)
 }
 
+/// What this user may still write to the file system of `path`, bytes; None while it is not there.
+pub fn free_disk_bytes(path: &Path) -> Option<u64> {
+    let stat = rustix::fs::statvfs(path).ok()?;
+    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -47,5 +65,44 @@ mod tests {
     fn the_peak_is_at_least_what_is_resident_now() {
         let now = rss_bytes().expect("procfs");
         assert!(peak_rss_bytes().expect("procfs") + (1 << 20) >= now && now > 1 << 20);
+    }
+
+    const LIMITED: &str = "DGTR_FILE_SIZE_LIMITED";
+
+    /// Not a test of its own: what the next one starts.
+    #[test]
+    #[ignore = "started by another test"]
+    fn limited_child() {
+        let Some(path) = std::env::var_os(LIMITED).map(std::path::PathBuf::from) else { return };
+        if path.extension().is_some() {
+            survive_file_size_limit().expect("a handler");
+        }
+        setrlimit(Resource::Fsize, Rlimit { current: Some(4096), maximum: None }).expect("a limit");
+        let disk = config::disk::Disk::default();
+        let e = disk.replace(&path, |out| out.write_all(&[7; 1 << 20])).expect_err("over the limit");
+        assert!(config::disk::is_full(&e.source), "{e}");
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn a_file_over_the_size_limit_is_an_error_and_not_the_end_of_the_process() {
+        use std::os::unix::process::ExitStatusExt;
+        let dir = tempfile::tempdir().expect("folder");
+        let run = |name: &str| {
+            let mut command = std::process::Command::new(std::env::current_exe().expect("this program"));
+            command.args(["resources::tests::limited_child", "--exact", "--ignored", "--test-threads=1"]);
+            command.env(LIMITED, dir.path().join(name)).stdout(std::process::Stdio::null());
+            command.stderr(std::process::Stdio::null()).status().expect("starts")
+        };
+        assert_eq!(run("bare").signal(), Some(signal_hook::consts::SIGXFSZ), "without the handler it is the end");
+        assert!(run("survives.bin").success());
+        assert_eq!(
+            std::fs::read_dir(dir.path())
+                .expect("folder")
+                .flatten()
+                .filter(|e| !e.file_name().to_string_lossy().starts_with(".dgtr-"))
+                .count(),
+            0
+        );
     }
 }

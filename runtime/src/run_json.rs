@@ -1,7 +1,6 @@
-//! `run.json`: what a job did and what it took, for scripts and for comparing runs. The schema is in the README.
+//! `run.json`: what a job did and what it took, for scripts and for comparing runs. The schema is in `models/FORMATS.md`.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -98,6 +97,12 @@ impl RunReport {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_page_on_formats_states_this_version() {
+        let row = format!("| `run.json` | schema {SCHEMA} |");
+        assert!(include_str!("../../models/FORMATS.md").contains(&row), "{row}");
+    }
 
     #[test]
     fn a_report_has_the_promised_fields_and_comes_back() {

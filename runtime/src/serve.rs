@@ -7,11 +7,19 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use config::error::{Error, ErrorKind};
 use config::mission::Mission;
 
-use crate::aggregate::{self, AggregateError, LocalModel, Outcome};
+use crate::aggregate::{self, AggregateError, Outcome};
+use crate::keys::{GROUND, Identity};
 use crate::upload::UploadError;
+use crate::upload::admission::{Admission, ModelRefusal, Refusals};
 use crate::upload::receive::{ReceiveCounters, Received, Receiver};
+
+mod admit;
+
+/// After the last model is here, the aircraft have so long to take their receipts.
+const RECEIPTS: Duration = Duration::from_secs(10);
 
 /// Why nothing could be served or merged.
 #[derive(Debug, thiserror::Error)]
@@ -25,6 +33,16 @@ pub enum ServeError {
     /// Stopped or timed out before any model was complete.
     #[error("no model of mission {0:?} has arrived yet; start again to continue receiving")]
     Nothing(String),
+}
+
+impl Error for ServeError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Upload(e) => e.kind(),
+            Self::Aggregate(e) => e.kind(),
+            Self::Nothing(_) => ErrorKind::Interrupted,
+        }
+    }
 }
 
 /// What is told while receiving.
@@ -49,6 +67,8 @@ pub struct Reception {
     pub missing: Vec<String>,
     /// What happened on the way.
     pub counters: ReceiveCounters,
+    /// What was not let in, and why.
+    pub refusals: Refusals,
     /// Seconds.
     pub seconds: f64,
 }
@@ -64,10 +84,10 @@ pub fn receive(
     stop: &AtomicBool,
     tell: &mut dyn FnMut(&Progress),
 ) -> Result<Reception, UploadError> {
-    mission.upload.validate()?;
     let start = Instant::now();
     let ids: Vec<String> = mission.aircraft.iter().map(|a| a.id.clone()).collect();
-    let mut receiver = Receiver::open(&mission.upload, &mission.name, &ids, &out.join("received"))?;
+    let mut receiver = Receiver::open(&mission.upload, admission(mission)?, &out.join("received"))?;
+    let mut complete: Option<Instant> = None;
     let over = || stop.load(std::sync::atomic::Ordering::Relaxed) || timeout.is_some_and(|t| start.elapsed() >= t);
     loop {
         let more = receiver.round(stop)?;
@@ -78,7 +98,13 @@ pub fn receive(
             transfers: receiver.progress().into_iter().filter(|p| p.2 > 0).collect(),
             bytes: receiver.counters.bytes,
         });
-        if receiver.all_finished() || over() {
+        if receiver.all_finished() {
+            let since = complete.get_or_insert_with(Instant::now);
+            if receiver.all_told() || since.elapsed() > RECEIPTS {
+                break;
+            }
+        }
+        if over() {
             break;
         }
         if !more {
@@ -90,52 +116,48 @@ pub fn receive(
     Ok(Reception {
         missing: ids.iter().filter(|id| !is_here(id)).cloned().collect(),
         counters: receiver.counters,
+        refusals: std::mem::take(&mut receiver.refusals),
         seconds: start.elapsed().as_secs_f64(),
         received,
     })
 }
 
-/// Merges what has been received, around the mission's origin. A received model that cannot be read is left out and
-/// returned with its reason, so that one bad file does not cost the others.
+/// What the ground of this mission lets in.
+fn admission(mission: &Mission) -> Result<Admission, UploadError> {
+    let identity = Identity::of(mission, GROUND)?;
+    let (name, aircraft) = (mission.name.clone(), mission.aircraft.iter().map(|a| a.id.clone()).collect());
+    let mission = mission.clone();
+    let check = Box::new(move |id: &str, path: &Path| admit::admit(&mission, id, path).map(drop));
+    Ok(Admission { mission: name, aircraft, identity, check })
+}
+
+/// Merges what has been received, around the mission's origin. A received model that does not count (any more) is left out
+/// and returned with its reason, so that one bad file does not cost the others.
 ///
 /// # Errors
-/// Nothing readable has arrived, or what has does not belong together.
+/// Nothing that counts has arrived.
 pub fn merge(
     mission: &Mission,
     reception: &Reception,
     out: &Path,
     go_on: &dyn Fn() -> bool,
-) -> Result<(Outcome, Vec<(PathBuf, AggregateError)>), ServeError> {
-    let (mut models, mut unreadable) = (Vec::new(), Vec::new());
+) -> Result<(Outcome, Vec<(PathBuf, ModelRefusal)>), ServeError> {
+    let (mut models, mut left_out) = (Vec::new(), Vec::new());
     for r in &reception.received {
-        match LocalModel::read(&r.path) {
-            Ok(mut model) => {
-                // The mission says who flew where; a model made by hand may not.
-                model.header.origin.get_or_insert(mission.origin);
-                if model.header.region.is_empty()
-                    && let Ok(aircraft) = mission.aircraft(Some(&r.aircraft))
-                {
-                    model.header.region = mission.region(aircraft);
-                    if let Some(own) = model.header.origin {
-                        let motion = aggregate::frame::Motion::between(mission.origin, own);
-                        motion.corners(&mut model.header.region);
-                    }
-                }
-                model.header.aircraft.clone_from(&r.aircraft);
-                models.push(model);
-            }
-            Err(e) => unreadable.push((r.path.clone(), e)),
+        match admit::admit(mission, &r.aircraft, &r.path) {
+            Ok(model) => models.push(model),
+            Err(why) => left_out.push((r.path.clone(), why)),
         }
     }
     if models.is_empty() {
-        return match unreadable.into_iter().next() {
-            Some((_, e)) => Err(e.into()),
-            None => Err(ServeError::Nothing(mission.name.clone())),
-        };
+        return Err(ServeError::Nothing(mission.name.clone()));
     }
     let outcome = aggregate::run(models, &mission.ground, Some(mission.origin), out, go_on)?;
-    Ok((outcome, unreadable))
+    Ok((outcome, left_out))
 }
 
+#[cfg(test)]
+#[cfg(feature = "zenoh")]
+mod fault_table;
 #[cfg(test)]
 mod tests;

@@ -1,60 +1,51 @@
-//! Training from a folder: poses, initialisation, optimisation, evaluation — with a valid model on disc at every moment,
-//! so that Ctrl-C, a power cut or a crash costs at most the time since the last checkpoint.
+//! Training from a folder: the engine over a data set, with a valid model on disc at every moment, so that Ctrl-C, a power
+//! cut or a crash costs at most the time since the last checkpoint.
 
-use std::collections::HashMap;
+use std::collections::HashSet;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use config::disk::Disk;
 use config::init::InitSettings;
-use config::mission::NetworkSettings;
-use config::plan::{Plan, PlanRequest};
+use config::mission::{KeyframeSettings, NetworkSettings};
+use config::plan::Plan;
 use config::refine::RefineSettings;
-use config::training::{ShSettings, TrainSettings};
-use models::camera::{Pose, PosedImage};
-use models::cloud::GaussianCloud;
+use config::training::TrainSettings;
+use models::card::CardOptions;
 use models::dataset::{Dataset, PoseSource, scaled};
-use models::formats::model::{self, ModelHeader};
-use models::onnx::depth::DepthNetwork;
+use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
-use vulkan::gpu::Gpu;
-use vulkan::trainer::{RunBudget, StopReason, Trainer};
+use vulkan::trainer::{RunBudget, StopReason};
 
-use crate::cli::CliError;
 use crate::console::Progress;
+use crate::engine::device::DeviceRequest;
+use crate::engine::source::Folder;
+use crate::engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
+use crate::error::JobError;
 use crate::evaluate;
 use crate::interrupt::Interrupt;
-use crate::kernels;
 use crate::run_json::RunReport;
 use crate::transfer::PoseTransfer;
 
-mod resume;
-mod start;
-
-use start::Start;
-
-/// Where the first Gaussians come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum InitKind {
-    /// The feed-forward network.
-    FeedForward,
-    /// Sparse points: the data set's, or those of the pose refinement.
-    SparsePoints,
-    /// Points at random in what the cameras see.
-    Random,
-}
+mod card;
+pub mod log;
 
 /// Everything a training needs to know; see `dgtr train --help`.
 #[derive(Clone, Debug)]
 pub struct TrainJob {
-    /// Folder of posed pictures.
-    pub dataset: PathBuf,
+    /// Folder of posed pictures, or folders of a card.
+    pub folders: Vec<PathBuf>,
+    /// What a card is read with.
+    pub card: CardOptions,
     /// Folder of the results.
     pub out: PathBuf,
     /// Name of the list of training pictures.
     pub split: String,
     /// Restricts the split.
     pub region: Option<String>,
+    /// The rule by which a flight chooses key frames; `None` takes every picture.
+    pub keyframes: Option<KeyframeSettings>,
     /// First Gaussians.
     pub init: InitKind,
     /// Poses.
@@ -69,8 +60,8 @@ pub struct TrainJob {
     pub budget_mib: u32,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
-    /// Image scale.
-    pub scale: f64,
+    /// Image scale; `None`: as large as the plan holds.
+    pub scale: Option<f64>,
     /// Part of the Vulkan device's name.
     pub device: Option<String>,
     /// `[network]`: manifests of the user's own networks.
@@ -89,11 +80,12 @@ pub struct TrainJob {
     pub refine_settings: RefineSettings,
 }
 
-/// The user's networks that training itself asks, checked before it begins.
-struct Networks {
-    depth: Option<DepthNetwork>,
-    metric: Option<PerceptualMetric>,
-}
+/// Scales that are tried where none is asked for: halves, at which JPEG files are decoded for less, and between.
+const SCALES: [f64; 9] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125];
+/// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
+const GAUSSIANS_OF_A_CARD: usize = 100_000;
+/// Shares that a sort is done in at most; fewer need less memory.
+const MOST_SORT_LANES: u32 = 256;
 
 /// How a job ended.
 #[derive(Clone, Debug)]
@@ -106,203 +98,207 @@ pub struct Outcome {
     pub report: RunReport,
 }
 
+/// Size of the largest picture by area.
+fn largest(set: &Dataset, frames: &[usize], scale: f64) -> Result<(u32, u32), JobError> {
+    let sizes = frames.iter().map(|&i| scaled(&set.frames[i].view.intrinsics, scale));
+    let sizes = sizes.collect::<Result<Vec<_>, _>>()?;
+    Ok(sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height)))
+}
+
 impl TrainJob {
     /// The model file, written from the start on.
     pub fn model_path(&self) -> PathBuf {
-        self.out.join("model.dgtr")
+        model_path(&self.out)
     }
 
     /// Runs the job to its goal, or until asked to stop.
     ///
     /// # Errors
     /// Bad input, no device, or a full disc.
-    pub fn run(&self) -> Result<Outcome, CliError> {
+    pub fn run(&self) -> Result<Outcome, JobError> {
         let began = Instant::now();
-        let stop = Interrupt::install().map_err(CliError::failed)?;
-        let mut report = RunReport::new("train");
-        let set = Dataset::open(&self.dataset)?;
+        let stop = Interrupt::install()?;
+        let go_on = || !stop.requested();
+        let mut set = match self.folders.as_slice() {
+            [folder] if self.card == CardOptions::default() => Dataset::open(folder)?,
+            folders => Dataset::open_card(folders, &self.card)?,
+        };
+        let is_card = set.card.is_some();
+        // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
+        let poses = if is_card { PoseSource::Dataset } else { self.poses };
+        let picture_scale = self.picture_scale(&set, is_card)?;
+        let settings = self.refine.then_some(&self.refine_settings);
+        let Some(remarks) = card::settle(&mut set, &self.out, self.fresh, settings, &go_on)? else {
+            return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train") });
+        };
         let frames = set.select(&self.split, self.region.as_deref())?;
+        // Matching sees telemetry's pictures whole; where nothing is matched they come at the size they are trained at.
+        let refine = self.refine && poses == PoseSource::Telemetry;
+        let (load_scale, scale) = if refine { (1.0, picture_scale) } else { (picture_scale, 1.0) };
+        let mut source = Folder::new(&set, frames, load_scale, poses, self.keyframes)?;
+        let frames = source.frames();
         if frames.is_empty() {
-            return Err(CliError::input(format!("{}: split {:?} holds no pictures", set.root.display(), self.split)));
+            return Err(JobError::Request(format!("{}: split {:?} holds no pictures", set.root.display(), self.split)));
         }
-        let mut settings = self.training.clone();
-        settings.steps = self.steps.unwrap_or(settings.steps);
-        settings.seconds = self.seconds.or(settings.seconds);
-        // What the user names is looked at before anything slow begins.
-        let largest = self.largest(&set, &frames)?;
-        let mut networks = self.open_networks(largest)?;
-        let gpu = Gpu::open(self.device.as_deref())?;
-        let plan = self.plan(&gpu, &frames, largest, &settings.sh)?;
-        let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::shape_of(&gpu))?;
-        report.device = gpu.info().name.clone();
-        report.seed = settings.seed;
-        report.views = frames.len() as u64;
-        report.device_bytes_planned = plan.total_bytes;
-        report.device_bytes_peak = trainer.device_bytes();
-
-        let mut header = ModelHeader {
+        let size = largest(&set, &frames, picture_scale)?;
+        let metric = self.network.metric.as_deref().filter(|_| self.evaluate);
+        let mut metric = evaluate::open_metric(metric, size)?;
+        let settings = EngineSettings {
+            disk: Disk::default(),
+            device: DeviceRequest {
+                device: self.device.clone(),
+                device_mib: self.budget_mib,
+                size,
+                views: frames.len(),
+                max_gaussians: self.max_gaussians,
+            },
+            host_mib: None,
+            camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
+            ahead: 0,
+            scale,
+            network: self.network.clone(),
+            training: self.settings(),
+            init: self.init_settings.clone(),
+            refine: refine.then(|| self.refine_settings.clone()),
+            start: self.init,
+            incremental: false,
+        };
+        let header = ModelHeader {
             origin: set.origin,
             region: self.region.as_deref().and_then(|r| set.region(r)).map(|r| r.polygon.clone()).unwrap_or_default(),
-            seed: settings.seed,
+            seed: self.training.seed,
             ..Default::default()
         };
-        let resumed = self.resume(&set, &frames)?;
-        let posed = match &resumed {
-            Some(r) => Some(r.posed()),
-            None => {
-                // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
-                model::write(&self.model_path(), &header, &GaussianCloud::default())?;
-                start::refined_poses(self, &set, &frames, &stop, &mut report)?
+        let mut engine = Reconstruction::open(settings, header, "train")?;
+        engine.report.views = frames.len() as u64;
+        engine.report.more.extend(remarks.into_iter().map(|(name, value)| (name.to_owned(), value)));
+        if !self.resume(&mut engine, &set, &frames)? {
+            if self.init != InitKind::FeedForward && !(self.init == InitKind::SparsePoints && refine) {
+                engine.hint_points(self.sparse_points(&set, &frames)?);
             }
-        };
-        let Some(posed) = posed else { return self.end(began, false, 0, report) };
-        let Some(start) =
-            start::start(self, &set, &frames, &posed, plan.gaussians, resumed.as_ref(), &stop, &mut report)?
-        else {
-            return self.end(began, false, resumed.map_or(0, |r| r.header.steps), report);
-        };
-        let loaded = trainer.load(&start.cloud)?;
-        report.skip("gaussians_not_finite", loaded.dropped_unsound as u64);
-        report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
-        self.add_views(&mut trainer, &set, &frames, &posed.poses, &start, networks.depth.take(), &mut report)?;
-        if let Some(r) = &resumed {
-            (header.steps, header.train_seconds) = (r.header.steps, r.header.train_seconds);
+            // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
+            engine.checkpoint(&self.out, false)?;
         }
-        let steps_before = header.steps;
-        let cloud = start.cloud;
-        let done = self.optimise(&mut trainer, &settings, header, cloud, &set, &frames, &stop, &mut report)?;
-        if let Some(header) = &done
-            && self.evaluate
-        {
-            self.score(&mut trainer, &set, &frames, header, networks.metric.as_mut(), &mut report)?;
+        let ready = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
+        let finished = ready && self.optimise(&mut engine, &stop)?;
+        if finished && self.evaluate {
+            self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
-        self.end(began, done.is_some(), steps_before + report.steps, report)
-    }
-
-    fn end(&self, began: Instant, finished: bool, steps: u64, mut report: RunReport) -> Result<Outcome, CliError> {
+        let steps = engine.header().steps;
+        let mut report = engine.report;
+        report.more.insert("steps_total".to_owned(), steps.into());
         report.outcome = if finished { "done" } else { "interrupted" }.to_owned();
         report.wall_s = began.elapsed().as_secs_f64();
-        report.more.insert("steps_total".to_owned(), steps.into());
+        report.more.insert("pictures_decoded".to_owned(), source.decoded().into());
+        let k = source.keyframes();
+        for (name, count) in [("too_close", k.too_close), ("covered", k.covered), ("over_plan", k.full)] {
+            if self.keyframes.is_some() {
+                report.skip(&format!("pictures_{name}"), count.into());
+            }
+        }
         report.write(&self.out)?;
         Ok(Outcome { finished, steps, report })
     }
 
-    /// Size of the largest picture by area.
-    fn largest(&self, set: &Dataset, frames: &[usize]) -> Result<(u32, u32), CliError> {
-        let sizes = frames.iter().map(|&i| scaled(&set.frames[i].view.intrinsics, self.scale));
-        let sizes = sizes.collect::<Result<Vec<_>, _>>()?;
-        Ok(sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height)))
+    fn settings(&self) -> TrainSettings {
+        let (steps, seconds) = (self.steps.unwrap_or(self.training.steps), self.seconds.or(self.training.seconds));
+        TrainSettings { steps, seconds, ..self.training.clone() }
     }
 
-    fn open_networks(&self, size: (u32, u32)) -> Result<Networks, CliError> {
-        let init = &self.init_settings;
-        let depth = self.network.depth.as_deref().filter(|_| self.training.loss.depth > 0.0);
-        let depth = depth.map(|path| DepthNetwork::open(path, size, init.max_side, init.threads)).transpose()?;
-        let metric = self.network.metric.as_deref().filter(|_| self.evaluate);
-        Ok(Networks { depth, metric: evaluate::open_metric(metric, size)? })
-    }
-
-    /// The largest picture decides; the trainer fits the others in.
-    fn plan(
-        &self,
-        gpu: &Gpu,
-        frames: &[usize],
-        (width, height): (u32, u32),
-        sh: &ShSettings,
-    ) -> Result<Plan, CliError> {
-        Ok(Plan::new(&PlanRequest {
-            device_mib: self.budget_mib,
-            width,
-            height,
-            views: frames.len() as u32,
-            sh_degree: sh.degree,
-            max_gaussians: self.max_gaussians,
-            half_moments: sh.half_moments,
-            sort_lanes: gpu.info().sort_lanes(),
-        })?)
-    }
-
-    /// Picture `i` with the pose that is trained with.
-    fn posed(&self, set: &Dataset, i: usize, poses: &HashMap<String, Pose>) -> Result<PosedImage, CliError> {
-        let mut picture = set.load_posed(i, self.scale, PoseSource::Dataset)?;
-        if let Some(pose) = poses.get(&picture.name) {
-            picture.view.pose = *pose;
+    /// The scale asked for; else the largest for which the plan holds all pictures and, for a card, Gaussians worth the name.
+    fn picture_scale(&self, set: &Dataset, is_card: bool) -> Result<f64, JobError> {
+        if let Some(scale) = self.scale {
+            return Ok(scale);
         }
-        Ok(picture)
+        let frames = set.select(&self.split, self.region.as_deref())?;
+        let wanted = if is_card { self.max_gaussians.unwrap_or(usize::MAX).min(GAUSSIANS_OF_A_CARD) } else { 0 };
+        for scale in SCALES {
+            let request = DeviceRequest {
+                device: None,
+                device_mib: self.budget_mib,
+                size: largest(set, &frames, scale)?,
+                views: frames.len(),
+                max_gaussians: self.max_gaussians,
+            };
+            let plan = Plan::new(&request.plan_request(&self.training.sh, MOST_SORT_LANES));
+            if plan.is_ok_and(|p| p.gaussians >= wanted) {
+                if is_card || scale < 1.0 {
+                    let (w, h) = request.size;
+                    tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {} MiB hold", self.budget_mib);
+                }
+                return Ok(scale);
+            }
+        }
+        // Not even the smallest fits: the plan itself says what is missing.
+        Ok(1.0)
     }
 
-    #[allow(clippy::too_many_arguments)] // each is one thing the views need; a struct would only rename them
-    fn add_views(
-        &self,
-        trainer: &mut Trainer,
-        set: &Dataset,
-        frames: &[usize],
-        poses: &HashMap<String, Pose>,
-        start: &Start,
-        mut depth: Option<DepthNetwork>,
-        report: &mut RunReport,
-    ) -> Result<(), CliError> {
-        let mut with_prior = 0;
-        for &i in frames {
-            let picture = self.posed(set, i, poses)?;
-            // One at a time: the trainer keeps the priors in the device's memory.
-            let estimated = depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
-            let prior = estimated.as_ref().or_else(|| start.priors.get(&picture.name));
-            with_prior += u64::from(prior.is_some());
-            trainer.add_view(&picture, prior)?;
+    /// Takes up the model in `out` when it is of the same pictures and holds Gaussians; a model of other pictures is an
+    /// error rather than overwritten.
+    fn resume(&self, engine: &mut Reconstruction, set: &Dataset, frames: &[usize]) -> Result<bool, JobError> {
+        if self.fresh {
+            return Ok(false);
         }
-        if with_prior > 0 {
-            let by = depth.as_ref().map_or(start.priors_by.as_str(), DepthNetwork::name);
-            report.more.insert("depth_prior".to_owned(), serde_json::json!({ "name": by, "views": with_prior }));
+        let Some(views) = engine.resume(&self.out)? else { return Ok(false) };
+        let wanted: HashSet<&str> = frames.iter().map(|&i| set.frames[i].name.as_str()).collect();
+        if views.len() == wanted.len() && wanted.iter().all(|name| views.contains_key(*name)) {
+            return Ok(true);
         }
-        Ok(())
+        Err(JobError::Request(format!(
+            "{}: was trained on other pictures; give another --out, or --fresh to replace it",
+            self.model_path().display()
+        )))
     }
 
-    /// Trains in slices between checkpoints; the header of the finished model, or `None` when asked to stop.
-    #[allow(clippy::too_many_arguments)] // each is one thing the loop needs; a struct would only rename them
-    fn optimise(
+    /// The data set's points that two of the pictures saw. They lie in the frame of the data set's poses.
+    fn sparse_points(&self, set: &Dataset, frames: &[usize]) -> Result<Vec<Point>, JobError> {
+        let points: Vec<Point> = set.sparse_points_of(frames)?.iter().map(|p| (p.position, p.color)).collect();
+        if points.is_empty() && self.init == InitKind::SparsePoints {
+            let what = "no sparse points that two of the training pictures saw; use --init feed-forward or random";
+            return Err(JobError::Request(format!("{}: {what}", set.root.display())));
+        }
+        Ok(points)
+    }
+
+    /// All pictures into the engine; false when asked to stop.
+    fn take(
         &self,
-        trainer: &mut Trainer,
-        settings: &TrainSettings,
-        mut header: ModelHeader,
-        mut cloud: GaussianCloud,
-        set: &Dataset,
-        frames: &[usize],
-        stop: &Interrupt,
-        report: &mut RunReport,
-    ) -> Result<Option<ModelHeader>, CliError> {
-        let (steps_before, seconds_before) = (header.steps, header.train_seconds);
-        let names: Vec<&str> = frames.iter().map(|&i| set.frames[i].name.as_str()).collect();
-        let mut save = |trainer: &mut Trainer,
-                        report: &mut RunReport,
-                        finished: bool|
-         -> Result<ModelHeader, CliError> {
-            let from = Instant::now();
-            trainer.snapshot(&mut cloud)?;
-            header.views =
-                names.iter().enumerate().filter_map(|(i, n)| Some(((*n).to_owned(), trainer.view_pose(i)?))).collect();
-            header.steps = steps_before + u64::from(trainer.steps());
-            header.train_seconds = seconds_before + trainer.elapsed_s();
-            header.finished = finished;
-            model::write(&self.model_path(), &header, &cloud)?;
-            report.stage("checkpoint", from);
-            Ok(header.clone())
-        };
-        save(trainer, report, false)?;
-        trainer.continue_from(u32::try_from(steps_before).unwrap_or(u32::MAX), seconds_before);
+        engine: &mut Reconstruction,
+        source: &mut Folder<'_>,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<bool, JobError> {
+        let total = source.waiting();
+        let mut progress = Progress::new("pictures", total as u64);
+        loop {
+            let decoding = Instant::now();
+            let Some(picture) = source.next(Duration::ZERO)? else { break };
+            engine.report.stage("decode", decoding);
+            progress.set((total - source.waiting()) as u64, || picture.name.clone());
+            engine.add(picture)?;
+            if !go_on() {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Trains in slices between checkpoints; false when asked to stop before the goal.
+    fn optimise(&self, engine: &mut Reconstruction, stop: &Interrupt) -> Result<bool, JobError> {
+        self.save(engine, false)?;
+        let steps_before = engine.header().steps;
+        let settings = self.settings();
         let budget = RunBudget {
             steps: self.steps.or(if self.seconds.is_none() { Some(settings.steps) } else { None }),
             seconds: settings.seconds,
         };
         let mut progress = Progress::new("training", u64::from(budget.steps.unwrap_or(100)));
-        let (mut last, mut loss) = (Instant::now(), f32::NAN);
         let every = Duration::from_secs_f64(self.checkpoint_seconds);
-        let from = Instant::now();
-        let outcome = loop {
-            let summary = trainer.run(&budget, &mut |step| {
-                loss = step.loss;
+        loop {
+            let (last, mut words) = (Instant::now(), String::new());
+            let reason = engine.train(&budget, &mut |step| {
                 let at = budget.steps.map_or((step.progress * 100.0) as u64, |_| steps_before + u64::from(step.step));
                 progress.set(at, || format!("loss {:.4}, {} Gaussians", step.loss, step.gaussians));
+                words = format!("loss {:.4}", step.loss);
                 // Only where saving leaves no trace: the same seed gives the same bytes however slow the machine is.
                 if stop.requested() || (step.settled && last.elapsed() >= every) {
                     ControlFlow::Break(())
@@ -310,67 +306,48 @@ impl TrainJob {
                     ControlFlow::Continue(())
                 }
             })?;
-            let c = summary.counters;
-            for (name, count) in [
-                ("culled", c.culled),
-                ("behind_opaque", c.behind_opaque),
-                ("gradients_not_finite", c.unsound_gradients),
-                ("sh_coefficients", c.sh_missing),
-            ] {
-                // The counters run on since `load`.
-                report.skipped.insert(name.to_owned(), count);
+            let over = reason != StopReason::Caller;
+            self.save(engine, over)?;
+            if over || stop.requested() {
+                progress.finish(&format!("{} steps, {words}, {} Gaussians", engine.header().steps, engine.gaussians()));
+                return Ok(over);
             }
-            let work = serde_json::json!({ "instances": c.instances, "evaluations": c.evaluations });
-            report.more.insert("work".to_owned(), work);
-            let over = summary.reason != StopReason::Caller;
-            if over {
-                break Some(save(trainer, report, true)?);
-            }
-            save(trainer, report, false)?;
-            if stop.requested() {
-                break None;
-            }
-            last = Instant::now();
-        };
-        report.stage("train", from);
-        for (name, ms) in trainer.stage_ms() {
-            report.stage_ms.insert(format!("device_{name}"), ms);
         }
-        report.steps = u64::from(trainer.steps());
-        report.gaussians = trainer.gaussians() as u64;
-        if loss.is_finite() {
-            report.more.insert("loss".to_owned(), f64::from(loss).into());
-        }
-        progress.finish(&format!(
-            "{} steps, loss {loss:.4}, {} Gaussians",
-            steps_before + report.steps,
-            report.gaussians
-        ));
-        Ok(outcome)
+    }
+
+    /// The model, and beside it what a continuation needs to know and the model does not say: the same seed gives the same
+    /// file, but not the same seconds.
+    fn save(&self, engine: &mut Reconstruction, finished: bool) -> Result<(), JobError> {
+        engine.checkpoint(&self.out, finished)?;
+        let (steps, train_s) = (engine.header().steps, engine.train_seconds());
+        engine.report.outcome = "interrupted".to_owned();
+        engine.report.more.insert("steps_total".to_owned(), steps.into());
+        engine.report.more.insert("train_seconds".to_owned(), train_s.into());
+        engine.report.write(&self.out)?;
+        Ok(())
     }
 
     fn score(
         &self,
-        trainer: &mut Trainer,
+        engine: &mut Reconstruction,
         set: &Dataset,
         frames: &[usize],
-        header: &ModelHeader,
+        scale: f64,
         metric: Option<&mut PerceptualMetric>,
-        report: &mut RunReport,
-    ) -> Result<(), CliError> {
+    ) -> Result<(), JobError> {
         let Ok(held_out) = set.select("test", self.region.as_deref()) else { return Ok(()) };
         let held_out: Vec<usize> = held_out.into_iter().filter(|i| !frames.contains(i)).collect();
         if held_out.is_empty() {
             return Ok(());
         }
         let from = Instant::now();
-        let transfer = PoseTransfer::between(set, &header.views);
-        let scores = evaluate::evaluate(trainer, set, &held_out, self.scale, &transfer, metric, None)?;
-        (report.psnr, report.ssim) = (Some(scores.psnr), Some(scores.ssim));
+        let transfer = PoseTransfer::between(set, &engine.header().views);
+        let scores = evaluate::evaluate(engine.trainer(), set, &held_out, scale, &transfer, metric, None)?;
+        (engine.report.psnr, engine.report.ssim) = (Some(scores.psnr), Some(scores.ssim));
         if let Some(p) = &scores.perceptual {
-            report.more.insert("perceptual".to_owned(), serde_json::to_value(p).map_err(CliError::failed)?);
+            engine.report.more.insert("perceptual".to_owned(), serde_json::to_value(p)?);
         }
-        report.stage("evaluate", from);
+        engine.report.stage("evaluate", from);
         Ok(())
     }
 }

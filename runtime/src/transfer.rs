@@ -6,17 +6,21 @@
 //! this changes nothing.
 
 use std::collections::HashMap;
+use std::path::Path;
 
 use glam::{DQuat, DVec3};
 use models::camera::{Pose, View};
 use models::dataset::Dataset;
 
-use crate::evaluate::stem;
-
 /// Neighbours that vote: enough to average their noise, few enough to stay local.
 const NEIGHBOURS: usize = 4;
 /// Poses nearer than this are the same (metres, and 1 − |cos| of half the angle).
 const SAME: f64 = 1e-9;
+
+/// File name without folder and extension.
+pub fn stem(name: &str) -> String {
+    Path::new(name).file_stem().map_or_else(|| name.to_owned(), |s| s.to_string_lossy().into_owned())
+}
 
 /// Pairs of poses of the same pictures: in the data set, and in the model.
 #[derive(Clone, Debug, Default)]

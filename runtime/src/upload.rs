@@ -4,23 +4,77 @@
 //! [`Offerer`] is the aircraft's side and runs in a thread of its own, so that neither a slow link nor a missing
 //! stick ever delays capture or training. [`receive::Receiver`] is the ground's.
 
+use std::path::{Path, PathBuf};
+
+use config::mission::Mission;
+
+use crate::keys::{Identity, KeyError};
+
+pub mod admission;
+mod flight_number;
 pub mod folder;
+mod medium;
 #[cfg(feature = "zenoh")]
 pub mod network;
 pub mod offer;
 mod offerer;
+pub mod receipt;
 pub mod receive;
+#[cfg(test)]
+#[cfg(feature = "zenoh")]
+mod slow_link;
 pub mod store;
+#[cfg(test)]
+#[cfg(feature = "zenoh")]
+mod storm;
+#[cfg(test)]
+#[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "bad links are the network's"))]
+pub(crate) mod testing;
 pub mod transport;
 
+use config::error::{Error, ErrorKind};
+
 pub use offerer::{Offerer, OffererStatus};
+
+/// Whose models are offered, and in what name they are signed.
+#[derive(Clone)]
+pub struct Source {
+    /// Name of the mission.
+    pub mission: String,
+    /// Id of the aircraft.
+    pub aircraft: String,
+    /// Its key, and the ground's.
+    pub identity: Identity,
+    /// Where the number of the last flight is kept; None = every start is flight 1.
+    pub flight_number: Option<PathBuf>,
+}
+
+impl Source {
+    /// An aircraft of a mission; the number of its last flight lies beside its key, without keys in `out`.
+    ///
+    /// # Errors
+    /// The mission may not be flown unsigned, or the private key is not usable.
+    pub fn of(mission: &Mission, aircraft: &str, out: &Path) -> Result<Self, KeyError> {
+        let identity = Identity::of(mission, aircraft)?;
+        let folder = if identity.is_signed() { &mission.upload.keys } else { out };
+        let flight_number = Some(folder.join(format!("{aircraft}.flight")));
+        Ok(Self { mission: mission.name.clone(), aircraft: aircraft.into(), identity, flight_number })
+    }
+
+    /// For tests of what does not depend on keys.
+    #[cfg(test)]
+    pub(crate) fn unsigned(mission: &str, aircraft: &str) -> Self {
+        let (mission, aircraft) = (mission.into(), aircraft.into());
+        Self { mission, aircraft, identity: Identity::unsigned(), flight_number: None }
+    }
+}
 
 /// Why upload or reception could not start or continue.
 #[derive(Debug, thiserror::Error)]
 pub enum UploadError {
     /// `[upload]` itself.
-    #[error("mission: {0}")]
-    Settings(#[from] config::upload::UploadSettingsError),
+    #[error("mission: [upload] {0}")]
+    Settings(#[from] config::settings::SettingError),
     /// Neither transport is configured on this end.
     #[error("mission: [upload] has neither folder nor {0}; set one of them")]
     NoTransport(&'static str),
@@ -30,10 +84,25 @@ pub enum UploadError {
     /// The network refused from the start (port in use, unreadable certificate).
     #[error(transparent)]
     Transport(#[from] transport::TransportError),
+    /// Identities.
+    #[error(transparent)]
+    Keys(#[from] KeyError),
     /// The ground's disk.
     #[error(transparent)]
     Store(#[from] store::StoreError),
     /// The background thread could not be started.
     #[error("upload thread: {0}")]
     Thread(std::io::Error),
+}
+
+impl Error for UploadError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Settings(_) | Self::NoTransport(_) | Self::NoNetwork => ErrorKind::Input,
+            Self::Transport(e) => e.kind(),
+            Self::Keys(e) => e.kind(),
+            Self::Store(e) => e.kind(),
+            Self::Thread(_) => ErrorKind::Failed,
+        }
+    }
 }

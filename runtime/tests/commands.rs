@@ -64,6 +64,41 @@ fn data_set(root: &Path) {
 }
 
 #[test]
+fn a_mission_written_by_init_is_accepted_by_plan_and_fly() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("m.toml");
+    let path = file.to_str().unwrap();
+    let told = ["--origin=-33.9,18.4,12", "--picture", "1280x960", "--fov-deg", "62", "--preset", "tiny"];
+    let fleet = ["--aircraft", "west=udpin:127.0.0.1:0", "--aircraft", "east=carrier:pigeon", "--area-m", "300,120"];
+    let init = |more: &[&str]| dgtr(&[&["init", "--out", path], &told[..], &fleet, more].concat());
+    let first = init(&[]);
+    assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
+    let text = std::fs::read_to_string(&file).unwrap();
+    // A file that is there is left alone, and a mission that cannot be flown is not written.
+    assert_eq!(init(&["--name", "other"]).status.code(), Some(2));
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), text);
+    let other = dir.path().join("other.toml");
+    let refused = init(&["--name", "a/b", "--out", other.to_str().unwrap()]);
+    assert_eq!((refused.status.code(), other.exists()), (Some(2), false));
+    let plan = dgtr(&["plan", "--mission", path]);
+    let (said, error) = (String::from_utf8_lossy(&plan.stdout), String::from_utf8_lossy(&plan.stderr));
+    assert!(said.contains("48 views of 320 x 240, SH degree 3, 96 MiB allowed"), "{said}{error}");
+    // The mission is accepted; what is refused is the link.
+    let out = dir.path().join("out");
+    let fly = dgtr(&["fly", "--mission", path, "--aircraft", "east", "--out", out.to_str().unwrap()]);
+    assert_eq!(fly.status.code(), Some(2));
+    assert!(error_line(&fly).contains("carrier"), "{}", error_line(&fly));
+}
+
+#[test]
+fn the_reference_of_settings_needs_no_other_argument() {
+    let reference = dgtr(&["init", "--reference"]);
+    let text = String::from_utf8_lossy(&reference.stdout).into_owned();
+    assert!(reference.status.success() && text.contains("heartbeat_timeout_s = 5.0"), "{text}");
+    assert_eq!(dgtr(&["init"]).status.code(), Some(2), "an origin and a camera cannot be guessed");
+}
+
+#[test]
 fn bad_input_is_one_line_and_exit_code_2() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
@@ -185,6 +220,50 @@ fn training_improves_on_naive_guesses_and_its_report_says_what_it_took() {
     assert_eq!(depth.color(), image::ColorType::L16);
 }
 
+/// A short training of `set` without held-out figures.
+fn short_training(set: &str, out: &str, more: &[&str]) -> runtime::run_json::RunReport {
+    let few = ["--init", "random", "--max-gaussians", "500", "--budget-mib", "64", "--steps", "20", "--no-eval"];
+    let output = dgtr(&[&["train", set, "--out", out], &few[..], more].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    runtime::run_json::RunReport::read(Path::new(out)).unwrap()
+}
+
+#[test]
+fn the_same_seed_writes_the_same_bytes_and_every_picture_is_decoded_once() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    data_set(&dir.path().join("set"));
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let files = ["a", "b"].map(|out| {
+        // A checkpoint wherever one can be leaves no trace.
+        let every = if out == "a" { "30" } else { "0.000001" };
+        let report = short_training(&path("set"), &path(out), &["--checkpoint-seconds", every]);
+        assert_eq!((report.views, &report.more["pictures_decoded"]), (10, &10.into()));
+        assert!(report.more["train_seconds"].as_f64().unwrap() > 0.0);
+        std::fs::read(dir.path().join(out).join("model.dgtr")).unwrap()
+    });
+    assert!(files[0] == files[1]);
+}
+
+#[test]
+fn a_folder_is_thinned_by_the_key_frame_rule_of_a_flight_when_asked() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    data_set(&dir.path().join("set"));
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let settings = path("settings.toml");
+    std::fs::write(&settings, "[keyframes]\nt_min_m = 6.0\n").unwrap();
+    let report = short_training(&path("set"), &path("out"), &["--keyframes", "--settings", &settings]);
+    // Rows of four pictures, 4 m apart, numbers 0 and 8 held out.
+    let left_out = report.skipped["pictures_too_close"] + report.skipped["pictures_covered"];
+    assert!(report.views < 10 && report.views + left_out == 10, "{report:?}");
+    assert_eq!(report.more["pictures_decoded"], report.views);
+}
+
 #[test]
 fn an_interrupted_training_leaves_a_valid_model_and_the_same_command_continues_it() {
     if !has_device() {
@@ -243,4 +322,74 @@ fn a_damaged_cache_of_workgroup_sizes_costs_a_warning_and_not_the_run() {
     assert!(output.status.success(), "{said}");
     let warnings: Vec<&str> = said.lines().filter(|l| l.contains("WARN")).collect();
     assert!(warnings.len() == 1 && warnings[0].contains("kernels.toml"), "{said}");
+}
+
+/// A mission of two aircraft whose ground listens on `listen`.
+fn mission(dir: &Path, listen: &str, keys: &[(&str, String)]) -> std::path::PathBuf {
+    let key = |id: &str| {
+        let found = keys.iter().find(|k| k.0 == id);
+        found.map_or(String::new(), |k| format!("public_key = \"{}\"", k.1))
+    };
+    let aircraft = ["west", "east"].map(|id| {
+        let region = "region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]";
+        let link = "link = \"udpin:127.0.0.1:14550\"\ncamera = { folder = \"pictures\" }";
+        format!("[[aircraft]]\nid = \"{id}\"\n{link}\n{region}\n{}\n", key(id))
+    });
+    let text = format!(
+        "name = \"park\"\norigin = {{ lat_deg = 28.0, lon_deg = -82.0, alt_m = 0.0 }}\n\
+         camera = {{ width = 64, height = 48, fx = 50.0, fy = 50.0, cx = 32.0, cy = 24.0 }}\n\
+         upload = {{ listen = [\"{listen}\"] }}\nground = {{ {} }}\n{}",
+        key("ground"),
+        aircraft.concat()
+    );
+    let path = dir.join("mission.toml");
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+/// The public keys that `dgtr keys` prints, in its order.
+fn printed_keys(output: &Output) -> Vec<String> {
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let keys = text.lines().filter_map(|l| l.strip_prefix("public_key = \"")?.strip_suffix('"').map(str::to_owned));
+    keys.collect()
+}
+
+#[test]
+fn a_mission_is_keyed_by_its_own_commands_and_refused_beyond_this_machine_without() {
+    let dir = tempfile::tempdir().unwrap();
+    let outside = "tcp/0.0.0.0:1";
+    let path = mission(dir.path(), outside, &[]);
+    let (path, out) = (path.to_str().unwrap(), dir.path().join("out"));
+    let serve = || dgtr(&["serve", "--mission", path, "--out", out.to_str().unwrap(), "--timeout", "1"]);
+    let refused = serve();
+    assert_eq!(refused.status.code(), Some(2));
+    let line = error_line(&refused);
+    assert!(line.contains(outside) && line.contains("dgtr keys") && line.contains("insecure = true"), "{line}");
+    let unkeyed = dgtr(&["doctor", "--mission", path]);
+    let text = String::from_utf8_lossy(&unkeyed.stdout).into_owned();
+    assert!(text.contains("missing  signatures"), "{text}");
+
+    // The keys are made once, and printed again when asked for one.
+    let keys = printed_keys(&dgtr(&["keys", "--mission", path]));
+    assert_eq!(keys.len(), 3);
+    assert_eq!(printed_keys(&dgtr(&["keys", "--mission", path, "--only", "west"])), keys[1..2]);
+    assert_eq!(dgtr(&["keys", "--mission", path, "--only", "nobody"]).status.code(), Some(2));
+    let all: Vec<(&str, String)> = ["ground", "west", "east"].into_iter().zip(keys).collect();
+    mission(dir.path(), outside, &all);
+    let keyed = String::from_utf8_lossy(&dgtr(&["doctor", "--mission", path]).stdout).into_owned();
+    for line in ["ok       signatures", "ok       private key", "note     encryption"] {
+        assert!(keyed.contains(line), "{line}: {keyed}");
+    }
+    // Port 1 is not ours to listen on, or nobody comes in time: either way it is not refused for its keys.
+    let served = error_line(&serve());
+    assert!(!served.contains("keys"), "{served}");
+
+    // One key forgotten, or another machine's in the place of ours.
+    mission(dir.path(), outside, &all[..2]);
+    assert!(error_line(&serve()).contains("aircraft[1].public_key"));
+    std::fs::copy(dir.path().join("keys/west.key"), dir.path().join("keys/ground.key")).unwrap();
+    mission(dir.path(), outside, &all);
+    let swapped = serve();
+    assert_eq!(swapped.status.code(), Some(2));
+    assert!(error_line(&swapped).contains("ground.key"));
 }

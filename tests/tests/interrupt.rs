@@ -44,7 +44,7 @@ fn ctrl_c_in_flight_leaves_a_valid_checkpoint_and_the_same_command_continues() {
     // The aircraft is gone by now or goes on; either way the second run starts from what the first one saved.
     let mut job = Running::start(at, &fly, &at.join("fly2.log"));
     wait_until("continuing", &at.join("fly2.log"), PATIENCE, || {
-        std::fs::read_to_string(at.join("fly2.log")).is_ok_and(|t| t.contains("continuing with"))
+        std::fs::read_to_string(at.join("fly2.log")).is_ok_and(|t| t.contains("continuing out/model.dgtr"))
     });
     std::thread::sleep(Duration::from_secs(1));
     job.interrupt();

@@ -1,5 +1,5 @@
 //! Trains a data set from its sparse points and reports time per stage and held-out PSNR:
-//! `cargo run --release -p dgtr-vulkan --example fit -- DATASET [steps] [max_gaussians] [growth]`
+//! `cargo run --release -p vulkan --example fit -- DATASET [steps] [max_gaussians] [growth]`
 use config::plan::{Plan, PlanRequest};
 use config::training::{Strategy, TrainSettings};
 use models::dataset::Dataset;

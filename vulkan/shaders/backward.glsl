@@ -3,8 +3,8 @@
 // With DEPTH, colour and depth are carried apart, so that the shape can be frozen against the depth loss.
 
 layout(std430, set = 0, binding = 1) readonly buffer Starts { uint starts[]; };
-layout(set = 0, binding = 11) uniform samplerBuffer image;
-layout(set = 0, binding = 12) uniform samplerBuffer image_gradient;
+TEXELS(vec4, 11, image)
+TEXELS(vec4, 12, image_gradient)
 layout(std430, set = 0, binding = 2) writeonly buffer Slots { vec4 slots[]; };
 
 const int AT_ONCE = 16;
@@ -21,14 +21,14 @@ void main() {
     vec3 gradient[PIXELS];
 #ifdef DEPTH
     float depth_behind[PIXELS], depth_gradient[PIXELS];
-    float thaw = (frame.counts.z & FLAG_FREEZE_SHAPE) != 0u ? 0.0 : 1.0;
+    float thaw = (frame.flags & FLAG_FREEZE_SHAPE) != 0u ? 0.0 : 1.0;
 #endif
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         bool inside = pixel_inside(origin, k);
         uint at = 0u;
         if (inside) at = pixel_index(origin, k);
         T[k] = inside ? 1.0 : -1.0;
-        vec4 g = texelFetch(image_gradient, int(at)), c = texelFetch(image, int(at));
+        vec4 g = FETCH(image_gradient, int(at)), c = FETCH(image, int(at));
         gradient[k] = g.xyz;
         behind[k] = dot(g.xyz, c.xyz);
 #ifdef DEPTH
@@ -113,14 +113,14 @@ void main() {
 #endif
             i++;
         }
-        live = most_of_tile(most) > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
+        live = most_of_tile(most) > 0.0 || (frame.flags & FLAG_NO_EARLY_END) != 0u;
     }
     // Slots behind an opaque tile: a total of zero says that the other two vectors were not written. Many in a turn,
     // because llvmpipe ends the loops of an invocation after 65,535 turns in all.
     for (; i < end; i += uint(AT_ONCE * LANES)) {
         [[unroll]] for (int j = 0; j < AT_ONCE; j++) {
             uint at = i + uint(j * LANES + own_row);
-            if (at < end) slots[texelFetch(instances, int(at)).y * 3u] = vec4(0.0);
+            if (at < end) slots[FETCH(instances, int(at)).y * 3u] = vec4(0.0);
         }
     }
 }

@@ -46,15 +46,15 @@ void main() {
             }
             i++;
         }
-        live = most_of_tile(most) > 0.0 || (frame.counts.z & FLAG_NO_EARLY_END) != 0u;
+        live = most_of_tile(most) > 0.0 || (frame.flags & FLAG_NO_EARLY_END) != 0u;
     }
     // Counted work: how many Gaussians were blended before the tile was opaque.
-    if (own_row == 0) starts[frame.window.z * frame.window.w + 1u + t] = i - first;
+    if (own_row == 0) starts[frame.window.x * frame.window.y + 1u + t] = i - first;
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         if (pixel_inside(origin, k)) {
             uint at = pixel_index(origin, k);
             float left = abs(T[k]);
-            image[at] = sum[k] + vec4(left * frame.background.xyz, 0.0);
+            image[at] = sum[k] + vec4(left * frame.background, 0.0);
             transmittance[at] = left;
         }
     }

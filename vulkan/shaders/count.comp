@@ -6,21 +6,20 @@
 #include "spans.glsl"
 #include "walk.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer projected;
-layout(set = 0, binding = 10) uniform usamplerBuffer order;
+TEXELS(vec4, 9, projected)
+TEXELS(uint, 10, order)
 layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
-layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) buffer StatusWords { Status status; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
     if (lane >= SORT_LANES) return;
-    uint tile_count = frame.window.z * frame.window.w, total = 0u, base = lane * tile_count;
-    uint cursor = WALK_CURSORS + lane * 4u;
-    Walk w = walk_begin(lane, status[0]);
+    uint tile_count = frame.window.x * frame.window.y, total = 0u, base = lane * tile_count;
+    Walk w = walk_begin(lane, status.visible);
     if (push.pass > 0u) {
-        w.i = status[cursor];
-        w.row = int(status[cursor + 1u]);
-        total = status[cursor + 2u];
+        w.i = status.cursors[lane].gaussian;
+        w.row = status.cursors[lane].row;
+        total = status.lane_instances[lane];
     }
     // One loop over all tiles of all Gaussians, not a loop in a loop in a loop: lanes in lockstep would wait in each for
     // the one with the largest Gaussian.
@@ -31,14 +30,14 @@ void main() {
     while (span.x <= span.y || (w.i < w.end && w.left > 0u)) {
         if (span.x > span.y) {
             if (!open) {
-                int at = int(texelFetch(order, int(w.i)).x) * 3;
-                s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+                int at = int(FETCH(order, int(w.i)).x) * 3;
+                s = spans_of(FETCH(projected, at), FETCH(projected, at + 2));
                 if (w.row >= 0) s.row = w.row;
                 open = true;
             }
             if (s.row <= s.last_row) {
                 span = span_in_band(s, s.row);
-                line = base + uint(s.row) * frame.window.z;
+                line = base + uint(s.row) * frame.window.x;
                 total += uint(max(span.y - span.x + 1, 0));
                 if (push.mode == 1u) span.y = span.x - 1;
                 s.row++;
@@ -53,9 +52,8 @@ void main() {
         }
         walk_pay(w);
     }
-    status[16u + lane] = total;
-    status[cursor] = w.i;
-    status[cursor + 1u] = uint(w.row);
-    status[cursor + 2u] = total;
-    status[cursor + 3u] = w.i >= w.end ? 1u : 0u;
+    status.lane_instances[lane] = total;
+    status.lane_counted[lane] = w.i >= w.end ? 1u : 0u;
+    status.cursors[lane].gaussian = w.i;
+    status.cursors[lane].row = w.row;
 }

@@ -6,27 +6,27 @@
 #include "spans.glsl"
 #include "walk.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer projected;
-layout(set = 0, binding = 10) uniform usamplerBuffer order;
+TEXELS(vec4, 9, projected)
+TEXELS(uint, 10, order)
 layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
-layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) buffer StatusWords { Status status; };
 
 shared uint all;
 
 void main() {
     // Everything is done in the first round.
     if (push.pass > 0u) return;
-    uint own = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, base = own * frame.window.z * frame.window.w, total = 0u;
+    uint own = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, base = own * frame.window.x * frame.window.y, total = 0u;
     if (lane == 0u) all = 0u;
     barrier();
-    Walk w = walk_begin(own, status[0]);
+    Walk w = walk_begin(own, status.visible);
     for (uint i = w.i + lane; i < w.end; i += gl_WorkGroupSize.x) {
-        int at = int(texelFetch(order, int(i)).x) * 3;
-        Spans s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+        int at = int(FETCH(order, int(i)).x) * 3;
+        Spans s = spans_of(FETCH(projected, at), FETCH(projected, at + 2));
         for (int row = s.row; row <= s.last_row; row++) {
             ivec2 span = span_in_band(s, row);
             total += uint(max(span.y - span.x + 1, 0));
-            uint line = base + uint(row) * frame.window.z;
+            uint line = base + uint(row) * frame.window.x;
             if (push.mode == 1u) span.y = span.x - 1;
             for (int x = span.x; x <= span.y; x++) atomicAdd(tiles[line + uint(x)], 1u);
         }
@@ -34,7 +34,7 @@ void main() {
     atomicAdd(all, total);
     barrier();
     if (lane == 0u) {
-        status[16u + own] = all;
-        status[WALK_CURSORS + own * 4u + 3u] = 1u;
+        status.lane_instances[own] = all;
+        status.lane_counted[own] = 1u;
     }
 }

@@ -1,15 +1,15 @@
-// Exact Adam for Gaussians that were not seen: k steps with a zero gradient only decay the moments, so their steps
+// Lazy Adam updates of Gaussians outside the view: k steps with a zero gradient only decay the moments, so their steps
 // form a sum that depends on k alone (epsilon is 1e-15 and left out). The host keeps that sum in `frame.deferred`.
-void catch_up(inout vec4 p, inout vec4 m, inout vec4 v, vec4 step_sum, vec2 decay) {
+void catch_up(inout vec4 p, inout vec4 m, inout vec4 v, vec4 step_sum, MissedSteps missed) {
     vec4 ratio = mix(m * inversesqrt(max(v, vec4(1.0e-37))), vec4(0.0), lessThanEqual(v, vec4(1.0e-37)));
     p -= step_sum * ratio;
-    m *= decay.x;
-    v *= decay.y;
+    m *= missed.first_decay;
+    v *= missed.second_decay;
 }
 
 // A Gaussian's state in one word: the steps its geometry (13 bits) and its SH (13 bits) were last moved in, its own SH
 // degree (2 bits), and bit 29, which makes the word an ordinary float: it travels as one, and no device may flush or
-// quiet it on the way. src/trainer/degrees.rs writes it, too.
+// quiet it on the way. src/trainer/state.rs writes it, too.
 const uint STATE_STEPS = 0x1FFFu;
 
 uint state_of(uint geometry, uint sh, uint degree) {

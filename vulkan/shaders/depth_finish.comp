@@ -4,23 +4,23 @@
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 
-layout(std430, set = 0, binding = 1) readonly buffer Partials { vec4 partials[]; };
-layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 1) readonly buffer LaneSums { DepthMoments lane_sums[]; };
+layout(std430, set = 0, binding = 2) buffer StatusWords { Status status; };
 
 void main() {
     if (gl_GlobalInvocationID.x != 0u) return;
     float n = 0.0, mean_d = 0.0, mean_e = 0.0, dd = 0.0, ee = 0.0, de = 0.0;
     for (uint lane = 0u; lane < LOOP_LANES; lane++) {
-        vec4 a = partials[lane * 2u], b = partials[lane * 2u + 1u];
-        if (a.x > 0.0) {
-            float both = n + a.x, share = a.x / both;
-            float by_d = a.y - mean_d, by_e = a.z - mean_e;
+        DepthMoments own = lane_sums[lane];
+        if (own.count > 0.0) {
+            float both = n + own.count, share = own.count / both;
+            float by_d = own.mean_d - mean_d, by_e = own.mean_e - mean_e;
             mean_d += by_d * share;
             mean_e += by_e * share;
             float weight = n * share;
-            dd += b.x + by_d * by_d * weight;
-            ee += b.y + by_e * by_e * weight;
-            de += b.z + by_d * by_e * weight;
+            dd += own.square_d + by_d * by_d * weight;
+            ee += own.square_e + by_e * by_e * weight;
+            de += own.product + by_d * by_e * weight;
             n = both;
         }
     }
@@ -31,13 +31,13 @@ void main() {
         float both = inversesqrt(dd) * inversesqrt(ee);
         correlation = de * both;
         // The loss is one minus the correlation.
-        line.x = -frame.exposure_offset.w * both;
-        line.y = frame.exposure_offset.w * correlation / dd;
+        line.x = -frame.depth_weight * both;
+        line.y = frame.depth_weight * correlation / dd;
         line.z = -(line.x * mean_e + line.y * mean_d);
     }
-    status[512] = floatBitsToUint(line.x);
-    status[513] = floatBitsToUint(line.y);
-    status[514] = floatBitsToUint(line.z);
-    status[515] = floatBitsToUint(correlation);
-    status[516] = useful ? 1u : 0u;
+    status.depth_by_prior = line.x;
+    status.depth_by_rendered = line.y;
+    status.depth_constant = line.z;
+    status.correlation = correlation;
+    status.correlates = useful ? 1u : 0u;
 }

@@ -6,7 +6,7 @@
 
 layout(std430, set = 0, binding = 1) readonly buffer Image { vec4 image[]; };
 layout(std430, set = 0, binding = 2) readonly buffer Target { uvec2 target[]; };
-layout(std430, set = 0, binding = 3) writeonly buffer Partials { vec4 partials[]; };
+layout(std430, set = 0, binding = 3) writeonly buffer LaneSums { DepthMoments lane_sums[]; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x, pixels = frame.size.x * frame.size.y;
@@ -14,7 +14,7 @@ void main() {
     for (uint i = lane; i < pixels; i += LOOP_LANES) {
         uvec2 wanted = target[i];
         float confidence = float(wanted.x >> 24) * (1.0 / 255.0);
-        if (confidence > 0.0 && confidence >= frame.exposure_gain.w) {
+        if (confidence > 0.0 && confidence >= frame.min_confidence) {
             float d = image[i].w, e = float(wanted.y) * (1.0 / 65535.0);
             n += 1.0;
             float before = d - mean_d, before_e = e - mean_e;
@@ -25,6 +25,5 @@ void main() {
             de += before * (e - mean_e);
         }
     }
-    partials[lane * 2u] = vec4(n, mean_d, mean_e, 0.0);
-    partials[lane * 2u + 1u] = vec4(dd, ee, de, 0.0);
+    lane_sums[lane] = DepthMoments(n, mean_d, mean_e, dd, ee, de, 0.0, 0.0);
 }

@@ -6,27 +6,27 @@
 #include "spans.glsl"
 #include "walk.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer projected;
-layout(set = 0, binding = 10) uniform usamplerBuffer order;
-layout(set = 0, binding = 11) uniform usamplerBuffer starts;
+TEXELS(vec4, 9, projected)
+TEXELS(uint, 10, order)
+TEXELS(uint, 11, starts)
 layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
-layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) buffer StatusWords { Status status; };
 layout(std430, set = 0, binding = 3) writeonly buffer Instances { uvec2 instances[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer SlotRanges { uvec2 slot_ranges[]; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
     if (lane >= SORT_LANES) return;
-    uint tile_count = frame.window.z * frame.window.w, base = lane * tile_count, origin = texelFetch(starts, int(push.first)).x;
-    uint cursor = WALK_CURSORS + lane * 4u, slot = 0u, begin;
-    Walk w = walk_begin(lane, status[0]);
-    for (uint b = 0u; b < lane; b++) slot += status[16u + b];
+    uint tile_count = frame.window.x * frame.window.y, base = lane * tile_count, origin = FETCH(starts, int(push.first)).x;
+    uint slot = 0u, begin;
+    Walk w = walk_begin(lane, status.visible);
+    for (uint b = 0u; b < lane; b++) slot += status.lane_instances[b];
     begin = slot;
     if (push.pass > 0u) {
-        w.i = status[cursor];
-        w.row = int(status[cursor + 1u]);
-        slot = status[cursor + 2u];
-        begin = status[cursor + 3u];
+        w.i = status.cursors[lane].gaussian;
+        w.row = status.cursors[lane].row;
+        slot = status.cursors[lane].slot;
+        begin = status.cursors[lane].first_slot;
     }
     // One loop, as in count.comp.
     Spans s;
@@ -36,8 +36,8 @@ void main() {
     while (span.x <= span.y || (w.i < w.end && w.left > 0u)) {
         if (span.x > span.y) {
             if (!open) {
-                int at = int(texelFetch(order, int(w.i)).x) * 3;
-                s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+                int at = int(FETCH(order, int(w.i)).x) * 3;
+                s = spans_of(FETCH(projected, at), FETCH(projected, at + 2));
                 if (w.row >= 0) s.row = w.row;
                 open = true;
             }
@@ -45,7 +45,7 @@ void main() {
             uint touched = 0u;
             if (s.row <= s.last_row) {
                 span = span_in_band(s, s.row);
-                line = uint(s.row) * frame.window.z;
+                line = uint(s.row) * frame.window.x;
                 touched = uint(max(span.y - span.x + 1, 0));
                 s.row++;
             }
@@ -61,14 +61,14 @@ void main() {
         if (span.x <= span.y) {
             uint t = line + uint(span.x), rank = tiles[base + t];
             tiles[base + t] = rank + 1u;
-            instances[texelFetch(starts, int(t)).x - origin + rank] = uvec2(gaussian, slot);
+            instances[FETCH(starts, int(t)).x - origin + rank] = uvec2(gaussian, slot);
             slot++;
             span.x++;
         }
         walk_pay(w);
     }
-    status[cursor] = w.i;
-    status[cursor + 1u] = uint(w.row);
-    status[cursor + 2u] = slot;
-    status[cursor + 3u] = begin;
+    status.cursors[lane].gaussian = w.i;
+    status.cursors[lane].row = w.row;
+    status.cursors[lane].slot = slot;
+    status.cursors[lane].first_slot = begin;
 }

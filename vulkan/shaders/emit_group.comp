@@ -6,12 +6,12 @@
 #include "spans.glsl"
 #include "walk.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer projected;
-layout(set = 0, binding = 10) uniform usamplerBuffer order;
-layout(set = 0, binding = 11) uniform usamplerBuffer starts;
+TEXELS(vec4, 9, projected)
+TEXELS(uint, 10, order)
+TEXELS(uint, 11, starts)
 // Coherent: the lane that meets a tile next may be another one.
 layout(std430, set = 0, binding = 1) coherent buffer Tiles { uint tiles[]; };
-layout(std430, set = 0, binding = 2) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) readonly buffer StatusWords { Status status; };
 layout(std430, set = 0, binding = 3) writeonly buffer Instances { uvec2 instances[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer SlotRanges { uvec2 slot_ranges[]; };
 
@@ -23,12 +23,12 @@ void main() {
     // Everything is done in the first round.
     if (push.pass > 0u) return;
     uint own = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
-    uint base = own * frame.window.z * frame.window.w, origin = texelFetch(starts, int(push.first)).x, slot = 0u;
-    Walk w = walk_begin(own, status[0]);
-    for (uint b = 0u; b < own; b++) slot += status[16u + b];
+    uint base = own * frame.window.x * frame.window.y, origin = FETCH(starts, int(push.first)).x, slot = 0u;
+    Walk w = walk_begin(own, status.visible);
+    for (uint b = 0u; b < own; b++) slot += status.lane_instances[b];
     for (uint i = w.i; i < w.end; i++) {
-        int at = int(texelFetch(order, int(i)).x) * 3;
-        Spans s = spans_of(texelFetch(projected, at), texelFetch(projected, at + 2));
+        int at = int(FETCH(order, int(i)).x) * 3;
+        Spans s = spans_of(FETCH(projected, at), FETCH(projected, at + 2));
         uint begin = slot;
         for (int top = s.row; top <= s.last_row; top += int(lanes)) {
             int row = top + int(lane);
@@ -42,9 +42,9 @@ void main() {
                 slot += widths[b];
             }
             for (int x = span.x; x <= span.y; x++) {
-                uint t = uint(row) * frame.window.z + uint(x), rank = tiles[base + t];
+                uint t = uint(row) * frame.window.x + uint(x), rank = tiles[base + t];
                 tiles[base + t] = rank + 1u;
-                instances[texelFetch(starts, int(t)).x - origin + rank] = uvec2(i, before + uint(x - span.x));
+                instances[FETCH(starts, int(t)).x - origin + rank] = uvec2(i, before + uint(x - span.x));
             }
             memoryBarrierBuffer();
             barrier();

@@ -5,12 +5,12 @@
 #include "frame.glsl"
 #include "window.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer blurred;
-layout(set = 0, binding = 10) uniform samplerBuffer image;
-layout(set = 0, binding = 11) uniform usamplerBuffer target;
+TEXELS(vec4, 9, blurred)
+TEXELS(vec4, 10, image)
+TEXELS(uvec2, 11, target)
 layout(std430, set = 0, binding = 1) writeonly buffer ImageGradient { vec4 image_gradient[]; };
-layout(std430, set = 0, binding = 2) buffer Partials { vec4 partials[]; };
-layout(std430, set = 0, binding = 3) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) writeonly buffer StripSums { LossSums strip_sums[]; };
+layout(std430, set = 0, binding = 3) readonly buffer StatusWords { Status status; };
 
 void main() {
     uint width = frame.size.x, i = gl_GlobalInvocationID.x;
@@ -27,7 +27,7 @@ void main() {
     [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
         int y = y0 + j;
         [[unroll]] for (int c = 0; c < 3; c++) {
-            vec3 v = texelFetch(blurred, c * int(pixels) + clamp(y, 0, height - 1) * int(width) + int(column)).xyz;
+            vec3 v = FETCH(blurred, c * int(pixels) + clamp(y, 0, height - 1) * int(width) + int(column)).xyz;
             v = y >= 0 && y < height ? v : vec3(0.0);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
                 if (abs(j - o) <= RADIUS) {
@@ -41,31 +41,31 @@ void main() {
     vec3 gain_gradient = vec3(0.0), offset_gradient = vec3(0.0);
     float l1 = 0.0;
     vec3 depth_line = vec3(0.0);
-    if ((frame.counts.z & FLAG_DEPTH) != 0u) {
-        depth_line = vec3(uintBitsToFloat(status[512]), uintBitsToFloat(status[513]), uintBitsToFloat(status[514]));
+    if ((frame.flags & FLAG_DEPTH) != 0u) {
+        depth_line = vec3(status.depth_by_prior, status.depth_by_rendered, status.depth_constant);
     }
     [[unroll]] for (int o = 0; o < STRIP; o++) {
         if (y0 + o < height) {
             uint at = uint(y0 + o) * width + column;
-            vec4 raw = texelFetch(image, int(at));
-            uvec2 wanted = texelFetch(target, int(at)).xy;
+            vec4 raw = FETCH(image, int(at));
+            uvec2 wanted = FETCH(target, int(at)).xy;
             vec4 y = unpackUnorm4x8(wanted.x);
-            vec3 x = raw.xyz * frame.exposure_gain.xyz + frame.exposure_offset.xyz;
+            vec3 x = raw.xyz * frame.exposure_gain + frame.exposure_offset;
             vec3 d = x - y.xyz;
             l1 += abs(d.x) + abs(d.y) + abs(d.z);
-            vec3 g = frame.loss.x * sign(d)
-                - frame.loss.y * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
+            vec3 g = frame.l1_weight * sign(d)
+                - frame.ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
             offset_gradient += g;
-            g *= frame.exposure_gain.xyz;
+            g *= frame.exposure_gain;
             gain_gradient += g * raw.xyz; // by the logarithm of the gain
             float depth = 0.0;
-            if (y.w > 0.0 && y.w >= frame.exposure_gain.w) {
+            if (y.w > 0.0 && y.w >= frame.min_confidence) {
                 depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
             }
             image_gradient[at] = vec4(g, depth);
         }
     }
-    uint at = frame.step.z + i * 2u;
-    partials[at] = vec4(l1, gain_gradient);
-    partials[at + 1u] = vec4(offset_gradient, partials[at + 1u].w);
+    strip_sums[i].gain = gain_gradient;
+    strip_sums[i].l1 = l1;
+    strip_sums[i].offset = offset_gradient;
 }

@@ -26,20 +26,20 @@ mat3 rotation_of(vec4 q) {
 }
 
 vec3 to_camera(vec3 v) {
-    return vec3(dot(frame.view_row[0].xyz, v), dot(frame.view_row[1].xyz, v), dot(frame.view_row[2].xyz, v));
+    return vec3(dot(frame.view_rows[0].xyz, v), dot(frame.view_rows[1].xyz, v), dot(frame.view_rows[2].xyz, v));
 }
 
 vec3 to_world(vec3 v) {
-    return v.x * frame.view_row[0].xyz + v.y * frame.view_row[1].xyz + v.z * frame.view_row[2].xyz;
+    return v.x * frame.view_rows[0].xyz + v.y * frame.view_rows[1].xyz + v.z * frame.view_rows[2].xyz;
 }
 
 // p.z must be positive.
 Projection project_gaussian(vec3 mean, vec3 log_scale, vec4 rotation) {
     Projection s;
-    s.p = to_camera(mean) + vec3(frame.view_row[0].w, frame.view_row[1].w, frame.view_row[2].w);
+    s.p = to_camera(mean) + vec3(frame.view_rows[0].w, frame.view_rows[1].w, frame.view_rows[2].w);
     float inverse_z = 1.0 / s.p.z;
     vec2 ratio = s.p.xy * inverse_z;
-    s.ratio = clamp(ratio, frame.clamp_ratio.xz, frame.clamp_ratio.yw);
+    s.ratio = clamp(ratio, frame.min_ratio, frame.max_ratio);
     s.clamped = notEqual(ratio, s.ratio);
     s.q_length = max(length(rotation), 1.0e-20);
     s.q = rotation / s.q_length;
@@ -49,7 +49,7 @@ Projection project_gaussian(vec3 mean, vec3 log_scale, vec4 rotation) {
     s.scale = min(scale, vec3(limit));
     s.scale_clamped = greaterThan(scale, vec3(limit));
     for (int k = 0; k < 3; k++) s.axes[k] = to_camera(s.rotation[k]) * s.scale[k];
-    vec2 f = frame.lens.xy * inverse_z;
+    vec2 f = frame.focal * inverse_z;
     vec3 ax = vec3(s.axes[0].x, s.axes[1].x, s.axes[2].x);
     vec3 ay = vec3(s.axes[0].y, s.axes[1].y, s.axes[2].y);
     vec3 az = vec3(s.axes[0].z, s.axes[1].z, s.axes[2].z);

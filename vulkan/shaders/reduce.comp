@@ -4,10 +4,10 @@
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 
-layout(set = 0, binding = 9) uniform usamplerBuffer slot_ranges;
-layout(set = 0, binding = 10) uniform samplerBuffer slots;
+TEXELS(uvec2, 9, slot_ranges)
+TEXELS(vec4, 10, slots)
 layout(std430, set = 0, binding = 1) buffer Reduced { vec4 reduced[]; };
-layout(std430, set = 0, binding = 2) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) readonly buffer StatusWords { Status status; };
 
 // llvmpipe ends the loops of an invocation after 65,535 turns in all: a Gaussian over more tiles takes sixteen in a turn.
 const uint ONE_BY_ONE = 30000u;
@@ -15,7 +15,7 @@ const uint AT_ONCE = 16u;
 
 void add_slot(uint i, inout vec4 a, inout vec4 b, inout vec4 c) {
     int at = int(i) * 3;
-    vec4 x = texelFetch(slots, at), y = texelFetch(slots, at + 1), z = texelFetch(slots, at + 2);
+    vec4 x = FETCH(slots, at), y = FETCH(slots, at + 1), z = FETCH(slots, at + 2);
     bool written = x.w > 0.0;
     a += x;
     b += written ? y : vec4(0.0);
@@ -24,14 +24,14 @@ void add_slot(uint i, inout vec4 a, inout vec4 b, inout vec4 c) {
 
 void main() {
     uint r = gl_GlobalInvocationID.x;
-    if (r >= status[0]) return;
+    if (r >= status.visible) return;
     vec4 a = vec4(0.0), b = vec4(0.0), c = vec4(0.0);
     if (push.mode == 1u) {
         a = reduced[r * 3];
         b = reduced[r * 3 + 1];
         c = reduced[r * 3 + 2];
     }
-    uvec2 range = texelFetch(slot_ranges, int(r)).xy;
+    uvec2 range = FETCH(slot_ranges, int(r)).xy;
     uint i = range.x, end = range.x + range.y, near = min(end, range.x + ONE_BY_ONE);
     for (; i < near; i++) add_slot(i, a, b, c);
     for (; i < end; i += AT_ONCE) {

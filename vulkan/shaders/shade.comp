@@ -1,35 +1,35 @@
 #version 450
-// Gathers the visible Gaussians in depth order and evaluates their colours, each at its own SH degree, after making up
-// for the SH steps in which they were not seen. Mode 1 makes up for all Gaussians and shades nothing.
+// Gathers the visible Gaussians in depth order and evaluates their colours, each at its own SH degree, after the lazy Adam
+// updates of the SH that they missed outside the view. Mode 1 does those updates for all Gaussians and shades nothing.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "harmonics.glsl"
 #include "deferred.glsl"
 #include "moments.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer projected;
-layout(set = 0, binding = 10) uniform samplerBuffer geometry_rows;
-layout(set = 0, binding = 11) uniform samplerBuffer sh_rows;
+TEXELS(vec4, 9, projected)
+TEXELS(vec4, 10, geometry_texels)
+TEXELS(vec4, 11, sh_texels)
 layout(std430, set = 0, binding = 1) readonly buffer Order { uint order[]; };
-layout(std430, set = 0, binding = 2) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) readonly buffer StatusWords { Status status; };
 layout(std430, set = 0, binding = 3) writeonly buffer Geometry { vec4 geometry[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer Sh { vec4 sh[]; };
 layout(std430, set = 0, binding = 7) writeonly buffer Shaded { vec4 shaded[]; };
 
 void main() {
-    bool all_rows = push.mode == 1u;
-    uint n = all_rows ? frame.counts.x : status[0];
+    bool catch_up_only = push.mode == 1u;
+    uint n = catch_up_only ? frame.gaussians : status.visible;
     for (uint r = gl_GlobalInvocationID.x; r < n; r += LOOP_LANES) {
         uint g = r;
-        if (!all_rows) g = order[r];
-        vec4 p0 = texelFetch(geometry_rows, int(g) * 9), p1 = texelFetch(geometry_rows, int(g) * 9 + 1);
+        if (!catch_up_only) g = order[r];
+        vec4 p0 = FETCH(geometry_texels, int(g) * 9), p1 = FETCH(geometry_texels, int(g) * 9 + 1);
         uint state = floatBitsToUint(p1.w);
-        uint behind = steps_behind(state_sh(state), frame.step.x - 1u);
+        uint behind = steps_behind(state_sh(state), frame.step - 1u);
         float coefficient[48];
-        vec4 d = vec4(0.0);
+        MissedSteps missed = MissedSteps(0.0, 0.0, 0.0, 0.0);
         if (behind > 0u) {
-            d = frame.deferred[behind];
-            p1.w = uintBitsToFloat(state_of(state_geometry(state), frame.step.x - 1u, state_degree(state)));
+            missed = frame.deferred[behind];
+            p1.w = uintBitsToFloat(state_of(state_geometry(state), frame.step - 1u, state_degree(state)));
             geometry[g * 9 + 1] = p1;
         }
         [[unroll]] for (uint i = 0u; i < 48u; i++) coefficient[i] = 0.0;
@@ -37,13 +37,13 @@ void main() {
         [[unroll]] for (uint c = 0u; c < SH_COLUMNS; c++) {
             if (!OWN_DEGREES || c < held) {
                 int at = int(g * SH_COLUMNS + c);
-                vec4 p = texelFetch(sh_rows, at);
+                vec4 p = FETCH(sh_texels, at);
                 if (behind > 0u) {
                     vec4 m, v;
                     fetch_moments(at, m, v);
-                    vec4 rate = vec4(frame.rates_more.y);
-                    if (c == 0u) rate.xyz = vec3(frame.rates_more.x);
-                    catch_up(p, m, v, d.y * rate, d.zw);
+                    vec4 rate = vec4(frame.sh_rest_rate);
+                    if (c == 0u) rate.xyz = vec3(frame.sh_dc_rate);
+                    catch_up(p, m, v, missed.unit * rate, missed);
                     sh[at] = p;
                     store_moments(uint(at), m, v);
                 }
@@ -51,14 +51,14 @@ void main() {
             }
         }
         float y[16];
-        harmonics(normalize(p0.xyz - frame.camera.xyz), min(frame.counts.y, own), y);
+        harmonics(normalize(p0.xyz - frame.camera_center), min(frame.sh_degree, own), y);
         vec3 colour = vec3(0.5);
         [[unroll]] for (uint i = 0u; i < COEFFICIENTS; i++) {
             colour += y[i] * vec3(coefficient[i * 3u], coefficient[i * 3u + 1u], coefficient[i * 3u + 2u]);
         }
-        if (!all_rows) {
-            shaded[r * 3 + 0] = texelFetch(projected, int(g) * 3);
-            shaded[r * 3 + 1] = texelFetch(projected, int(g) * 3 + 1);
+        if (!catch_up_only) {
+            shaded[r * 3 + 0] = FETCH(projected, int(g) * 3);
+            shaded[r * 3 + 1] = FETCH(projected, int(g) * 3 + 1);
             shaded[r * 3 + 2] = vec4(clamp(colour, vec3(0.0), vec3(COLOUR_MAX)), 0.0);
         }
     }

@@ -6,12 +6,12 @@
 
 layout(std430, set = 0, binding = 1) readonly buffer Keys { uint keys[]; };
 layout(std430, set = 0, binding = 2) buffer Histogram { uint histogram[]; };
-layout(std430, set = 0, binding = 3) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 3) readonly buffer StatusWords { Status status; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
     if (lane >= SORT_LANES) return;
-    uint n = push.pass == 0u ? frame.counts.x : status[0];
+    uint n = push.pass == 0u ? frame.gaussians : status.visible;
     uint share = (n + SORT_LANES - 1u) / SORT_LANES;
     uint i = lane * share, end = min(i + share, n), shift = push.pass * 8u;
     for (uint d = 0u; d < 256u; d++) histogram[lane * 256u + d] = 0u;

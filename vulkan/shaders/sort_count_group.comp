@@ -6,13 +6,13 @@
 
 layout(std430, set = 0, binding = 1) readonly buffer Keys { uint keys[]; };
 layout(std430, set = 0, binding = 2) writeonly buffer Histogram { uint histogram[]; };
-layout(std430, set = 0, binding = 3) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 3) readonly buffer StatusWords { Status status; };
 
 shared uint counts[256];
 
 void main() {
     uint own = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
-    uint n = push.pass == 0u ? frame.counts.x : status[0];
+    uint n = push.pass == 0u ? frame.gaussians : status.visible;
     uint share = (n + SORT_LANES - 1u) / SORT_LANES, first = own * share, end = min(first + share, n), shift = push.pass * 8u;
     counts[lane] = 0u;
     barrier();

@@ -4,7 +4,7 @@
 #include "frame.glsl"
 
 layout(std430, set = 0, binding = 1) buffer Histogram { uint histogram[]; };
-layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) buffer StatusWords { Status status; };
 
 shared uint totals[256];
 
@@ -25,7 +25,7 @@ void main() {
             totals[d] = running;
             running += count;
         }
-        if (push.pass == 0u) status[0] = running;
+        if (push.pass == 0u) status.visible = running;
     }
     barrier();
     uint base = totals[digit];

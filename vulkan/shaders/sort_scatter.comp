@@ -8,12 +8,12 @@ layout(std430, set = 0, binding = 2) readonly buffer RowsIn { uint rows_in[]; };
 layout(std430, set = 0, binding = 3) writeonly buffer KeysOut { uint keys_out[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer RowsOut { uint rows_out[]; };
 layout(std430, set = 0, binding = 5) buffer Histogram { uint histogram[]; };
-layout(std430, set = 0, binding = 6) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 6) readonly buffer StatusWords { Status status; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
     if (lane >= SORT_LANES) return;
-    uint n = push.pass == 0u ? frame.counts.x : status[0];
+    uint n = push.pass == 0u ? frame.gaussians : status.visible;
     uint share = (n + SORT_LANES - 1u) / SORT_LANES;
     uint i = lane * share, end = min(i + share, n), shift = push.pass * 8u;
     for (; i < end; i++) {

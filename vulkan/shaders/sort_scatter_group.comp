@@ -10,7 +10,7 @@ layout(std430, set = 0, binding = 2) readonly buffer RowsIn { uint rows_in[]; };
 layout(std430, set = 0, binding = 3) writeonly buffer KeysOut { uint keys_out[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer RowsOut { uint rows_out[]; };
 layout(std430, set = 0, binding = 5) readonly buffer Histogram { uint histogram[]; };
-layout(std430, set = 0, binding = 6) readonly buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 6) readonly buffer StatusWords { Status status; };
 
 const uint WORDS = 8u; // 256 lanes, one bit each
 
@@ -19,7 +19,7 @@ shared uint next[256];
 
 void main() {
     uint own = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
-    uint n = push.pass == 0u ? frame.counts.x : status[0];
+    uint n = push.pass == 0u ? frame.gaussians : status.visible;
     uint share = (n + SORT_LANES - 1u) / SORT_LANES, first = own * share, end = min(first + share, n), shift = push.pass * 8u;
     next[lane] = histogram[own * 256u + lane];
     for (uint w = 0u; w < WORDS; w++) masks[lane * WORDS + w] = 0u;

@@ -4,7 +4,7 @@
 #include "frame.glsl"
 #include "window.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer adjoint;
+TEXELS(vec4, 9, adjoint)
 layout(std430, set = 0, binding = 1) writeonly buffer Blurred { vec4 blurred[]; };
 
 void main() {
@@ -17,7 +17,7 @@ void main() {
         [[unroll]] for (int o = 0; o < STRIP; o++) sum[o] = vec3(0.0);
         [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
             int x = x0 + j;
-            vec3 v = texelFetch(adjoint, int(c * pixels) + row * width + clamp(x, 0, width - 1)).xyz;
+            vec3 v = FETCH(adjoint, int(c * pixels) + row * width + clamp(x, 0, width - 1)).xyz;
             v = x >= 0 && x < width ? v : vec3(0.0);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
                 if (abs(j - o) <= RADIUS) sum[o] += tap(j - o) * v;

@@ -5,9 +5,9 @@
 #include "frame.glsl"
 #include "window.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer moments;
+TEXELS(vec4, 9, moments)
 layout(std430, set = 0, binding = 1) writeonly buffer Adjoint { vec4 adjoint[]; };
-layout(std430, set = 0, binding = 2) buffer Partials { vec4 partials[]; };
+layout(std430, set = 0, binding = 2) writeonly buffer StripSums { LossSums strip_sums[]; };
 
 void main() {
     uint width = frame.size.x, i = gl_GlobalInvocationID.x;
@@ -21,7 +21,7 @@ void main() {
         [[unroll]] for (int o = 0; o < STRIP; o++) sum[o] = vec4(0.0);
         [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
             int y = y0 + j;
-            vec4 v = texelFetch(moments, int(c * pixels + column) + clamp(y, 0, height - 1) * int(width));
+            vec4 v = FETCH(moments, int(c * pixels + column) + clamp(y, 0, height - 1) * int(width));
             v = y >= 0 && y < height ? v : vec4(0.0);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
                 if (abs(j - o) <= RADIUS) sum[o] += tap(j - o) * v;
@@ -42,5 +42,5 @@ void main() {
             }
         }
     }
-    partials[frame.step.z + i * 2u + 1u] = vec4(0.0, 0.0, 0.0, total);
+    strip_sums[i].ssim = total;
 }

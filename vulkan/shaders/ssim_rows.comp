@@ -5,8 +5,8 @@
 #include "frame.glsl"
 #include "window.glsl"
 
-layout(set = 0, binding = 9) uniform samplerBuffer image;
-layout(set = 0, binding = 10) uniform usamplerBuffer target;
+TEXELS(vec4, 9, image)
+TEXELS(uvec2, 10, target)
 layout(std430, set = 0, binding = 1) writeonly buffer Moments { vec4 moments[]; };
 
 void main() {
@@ -22,8 +22,8 @@ void main() {
         vec3 a = vec3(0.0), b = vec3(0.0);
         // Fetched in any case, from inside the row: cheaper than a branch.
         int at = row * width + clamp(x, 0, width - 1);
-        vec3 shown = texelFetch(image, at).xyz * frame.exposure_gain.xyz + frame.exposure_offset.xyz;
-        vec3 wanted = unpackUnorm4x8(texelFetch(target, at).x).xyz;
+        vec3 shown = FETCH(image, at).xyz * frame.exposure_gain + frame.exposure_offset;
+        vec3 wanted = unpackUnorm4x8(FETCH(target, at).x).xyz;
         a = inside ? shown : a;
         b = inside ? wanted : b;
         [[unroll]] for (int c = 0; c < 3; c++) {

@@ -10,7 +10,7 @@ layout(std430, set = 0, binding = 2) writeonly buffer Target { uvec2 target[]; }
 void main() {
     uint i = gl_GlobalInvocationID.x;
     if (i >= frame.size.x * frame.size.y) return;
-    uint divisor = frame.counts.w, width = frame.source.x, depth_at = frame.source.z;
+    uint divisor = frame.divisor, width = frame.source_width, depth_at = frame.depth_offset;
     uvec2 corner = uvec2(i % frame.size.x, i / frame.size.x) * divisor;
     vec4 sum = vec4(0.0);
     float depth = 0.0;

@@ -3,8 +3,8 @@
 // quarter of the registers and has four times the lanes, for devices that have many lanes and few registers each. Sums over
 // a tile are taken over each row first and then over the rows, in order, so that both leave the same bits.
 
-layout(set = 0, binding = 9) uniform samplerBuffer shaded;
-layout(set = 0, binding = 10) uniform usamplerBuffer instances;
+TEXELS(vec4, 9, shaded)
+TEXELS(uvec2, 10, instances)
 
 #ifdef LANE_PER_ROW
 const int LANES = TILE_HEIGHT, ROWS = 1;
@@ -28,18 +28,18 @@ int row_of_lane() {
 
 // Top left pixel of a tile, in the picture.
 ivec2 tile_origin(uint t) {
-    return ivec2(frame.region.xy) + ivec2(TILE_WIDTH, TILE_HEIGHT) * ivec2(t % frame.window.z, t / frame.window.z);
+    return ivec2(frame.region_origin) + ivec2(TILE_WIDTH, TILE_HEIGHT) * ivec2(t % frame.window.x, t / frame.window.x);
 }
 
 // Whether pixel k of those from `origin` on is inside the rendered region, and where it is stored.
 bool pixel_inside(ivec2 origin, int k) {
     ivec2 p = origin + ivec2(k % TILE_WIDTH, k / TILE_WIDTH);
-    return all(lessThan(p, ivec2(frame.region.xy + frame.region.zw)));
+    return all(lessThan(p, ivec2(frame.region_origin + frame.region)));
 }
 
 uint pixel_index(ivec2 origin, int k) {
-    uvec2 p = uvec2(origin + ivec2(k % TILE_WIDTH, k / TILE_WIDTH)) - frame.region.xy;
-    return p.y * frame.region.z + p.x;
+    uvec2 p = uvec2(origin + ivec2(k % TILE_WIDTH, k / TILE_WIDTH)) - frame.region_origin;
+    return p.y * frame.region.x + p.x;
 }
 
 // An instance: what `shade` left of its Gaussian, and its gradient slot.
@@ -49,9 +49,9 @@ struct Splat {
 };
 
 Splat fetch(uint i) {
-    uvec2 instance = texelFetch(instances, int(i)).xy;
+    uvec2 instance = FETCH(instances, int(i)).xy;
     int r = int(instance.x) * 3;
-    return Splat(texelFetch(shaded, r), texelFetch(shaded, r + 1), texelFetch(shaded, r + 2), instance.y * 3u);
+    return Splat(FETCH(shaded, r), FETCH(shaded, r + 1), FETCH(shaded, r + 2), instance.y * 3u);
 }
 
 #ifdef LANE_PER_ROW

@@ -7,7 +7,7 @@ layout(std430, set = 0, binding = 1) buffer Tiles { uint tiles[]; };
 layout(std430, set = 0, binding = 2) writeonly buffer Starts { uint starts[]; };
 
 void main() {
-    uint t = gl_GlobalInvocationID.x, tile_count = frame.window.z * frame.window.w;
+    uint t = gl_GlobalInvocationID.x, tile_count = frame.window.x * frame.window.y;
     if (t >= tile_count) return;
     uint sum = 0u;
     for (uint b = 0u; b < SORT_LANES; b++) {

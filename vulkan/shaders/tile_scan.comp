@@ -5,7 +5,7 @@
 #include "frame.glsl"
 
 layout(std430, set = 0, binding = 1) buffer Starts { uint starts[]; };
-layout(std430, set = 0, binding = 2) buffer Status { uint status[]; };
+layout(std430, set = 0, binding = 2) buffer StatusWords { Status status; };
 
 shared uint totals[256];
 
@@ -16,7 +16,7 @@ uint saturating(uint a, uint b) {
 }
 
 void main() {
-    uint lane = gl_LocalInvocationID.x, n = frame.window.z * frame.window.w;
+    uint lane = gl_LocalInvocationID.x, n = frame.window.x * frame.window.y;
     uint share = (n + 255u) / 256u, first = min(lane * share, n), end = min(first + share, n);
     uint sum = 0u;
     for (uint t = first; t < end; t++) sum += starts[t];
@@ -31,7 +31,7 @@ void main() {
             all = saturating(all, count);
         }
         starts[n] = running;
-        status[1] = all;
+        status.instances = all;
     }
     barrier();
     uint running = totals[lane];

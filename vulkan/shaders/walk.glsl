@@ -3,7 +3,6 @@
 // LP_MAX_TGSI_LOOP_ITERATIONS), silently; the walk is one loop, which ends a row of tiles after its budget at the latest.
 
 const uint WALK_BUDGET = 24000u;
-const uint WALK_CURSORS = 1024u; // word of `status` where the cursors begin; four words per lane
 
 struct Walk {
     uint i, end;   // present Gaussian in depth order, one past the last

@@ -42,23 +42,11 @@ impl Arena {
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<Self, GpuError> {
         let device = gpu.device();
         let bytes = plan.total_bytes;
-        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
-            | vk::BufferUsageFlags::UNIFORM_BUFFER
-            | vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER
-            | vk::BufferUsageFlags::TRANSFER_DST
-            | vk::BufferUsageFlags::TRANSFER_SRC;
-        let create = vk::BufferCreateInfo::default().size(bytes).usage(usage);
-        // SAFETY: the create infos are complete and outlive the calls; on failure what was made is destroyed.
+        let buffer = buffer(gpu, plan)?;
+        // SAFETY: buffer and memory are ours; on failure the buffer is destroyed.
         unsafe {
-            let buffer = device.create_buffer(&create, None).map_err(|e| named("vkCreateBuffer", e, bytes))?;
-            let made = allocate(gpu, buffer, bytes);
-            let (memory, mapped) = match made {
-                Ok(m) => m,
-                Err(e) => {
-                    device.destroy_buffer(buffer, None);
-                    return Err(e);
-                }
-            };
+            let made = memory_kind(gpu, buffer, plan).and_then(|kind| allocate(gpu, buffer, bytes, kind));
+            let (memory, mapped) = made.inspect_err(|_| device.destroy_buffer(buffer, None))?;
             let mut offset = 0;
             let mut sections = Vec::with_capacity(plan.sections.len());
             for (name, bytes) in &plan.sections {
@@ -69,6 +57,18 @@ impl Arena {
             std::ptr::write_bytes(mapped, 0, bytes as usize);
             Ok(Self { gpu: gpu.clone(), buffer, memory, mapped, sections, total_bytes: bytes })
         }
+    }
+
+    /// Whether the device has room for the plan, as far as that is known without an allocation.
+    ///
+    /// # Errors
+    /// As [`Arena::new`].
+    pub fn check(gpu: &Gpu, plan: &Plan) -> Result<(), GpuError> {
+        let buffer = buffer(gpu, plan)?;
+        let kind = memory_kind(gpu, buffer, plan);
+        // SAFETY: the buffer is ours and nothing refers to it.
+        unsafe { gpu.device().destroy_buffer(buffer, None) };
+        kind.map(|_| ())
     }
 
     /// The section `name`; an unknown name has no bytes (the tests bind every kernel, so a slip shows at once).
@@ -107,31 +107,51 @@ fn named(call: &'static str, e: vk::Result, bytes: u64) -> GpuError {
     }
 }
 
+fn buffer(gpu: &Gpu, plan: &Plan) -> Result<vk::Buffer, GpuError> {
+    let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+        | vk::BufferUsageFlags::UNIFORM_BUFFER
+        | vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER
+        | vk::BufferUsageFlags::TRANSFER_DST
+        | vk::BufferUsageFlags::TRANSFER_SRC;
+    let create = vk::BufferCreateInfo::default().size(plan.buffer_bytes()).usage(usage);
+    // SAFETY: the create info is complete and outlives the call.
+    unsafe { gpu.device().create_buffer(&create, None) }.map_err(|e| named("vkCreateBuffer", e, plan.buffer_bytes()))
+}
+
+/// The memory type that serves the plan best: local, mapped, and what the driver wants for the buffer fits the plan.
+fn memory_kind(gpu: &Gpu, buffer: vk::Buffer, plan: &Plan) -> Result<u32, GpuError> {
+    let (needs, bytes) = (gpu.buffer_needs(buffer), plan.total_bytes);
+    if needs.size > bytes {
+        return Err(GpuError::PlanMismatch { wanted: needs.size, planned: bytes });
+    }
+    let properties = gpu.memory_properties();
+    let usable = vk::MemoryPropertyFlags::HOST_VISIBLE | vk::MemoryPropertyFlags::HOST_COHERENT;
+    let local = vk::MemoryPropertyFlags::DEVICE_LOCAL;
+    let cached = vk::MemoryPropertyFlags::HOST_CACHED;
+    let heap = |t: &vk::MemoryType| properties.memory_heaps[t.heap_index as usize].size;
+    let find = |flags: vk::MemoryPropertyFlags| {
+        properties.memory_types_as_slice().iter().enumerate().position(|(i, t)| {
+            needs.memory_type_bits & (1 << i) != 0 && t.property_flags.contains(flags) && heap(t) >= bytes
+        })
+    };
+    let kind = [usable | local | cached, usable | local, usable | cached, usable].into_iter().find_map(find);
+    kind.map(|kind| kind as u32).ok_or(GpuError::NoMemoryType { bytes })
+}
+
 /// The only `vkAllocateMemory` of the crate.
 ///
 /// # Safety
-/// `buffer` was made by `gpu` with `bytes` bytes and has no memory yet.
-unsafe fn allocate(gpu: &Gpu, buffer: vk::Buffer, bytes: u64) -> Result<(vk::DeviceMemory, *mut u8), GpuError> {
+/// `buffer` was made by `gpu`, needs at most `bytes` of memory of type `kind`, and has none yet.
+unsafe fn allocate(
+    gpu: &Gpu,
+    buffer: vk::Buffer,
+    bytes: u64,
+    kind: u32,
+) -> Result<(vk::DeviceMemory, *mut u8), GpuError> {
     let device = gpu.device();
     // SAFETY: by this function's contract; the memory is bound once and mapped whole.
     unsafe {
-        let needs = device.get_buffer_memory_requirements(buffer);
-        if needs.size > bytes {
-            return Err(GpuError::PlanMismatch { wanted: needs.size, planned: bytes });
-        }
-        let properties = gpu.memory_properties();
-        let usable = vk::MemoryPropertyFlags::HOST_VISIBLE | vk::MemoryPropertyFlags::HOST_COHERENT;
-        let local = vk::MemoryPropertyFlags::DEVICE_LOCAL;
-        let cached = vk::MemoryPropertyFlags::HOST_CACHED;
-        let heap = |t: &vk::MemoryType| properties.memory_heaps[t.heap_index as usize].size;
-        let find = |flags: vk::MemoryPropertyFlags| {
-            properties.memory_types_as_slice().iter().enumerate().position(|(i, t)| {
-                needs.memory_type_bits & (1 << i) != 0 && t.property_flags.contains(flags) && heap(t) >= bytes
-            })
-        };
-        let kind = [usable | local | cached, usable | local, usable | cached, usable].into_iter().find_map(find);
-        let Some(kind) = kind else { return Err(GpuError::NoMemoryType { bytes }) };
-        let info = vk::MemoryAllocateInfo::default().allocation_size(bytes).memory_type_index(kind as u32);
+        let info = vk::MemoryAllocateInfo::default().allocation_size(bytes).memory_type_index(kind);
         let memory = device.allocate_memory(&info, None).map_err(|e| named("vkAllocateMemory", e, bytes))?;
         let mapped = device
             .bind_buffer_memory(buffer, memory, 0)
@@ -141,6 +161,33 @@ unsafe fn allocate(gpu: &Gpu, buffer: vk::Buffer, bytes: u64) -> Result<(vk::Dev
             Err(e) => {
                 device.free_memory(memory, None);
                 Err(named("vkMapMemory", e, bytes))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::Forced;
+    use config::plan::{DRIVER_ROOM, PlanRequest};
+
+    #[test]
+    fn what_a_driver_adds_to_the_buffer_fits_the_plan_and_more_than_its_room_is_refused() {
+        let plan =
+            Plan::with_capacities(&PlanRequest { width: 64, height: 48, views: 1, ..Default::default() }, 300, 1000);
+        // 256: what V3DV adds.
+        for (padding, fits) in [(0, true), (256, true), (DRIVER_ROOM, true), (DRIVER_ROOM + (1 << 20), false)] {
+            let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+            let gpu = gpu.forced(Forced { padding, ..Forced::default() });
+            let made = Arena::new(&gpu, &plan);
+            assert_eq!(Arena::check(&gpu, &plan).err(), made.as_ref().err().cloned());
+            match (made, fits) {
+                (Ok(arena), true) => assert_eq!(arena.total_bytes, plan.total_bytes),
+                (Err(GpuError::PlanMismatch { wanted, planned }), false) => {
+                    assert!(wanted > planned && planned == plan.total_bytes);
+                }
+                (other, _) => panic!("{padding}: {:?}", other.err()),
             }
         }
     }

@@ -10,10 +10,10 @@
 //! Every shape's kernels are compiled first, which can take longer than all steps together (lavapipe: seconds per shape),
 //! so the standard shape comes first and no further one is begun once the given time is over.
 
-use crate::cases::scenes::{cloud, photo, plain, posed, view};
 use crate::gpu::{Gpu, GpuInfo};
 use crate::kernels::Group;
 use crate::shape::KernelShape;
+use crate::synthetic::{cloud, photo, plain, posed, view};
 use crate::trainer::{TrainError, Trainer};
 use config::plan::{Plan, PlanRequest};
 use models::cloud::GaussianCloud;

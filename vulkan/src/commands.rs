@@ -4,6 +4,7 @@
 use crate::arena::{Arena, Section};
 use crate::gpu::{Gpu, GpuError};
 use crate::kernels::{GROUPS, Group, KERNELS, Kernel};
+use crate::layout::Push;
 use crate::pipelines::Pipelines;
 use crate::stages::{STAGE_NAMES, Stage};
 use ash::vk;
@@ -14,15 +15,6 @@ const STAMPS: usize = 64;
 
 /// How long a submission may take before the device counts as lost: lavapipe on a small board may need long.
 const TIMEOUT_NS: u64 = 600_000_000_000;
-
-/// What a kernel is told besides the frame: a band of tiles, a mode, a pass.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Push {
-    pub first: u32,
-    pub last: u32,
-    pub mode: u32,
-    pub pass: u32,
-}
 
 pub(crate) struct Commands {
     gpu: Gpu,
@@ -175,7 +167,9 @@ impl Recording<'_> {
     }
 
     fn dispatch(&self, kernel: Kernel, set: vk::DescriptorSet, lanes: usize, push: Push) {
-        let words = [push.first, push.last, push.mode, push.pass];
+        if self.commands.gpu.computes_nothing() {
+            return;
+        }
         let groups = self.pipelines.groups(kernel, lanes);
         let (device, buffer) = (self.commands.gpu.device(), self.commands.buffer);
         // SAFETY: the buffer is recording; pipeline, layout and set belong together and outlive the submission.
@@ -184,7 +178,7 @@ impl Recording<'_> {
             let layout = self.pipelines.layout;
             device.cmd_bind_descriptor_sets(buffer, vk::PipelineBindPoint::COMPUTE, layout, 0, &[set], &[]);
             let stages = vk::ShaderStageFlags::COMPUTE;
-            device.cmd_push_constants(buffer, layout, stages, 0, bytemuck::cast_slice(&words));
+            device.cmd_push_constants(buffer, layout, stages, 0, bytemuck::bytes_of(&push));
             device.cmd_dispatch(buffer, groups, 1, 1);
         }
         self.barrier();

@@ -62,8 +62,20 @@ struct Inner {
     queue: vk::Queue,
     family: u32,
     timestamp_ns: f64,
+    #[cfg(test)]
+    forced: Forced,
     // The loader stays open for as long as anything made by it.
     _entry: Entry,
+}
+
+/// Oddities of drivers that the tests' own does not have.
+#[cfg(test)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Forced {
+    /// Bytes that the driver wants beyond those of a buffer.
+    pub padding: u64,
+    /// Kernels have no effect.
+    pub computes_nothing: bool,
 }
 
 impl std::fmt::Debug for Gpu {
@@ -108,7 +120,18 @@ impl Gpu {
             Ok((physical, info, device, family, timestamp_ns)) => {
                 // SAFETY: queue 0 of `family` was requested when the device was made.
                 let queue = unsafe { device.get_device_queue(family, 0) };
-                let inner = Inner { info, device, instance, physical, queue, family, timestamp_ns, _entry: entry };
+                let inner = Inner {
+                    info,
+                    device,
+                    instance,
+                    physical,
+                    queue,
+                    family,
+                    timestamp_ns,
+                    #[cfg(test)]
+                    forced: Forced::default(),
+                    _entry: entry,
+                };
                 Ok(Self { inner: Arc::new(inner) })
             }
             Err(e) => {
@@ -132,6 +155,33 @@ impl Gpu {
         }
         assert_eq!(self.info().limits, limits, "somebody else holds this device");
         self
+    }
+
+    /// The same device, with a driver that is odd in these ways.
+    #[cfg(test)]
+    pub(crate) fn forced(mut self, forced: Forced) -> Self {
+        if let Some(inner) = Arc::get_mut(&mut self.inner) {
+            inner.forced = forced;
+        }
+        assert_eq!(self.inner.forced, forced, "somebody else holds this device");
+        self
+    }
+
+    /// Whether kernels are left out of what is submitted.
+    pub(crate) fn computes_nothing(&self) -> bool {
+        #[cfg(test)]
+        return self.inner.forced.computes_nothing;
+        #[cfg(not(test))]
+        false
+    }
+
+    /// What memory the driver wants for a buffer of this device.
+    pub(crate) fn buffer_needs(&self, buffer: vk::Buffer) -> vk::MemoryRequirements {
+        // SAFETY: the buffer was made by this device and is alive.
+        let needs = unsafe { self.inner.device.get_buffer_memory_requirements(buffer) };
+        #[cfg(test)]
+        let needs = vk::MemoryRequirements { size: needs.size + self.inner.forced.padding, ..needs };
+        needs
     }
 
     pub(crate) fn device(&self) -> &Device {

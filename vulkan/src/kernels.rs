@@ -24,11 +24,27 @@ pub(crate) const GROUPS: usize = Group::Scan as usize + 1;
 /// Lanes of a scanning workgroup (a number inside its shaders).
 pub(crate) const SCAN_LANES: u32 = 256;
 
+/// A kernel as it is checked in.
+#[derive(Clone, Copy)]
+pub(crate) struct Spirv {
+    /// What it only reads, it fetches as texels.
+    pub texels: &'static [u8],
+    /// The same from storage buffers; none where it fetches nothing.
+    pub storage: Option<&'static [u8]>,
+}
+
+impl Spirv {
+    /// What to compile on a device that has storage buffers enough (`storage`), or views large enough.
+    pub fn reading(&self, storage: bool) -> &'static [u8] {
+        self.storage.filter(|_| storage).unwrap_or(self.texels)
+    }
+}
+
 pub(crate) struct KernelInfo {
     pub name: &'static str,
-    pub spirv: &'static [u8],
+    pub spirv: Spirv,
     /// The variant with more lanes per tile or share.
-    pub more_lanes: Option<&'static [u8]>,
+    pub more_lanes: Option<Spirv>,
     pub bindings: &'static [&'static str],
     /// Sections read through texel fetches, from binding [`FIRST_TEXELS`] on.
     pub texels: &'static [&'static str],
@@ -37,19 +53,25 @@ pub(crate) struct KernelInfo {
 }
 
 macro_rules! spirv {
-    ($file:literal) => {
-        include_bytes!(concat!("../shaders/spirv/", $file, ".spv"))
+    ($file:literal $variant:literal []) => {
+        Spirv { texels: include_bytes!(concat!("../shaders/spirv/", $file, $variant, ".spv")), storage: None }
     };
-    (more_lanes Tiles $file:literal) => {
-        Some(include_bytes!(concat!("../shaders/spirv/", $file, "_rows.spv")))
+    ($file:literal $variant:literal [$($texels:literal)+]) => {
+        Spirv {
+            texels: include_bytes!(concat!("../shaders/spirv/", $file, $variant, ".spv")),
+            storage: Some(include_bytes!(concat!("../shaders/spirv/", $file, $variant, ".storage.spv"))),
+        }
     };
-    (more_lanes Sort $file:literal) => {
-        Some(include_bytes!(concat!("../shaders/spirv/", $file, "_group.spv")))
+    (more_lanes Tiles $file:literal $texels:tt) => {
+        Some(spirv!($file "_rows" $texels))
     };
-    (more_lanes Walk $file:literal) => {
-        Some(include_bytes!(concat!("../shaders/spirv/", $file, "_group.spv")))
+    (more_lanes Sort $file:literal $texels:tt) => {
+        Some(spirv!($file "_group" $texels))
     };
-    (more_lanes $other:ident $file:literal) => {
+    (more_lanes Walk $file:literal $texels:tt) => {
+        Some(spirv!($file "_group" $texels))
+    };
+    (more_lanes $other:ident $file:literal $texels:tt) => {
         None
     };
 }
@@ -60,10 +82,13 @@ macro_rules! kernels {
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub(crate) enum Kernel { $($id),* }
 
+        /// Every kernel, in the order of [`KERNELS`].
+        pub(crate) const ALL: &[Kernel] = &[$(Kernel::$id),*];
+
         pub(crate) const KERNELS: &[KernelInfo] = &[$(KernelInfo {
             name: stringify!($id),
-            spirv: spirv!($file),
-            more_lanes: spirv!(more_lanes $group $file),
+            spirv: spirv!($file "" [$($texels)*]),
+            more_lanes: spirv!(more_lanes $group $file [$($texels)*]),
             bindings: &[$($binding),*],
             texels: &[$($texels),*],
             group: Group::$group,
@@ -78,36 +103,35 @@ kernels! {
     SortCount "sort_count" Sort Sort ["keys" "digits" "status"] [];
     SortCountOther "sort_count" Sort Sort ["keys_other" "digits" "status"] [];
     SortScan "sort_scan" Sort Scan ["digits" "status"] [];
-    SortScatter "sort_scatter" Sort Sort ["keys" "rows" "keys_other" "rows_other" "digits" "status"] [];
-    SortScatterBack "sort_scatter" Sort Sort ["keys_other" "rows_other" "keys" "rows" "digits" "status"] [];
-    Shade "shade" Shade Wide ["rows" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "shaded"]
+    SortScatter "sort_scatter" Sort Sort ["keys" "order" "keys_other" "order_other" "digits" "status"] [];
+    SortScatterBack "sort_scatter" Sort Sort ["keys_other" "order_other" "keys" "order" "digits" "status"] [];
+    Shade "shade" Shade Wide ["order" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "shaded"]
         ["projected" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
-    Count "count" Count Walk ["tiles" "status"] ["projected" "rows"];
+    Count "count" Count Walk ["tiles" "status"] ["projected" "order"];
     TilePrefix "tile_prefix" Count Wide ["tiles" "tile_starts"] [];
     TileScan "tile_scan" Count Scan ["tile_starts" "status"] [];
-    Emit "emit" Emit Walk ["tiles" "status" "instances" "slot_ranges"] ["projected" "rows" "tile_starts"];
+    Emit "emit" Emit Walk ["tiles" "status" "instances" "slot_ranges"] ["projected" "order" "tile_starts"];
     Rasterise "rasterise" Rasterise Tiles ["tile_starts" "image" "transmittance"] ["shaded" "instances"];
-    DepthSums "depth_sums" Loss Wide ["image" "target" "partials"] [];
-    DepthFinish "depth_finish" Loss Wide ["partials" "status"] [];
+    DepthSums "depth_sums" Loss Wide ["image" "target" "lane_sums"] [];
+    DepthFinish "depth_finish" Loss Wide ["lane_sums" "status"] [];
     SsimRows "ssim_rows" Loss Wide ["moments"] ["image" "target"];
-    SsimColumns "ssim_columns" Loss Wide ["adjoint" "partials"] ["moments"];
+    SsimColumns "ssim_columns" Loss Wide ["adjoint" "strip_sums"] ["moments"];
     SsimBackRows "ssim_back_rows" Loss Wide ["moments"] ["adjoint"];
-    LossGradient "loss_gradient" Loss Wide ["image_gradient" "partials" "status"] ["moments" "image" "target"];
+    LossGradient "loss_gradient" Loss Wide ["image_gradient" "strip_sums" "status"] ["moments" "image" "target"];
     RasteriseBackward "rasterise_backward" RasteriseBackward Tiles ["tile_starts" "slots"]
         ["shaded" "instances" "image" "image_gradient"];
     RasteriseBackwardDepth "rasterise_backward_depth" RasteriseBackward Tiles ["tile_starts" "slots"]
         ["shaded" "instances" "image" "image_gradient"];
     Reduce "reduce" Reduce Wide ["reduced" "status"] ["slot_ranges" "slots"];
-    Optimise "optimise" Optimise Wide ["rows" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "partials"]
+    Optimise "optimise" Optimise Wide ["order" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "lane_sums"]
         ["reduced" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
 }
 
 /// A number that changes whenever any kernel does (FNV-1a over names and SPIR-V): what was measured with other kernels
 /// says nothing about these.
 pub(crate) fn fingerprint() -> u64 {
-    let bytes = KERNELS
-        .iter()
-        .flat_map(|k| k.name.bytes().chain([Some(k.spirv), k.more_lanes].into_iter().flatten().flatten().copied()));
+    let variants = |k: &KernelInfo| [Some(k.spirv), k.more_lanes].into_iter().flatten().flat_map(|s| s.texels);
+    let bytes = KERNELS.iter().flat_map(|k| k.name.bytes().chain(variants(k).copied()));
     bytes.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3))
 }
 
@@ -119,17 +143,28 @@ pub(crate) fn texel_format(name: &str, half_moments: bool) -> ash::vk::Format {
     match name {
         "sh_first_moment" | "sh_second_moment" if half_moments => ash::vk::Format::R16G16B16A16_SFLOAT,
         "instances" | "target" | "slot_ranges" => ash::vk::Format::R32G32_UINT,
-        "rows" | "tile_starts" => ash::vk::Format::R32_UINT,
+        "order" | "tile_starts" => ash::vk::Format::R32_UINT,
         _ => ash::vk::Format::R32G32B32A32_SFLOAT,
     }
 }
 
-/// SSIM's maps lie where the gradient slots will be: each half as many vec4 as three channels of pixels need.
-pub(crate) fn part_of_slots(name: &str, slots: Section, pixels: usize) -> Option<Section> {
-    let half = 48 * pixels as u64;
-    match name {
-        "moments" => Some(Section { offset: slots.offset, bytes: half }),
-        "adjoint" => Some(Section { offset: slots.offset + half, bytes: half }),
-        _ => None,
+/// Bytes of one element of a format.
+pub(crate) fn texel_bytes(format: ash::vk::Format) -> u64 {
+    match format {
+        ash::vk::Format::R32_UINT => 4,
+        ash::vk::Format::R32G32_UINT | ash::vk::Format::R16G16B16A16_SFLOAT => 8,
+        _ => 16,
     }
+}
+
+/// Bytes of SSIM's maps, which lie where the gradient slots will be: each as many vec4 as three channels of pixels need.
+pub(crate) fn part_bytes_of_slots(name: &str, pixels: usize) -> Option<u64> {
+    matches!(name, "moments" | "adjoint").then_some(48 * pixels as u64)
+}
+
+/// Where SSIM's maps lie.
+pub(crate) fn part_of_slots(name: &str, slots: Section, pixels: usize) -> Option<Section> {
+    let bytes = part_bytes_of_slots(name, pixels)?;
+    let first = if name == "moments" { 0 } else { bytes };
+    Some(Section { offset: slots.offset + first, bytes })
 }

@@ -4,14 +4,17 @@
 
 mod arena;
 pub mod calibration;
+#[cfg(feature = "lab")]
 pub mod cases;
 pub mod ceiling;
 mod commands;
 pub mod constants;
 pub mod gpu;
 mod kernels;
+mod layout;
 mod pipelines;
 pub mod shape;
 pub mod stages;
+pub mod synthetic;
 pub mod trainer;
 pub mod twin;

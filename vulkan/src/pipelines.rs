@@ -1,8 +1,9 @@
 //! One pipeline and one descriptor set per kernel, all made at start-up over one shared layout.
 
 use crate::arena::{Arena, Section};
-use crate::gpu::{Gpu, GpuError};
-use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_of_slots, texel_format};
+use crate::gpu::{DeviceLimits, Gpu, GpuError};
+use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots};
+use crate::kernels::{texel_bytes, texel_format};
 use crate::shape::KernelShape;
 use ash::vk;
 use config::plan::{LOOP_LANES, Plan, sh_columns};
@@ -23,6 +24,8 @@ pub(crate) struct Pipelines {
     view_sets: Vec<vk::DescriptorSet>,
     texel_views: Vec<vk::BufferView>,
     shape: KernelShape,
+    /// Kernels read storage buffers where they would fetch texels.
+    storage_reads: bool,
 }
 
 impl Drop for Pipelines {
@@ -56,21 +59,40 @@ struct Specialisation {
     staged: u32,
 }
 
+/// What a kernel sees of the arena under a section's name.
+fn bound(arena: &Arena, plan: &Plan, name: &str) -> Section {
+    part_of_slots(name, arena.section("slots"), plan.pixels).unwrap_or_else(|| arena.section(name))
+}
+
 fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
     move |e| GpuError::from_vk(call, e)
 }
 
 impl Pipelines {
-    /// `own_degrees`: whether Gaussians have SH degrees of their own, or all the plan's.
-    pub fn new(gpu: &Gpu, plan: &Plan, arena: &Arena, shape: KernelShape, own_degrees: bool) -> Result<Self, GpuError> {
+    /// Compiles `kernels`; the others must not be run. `own_degrees`: whether Gaussians have SH degrees of their own, or all
+    /// the plan's.
+    pub fn new(
+        gpu: &Gpu,
+        plan: &Plan,
+        arena: &Arena,
+        shape: KernelShape,
+        own_degrees: bool,
+        kernels: &[Kernel],
+    ) -> Result<Self, GpuError> {
+        // Compiling may take minutes: what the device refuses is found out first.
         let limits = &gpu.info().limits;
         limits.check_workgroup(shape.largest_workgroup().max(SCAN_LANES))?;
+        let storage_reads = Self::needs_storage_reads(limits, plan)?;
         let device = gpu.device();
+        let read = match storage_reads {
+            true => vk::DescriptorType::STORAGE_BUFFER,
+            false => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+        };
         let binding = |i: u32| {
             let kind = match i {
                 0 => vk::DescriptorType::UNIFORM_BUFFER,
                 i if i < FIRST_TEXELS => vk::DescriptorType::STORAGE_BUFFER,
-                _ => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+                _ => read,
             };
             vk::DescriptorSetLayoutBinding::default()
                 .binding(i)
@@ -86,10 +108,7 @@ impl Pipelines {
                 ty: vk::DescriptorType::STORAGE_BUFFER,
                 descriptor_count: set_count * STORAGE_BINDINGS,
             },
-            vk::DescriptorPoolSize {
-                ty: vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
-                descriptor_count: set_count * TEXEL_BINDINGS,
-            },
+            vk::DescriptorPoolSize { ty: read, descriptor_count: set_count * TEXEL_BINDINGS },
         ];
         let set_info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings);
         let pool_info = vk::DescriptorPoolCreateInfo::default().max_sets(set_count).pool_sizes(&sizes);
@@ -108,6 +127,7 @@ impl Pipelines {
                 view_sets: Vec::new(),
                 texel_views: Vec::new(),
                 shape,
+                storage_reads,
             };
             let layouts = [set_layout];
             let push = [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(16)];
@@ -116,8 +136,11 @@ impl Pipelines {
                 device.create_pipeline_layout(&layout_info, None).map_err(vulkan("vkCreatePipelineLayout"))?;
             made.pool = device.create_descriptor_pool(&pool_info, None).map_err(vulkan("vkCreateDescriptorPool"))?;
             for index in 0..KERNELS.len() {
-                let pipeline = made.pipeline(index, plan, own_degrees)?;
-                made.pipelines.push(pipeline);
+                let wanted = kernels.iter().any(|k| *k as usize == index);
+                made.pipelines.push(match wanted {
+                    true => made.pipeline(index, plan, own_degrees)?,
+                    false => vk::Pipeline::null(),
+                });
             }
             let all = vec![set_layout; set_count as usize];
             let allocate = vk::DescriptorSetAllocateInfo::default().descriptor_pool(made.pool).set_layouts(&all);
@@ -128,18 +151,40 @@ impl Pipelines {
                     if *name == "view" {
                         continue; // bound per view
                     }
-                    let part = part_of_slots(name, arena.section("slots"), plan.pixels);
-                    made.bind(made.sets[index], i as u32 + 1, arena, part.unwrap_or_else(|| arena.section(name)));
+                    made.bind(made.sets[index], i as u32 + 1, arena, bound(arena, plan, name));
                 }
                 made.bind(made.sets[index], 0, arena, arena.section("frame"));
                 for (i, name) in kernel.texels.iter().enumerate() {
-                    let part = part_of_slots(name, arena.section("slots"), plan.pixels);
-                    let section = part.unwrap_or_else(|| arena.section(name));
-                    let format = texel_format(name, plan.half_moments);
-                    made.bind_texels(made.sets[index], FIRST_TEXELS + i as u32, arena, section, (name, format))?;
+                    let (set, binding, section) = (made.sets[index], FIRST_TEXELS + i as u32, bound(arena, plan, name));
+                    match storage_reads {
+                        true => made.bind(set, binding, arena, section),
+                        false => made.bind_texels(
+                            set,
+                            binding,
+                            arena,
+                            section,
+                            (name, texel_format(name, plan.half_moments)),
+                        )?,
+                    }
                 }
             }
             Ok(made)
+        }
+    }
+
+    /// Whether some section of the plan has more elements than the device shows to a kernel as texels, so that kernels have to
+    /// read storage buffers instead.
+    ///
+    /// # Errors
+    /// [`GpuError::ViewTooLarge`] when the device has too few storage buffers for that.
+    pub fn needs_storage_reads(limits: &DeviceLimits, plan: &Plan) -> Result<bool, GpuError> {
+        let refused = KERNELS.iter().flat_map(|k| k.texels).find_map(|name| {
+            let bytes = part_bytes_of_slots(name, plan.pixels).unwrap_or_else(|| plan.bytes(name));
+            limits.check_view(name, bytes / texel_bytes(texel_format(name, plan.half_moments))).err()
+        });
+        match refused {
+            Some(refused) if limits.storage_buffers < STORAGE_BINDINGS + TEXEL_BINDINGS => Err(refused),
+            refused => Ok(refused.is_some()),
         }
     }
 
@@ -212,7 +257,14 @@ impl Pipelines {
             _ => self.shape.tile_lanes > 1,
         });
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
-        unsafe { self.gpu.compute_pipeline(kernel.name, more_lanes.unwrap_or(kernel.spirv), self.layout, &special) }
+        unsafe {
+            self.gpu.compute_pipeline(
+                kernel.name,
+                more_lanes.unwrap_or(kernel.spirv).reading(self.storage_reads),
+                self.layout,
+                &special,
+            )
+        }
     }
 
     fn local_size(&self, group: Group) -> u32 {

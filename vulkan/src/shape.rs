@@ -114,7 +114,7 @@ mod tests {
             heap_bytes: 1 << 30,
             ids: (1, 2),
             driver_version: 3,
-            limits: DeviceLimits { workgroup_lanes, texel_elements: 1 << 27 },
+            limits: DeviceLimits { workgroup_lanes, texel_elements: 1 << 27, storage_buffers: 8 },
         }
     }
 

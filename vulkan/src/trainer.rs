@@ -4,6 +4,7 @@
 //! then blending, loss, gradient and Adam — in several bands of tiles when the instances do not fit, with the same bits.
 
 mod bands;
+mod check;
 mod control;
 mod deferred;
 mod degrees;
@@ -12,24 +13,27 @@ mod error;
 pub(crate) mod frame;
 mod gradient;
 mod moments;
+mod parameters;
 mod pose;
 mod render;
-mod report;
-mod rows;
+mod run;
 mod sampler;
+mod state;
 mod step;
 mod views;
 
+pub use check::{PlanFit, check_device, check_plan};
 pub use error::TrainError;
 pub use gradient::ViewGradients;
+pub use parameters::LoadReport;
 pub use render::Rendering;
-pub use report::{Counters, RunBudget, StepReport, StopReason, TrainSummary};
-pub use rows::LoadReport;
+pub use run::{Counters, RunBudget, StepReport, StopReason, TrainSummary};
 
 use crate::arena::Arena;
-use crate::commands::{Commands, Push, Recording};
+use crate::commands::{Commands, Recording};
 use crate::gpu::Gpu;
-use crate::kernels::{GROUPS, Kernel};
+use crate::kernels::{ALL, GROUPS, Kernel};
+use crate::layout::{Frame, Push, Status};
 use crate::pipelines::Pipelines;
 use crate::shape::KernelShape;
 use crate::stages::STAGE_NAMES;
@@ -48,8 +52,8 @@ pub struct Trainer {
     gpu: Gpu,
     plan: Plan,
     settings: TrainSettings,
-    rows: rows::Rows,
-    frame: Box<frame::Frame>,
+    parameters: parameters::Parameters,
+    frame: Box<Frame>,
     deferred: deferred::Deferred,
     views: Vec<views::Resident>,
     sampler: sampler::Sampler,
@@ -63,7 +67,7 @@ pub struct Trainer {
     extent: f32,
     /// Steps taken since `load`.
     steps: u32,
-    /// Whether every Gaussian has made up for the steps it was not seen in.
+    /// Whether the lazy Adam updates of all Gaussians are done.
     flushed: bool,
     /// Gradients are left where the first moments are, and nothing moves (gradient checks).
     gradients_only: bool,
@@ -71,7 +75,7 @@ pub struct Trainer {
     elapsed_s: f64,
     /// Steps and seconds that earlier processes spent on the same schedule.
     before: (u32, f64),
-    totals: report::Totals,
+    counters: Counters,
 }
 
 impl std::fmt::Debug for Trainer {
@@ -100,19 +104,30 @@ impl Trainer {
         settings: &TrainSettings,
         shape: KernelShape,
     ) -> Result<Self, TrainError> {
+        Self::with_kernels(gpu, plan, settings, shape, ALL)
+    }
+
+    /// The same with some of the kernels only.
+    pub(crate) fn with_kernels(
+        gpu: &Gpu,
+        plan: &Plan,
+        settings: &TrainSettings,
+        shape: KernelShape,
+        kernels: &[Kernel],
+    ) -> Result<Self, TrainError> {
         settings.check()?;
         let arena = Arena::new(gpu, plan)?;
-        let pipelines = Pipelines::new(gpu, plan, &arena, shape, settings.sh.raise_share < 1.0)?;
+        let pipelines = Pipelines::new(gpu, plan, &arena, shape, settings.sh.raise_share < 1.0, kernels)?;
         let commands = Commands::new(gpu)?;
-        let rows = rows::Rows::new(&arena, plan);
+        let parameters = parameters::Parameters::new(&arena, plan);
         Ok(Self {
             commands,
             pipelines,
             arena,
             gpu: gpu.clone(),
             plan: plan.clone(),
-            rows,
-            frame: Box::new(frame::Frame::zeroed()),
+            parameters,
+            frame: Box::new(Frame::zeroed()),
             deferred: deferred::Deferred::new(&settings.adam),
             views: Vec::with_capacity(plan.views),
             sampler: sampler::Sampler::new(settings.seed, plan.views),
@@ -128,7 +143,7 @@ impl Trainer {
             gradients_only: false,
             elapsed_s: 0.0,
             before: (0, 0.0),
-            totals: report::Totals::default(),
+            counters: Counters::default(),
             settings: settings.clone(),
         })
     }
@@ -142,7 +157,7 @@ impl Trainer {
         self.deferred.reset();
         self.sampler.reset();
         self.strategy = self.settings.density.resolve(self.gaussians, self.plan.gaussians);
-        self.totals = report::Totals::default();
+        self.counters = Counters::default();
         self.extent = 0.0;
         self.density.last = 0;
         self.density.last_flush = 0;
@@ -169,7 +184,7 @@ impl Trainer {
         let start = (Instant::now(), self.steps, self.elapsed_s);
         let mut reason = StopReason::Schedule;
         let mut last = None;
-        let mut patience = report::Patience::default();
+        let mut patience = run::Patience::default();
         while self.progress() < 1.0 {
             let report = self.step()?;
             let stop = each(&report).is_break();
@@ -189,7 +204,7 @@ impl Trainer {
             reason,
             gaussians: self.gaussians,
             last,
-            counters: self.totals.counters,
+            counters: self.counters,
         })
     }
 
@@ -250,20 +265,19 @@ impl Trainer {
         if self.extent > 0.0 {
             return;
         }
-        let geometry = self.arena.slice::<[f32; 4]>(self.rows.geometry);
-        let means: Vec<[f32; 3]> =
-            geometry.chunks_exact(rows::GEOMETRY).take(self.gaussians).map(|g| [g[0][0], g[0][1], g[0][2]]).collect();
+        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
+        let means: Vec<[f32; 3]> = geometry.iter().map(|g| g.mean).collect();
         let centres: Vec<[f64; 3]> = self.views.iter().map(|v| v.view.pose.center.to_array()).collect();
         self.extent = scene_extent(&means, &centres);
     }
 
-    /// Every Gaussian makes up for the steps it was not seen in, so that rows may be read or moved.
+    /// Does the lazy Adam updates of all Gaussians, so that they may be read or moved.
     fn flush(&mut self) -> Result<(), TrainError> {
         if self.flushed || self.gaussians == 0 {
             return Ok(());
         }
-        self.frame.counts[0] = self.gaussians as u32;
-        self.frame.step[0] = self.steps + 1;
+        self.frame.gaussians = self.gaussians as u32;
+        self.frame.step = self.steps + 1;
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
         let all = Push { mode: 1, ..Push::default() };
@@ -281,7 +295,11 @@ impl Trainer {
 
     fn write_frame(&mut self) {
         let section = self.arena.section("frame");
-        let bytes = bytemuck::bytes_of(&*self.frame);
-        self.arena.slice_mut::<u8>(section)[..bytes.len()].copy_from_slice(bytes);
+        self.arena.slice_mut::<Frame>(section)[0] = *self.frame;
+    }
+
+    /// What the kernels left; the device must be idle.
+    fn status(&self) -> &Status {
+        &self.arena.slice::<Status>(self.arena.section("status"))[0]
     }
 }

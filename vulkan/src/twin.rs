@@ -1,5 +1,6 @@
-//! CPU twins: every shader stage once more under the same name, in plain Rust, over f32 or f64. (Density control has
-//! none: it runs on the host, in `trainer::density`.)
+//! CPU twins of the stages, in plain Rust, over f32 or f64: `project`, `sort`, `emit` (counting included), `shade`,
+//! `rasterise`, `loss`, `rasterise_backward` (with `reduce`: a twin sums at once), and of `optimise` the two halves
+//! `project_backward` and `adam`. The stage `target` has none, and neither has density control, which runs on the host.
 //!
 //! In f32 they say what the shaders should have computed; in f64 they are the judge of both: the gradient checks
 //! compare them with central differences, and the parity test with the published formulas. They are
@@ -7,13 +8,13 @@
 
 pub mod adam;
 pub mod camera;
+pub mod emit;
 pub mod gaussian;
 pub mod loss;
 pub mod project;
 pub mod project_backward;
 pub mod rasterise;
 pub mod real;
-pub mod sh;
+pub mod shade;
 pub mod step;
-pub mod tiles;
 pub mod trainer;

@@ -1,5 +1,5 @@
 //! A guard against slow creep that needs no clock: the work of a fixed scene, counted, stays within 2 % of what
-//! `counted_work.txt` says. After a change that is meant: `DGTR_BLESS=1 cargo test --release -p dgtr-vulkan --test
+//! `counted_work.txt` says. After a change that is meant: `DGTR_BLESS=1 cargo test --release -p vulkan --test
 //! counted_work` writes the file anew.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 

@@ -96,11 +96,11 @@ fn ten_thousand_steps_need_no_more_memory_than_one_thousand() {
             ControlFlow::Continue(())
         });
         let counters = summary.unwrap().counters;
-        println!("answer={early},{},{},{}", high_water(), trainer.gaussians(), counters.unsound_gradients);
+        println!("answer={early},{},{},{}", high_water(), trainer.gaussians(), counters.non_finite_gradients);
         return;
     }
     let Some(answer) = child(name, "2", "0") else { return };
-    println!("KiB after 1,000 and 10,000 steps, Gaussians, unsound gradients: {answer}");
+    println!("KiB after 1,000 and 10,000 steps, Gaussians, non-finite gradients: {answer}");
     let parts: Vec<&str> = answer.split(',').collect();
     let (early, late): (u64, u64) = (parts[0].parse().unwrap(), parts[1].parse().unwrap());
     // Density control goes on until 7,000 steps; its lists and the arena were there from the start.

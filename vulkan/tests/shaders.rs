@@ -2,6 +2,7 @@
 //! from, and where the same `glslangValidator` is installed the bytes are compared too. `DGTR_BLESS=1` remakes both.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -37,10 +38,17 @@ fn compiler() -> Option<String> {
     String::from_utf8_lossy(&said.stdout).lines().next().map(str::to_owned)
 }
 
-fn compile(source: &Path, to: &Path) {
-    let target = ["-V", "--target-env", "vulkan1.1", "-o"];
-    let done = Command::new("glslangValidator").args(target).arg(to).arg(source).output().unwrap();
-    assert!(done.status.success(), "{}: {}", source.display(), String::from_utf8_lossy(&done.stdout));
+/// Compiles all kernels into `folder`.
+fn compile(folder: &Path) {
+    let done = Command::new(shaders().join("compile.sh")).arg(folder).output().unwrap();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+}
+
+/// The compiled kernels of a folder by name.
+fn compiled(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let files = fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+    let kernels = files.filter(|p| p.extension().is_some_and(|e| e == "spv"));
+    kernels.map(|p| (p.file_name().unwrap().display().to_string(), fs::read(&p).unwrap())).collect()
 }
 
 #[test]
@@ -51,31 +59,25 @@ fn checked_in_spirv_is_what_the_sources_compile_to() {
     let mut sources: Vec<PathBuf> = fs::read_dir(shaders()).unwrap().map(|e| e.unwrap().path()).collect();
     sources.retain(|p| p.extension().is_some_and(|e| e == "comp"));
     sources.sort();
-    let stored = |source: &Path| spirv.join(source.file_stem().unwrap()).with_extension("spv");
-    if bless {
-        let mut text = compiler.clone().unwrap() + "\n";
-        for source in &sources {
-            compile(source, &stored(source));
-            writeln!(text, "{:016x} {}", hash(&expanded(source)), source.file_name().unwrap().display()).unwrap();
-        }
-        fs::write(&list, text).unwrap();
-    }
-    let text = fs::read_to_string(&list).unwrap();
-    let (made_by, hashes) = text.split_once('\n').unwrap();
     let fresh = sources.iter().fold(String::new(), |mut all, s| {
         writeln!(all, "{:016x} {}", hash(&expanded(s)), s.file_name().unwrap().display()).unwrap();
         all
     });
+    if bless {
+        compile(&spirv);
+        fs::write(&list, compiler.clone().unwrap() + "\n" + &fresh).unwrap();
+    }
+    let text = fs::read_to_string(&list).unwrap();
+    let (made_by, hashes) = text.split_once('\n').unwrap();
     assert!(hashes == fresh, "the SPIR-V is older than its sources: DGTR_BLESS=1 remakes it");
-    assert_eq!(fs::read_dir(&spirv).unwrap().count(), sources.len() + 1, "a SPIR-V file without a source");
     if compiler.as_deref() != Some(made_by) {
         return println!("bytes not compared: they were made by {made_by}");
     }
     let folder = tempfile::tempdir().unwrap();
-    for source in &sources {
-        let remade = folder.path().join("remade.spv");
-        compile(source, &remade);
-        let stored = stored(source);
-        assert!(fs::read(&stored).unwrap() == fs::read(&remade).unwrap(), "{} is stale", stored.display());
+    compile(folder.path());
+    let (stored, remade) = (compiled(&spirv), compiled(folder.path()));
+    assert!(stored.keys().eq(remade.keys()), "a SPIR-V file without a source, or the other way round");
+    for (name, bytes) in &stored {
+        assert!(remade[name] == *bytes, "{name} is stale");
     }
 }

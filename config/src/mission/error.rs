@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::settings::{SettingError, SyntaxError};
+
 /// Why a mission file was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum MissionError {
@@ -23,22 +25,12 @@ pub enum MissionError {
         /// The bound.
         limit: u64,
     },
-    /// Not TOML, an unknown field, or a wrong type.
-    #[error("line {line}: {what}")]
-    Syntax {
-        /// Line, from 1.
-        line: usize,
-        /// The parser's reason on one line.
-        what: String,
-    },
+    /// Not TOML, an unknown setting, or a wrong type.
+    #[error(transparent)]
+    Syntax(#[from] SyntaxError),
     /// A value that cannot be flown with.
-    #[error("{field}: {what}")]
-    Invalid {
-        /// The field's path in the file.
-        field: String,
-        /// What is wrong and what would be right.
-        what: String,
-    },
+    #[error(transparent)]
+    Setting(#[from] SettingError),
     /// One of the above, in a file.
     #[error("mission file {}, {inner}", path.display())]
     InFile {
@@ -64,12 +56,6 @@ pub enum MissionError {
 }
 
 impl MissionError {
-    pub(super) fn syntax(text: &str, e: &toml::de::Error) -> Self {
-        let start = e.span().map_or(0, |s| s.start.min(text.len()));
-        let line = text.as_bytes()[..start].iter().filter(|b| **b == b'\n').count() + 1;
-        Self::Syntax { line, what: e.message().replace('\n', " ") }
-    }
-
     pub(super) fn in_file(self, path: &Path) -> Self {
         Self::InFile { path: path.into(), inner: Box::new(self) }
     }

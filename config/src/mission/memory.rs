@@ -1,29 +1,27 @@
 //! `[memory]`: the two numbers everything is planned from, or a preset that stands for them.
 
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 
 use crate::preset::Preset;
+use crate::settings::{Limits, table};
 
-/// The two numbers everything is planned from.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(from = "Given")]
-pub struct MemorySettings {
-    /// Fills what is not given: here, and `seconds` of `[training]`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub preset: Option<Preset>,
-    /// The one device allocation, MiB.
-    pub device_mib: u32,
-    /// Bound on the host's resident memory (refused at start when the plan exceeds it), MiB.
-    pub host_mib: u32,
-    /// Cap on the number of Gaussians below what the budget would hold.
-    pub max_gaussians: Option<u32>,
-    /// Pictures are trained at this fraction of their size, 0 < scale ≤ 1.
-    pub image_scale: f32,
-}
-
-impl Default for MemorySettings {
-    fn default() -> Self {
-        Self { preset: None, device_mib: 512, host_mib: 2048, max_gaussians: None, image_scale: 1.0 }
+table! {
+    /// The two numbers everything is planned from, or a preset that stands for them.
+    #[derive(Copy)]
+    #[serde(from = "Given")]
+    pub struct MemorySettings {
+        /// Fills what is not given: here, and `seconds` of `[training]`.
+        pub preset: Option<Preset> = None;
+        /// The one device allocation.
+        pub device_mib: u32 = 512, in Limits::within(16.0, 131_072.0);
+        /// Bound on the host's resident memory (refused at start when the plan exceeds it).
+        pub host_mib: u32 = 2048, in Limits::within(64.0, 1_048_576.0);
+        /// Cap on the number of Gaussians below what the budget would hold; absent = what it holds.
+        pub max_gaussians: Option<u32> = None;
+        /// Bound on what an aircraft's output folder takes of the disk, MiB; absent = what is free.
+        pub disk_mib: Option<u32> = None;
+        /// Pictures are trained at this fraction of their size.
+        pub image_scale: f32 = 1.0, in Limits::above(0.0).up_to(1.0);
     }
 }
 
@@ -35,6 +33,7 @@ struct Given {
     device_mib: Option<u32>,
     host_mib: Option<u32>,
     max_gaussians: Option<u32>,
+    disk_mib: Option<u32>,
     image_scale: Option<f32>,
 }
 
@@ -49,6 +48,7 @@ impl From<Given> for MemorySettings {
         all.device_mib = given.device_mib.unwrap_or(all.device_mib);
         all.host_mib = given.host_mib.unwrap_or(all.host_mib);
         all.max_gaussians = given.max_gaussians.or(all.max_gaussians);
+        all.disk_mib = given.disk_mib;
         all.image_scale = given.image_scale.unwrap_or(all.image_scale);
         all
     }
@@ -62,11 +62,11 @@ mod tests {
     fn a_preset_fills_only_what_is_not_given() {
         let of = |text: &str| toml::from_str::<MemorySettings>(text).unwrap();
         assert_eq!(of(""), MemorySettings::default());
-        let values = Preset::Rpi5.values();
-        let all = of("preset = \"rpi5\"");
+        let values = Preset::Medium.values();
+        let all = of("preset = \"medium\"");
         assert_eq!((all.device_mib, all.image_scale), (values.device_mib, values.image_scale));
         assert_eq!(all.max_gaussians, Some(values.max_gaussians));
-        let some = of("preset = \"rpi5\"\ndevice_mib = 100");
+        let some = of("preset = \"medium\"\ndevice_mib = 100");
         assert_eq!((some.device_mib, some.max_gaussians), (100, Some(values.max_gaussians)));
         assert!(toml::from_str::<MemorySettings>("preset = \"toaster\"").is_err());
         assert!(toml::from_str::<MemorySettings>("devce_mib = 3").is_err());

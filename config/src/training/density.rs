@@ -1,58 +1,43 @@
 //! Density control under the hard cap: where Gaussians are taken from and where they go.
 
-use serde::{Deserialize, Serialize};
+use crate::settings::{Limits, choice, table};
 
-/// What happens at a densification.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Strategy {
-    /// [`Strategy::None`] when the initialisation already fills [`DensitySettings::dense_share`] of the plan's
-    /// Gaussians, [`Strategy::Relocate`] otherwise.
-    #[default]
-    Auto,
-    /// Dead Gaussians move onto live ones (3DGS-MCMC), free rows are filled by splitting.
-    Relocate,
-    /// Dead Gaussians are removed, nothing is added.
-    Prune,
-    /// The number and the identity of the Gaussians stay as they are (InstantSplat).
-    None,
+choice! {
+    /// What happens at a densification.
+    pub enum Strategy {
+        /// `none` when the initialisation already fills `dense_share` of the plan's Gaussians, `relocate` otherwise.
+        Auto = "auto",
+        /// Dead Gaussians move onto live ones (3DGS-MCMC), free rows are filled by splitting.
+        Relocate = "relocate",
+        /// Dead Gaussians are removed, nothing is added.
+        Prune = "prune",
+        /// The number and the identity of the Gaussians stay as they are (InstantSplat).
+        None = "none",
+    }
 }
 
-/// When and how much.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct DensitySettings {
-    /// What happens.
-    pub strategy: Strategy,
-    /// Longest distance between two densifications, steps.
-    pub every: u32,
-    /// A short schedule still densifies this often before [`Self::until`].
-    pub at_least: u32,
-    /// No densification after this progress.
-    pub until: f32,
-    /// At most this share of the present Gaussians is added at one densification.
-    pub growth: f32,
-    /// A copy begins this far from its source, in standard deviations drawn from the source's own Gaussian. In a
-    /// schedule of a few hundred steps two Gaussians at one place would not part in time.
-    pub spread: f32,
-    /// A Gaussian below this opacity is dead.
-    pub dead_opacity: f32,
-    /// Share of the plan's Gaussians from which on an initialisation counts as dense.
-    pub dense_share: f32,
-}
-
-impl Default for DensitySettings {
-    fn default() -> Self {
-        Self {
-            strategy: Strategy::default(),
-            every: 300, // paper §4.1: every 300 iterations
-            at_least: 6,
-            until: 0.7,
-            growth: 0.2,
-            spread: 0.5, // Brush; +0.4 dB on fox at 1,000 steps against copies at the same place (3DGS-MCMC)
-            dead_opacity: 0.005, // 3DGS and 3DGS-MCMC min_opacity
-            dense_share: 0.5,
-        }
+table! {
+    /// Relocation, growth and pruning.
+    #[derive(Copy)]
+    pub struct DensitySettings {
+        /// What happens at a densification.
+        pub strategy: Strategy = Strategy::default();
+        /// Longest distance between two densifications.
+        pub every: u32 = 300, unit "steps", from "the paper, 4.1";
+        /// A short schedule still densifies this often before `until`.
+        pub at_least: u32 = 6;
+        /// No densification after this progress.
+        pub until: f32 = 0.7;
+        /// At most this share of the present Gaussians is added at one densification.
+        pub growth: f32 = 0.2, in Limits::at_least(0.0);
+        /// A copy begins this far from its source, in standard deviations drawn from the source's own Gaussian. In a
+        /// schedule of a few hundred steps two Gaussians at one place would not part in time.
+        pub spread: f32 = 0.5, in Limits::at_least(0.0),
+            from "Brush; +0.4 dB on fox at 1,000 steps against copies at the same place (3DGS-MCMC)";
+        /// A Gaussian below this opacity is dead.
+        pub dead_opacity: f32 = 0.005, in Limits::within(0.0, 0.5), from "3DGS and 3DGS-MCMC min_opacity";
+        /// Share of the plan's Gaussians from which on an initialisation counts as dense.
+        pub dense_share: f32 = 0.5;
     }
 }
 

@@ -1,54 +1,40 @@
 //! Step sizes of the parameter groups and Adam's constants.
 
-use serde::{Deserialize, Serialize};
+use crate::settings::{Limits, table};
 
-/// Learning rates per step. Means and pose translations are multiplied by the scene's extent.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct RateSettings {
-    /// Means at progress 0, in extents.
-    pub mean_start: f32,
-    /// Means at progress 1, in extents; exponential in between.
-    pub mean_end: f32,
-    /// Natural logarithm of the scales.
-    pub log_scale: f32,
-    /// Quaternion components.
-    pub rotation: f32,
-    /// Opacity logits.
-    pub opacity: f32,
-    /// SH degree 0.
-    pub sh_dc: f32,
-    /// SH degrees 1…3.
-    pub sh_rest: f32,
-    /// Pose rotation, radians.
-    pub pose_rotation: f32,
-    /// Pose translation, in extents.
-    pub pose_translation: f32,
-    /// Log gain and offset of the exposure.
-    pub exposure: f32,
-    /// Share of their rate that log scales, rotations, opacities and SH still have at progress 1; exponential in between.
-    pub final_share: f32,
-}
-
-/// The peers' rates are made for 30,000 steps; an aircraft has a few hundred. Held-out PSNR on fox (270 × 480, SfM points, growth
-/// to 24,000 Gaussians) after 1,000 steps: a third of these 26.9 dB, with copies displaced by half a deviation and two thirds of
-/// these 28.6 dB, with these 29.0 dB; on sheffield_cross (feed-forward, 98,000 Gaussians) after 300 steps a third of these 23.4 dB,
-/// two thirds 24.1 dB.
-impl Default for RateSettings {
-    fn default() -> Self {
-        Self {
-            mean_start: 1.5e-3,     // 3DGS: 1.6e-4
-            mean_end: 1.5e-5,       // 3DGS: final = initial / 100
-            log_scale: 6e-2,        // 3DGS: 5e-3, Brush: 7e-3
-            rotation: 3e-2,         // 3DGS: 1e-3, Brush: 2e-3
-            opacity: 1.5e-1,        // 3DGS: 5e-2 until 2024, now 2.5e-2; Brush: 1.2e-2
-            sh_dc: 3e-2,            // 3DGS: 2.5e-3, Brush: 2e-3
-            sh_rest: 1.5e-3,        // sh_dc / 20 as 3DGS
-            pose_rotation: 1e-4,    // a third of a milliradian every few steps: ≈ 0.04 px at f = 357 px
-            pose_translation: 1e-4, // the same displacement in pixels as pose_rotation
-            exposure: 1e-3,         // 3DGS exposure_lr_final
-            final_share: 0.1,       // 0.03 and 0.05 lose 0.3 dB, 0.2 is the same
-        }
+table! {
+    /// Learning rates per step. Means and pose translations are multiplied by the scene's extent.
+    ///
+    /// The peers' rates are made for 30,000 steps; an aircraft has a few hundred. Held-out PSNR on fox (270 × 480, SfM points,
+    /// growth to 24,000 Gaussians) after 1,000 steps: a third of these 26.9 dB, with copies displaced by half a deviation and two
+    /// thirds of these 28.6 dB, with these 29.0 dB; on sheffield_cross (feed-forward, 98,000 Gaussians) after 300 steps a third of
+    /// these 23.4 dB, two thirds 24.1 dB.
+    #[derive(Copy)]
+    pub struct RateSettings {
+        /// Means at progress 0.
+        pub mean_start: f32 = 1.5e-3, in Limits::at_least(0.0), unit "extents", from "3DGS: 1.6e-4";
+        /// Means at progress 1; exponential in between.
+        pub mean_end: f32 = 1.5e-5, in Limits::at_least(0.0), unit "extents", from "3DGS: final = initial / 100";
+        /// Natural logarithm of the scales.
+        pub log_scale: f32 = 6e-2, in Limits::at_least(0.0), from "3DGS: 5e-3, Brush: 7e-3";
+        /// Quaternion components.
+        pub rotation: f32 = 3e-2, in Limits::at_least(0.0), from "3DGS: 1e-3, Brush: 2e-3";
+        /// Opacity logits.
+        pub opacity: f32 = 1.5e-1, in Limits::at_least(0.0), from "3DGS: 5e-2 until 2024, now 2.5e-2; Brush: 1.2e-2";
+        /// SH degree 0.
+        pub sh_dc: f32 = 3e-2, in Limits::at_least(0.0), from "3DGS: 2.5e-3, Brush: 2e-3";
+        /// SH degrees 1…3.
+        pub sh_rest: f32 = 1.5e-3, in Limits::at_least(0.0), from "sh_dc / 20 as 3DGS";
+        /// Pose rotation.
+        pub pose_rotation: f32 = 1e-4, in Limits::at_least(0.0), unit "radians",
+            from "a third of a milliradian every few steps: 0.04 pixels at f = 357 pixels";
+        /// Pose translation.
+        pub pose_translation: f32 = 1e-4, in Limits::at_least(0.0), unit "extents",
+            from "the same displacement in pixels as pose_rotation";
+        /// Log gain and offset of the exposure.
+        pub exposure: f32 = 1e-3, in Limits::at_least(0.0), from "3DGS exposure_lr_final";
+        /// Share of their rate that log scales, rotations, opacities and SH still have at progress 1; exponential in between.
+        pub final_share: f32 = 0.1, in Limits::within(1e-6, 1.0), from "0.03 and 0.05 lose 0.3 dB, 0.2 is the same";
     }
 }
 
@@ -69,21 +55,16 @@ impl RateSettings {
     }
 }
 
-/// Adam (Kingma & Ba 2015) as 3DGS configures it.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct AdamSettings {
-    /// Decay of the first moment.
-    pub beta1: f32,
-    /// Decay of the second moment.
-    pub beta2: f32,
-    /// Added to the root of the second moment; 3DGS uses 1e-15 because gradients of a mean over pixels are tiny.
-    pub epsilon: f32,
-}
-
-impl Default for AdamSettings {
-    fn default() -> Self {
-        Self { beta1: 0.9, beta2: 0.999, epsilon: 1e-15 }
+table! {
+    /// Adam (Kingma & Ba 2015) as 3DGS configures it.
+    #[derive(Copy)]
+    pub struct AdamSettings {
+        /// Decay of the first moment.
+        pub beta1: f32 = 0.9, in Limits::within(0.0, 0.999_999), from "3DGS";
+        /// Decay of the second moment.
+        pub beta2: f32 = 0.999, in Limits::within(0.0, 0.999_999), from "3DGS";
+        /// Added to the root of the second moment; tiny because gradients of a mean over pixels are.
+        pub epsilon: f32 = 1e-15, in Limits::within(f32::MIN_POSITIVE as f64, 1.0), from "3DGS";
     }
 }
 

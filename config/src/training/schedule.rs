@@ -1,26 +1,21 @@
 //! What changes while training goes on: SH degree, resolution, choice of views, early stop.
 
-use serde::{Deserialize, Serialize};
+use crate::settings::{Limits, table};
 
-/// Spherical harmonics.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ShSettings {
-    /// Highest degree, 0…3.
-    pub degree: u8,
-    /// Progress from which degree 1, 2, 3 may be used.
-    pub raise_at: [f32; 3],
-    /// Share of the Gaussians whose own degree is raised by one at each of six occasions in the first half: those whose
-    /// views disagree most on their colour. 1 = every Gaussian has the degree in use.
-    pub raise_share: f32,
-    /// Adam's moments of the coefficients in 16 bits instead of 32: at degree 3 a fifth less memory per Gaussian.
-    pub half_moments: bool,
-}
-
-impl Default for ShSettings {
-    fn default() -> Self {
-        // All at once, as Brush; 3DGS raises the degree every 1,000 of 30,000 steps ([0.033, 0.067, 0.1]).
-        Self { degree: 3, raise_at: [0.0; 3], raise_share: 1.0, half_moments: false }
+table! {
+    /// Spherical harmonics.
+    #[derive(Copy)]
+    pub struct ShSettings {
+        /// Highest degree.
+        pub degree: u8 = 3, in Limits::within(0.0, 3.0);
+        /// Progress from which degree 1, 2, 3 may be used.
+        pub raise_at: [f32; 3] = [0.0; 3],
+            from "all at once, as Brush; 3DGS raises the degree every 1,000 of 30,000 steps ([0.033, 0.067, 0.1])";
+        /// Share of the Gaussians whose own degree is raised by one at each of six occasions in the first half: those whose
+        /// views disagree most on their colour. 1 = every Gaussian has the degree in use.
+        pub raise_share: f32 = 1.0, in Limits::within(0.0, 1.0);
+        /// Adam's moments of the coefficients in 16 bits instead of 32: at degree 3 a fifth less memory per Gaussian.
+        pub half_moments: bool = false;
     }
 }
 
@@ -32,25 +27,21 @@ impl ShSettings {
     }
 }
 
-/// Coarse to fine: pictures are averaged 4 × 4, then 2 × 2, then taken as they are.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ResolutionSettings {
-    /// A quarter of the size until this progress.
-    pub quarter_until: f32,
-    /// Half the size until this progress.
-    pub half_until: f32,
-    /// No picture becomes shorter than this on either side, pixels.
-    pub least_side: u32,
-    /// The size is reduced at least by this, whatever the progress: 1, 2 or 4.
-    pub least_divisor: u32,
-}
-
-impl Default for ResolutionSettings {
-    fn default() -> Self {
-        // Short, because Gaussians fitted to coarse pixels shrink below the low-pass of fine ones: on fox, half the size
-        // until progress 0.5 cost 3.6 dB at full size between steps 250 and 500.
-        Self { quarter_until: 0.0, half_until: 0.1, least_side: 64, least_divisor: 1 }
+table! {
+    /// Coarse to fine: pictures are averaged 4 × 4, then 2 × 2, then taken as they are.
+    ///
+    /// The schedule is short because Gaussians fitted to coarse pixels shrink below the low-pass of fine ones: on fox, half the
+    /// size until progress 0.5 cost 3.6 dB at full size between steps 250 and 500.
+    #[derive(Copy)]
+    pub struct ResolutionSettings {
+        /// A quarter of the size until this progress.
+        pub quarter_until: f32 = 0.0;
+        /// Half the size until this progress.
+        pub half_until: f32 = 0.1, from "fox: 0.5 cost 3.6 dB between steps 250 and 500";
+        /// No picture becomes shorter than this on either side.
+        pub least_side: u32 = 64, unit "pixels";
+        /// The size is reduced at least by this, whatever the progress: 1, 2 or 4.
+        pub least_divisor: u32 = 1;
     }
 }
 
@@ -68,35 +59,25 @@ impl ResolutionSettings {
     }
 }
 
-/// Which view comes next. Every epoch visits each view once, in a seeded shuffle.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ViewSettings {
-    /// Share of extra visits per epoch that go to the views with the largest last loss.
-    pub residual_share: f32,
-}
-
-impl Default for ViewSettings {
-    fn default() -> Self {
-        Self { residual_share: 0.0 }
+table! {
+    /// Which view comes next. Every epoch visits each view once, in a seeded shuffle.
+    #[derive(Copy)]
+    pub struct ViewSettings {
+        /// Share of extra visits per epoch that go to the views with the largest last loss.
+        pub residual_share: f32 = 0.0, in Limits::within(0.0, 1.0);
     }
 }
 
-/// End early when the loss has stopped falling.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct StopSettings {
-    /// Whether to look at all.
-    pub enabled: bool,
-    /// Epochs in a row that must improve by less than `least_gain` before training ends.
-    pub patience: u32,
-    /// Relative fall of an epoch's mean loss that counts as progress.
-    pub least_gain: f32,
-}
-
-impl Default for StopSettings {
-    fn default() -> Self {
-        Self { enabled: false, patience: 5, least_gain: 2e-3 }
+table! {
+    /// When to end before the schedule does: when the loss has stopped falling.
+    #[derive(Copy)]
+    pub struct StopSettings {
+        /// Whether to look at all.
+        pub enabled: bool = false;
+        /// Epochs in a row that must improve by less than `least_gain` before training ends.
+        pub patience: u32 = 5, unit "epochs";
+        /// Relative fall of an epoch's mean loss that counts as progress.
+        pub least_gain: f32 = 2e-3;
     }
 }
 

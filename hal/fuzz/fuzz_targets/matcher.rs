@@ -1,7 +1,7 @@
 //! Any exposures and pictures, in any order, with any clues.
 #![no_main]
 
-#[path = "../src/victim.rs"]
-mod victim;
+#[path = "../src/targets.rs"]
+mod targets;
 
-libfuzzer_sys::fuzz_target!(|data: &[u8]| victim::match_up(data));
+libfuzzer_sys::fuzz_target!(|data: &[u8]| targets::match_up(data));

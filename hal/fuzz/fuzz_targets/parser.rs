@@ -1,7 +1,7 @@
 //! Any bytes on the line.
 #![no_main]
 
-#[path = "../src/victim.rs"]
-mod victim;
+#[path = "../src/targets.rs"]
+mod targets;
 
-libfuzzer_sys::fuzz_target!(|data: &[u8]| victim::parse(data));
+libfuzzer_sys::fuzz_target!(|data: &[u8]| targets::parse(data));

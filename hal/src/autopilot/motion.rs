@@ -4,7 +4,7 @@
 use config::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
-use super::{Autopilot, Heard};
+use super::{Autopilot, Handled};
 use crate::frames::{euler_to_ned, ned_to_enu};
 use crate::mavlink::Frame;
 use crate::mavlink::dialect::{
@@ -59,8 +59,8 @@ fn unit(q: [f32; 4]) -> Option<DQuat> {
 }
 
 impl Autopilot {
-    pub(super) fn on_global_position(&mut self, frame: &Frame<'_>, now_ns: u64) -> Heard {
-        let Some(m) = frame.message::<GLOBAL_POSITION_INT_DATA>() else { return Heard::Other };
+    pub(super) fn on_global_position(&mut self, frame: &Frame<'_>, now_ns: u64) -> Handled {
+        let Some(m) = frame.message::<GLOBAL_POSITION_INT_DATA>() else { return Handled::Other };
         let boot_ns = self.stamp(m.time_boot_ms, now_ns);
         let position = Geodetic {
             lat_deg: f64::from(m.lat) * 1e-7,
@@ -70,31 +70,32 @@ impl Autopilot {
         // Exactly 0, 0 is what autopilots send before the first fix.
         if m.lat == 0 && m.lon == 0 {
             self.counters.unfixed += 1;
-            return Heard::Other;
+            return Handled::Other;
         }
         if !position.is_valid() {
             self.counters.impossible += 1;
-            return Heard::Other;
+            return Handled::Other;
         }
         let cm_s = |v: i16| f64::from(v) * 0.01;
         let velocity = ned_to_enu(DVec3::new(cm_s(m.vx), cm_s(m.vy), cm_s(m.vz)));
+        self.landing.on_motion(f64::from(m.relative_alt) * 1e-3, velocity.length(), now_ns);
         self.motion.global_heard_ns = Some(boot_ns);
         let sigma_m = self.motion.gps_sigma_m.unwrap_or(DVec3::splat(UNKNOWN_SIGMA_M));
         self.add_position(PositionSample { boot_ns, position, velocity, sigma_m })
     }
 
-    pub(super) fn on_odometry(&mut self, frame: &Frame<'_>, now_ns: u64) -> Heard {
-        let Some(m) = frame.message::<ODOMETRY_DATA>() else { return Heard::Other };
+    pub(super) fn on_odometry(&mut self, frame: &Frame<'_>, now_ns: u64) -> Handled {
+        let Some(m) = frame.message::<ODOMETRY_DATA>() else { return Handled::Other };
         let fields = [m.x, m.y, m.z, m.vx, m.vy, m.vz];
         let (Some(q), true) = (unit(m.q), fields.iter().all(|v| v.is_finite())) else {
             self.counters.impossible += 1;
-            return Heard::Other;
+            return Handled::Other;
         };
         // Only a frame tied to north can be placed in the world; only a body frame makes `q` an attitude.
         let child_is_body = m.child_frame_id == MavFrame::MAV_FRAME_BODY_FRD;
-        let Some(boot_ns) = self.place_us(m.time_usec) else { return Heard::Other };
+        let Some(boot_ns) = self.place_us(m.time_usec) else { return Handled::Other };
         if m.frame_id != MavFrame::MAV_FRAME_LOCAL_NED || !child_is_body {
-            return Heard::Other;
+            return Handled::Other;
         }
         self.clock.arrival(now_ns, boot_ns);
         if self.motion.odometry_resets.replace(m.reset_counter).is_some_and(|r| r != m.reset_counter) {
@@ -103,11 +104,11 @@ impl Autopilot {
         }
         self.add_attitude(AttitudeSample { boot_ns, frd_to_ned: q, sigma_rad: attitude_sigma() }, 1);
         let global = self.motion.global_heard_ns.is_some_and(|t| boot_ns.saturating_sub(t) < HOLD_NS);
-        let (Some(origin), false) = (self.motion.origin, global) else { return Heard::Other };
+        let (Some(origin), false) = (self.motion.origin, global) else { return Handled::Other };
         let enu = ned_to_enu(DVec3::new(m.x.into(), m.y.into(), m.z.into()));
         if enu.length() > 1e5 {
             self.counters.impossible += 1;
-            return Heard::Other;
+            return Handled::Other;
         }
         let velocity = ned_to_enu(q * DVec3::new(m.vx.into(), m.vy.into(), m.vz.into()));
         // Row-major upper triangle of 6 × 6: variances of x, y, z at 0, 6, 11; NaN at 0 = unknown.
@@ -222,7 +223,7 @@ impl Autopilot {
         }
     }
 
-    fn add_position(&mut self, mut sample: PositionSample) -> Heard {
+    fn add_position(&mut self, mut sample: PositionSample) -> Handled {
         let motion = &mut self.motion;
         if let Some(newest) = self.track.newest_position() {
             let dt = sample.boot_ns.saturating_sub(newest.boot_ns) as f64 * 1e-9;
@@ -232,7 +233,7 @@ impl Autopilot {
                 if motion.position_spikes < SPIKES {
                     motion.position_spikes += 1;
                     self.counters.spikes += 1;
-                    return Heard::Other;
+                    return Handled::Other;
                 }
                 self.counters.position_steps += 1;
                 motion.step_m = off;
@@ -245,10 +246,10 @@ impl Autopilot {
             sample.sigma_m = sample.sigma_m.max(DVec3::splat(motion.step_m));
         }
         if !self.track.push_position(sample) {
-            return Heard::Other;
+            return Handled::Other;
         }
         self.counters.positions += 1;
-        Heard::Position
+        Handled::Position
     }
 }
 

@@ -25,10 +25,10 @@ impl Wire {
         Self { autopilot: Autopilot::new(ids), encoder: Encoder::new(1, 1), now_ns: 500 * S }
     }
 
-    fn hear<D: MessageData>(&mut self, message: &D) -> Heard {
+    fn handle<D: MessageData>(&mut self, message: &D) -> Handled {
         let mut framer = Framer::new();
         framer.push(self.encoder.encode(message, None));
-        self.autopilot.hear(&framer.next_frame().expect("a frame"), self.now_ns)
+        self.autopilot.handle(&framer.next_frame().expect("a frame"), self.now_ns)
     }
 
     /// Level flight east at 10 m/s from boot time `from_ms`, 25 attitudes and 10 positions a second.
@@ -36,7 +36,7 @@ impl Wire {
         for time_boot_ms in (from_ms..to_ms).step_by(20) {
             self.now_ns += 20_000_000;
             if time_boot_ms % 40 == 0 {
-                self.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms, q1: 1.0, ..Default::default() });
+                self.handle(&ATTITUDE_QUATERNION_DATA { time_boot_ms, q1: 1.0, ..Default::default() });
             }
             if time_boot_ms % 100 == 0 {
                 self.position(time_boot_ms, 0.0);
@@ -44,10 +44,10 @@ impl Wire {
         }
     }
 
-    fn position(&mut self, time_boot_ms: u32, off_m: f64) -> Heard {
+    fn position(&mut self, time_boot_ms: u32, off_m: f64) -> Handled {
         let east = f64::from(time_boot_ms) * 0.01;
         let at = EnuFrame::new(HOME).to_geodetic(DVec3::new(east, off_m, 0.0));
-        self.hear(&GLOBAL_POSITION_INT_DATA {
+        self.handle(&GLOBAL_POSITION_INT_DATA {
             time_boot_ms,
             lat: (at.lat_deg * 1e7) as i32,
             lon: (at.lon_deg * 1e7) as i32,
@@ -67,12 +67,12 @@ fn feedback_is_placed_from_unix_time_and_from_wrapping_boot_time() {
     let mut h = Wire::new();
     h.fly(10_000, 12_000);
     let boot_us = (1u64 << 32) - 500_000;
-    h.hear(&SYSTEM_TIME_DATA { time_unix_usec: 1_795_248_400_000_000, time_boot_ms: 12_000 });
-    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 1_795_248_399_500_000, img_idx: 1, ..Default::default() });
-    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 11_900_000, img_idx: 3, ..Default::default() });
-    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 11_900_000, img_idx: 3, ..Default::default() });
+    h.handle(&SYSTEM_TIME_DATA { time_unix_usec: 1_795_248_400_000_000, time_boot_ms: 12_000 });
+    h.handle(&CAMERA_FEEDBACK_DATA { time_usec: 1_795_248_399_500_000, img_idx: 1, ..Default::default() });
+    h.handle(&CAMERA_FEEDBACK_DATA { time_usec: 11_900_000, img_idx: 3, ..Default::default() });
+    h.handle(&CAMERA_FEEDBACK_DATA { time_usec: 11_900_000, img_idx: 3, ..Default::default() });
     // Not a time of this flight: taken at its arrival.
-    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: boot_us, img_idx: 4, ..Default::default() });
+    h.handle(&CAMERA_FEEDBACK_DATA { time_usec: boot_us, img_idx: 4, ..Default::default() });
     let times: std::vec::Vec<_> =
         core::iter::from_fn(|| h.autopilot.next_trigger()).map(|t| (t.sequence, t.boot_ns / 1_000_000)).collect();
     assert_eq!(times[..2], [(1, 11_500), (3, 11_900)]);
@@ -88,14 +88,14 @@ fn px4s_second_announcement_of_an_exposure_is_a_duplicate() {
     for seq in 5..8u32 {
         h.fly(11_000 + seq * 1000, 12_000 + seq * 1000);
         let boot_ms = 11_900 + seq * 1000;
-        h.hear(&CAMERA_TRIGGER_DATA { time_usec: u64::from(boot_ms) * 1000, seq });
+        h.handle(&CAMERA_TRIGGER_DATA { time_usec: u64::from(boot_ms) * 1000, seq });
         let captured = CAMERA_IMAGE_CAPTURED_DATA {
             time_boot_ms: boot_ms,
             image_index: seq as i32,
             capture_result: MavBool::MAV_BOOL_TRUE,
             ..Default::default()
         };
-        h.hear(&captured);
+        h.handle(&captured);
     }
     let kinds: std::vec::Vec<_> = core::iter::from_fn(|| h.autopilot.next_trigger()).map(|t| t.kind).collect();
     assert_eq!(kinds, [TriggerKind::CameraTrigger; 3]);
@@ -107,7 +107,7 @@ fn our_own_exposure_gives_way_to_the_autopilots_announcement() {
     let mut h = Wire::new();
     h.fly(10_000, 11_000);
     h.autopilot.announce_own(1, h.now_ns);
-    h.hear(&CAMERA_FEEDBACK_DATA { time_usec: 10_950_000, img_idx: 1, ..Default::default() });
+    h.handle(&CAMERA_FEEDBACK_DATA { time_usec: 10_950_000, img_idx: 1, ..Default::default() });
     h.autopilot.settle_own(h.now_ns + S);
     assert_eq!(h.autopilot.next_trigger().map(|t| t.kind), Some(TriggerKind::Feedback));
     assert_eq!(h.autopilot.next_trigger(), None);
@@ -123,7 +123,7 @@ fn our_own_exposure_gives_way_to_the_autopilots_announcement() {
 #[test]
 fn odometry_is_placed_by_the_origin_and_only_in_frames_tied_to_north() {
     let mut h = Wire::new();
-    h.hear(&SYSTEM_TIME_DATA { time_unix_usec: 0, time_boot_ms: 5_000 });
+    h.handle(&SYSTEM_TIME_DATA { time_unix_usec: 0, time_boot_ms: 5_000 });
     let odometry = ODOMETRY_DATA {
         time_usec: 5_000_000,
         x: 30.0,
@@ -136,23 +136,23 @@ fn odometry_is_placed_by_the_origin_and_only_in_frames_tied_to_north() {
         pose_covariance: [f32::NAN; 21],
         ..Default::default()
     };
-    assert_eq!(h.hear(&odometry), Heard::Other, "no origin yet");
-    h.hear(&GPS_GLOBAL_ORIGIN_DATA {
+    assert_eq!(h.handle(&odometry), Handled::Other, "no origin yet");
+    h.handle(&GPS_GLOBAL_ORIGIN_DATA {
         latitude: (HOME.lat_deg * 1e7) as i32,
         longitude: (HOME.lon_deg * 1e7) as i32,
         altitude: 200_000,
         ..Default::default()
     });
     let next = ODOMETRY_DATA { time_usec: 5_100_000, ..odometry.clone() };
-    assert_eq!(h.hear(&next), Heard::Position);
+    assert_eq!(h.handle(&next), Handled::Position);
     let pose = h.autopilot.pose_at(5_100_000_000).expect("a pose");
     let enu = EnuFrame::new(HOME).to_enu(pose.position);
     assert!((enu - DVec3::new(40.0, 30.0, 50.0)).length() < 0.02, "{enu}");
     assert!((pose.velocity - DVec3::new(0.0, 2.0, 0.0)).length() < 1e-6 && pose.position_sigma_m.is_finite());
     let adrift = ODOMETRY_DATA { time_usec: 5_200_000, frame_id: MavFrame::MAV_FRAME_LOCAL_FRD, ..odometry.clone() };
-    assert_eq!(h.hear(&adrift), Heard::Other);
-    h.hear(&ODOMETRY_DATA { time_usec: 5_300_000, x: f32::NAN, ..odometry.clone() });
-    h.hear(&ODOMETRY_DATA { time_usec: 5_400_000, reset_counter: 1, ..odometry });
+    assert_eq!(h.handle(&adrift), Handled::Other);
+    h.handle(&ODOMETRY_DATA { time_usec: 5_300_000, x: f32::NAN, ..odometry.clone() });
+    h.handle(&ODOMETRY_DATA { time_usec: 5_400_000, reset_counter: 1, ..odometry });
     assert_eq!((h.counters().impossible, h.counters().position_steps), (1, 1));
 }
 
@@ -171,9 +171,9 @@ fn gimbal_yaw_obeys_its_frame_flags() {
         let [q1, q2, q3, q4] = wire(euler_to_ned(0.1, 0.0, east));
         let q = wire(euler_to_ned(0.0, -0.5, 0.0));
         for time_boot_ms in [8_000, 8_100] {
-            h.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms, q1, q2, q3, q4, ..Default::default() });
+            h.handle(&ATTITUDE_QUATERNION_DATA { time_boot_ms, q1, q2, q3, q4, ..Default::default() });
             h.position(time_boot_ms, 0.0);
-            h.hear(&GIMBAL_DEVICE_ATTITUDE_STATUS_DATA {
+            h.handle(&GIMBAL_DEVICE_ATTITUDE_STATUS_DATA {
                 time_boot_ms,
                 q,
                 flags,
@@ -192,13 +192,16 @@ fn gimbal_yaw_obeys_its_frame_flags() {
 fn a_spike_is_left_out_and_a_lasting_jump_is_followed_with_its_size_as_uncertainty() {
     let mut h = Wire::new();
     h.fly(10_000, 12_000);
-    assert_eq!(h.position(12_000, 60.0), Heard::Other);
-    h.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_000, q2: 1.0, ..Default::default() });
-    h.hear(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_010, q1: f32::NAN, ..Default::default() });
+    assert_eq!(h.position(12_000, 60.0), Handled::Other);
+    h.handle(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_000, q2: 1.0, ..Default::default() });
+    h.handle(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_010, q1: f32::NAN, ..Default::default() });
     h.fly(12_100, 13_000);
     assert_eq!((h.counters().spikes, h.counters().impossible, h.counters().position_steps), (2, 1, 0));
     let heard: std::vec::Vec<_> = (0..6).map(|i| h.position(13_000 + i * 100, 60.0)).collect();
-    assert_eq!(heard, [Heard::Other, Heard::Other, Heard::Other, Heard::Other, Heard::Position, Heard::Position]);
+    assert_eq!(
+        heard,
+        [Handled::Other, Handled::Other, Handled::Other, Handled::Other, Handled::Position, Handled::Position]
+    );
     assert_eq!(h.counters().position_steps, 1);
     let newest = h.autopilot.track().newest_position().expect("one");
     assert!(newest.sigma_m.min_element() > 50.0, "{}", newest.sigma_m);
@@ -220,13 +223,13 @@ fn gps_accuracy_reaches_the_pose_and_its_loss_shows() {
         (gps(GpsFixType::GPS_FIX_TYPE_3D_FIX, 0, 80), 0.8485),
         (gps(GpsFixType::GPS_FIX_TYPE_NO_FIX, 0, u16::MAX), 100.0),
     ] {
-        h.hear(&message);
+        h.handle(&message);
         let next = h.autopilot.track().newest_position().map_or(9_000, |p| (p.boot_ns / 1_000_000) as u32 + 100);
         h.position(next, 0.0);
         let sigma = h.autopilot.track().newest_position().expect("one").sigma_m;
         assert!((sigma.x - east).abs() < 1e-3 * east.max(1.0), "{sigma}");
     }
-    assert_eq!(h.autopilot.state().gps_fix, Some(1));
+    assert_eq!(h.autopilot.state(h.now_ns).gps_fix, Some(1));
 }
 
 #[test]
@@ -245,14 +248,14 @@ fn a_restarted_autopilot_starts_a_new_track() {
 fn other_systems_and_our_own_echo_are_ignored_and_a_timesync_is_answered() {
     let mut h = Wire::new();
     h.encoder = Encoder::new(2, 1);
-    assert_eq!(h.position(9_000, 0.0), Heard::Foreign);
+    assert_eq!(h.position(9_000, 0.0), Handled::Foreign);
     h.encoder = Encoder::new(1, 100);
-    assert_eq!(h.position(9_000, 0.0), Heard::Foreign);
+    assert_eq!(h.position(9_000, 0.0), Handled::Foreign);
     assert_eq!(h.counters().foreign, 2);
     h.encoder = Encoder::new(1, 1);
-    h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() });
+    h.handle(&TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() });
     let answer = h.autopilot.next_answer().expect("an answer");
     assert_eq!((answer.ts1, answer.tc1), (77, h.now_ns as i64));
-    h.hear(&TIMESYNC_DATA { tc1: 0, ts1: 78, target_system: 1, target_component: 50 });
+    h.handle(&TIMESYNC_DATA { tc1: 0, ts1: 78, target_system: 1, target_component: 50 });
     assert_eq!(h.autopilot.next_answer(), None);
 }

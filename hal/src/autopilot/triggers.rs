@@ -129,6 +129,7 @@ impl Autopilot {
         self.announcements.believed = Some((kind, now_ns));
         self.announcements.last = Some(trigger);
         self.counters.triggers += 1;
+        self.landing.on_exposure();
         if self.announcements.waiting.is_full() {
             self.announcements.waiting.pop_front();
             self.counters.triggers_unmatched += 1;

@@ -1,7 +1,6 @@
 //! What a picture says about itself: the camera's clock, and a pose (EXIF GPS position, DJI's XMP gimbal angles) for use
 //! when the autopilot's is missing.
 
-use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
@@ -9,6 +8,7 @@ use config::geodesy::Geodetic;
 use exif::{DateTime, Exif, In, Reader, Tag, Value};
 use glam::DQuat;
 
+use super::regular;
 use crate::frames::{attitude_to_enu, euler_to_ned};
 
 /// XMP stands in the first segments of the file.
@@ -24,7 +24,7 @@ pub struct ExifPose {
 }
 
 fn read(path: &Path) -> Option<Exif> {
-    let mut file = BufReader::new(File::open(path).ok()?);
+    let mut file = BufReader::new(regular::open(path).ok()?);
     Reader::new().read_from_container(&mut file).ok()
 }
 
@@ -80,7 +80,7 @@ pub fn exif_pose(path: &Path) -> Option<ExifPose> {
 /// DJI's gimbal angles: yaw clockwise from north, pitch −90 straight down, degrees.
 fn gimbal(path: &Path) -> Option<DQuat> {
     let mut head = Vec::new();
-    File::open(path).ok()?.take(XMP_WITHIN).read_to_end(&mut head).ok()?;
+    regular::open(path).ok()?.take(XMP_WITHIN).read_to_end(&mut head).ok()?;
     let angle = |name: &str| {
         let key = format!("drone-dji:Gimbal{name}Degree=\"");
         let start = head.windows(key.len()).position(|w| w == key.as_bytes())? + key.len();

@@ -1,13 +1,16 @@
 //! A folder that another program writes pictures into. Files appear slowly, half written, out of order, under temporary
 //! names; a picture is handed out once it is whole.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
+use std::fs::Metadata;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use super::exif::camera_clock;
-use super::{Picture, is_complete};
+use super::jpeg::is_complete;
+use super::picture::Picture;
 use crate::error::HalError;
 use crate::traits::{Camera, PictureClues};
 
@@ -20,6 +23,9 @@ const STALLED_NS: u64 = 10_000_000_000;
 const MAX_FILES: usize = 1 << 17;
 /// Most files that grow at the same time.
 const MAX_GROWING: usize = 64;
+/// Every so many listings, what was handed out is looked at again: a camera program that was restarted numbers anew and writes
+/// over its old files.
+const RECHECK: u64 = 10;
 
 struct Growing {
     path: PathBuf,
@@ -27,23 +33,41 @@ struct Growing {
     since_ns: u64,
 }
 
+/// Which file system a folder is on, and which folder it is there: another one after its medium was unmounted.
+type Place = (u64, u64);
+
 /// A watched folder.
 pub struct FolderCamera {
     folder: PathBuf,
-    /// Hashes of the names that were handed out or given up.
-    done: HashSet<u64>,
+    place: Place,
+    /// Hashes of the names that were handed out or given up, and of size and time of what was.
+    done: HashMap<u64, u64>,
     growing: Vec<Growing>,
     /// Whole pictures waiting, the next one last.
     ready: Vec<(PictureClues, PathBuf)>,
     next_scan_ns: u64,
+    scans: u64,
     /// Files arrive when they are seen, not when they were written.
     simulated_clock: bool,
 }
 
-fn key(path: &Path) -> u64 {
+fn hash(of: impl Hash) -> u64 {
     let mut hasher = DefaultHasher::new();
-    path.file_name().hash(&mut hasher);
+    of.hash(&mut hasher);
     hasher.finish()
+}
+
+fn key(path: &Path) -> u64 {
+    hash(path.file_name())
+}
+
+/// Changes when a file is written anew under its old name.
+fn version(meta: &Metadata) -> u64 {
+    hash((meta.len(), meta.modified().ok()))
+}
+
+fn place(folder: &Path) -> std::io::Result<Place> {
+    folder.metadata().map(|m| (m.dev(), m.ino()))
 }
 
 /// The last run of digits in a file's name: `DJI_0054.jpg` is 54.
@@ -78,58 +102,75 @@ impl FolderCamera {
     pub fn open_since(folder: &Path, since: Option<SystemTime>) -> Result<Self, HalError> {
         let mut camera = Self {
             folder: folder.into(),
-            done: HashSet::new(),
+            place: (0, 0),
+            done: HashMap::new(),
             growing: Vec::with_capacity(MAX_GROWING),
             ready: Vec::new(),
             next_scan_ns: 0,
+            scans: 0,
             simulated_clock: false,
         };
-        let earlier = |path: &Path| {
-            let written = path.metadata().and_then(|m| m.modified());
-            since.is_none_or(|since| written.is_ok_and(|at| at <= since))
-        };
+        camera.place =
+            place(folder).map_err(|e| camera.wrong(format!("{e}; create it or correct the mission's camera")))?;
+        let earlier = |meta: &Metadata| since.is_none_or(|since| meta.modified().is_ok_and(|at| at <= since));
         for path in camera.list()? {
-            if earlier(&path) && is_complete(&path).unwrap_or(false) {
-                camera.done.insert(key(&path));
+            let Ok(meta) = path.metadata() else { continue };
+            if earlier(&meta) && is_complete(&path).unwrap_or(false) {
+                camera.done.insert(key(&path), version(&meta));
             }
         }
         Ok(camera)
     }
 
     /// For a clock that is not the wall's: the age of a file says nothing then.
+    #[cfg(any(test, feature = "lab"))]
     pub fn on_simulated_clock(self) -> Self {
         Self { simulated_clock: true, ..self }
     }
 
+    fn wrong(&self, why: String) -> HalError {
+        HalError::Camera { what: format!("folder {}", self.folder.display()), why }
+    }
+
+    /// Names that may be pictures. Entries that cannot be read are passed over: the others can.
     fn list(&self) -> Result<Vec<PathBuf>, HalError> {
-        let wrong = |e: std::io::Error| HalError::Camera {
-            what: format!("folder {}", self.folder.display()),
-            why: format!("{e}; create it or correct the mission's camera"),
-        };
-        let mut paths = Vec::new();
-        for entry in std::fs::read_dir(&self.folder).map_err(wrong)? {
-            let path = entry.map_err(wrong)?.path();
-            if is_picture(&path) && !self.done.contains(&key(&path)) {
-                paths.push(path);
-            }
-        }
-        Ok(paths)
+        let entries = std::fs::read_dir(&self.folder)
+            .map_err(|e| self.wrong(format!("{e}; is its medium mounted? It is looked at again")))?;
+        let names = entries.flatten().map(|entry| entry.path()).filter(|path| is_picture(path));
+        Ok(names.take(MAX_FILES).collect())
     }
 
     fn scan(&mut self, now_ns: u64) -> Result<(), HalError> {
+        self.scans += 1;
+        let recheck = self.scans.is_multiple_of(RECHECK);
+        let now_at = place(&self.folder).unwrap_or(self.place);
+        if std::mem::replace(&mut self.place, now_at) != now_at {
+            return Err(self.wrong("another file system is there now; was its medium unmounted?".into()));
+        }
         let mut broken = None;
         for path in self.list()? {
+            let done = self.done.get(&key(&path)).copied();
+            if done.is_some() && !recheck {
+                continue;
+            }
             // Gone again between listing and looking: renamed or deleted, the next scan knows.
-            let Ok(meta) = path.metadata() else { continue };
-            if is_complete(&path).unwrap_or(false) {
+            let Ok(meta) = path.metadata().map_err(drop).and_then(|m| if m.is_file() { Ok(m) } else { Err(()) }) else {
+                continue;
+            };
+            if done == Some(version(&meta)) {
+                continue;
+            }
+            let complete = is_complete(&path);
+            if complete.as_ref().is_ok_and(|complete| *complete) {
                 self.growing.retain(|g| g.path != path);
-                self.take(path, &meta, now_ns);
+                self.take(path, &meta, now_ns, done.is_some());
             } else if let Some(g) = self.growing.iter_mut().find(|g| g.path == path) {
                 if g.size != meta.len() {
                     (g.size, g.since_ns) = (meta.len(), now_ns);
                 } else if now_ns.saturating_sub(g.since_ns) > STALLED_NS {
-                    self.done.insert(key(&path));
-                    broken = Some(path);
+                    self.done.insert(key(&path), version(&meta));
+                    let why = complete.err().map_or("half written and no longer growing".into(), |e| e.to_string());
+                    broken = Some((path, why));
                 }
             } else if self.growing.len() < MAX_GROWING {
                 self.growing.push(Growing { path, size: meta.len(), since_ns: now_ns });
@@ -138,30 +179,34 @@ impl FolderCamera {
         // By number, so that files that came within one scan are handed out in the camera's order.
         self.ready.sort_by(|(a, p), (b, q)| (b.number, q).cmp(&(a.number, p)));
         match broken {
-            Some(path) => {
+            Some((path, why)) => {
                 self.growing.retain(|g| g.path != path);
-                Err(HalError::Picture { path, why: "half written and no longer growing; left out".into() })
+                Err(HalError::Picture { path, why: format!("{why}; left out") })
             }
             None => Ok(()),
         }
     }
 
-    fn take(&mut self, path: PathBuf, meta: &std::fs::Metadata, now_ns: u64) {
+    /// A whole picture; `anew` under the name of an earlier one, so that its number says nothing.
+    fn take(&mut self, path: PathBuf, meta: &Metadata, now_ns: u64, anew: bool) {
         if self.done.len() >= MAX_FILES {
             return;
         }
-        self.done.insert(key(&path));
+        self.done.insert(key(&path), version(meta));
         // When its last byte was written, on our clock; a clock that was set meanwhile counts for a scan at most.
         let age = meta.modified().ok().and_then(|m| SystemTime::now().duration_since(m).ok());
         let longest_ns = if self.simulated_clock { 0 } else { 2 * SCAN_EVERY_NS };
         let age_ns = age.map_or(0, |a| a.as_nanos() as u64).min(longest_ns);
         let (camera_ns, camera_resolution_ns) = camera_clock(&path).unzip();
+        let written = meta.modified().ok().filter(|_| !self.simulated_clock);
+        let written = written.and_then(|at| at.duration_since(SystemTime::UNIX_EPOCH).ok());
         let clues = PictureClues {
             arrived_ns: now_ns.saturating_sub(age_ns),
-            number: number_of(&path),
+            number: if anew { None } else { number_of(&path) },
             camera_ns,
-            stamped_ns: None,
             camera_resolution_ns: camera_resolution_ns.unwrap_or(0),
+            written_ns: written.and_then(|at| u64::try_from(at.as_nanos()).ok()),
+            ..PictureClues::default()
         };
         self.ready.push((clues, path));
     }
@@ -255,5 +300,61 @@ mod tests {
     fn a_missing_folder_is_named() {
         let error = FolderCamera::open(Path::new("/nonexistent/camera")).err().expect("missing");
         assert!(error.to_string().contains("/nonexistent/camera"));
+    }
+
+    #[test]
+    fn what_cannot_be_read_costs_no_picture_and_nobody_waits_for_a_fifo() {
+        use std::os::unix::fs::{PermissionsExt, symlink};
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        rustix::fs::mknodat(rustix::fs::CWD, at("a_1.jpg"), rustix::fs::FileType::Fifo, 0o600.into(), 0)
+            .expect("a FIFO");
+        std::fs::create_dir(at("a_2.jpg")).expect("a folder");
+        symlink("/nonexistent", at("a_3.jpg")).expect("a link");
+        symlink(at("a_1.jpg"), at("a_4.jpg")).expect("a link");
+        let mut camera = FolderCamera::open(folder.path()).expect("opens");
+        std::fs::write(at("a_5.jpg"), jpeg()).expect("written");
+        // Another user's file, unless this user may read everything.
+        std::fs::write(at("a_6.jpg"), jpeg()).expect("written");
+        std::fs::set_permissions(at("a_6.jpg"), std::fs::Permissions::from_mode(0o000)).expect("set");
+        let everything = std::fs::File::open(at("a_6.jpg")).is_ok();
+        let expected = if everything { vec!["a_5.jpg", "a_6.jpg"] } else { vec!["a_5.jpg"] };
+        assert_eq!(names(&mut camera, 1), expected);
+        assert!(super::super::regular::open(&at("a_1.jpg")).is_err(), "refused, not waited for");
+        if !everything {
+            let error = camera.next_picture(2 * STALLED_NS).expect_err("named once").to_string();
+            assert!(error.contains("a_6.jpg") && error.contains("ermission"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_folder_that_is_unmounted_or_replaced_is_noticed_once_and_watched_on() {
+        let parent = tempfile::tempdir().expect("a folder");
+        let folder = parent.path().join("card");
+        std::fs::create_dir(&folder).expect("a folder");
+        let mut camera = FolderCamera::open(&folder).expect("opens");
+        std::fs::rename(&folder, parent.path().join("away")).expect("renamed");
+        let error = camera.next_picture(1).expect_err("gone").to_string();
+        assert!(error.contains("mounted"), "{error}");
+        std::fs::create_dir(&folder).expect("a folder");
+        let error = camera.next_picture(1 + SCAN_EVERY_NS).expect_err("another one").to_string();
+        assert!(error.contains("unmounted"), "{error}");
+        std::fs::write(folder.join("a_1.jpg"), jpeg()).expect("written");
+        assert_eq!(names(&mut camera, 1 + 2 * SCAN_EVERY_NS), ["a_1.jpg"]);
+    }
+
+    #[test]
+    fn a_restarted_camera_that_writes_over_its_files_takes_new_pictures() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut camera = FolderCamera::open(folder.path()).expect("opens");
+        let path = folder.path().join("frame_000001.jpg");
+        std::fs::write(&path, jpeg()).expect("written");
+        assert_eq!(names(&mut camera, 1), ["frame_000001.jpg"]);
+        std::fs::write(&path, [jpeg(), vec![0; 3]].concat()).expect("written anew");
+        let again: Vec<_> = (1..=RECHECK)
+            .filter_map(|k| camera.next_picture(1 + k * SCAN_EVERY_NS).expect("readable"))
+            .map(|(clues, _)| clues.number)
+            .collect();
+        assert_eq!(again, [None], "once, and its number says nothing");
     }
 }

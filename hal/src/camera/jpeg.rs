@@ -1,16 +1,20 @@
 //! Where a JPEG ends: needed to know that a file is complete, and to cut a stream of them (MJPEG) into pictures. Walks the
 //! segments instead of searching for end markers, because EXIF thumbnails contain some.
 
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
+
+use super::regular;
 
 /// Largest picture of a stream; more without an end is garbage.
 const MAX_PICTURE: usize = 32 << 20;
 
 /// True when the file at `path` ends as a JPEG or PNG does. Half-written files do not.
+///
+/// # Errors
+/// It cannot be read, or is no regular file.
 pub fn is_complete(path: &Path) -> std::io::Result<bool> {
-    let mut file = File::open(path)?;
+    let mut file = regular::open(path)?;
     let len = file.seek(SeekFrom::End(0))?;
     let mut head = [0; 2];
     file.seek(SeekFrom::Start(0))?;

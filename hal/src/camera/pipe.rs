@@ -9,8 +9,9 @@ use std::time::Instant;
 
 use image::RgbImage;
 
+use super::jpeg::JpegSplitter;
+use super::picture::Picture;
 use super::restart::Restart;
-use super::{JpegSplitter, Picture};
 use crate::error::HalError;
 use crate::traits::{Camera, PictureClues};
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 /// The pinhole picture of a distorted one. A lens without distortion returns the picture untouched.
 pub fn undistort(image: RgbImage, settings: &CameraSettings) -> RgbImage {
     let [k1, k2, p1, p2] = settings.distortion.map(f64::from);
-    let distortion = Distortion { k1, k2, k3: 0.0, p1, p2 };
+    let distortion = Distortion { k1, k2, p1, p2, ..Distortion::default() };
     if distortion.is_none() || image.width() == 0 || image.height() == 0 {
         return image;
     }

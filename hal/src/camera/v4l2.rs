@@ -3,6 +3,7 @@
 
 mod device;
 mod stamp;
+mod stream;
 mod yuyv;
 
 use std::io;
@@ -13,33 +14,15 @@ use std::time::Duration;
 
 use rustix::io::Errno;
 
-use super::Picture;
+use super::picture::Picture;
 use super::restart::Restart;
 use crate::error::{ErrorKind, HalError};
 use crate::traits::{Camera, PictureClues};
 use stamp::{Numbers, monotonic_now, on_companion_clock};
+use stream::{Stamp, Stream, video};
 
 /// Pictures waiting between the device and us; when nobody fetches them, the newest are dropped (and counted as lost).
 const WAITING: usize = 4;
-
-/// What the driver says about a picture.
-#[derive(Clone, Copy, Debug)]
-struct Stamp {
-    number: u32,
-    /// On CLOCK_MONOTONIC; `None` from drivers that stamp by another clock.
-    taken: Option<Duration>,
-    /// The driver marks its contents as damaged.
-    damaged: bool,
-}
-
-/// A device that streams.
-trait Stream {
-    /// Waits for the next picture.
-    fn next(&mut self) -> io::Result<(&[u8], Stamp)>;
-
-    /// The picture in these bytes; `None` when they are too few or too many.
-    fn picture(&self, bytes: &[u8]) -> Option<Picture>;
-}
 
 /// How a device is opened: the real one, or a test's.
 type Open = dyn Fn() -> Result<Box<dyn Stream>, HalError> + Send + Sync;
@@ -138,10 +121,6 @@ fn grab(device: &Path, stream: &mut dyn Stream, sender: &SyncSender<Result<Grabb
             return;
         }
     }
-}
-
-fn video(device: &Path, kind: ErrorKind, why: impl Into<String>) -> HalError {
-    HalError::Video { device: device.into(), kind, why: why.into() }
 }
 
 fn not_understood(device: &Path) -> HalError {

@@ -34,6 +34,19 @@ pub enum LinkAddress {
     Pty(Option<PathBuf>),
 }
 
+impl LinkAddress {
+    /// Anybody who reaches this port or host may speak on it: MAVLink is believed unless it is signed.
+    pub fn is_shared(&self) -> bool {
+        match self {
+            Self::UdpIn(host) | Self::UdpOut(host) | Self::TcpIn(host) | Self::TcpOut(host) => {
+                let name = host.rsplit_once(':').map_or("", |h| h.0).trim_matches(['[', ']']);
+                name != "localhost" && !name.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
+            }
+            Self::Serial { .. } | Self::File(_) | Self::Pty(_) => false,
+        }
+    }
+}
+
 impl FromStr for LinkAddress {
     type Err = HalError;
 
@@ -124,5 +137,13 @@ mod tests {
             let message = text.parse::<LinkAddress>().expect_err(text).to_string();
             assert!(message.contains(why) && message.contains("udpin:HOST:PORT"), "{message}");
         }
+    }
+
+    #[test]
+    fn only_links_that_others_can_reach_are_shared() {
+        let shared = |text: &str| text.parse::<LinkAddress>().expect(text).is_shared();
+        assert!(["udpin:0.0.0.0:14550", "tcpin:[::]:5760", "udpout:10.0.0.2:14550"].into_iter().all(shared));
+        let own = ["udpin:127.0.0.1:14550", "tcpout:localhost:5760", "tcpin:[::1]:5760", "serial:/dev/ttyAMA0", "pty"];
+        assert!(!own.into_iter().any(shared));
     }
 }

@@ -90,7 +90,7 @@ impl Link for PtyLink {
         }
         match rustix::io::read(&self.near, into) {
             Ok(0) => Err(HalError::Closed { address: self.address.clone() }),
-            Ok(bytes) => Ok(Received { bytes, time_ns: None }),
+            Ok(bytes) => Ok(Received { bytes, ..NOTHING }),
             Err(Errno::AGAIN | Errno::INTR) => Ok(NOTHING),
             Err(e) => Err(self.failed(e)),
         }

@@ -1,6 +1,7 @@
 //! Keeps a link open: when it closes or fails, it is opened again, first soon, then ever more rarely. Nothing above
 //! has to know that a cable was unplugged, except through [`LinkState`].
 
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use super::{AnyLink, LinkAddress, NOTHING, open};
@@ -130,6 +131,18 @@ impl Link for Reconnecting {
                 Err(HalError::Full { address: self.address.to_string() })
             }
             other => other,
+        }
+    }
+
+    fn pin(&mut self, peer: SocketAddr) {
+        if let Some(link) = &mut self.link {
+            link.pin(peer);
+        }
+    }
+
+    fn dismiss(&mut self) {
+        if let Some(link) = &mut self.link {
+            link.dismiss();
         }
     }
 

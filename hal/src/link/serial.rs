@@ -52,7 +52,7 @@ impl Link for SerialLink {
         self.wait_at_most(timeout)?;
         match self.port.read(into) {
             Ok(0) => Err(HalError::Closed { address: self.address.clone() }),
-            Ok(bytes) => Ok(Received { bytes, time_ns: None }),
+            Ok(bytes) => Ok(Received { bytes, ..NOTHING }),
             Err(e) if is_timeout(&e) => Ok(NOTHING),
             Err(e) => Err(self.failed(e)),
         }

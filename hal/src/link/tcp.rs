@@ -14,11 +14,16 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 const WRITE_TIMEOUT: Duration = Duration::from_millis(50);
 /// How often a waiting `tcpin` looks for its peer.
 const ACCEPT_EVERY: Duration = Duration::from_millis(5);
+/// A peer of `tcpin` that says nothing for this long makes room for the next: an autopilot's heart beats at 1 Hz.
+const MUTE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A TCP connection, and the listener it came from.
 pub struct TcpLink {
     listener: Option<TcpListener>,
     stream: Option<TcpStream>,
+    peer: Option<SocketAddr>,
+    /// When it last sent something.
+    spoke: Instant,
     timeout: Option<Duration>,
     address: String,
 }
@@ -36,7 +41,14 @@ impl TcpLink {
             Ok(listener)
         };
         match open() {
-            Ok(listener) => Ok(Self { listener: Some(listener), stream: None, timeout: None, address }),
+            Ok(listener) => Ok(Self {
+                listener: Some(listener),
+                stream: None,
+                peer: None,
+                spoke: Instant::now(),
+                timeout: None,
+                address,
+            }),
             Err(source) => Err(HalError::Open { address, source }),
         }
     }
@@ -52,7 +64,10 @@ impl TcpLink {
             prepare(TcpStream::connect_timeout(&peer, CONNECT_TIMEOUT)?)
         };
         match open() {
-            Ok(stream) => Ok(Self { listener: None, stream: Some(stream), timeout: None, address }),
+            Ok(stream) => {
+                let peer = stream.peer_addr().ok();
+                Ok(Self { listener: None, stream: Some(stream), peer, spoke: Instant::now(), timeout: None, address })
+            }
             Err(source) => Err(HalError::Open { address, source }),
         }
     }
@@ -74,8 +89,8 @@ impl TcpLink {
         loop {
             match listener.accept().and_then(|(stream, _)| prepare(stream)) {
                 Ok(stream) => {
-                    self.stream = Some(stream);
-                    self.timeout = None;
+                    (self.peer, self.spoke) = (stream.peer_addr().ok(), Instant::now());
+                    (self.stream, self.timeout) = (Some(stream), None);
                     return Ok(true);
                 }
                 Err(e) if is_timeout(&e) && Instant::now() < until => std::thread::sleep(ACCEPT_EVERY.min(timeout)),
@@ -121,9 +136,21 @@ impl Link for TcpLink {
         }
         match stream.read(into) {
             Ok(0) => Err(self.drop_peer(None)),
-            Ok(bytes) => Ok(Received { bytes, time_ns: None }),
+            Ok(bytes) => {
+                self.spoke = Instant::now();
+                Ok(Received { bytes, peer: self.peer, ..NOTHING })
+            }
+            Err(e) if is_timeout(&e) && self.listener.is_some() && self.spoke.elapsed() > MUTE_TIMEOUT => {
+                Err(self.drop_peer(None))
+            }
             Err(e) if is_timeout(&e) => Ok(NOTHING),
             Err(e) => Err(self.drop_peer(Some(e))),
+        }
+    }
+
+    fn dismiss(&mut self) {
+        if self.listener.is_some() {
+            self.stream = None;
         }
     }
 

@@ -1,4 +1,4 @@
-//! UDP, either way round: `udpin` waits and answers the last sender, `udpout` sends first.
+//! UDP, either way round: `udpin` waits and answers the last sender until one is pinned, `udpout` sends first.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::time::Duration;
@@ -11,8 +11,9 @@ use crate::traits::{Link, Received};
 pub struct UdpLink {
     socket: UdpSocket,
     peer: Option<SocketAddr>,
-    /// `udpin`: whoever sent last is answered.
+    /// `udpin`: whoever sent last is answered, until one is pinned.
     follow: bool,
+    listens: bool,
     timeout: Option<Duration>,
     address: String,
 }
@@ -25,7 +26,7 @@ impl UdpLink {
     pub fn listen(host: &str) -> Result<Self, HalError> {
         let address = format!("udpin:{host}");
         match UdpSocket::bind(host) {
-            Ok(socket) => Ok(Self { socket, peer: None, follow: true, timeout: None, address }),
+            Ok(socket) => Ok(Self { socket, peer: None, follow: true, listens: true, timeout: None, address }),
             Err(source) => Err(HalError::Open { address, source }),
         }
     }
@@ -43,7 +44,9 @@ impl UdpLink {
             Ok((UdpSocket::bind(any)?, peer))
         };
         match open() {
-            Ok((socket, peer)) => Ok(Self { socket, peer: Some(peer), follow: false, timeout: None, address }),
+            Ok((socket, peer)) => {
+                Ok(Self { socket, peer: Some(peer), follow: false, listens: false, timeout: None, address })
+            }
             Err(source) => Err(HalError::Open { address, source }),
         }
     }
@@ -72,14 +75,21 @@ impl Link for UdpLink {
             Ok((bytes, from)) => {
                 if self.follow {
                     self.peer = Some(from);
-                } else if self.peer.is_some_and(|p| p.port() != from.port()) {
+                } else if !self.listens && self.peer.is_some_and(|p| p.port() != from.port()) {
                     return Ok(NOTHING);
                 }
-                Ok(Received { bytes, time_ns: None })
+                Ok(Received { bytes, peer: Some(from), ..NOTHING })
             }
             // Linux reports that an earlier datagram met a closed port: the peer is not up yet.
             Err(e) if is_timeout(&e) || e.kind() == std::io::ErrorKind::ConnectionRefused => Ok(NOTHING),
             Err(e) => Err(self.failed(e)),
+        }
+    }
+
+    fn pin(&mut self, peer: SocketAddr) {
+        // `udpout` goes on sending where it was told to.
+        if self.listens {
+            (self.peer, self.follow) = (Some(peer), false);
         }
     }
 

@@ -41,7 +41,7 @@ impl Link for WireLink {
         for (to, from) in into.iter_mut().zip(bytes.drain(..count)) {
             *to = from;
         }
-        Ok(Received { bytes: count, time_ns: None })
+        Ok(Received { bytes: count, ..NOTHING })
     }
 
     fn write(&mut self, frame: &[u8]) -> Result<(), HalError> {

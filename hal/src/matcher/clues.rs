@@ -120,6 +120,11 @@ impl Learnt {
         Choice::Exposure { index, certain }
     }
 
+    /// No picture was matched yet.
+    pub(super) fn is_new(&self) -> bool {
+        self.matches == 0
+    }
+
     /// A number stood for an exposure that never was: the camera may have started to count anew.
     pub(super) fn doubt_numbers(&mut self) {
         self.number_held = self.number_held.saturating_sub(1);

@@ -169,3 +169,19 @@ fn a_flood_is_bounded_and_every_piece_accounted_for() {
     }
     assert_eq!(out, 2000);
 }
+
+#[test]
+fn a_camera_that_is_late_from_the_start_is_matched_to_no_other_exposures() {
+    // Later than patience, later than several exposures, and all at once when the card is read at last.
+    for delay_ms in [40_000, 9_000] {
+        let mut shots = shots(40);
+        shots.iter_mut().for_each(|s| s.delay_ms = delay_ms);
+        let (matched, alone) = play(40, &shots, &[]);
+        assert!(all_right(&matched), "{delay_ms} ms: {matched:?}");
+        assert!(!alone.is_empty());
+    }
+    let mut burst = shots(30);
+    burst.iter_mut().for_each(|s| s.delay_ms = 61_000 - 2000 * u64::from(s.of));
+    let (matched, alone) = play(30, &burst, &[]);
+    assert!(all_right(&matched) && !alone.is_empty(), "{matched:?}");
+}

@@ -1,5 +1,6 @@
 //! Frames over a link: what a simulator, a test or the vehicle driver needs to talk MAVLink, signing included.
 
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use super::{Encoder, Frame, FrameCounters, Framer, MessageData, Refusal, Signer};
@@ -30,6 +31,7 @@ pub struct Channel<L: Link> {
     encoder: Encoder,
     signer: Signer,
     received_ns: Option<u64>,
+    peer: Option<SocketAddr>,
     counters: ChannelCounters,
 }
 
@@ -42,6 +44,7 @@ impl<L: Link> Channel<L> {
             encoder: Encoder::new(system, component),
             signer,
             received_ns: None,
+            peer: None,
             counters: ChannelCounters::default(),
         }
     }
@@ -88,6 +91,11 @@ impl<L: Link> Channel<L> {
         self.received_ns
     }
 
+    /// Who sent what was read last, on links where anybody may.
+    pub fn peer(&self) -> Option<SocketAddr> {
+        self.peer
+    }
+
     /// Reads what the link has, waiting `timeout` at most; true when something came. Then call [`Channel::next_frame`]
     /// until it returns `None`.
     ///
@@ -96,7 +104,7 @@ impl<L: Link> Channel<L> {
     pub fn fill(&mut self, timeout: Duration) -> Result<bool, L::Error> {
         let received = self.link.read(self.framer.space(), timeout)?;
         self.framer.filled(received.bytes);
-        self.received_ns = received.time_ns;
+        (self.received_ns, self.peer) = (received.time_ns, received.peer);
         Ok(received.bytes > 0)
     }
 

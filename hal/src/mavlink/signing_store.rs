@@ -1,10 +1,10 @@
 //! The signing key from its file, and the time stamp kept beside it: signing time stamps must never go back, also over a
 //! restart on a computer without a battery-backed clock.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use config::disk::Disk;
 use config::link::{LinkSettings, Signing};
 
 use super::signing::{Signer, SigningMode, timestamp_of_unix_us};
@@ -61,13 +61,20 @@ fn read_key(path: &Path) -> Result<[u8; 32], HalError> {
 }
 
 impl SigningStore {
+    /// The newest time stamp that can be read. Damage never keeps an aircraft on the ground: with what is lost the reserve of
+    /// two writes is skipped, so that no time stamp is used again.
     fn read(&self) -> Result<u64, HalError> {
-        let wrong = |why: String| HalError::Signing { path: self.path.clone(), why };
-        match std::fs::read_to_string(&self.path) {
-            Ok(text) => text.trim().parse().map_err(|_| wrong("not a time stamp; delete it to start afresh".into())),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(0),
-            Err(e) => Err(wrong(e.to_string())),
-        }
+        let read = |path: &Path| {
+            let text = std::fs::read_to_string(path).map_err(|e| e.to_string())?;
+            // 48 bits on the wire.
+            let stamp = text.trim().parse().ok().filter(|stamp: &u64| stamp >> 48 == 0);
+            stamp.ok_or_else(|| format!("{}: not a time stamp", path.display()))
+        };
+        let wrong = |e: std::io::Error| HalError::Signing { path: self.path.clone(), why: e.to_string() };
+        let newest = Disk::default().newest(&self.path, read).map_err(wrong)?;
+        newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));
+        let skipped = if newest.damaged.is_empty() { 0 } else { 2 * RESERVE };
+        Ok(newest.found.unwrap_or(0).saturating_add(skipped))
     }
 
     /// Writes the time stamp when the reserve is used up.
@@ -79,15 +86,8 @@ impl SigningStore {
             return Ok(());
         }
         let stamp = signer.timestamp() + RESERVE;
-        let folder = self.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let write = || -> std::io::Result<()> {
-            let mut file = tempfile::NamedTempFile::new_in(folder)?;
-            writeln!(file, "{stamp}")?;
-            file.as_file().sync_all()?;
-            file.persist(&self.path)?;
-            Ok(())
-        };
-        write().map_err(|e| HalError::Signing { path: self.path.clone(), why: e.to_string() })?;
+        let written = Disk::default().replace_keeping(&self.path, |out| writeln!(out, "{stamp}"));
+        written.map_err(|e| HalError::Signing { path: self.path.clone(), why: e.to_string() })?;
         self.stored = stamp;
         Ok(())
     }
@@ -109,6 +109,20 @@ mod tests {
         let (first, _) = open(&settings(&key)).expect("opens");
         let (second, _) = open(&settings(&key)).expect("opens");
         assert!(second.timestamp() >= first.timestamp() + RESERVE);
+    }
+
+    #[test]
+    fn a_damaged_time_stamp_is_set_aside_and_none_is_used_again() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let key = folder.path().join("key");
+        std::fs::write(&key, [7; 32]).expect("written");
+        open(&settings(&key)).expect("opens");
+        let (last, _) = open(&settings(&key)).expect("opens");
+        let stamp = folder.path().join("key.timestamp");
+        std::fs::write(&stamp, b"\xff\xfe").expect("damaged");
+        let (again, _) = open(&settings(&key)).expect("a damaged file does not keep it from opening");
+        assert!(again.timestamp() > last.timestamp());
+        assert_eq!(std::fs::read(folder.path().join("key.damaged-1.timestamp")).expect("set aside"), b"\xff\xfe");
     }
 
     #[test]

@@ -8,7 +8,7 @@ use glam::{DQuat, DVec3};
 
 use super::*;
 use crate::sim::aircraft::angle_between;
-use crate::sim::listener::accompany;
+use crate::sim::companion::accompany;
 use crate::sim::reference::Lens;
 use crate::sim::world::WorldSettings;
 

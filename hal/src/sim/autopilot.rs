@@ -11,16 +11,16 @@ use config::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::aircraft::Flight;
-use super::dice::{About, bits, strikes};
 use super::faulty_link::FaultyLink;
 use super::messages;
+use super::random::{About, bits, strikes};
 use super::track::Sample;
 use crate::error::HalError;
 use crate::link::Reconnecting;
 use crate::mavlink::channel::{Channel, ChannelCounters};
 use crate::mavlink::dialect::{
-    ATTITUDE_QUATERNION_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_RAW_INT_DATA,
-    HEARTBEAT_DATA, SIM_STATE_DATA, SYSTEM_TIME_DATA, TIMESYNC_DATA,
+    ATTITUDE_QUATERNION_DATA, EXTENDED_SYS_STATE_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA,
+    GPS_RAW_INT_DATA, HEARTBEAT_DATA, MavLandedState, SIM_STATE_DATA, SYSTEM_TIME_DATA, TIMESYNC_DATA,
 };
 use crate::mavlink::signing::timestamp_of_unix_us;
 use crate::mavlink::{MessageData, Signer, SigningMode};
@@ -31,9 +31,14 @@ mod requests;
 
 pub use announce::Announcing;
 
+/// No message's id: somebody else's heartbeat, when that fault acts.
+const FORGED_HEARTBEAT: u32 = u32::MAX;
+const STREAM_COUNT: usize = 10;
 /// Message ids and rates of an ArduPilot with its streams set for a companion, Hz.
-const STREAMS: [(u32, f64); 8] = [
+const STREAMS: [(u32, f64); STREAM_COUNT] = [
     (HEARTBEAT_DATA::ID, 1.0),
+    (EXTENDED_SYS_STATE_DATA::ID, 1.0),
+    (FORGED_HEARTBEAT, 2.0),
     (SYSTEM_TIME_DATA::ID, 2.0),
     (TIMESYNC_DATA::ID, 0.1),
     (GPS_RAW_INT_DATA::ID, 5.0),
@@ -64,6 +69,8 @@ pub struct AutopilotSettings {
     pub announcing: Announcing,
     /// Signs with this key and requires signatures.
     pub signing_key: Option<[u8; 32]>,
+    /// It is switched off after the flight without having disarmed.
+    pub stays_armed: bool,
     /// Seed of the faults.
     pub seed: u64,
     /// The faults at the start.
@@ -81,6 +88,7 @@ impl Default for AutopilotSettings {
             truth_hz: 0.0,
             announcing: Announcing::default(),
             signing_key: None,
+            stays_armed: false,
             seed: 0,
             faults: FaultSettings::default(),
         }
@@ -101,7 +109,7 @@ pub struct Autopilot<L: Link<Error = HalError> = Reconnecting> {
     flight: Flight,
     frame: EnuFrame,
     faults: FaultSettings,
-    streams: [Stream; 8],
+    streams: [Stream; STREAM_COUNT],
     unix_start_us: u64,
     /// Simulation time of take-off.
     takeoff_s: Option<f64>,
@@ -199,6 +207,10 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
     /// # Errors
     /// The link's.
     pub fn land(&mut self, now_s: f64) -> Result<(), HalError> {
+        if self.settings.stays_armed {
+            self.streams.iter_mut().for_each(|stream| stream.period_s = None);
+            return Ok(());
+        }
         self.landed = true;
         self.prepare_line(now_s);
         self.say(HEARTBEAT_DATA::ID, 0, now_s)
@@ -310,6 +322,17 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
                 let wall = timestamp_of_unix_us(self.unix_us(now_s));
                 self.channel.signer_mut().advance_to(wall);
                 self.channel.send(&announce::heartbeat(self.settings.announcing, !self.landed))
+            }
+            EXTENDED_SYS_STATE_DATA::ID => {
+                let landed_state = if self.landed || self.takeoff_s.is_none() {
+                    MavLandedState::MAV_LANDED_STATE_ON_GROUND
+                } else {
+                    MavLandedState::MAV_LANDED_STATE_IN_AIR
+                };
+                self.channel.send(&EXTENDED_SYS_STATE_DATA { landed_state, ..Default::default() })
+            }
+            FORGED_HEARTBEAT if self.acting(now_s).forged_disarm >= 0.5 => {
+                self.channel.send(&announce::heartbeat(self.settings.announcing, false))
             }
             SYSTEM_TIME_DATA::ID => {
                 let lost = self.acting(now_s).unix_time_lost >= 0.5;

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use config::error::{Error, ErrorKind};
+
 use crate::error::HalError;
 
 /// One line each: what, where, how to mend.
@@ -40,4 +42,15 @@ pub enum SimError {
         /// What is wrong and what would be right.
         why: String,
     },
+}
+
+impl Error for SimError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Link(e) => Error::kind(e),
+            Self::Folder { source, .. } => Error::kind(source),
+            Self::Settings { .. } => ErrorKind::Input,
+            Self::Picture { .. } | Self::CameraStopped { .. } => ErrorKind::Failed,
+        }
+    }
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use config::faults::FaultSettings;
 
-use super::dice::{About, bits, strikes};
+use super::random::{About, bits, strikes};
 use crate::error::HalError;
 use crate::link::Reconnecting;
 use crate::traits::{Link, Received};
@@ -28,7 +28,7 @@ pub struct FaultyLink<L = Reconnecting> {
     link: L,
     seed: u64,
     acting: FaultSettings,
-    /// Frames seen per message id: the key of the dice.
+    /// Frames seen per message id: the key of the random.
     ordinals: HashMap<u32, u64>,
     done: LineFaults,
 }

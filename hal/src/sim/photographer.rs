@@ -1,20 +1,20 @@
 //! The simulated camera: makes pictures ahead of time on a thread of its own and lets each file appear in the camera
 //! folder when it is due, whole (written under another name, then renamed), or spoiled as told.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 
+use config::disk::Disk;
 use config::faults::FaultSettings;
 use image::codecs::jpeg::JpegEncoder;
 use image::{ExtendedColorType, RgbImage};
 
 use super::aircraft::Exposure;
-use super::dice::{About, strikes};
 use super::error::SimError;
+use super::random::{About, strikes};
 
 /// Pictures made ahead of their time.
 const AHEAD: usize = 3;
@@ -217,12 +217,8 @@ fn copy_name(name: &str) -> String {
 
 /// Writes a file so that a reader of its folder sees it whole or not at all.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SimError> {
-    let failed = |source| SimError::Folder { path: path.into(), source };
-    let folder = path.parent().unwrap_or(Path::new("."));
-    let mut file = tempfile::Builder::new().prefix(".").suffix(".part").tempfile_in(folder).map_err(failed)?;
-    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(failed)?;
-    file.persist(path).map_err(|e| failed(e.error))?;
-    Ok(())
+    let written = Disk::default().replace(path, |out| out.write_all(bytes));
+    written.map_err(|e| SimError::Folder { path: path.into(), source: e.into() })
 }
 
 /// A picture as a JPEG file of good quality.

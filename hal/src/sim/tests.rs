@@ -32,9 +32,9 @@ pub(super) fn quick() -> SimSettings {
     }
 }
 
-/// What a listener heard.
+/// What a companion heard.
 #[derive(Default)]
-pub(super) struct Heard {
+pub(super) struct Handled {
     pub counts: BTreeMap<u32, usize>,
     pub boot_ms: Vec<u32>,
     pub positions: Vec<GLOBAL_POSITION_INT_DATA>,
@@ -49,14 +49,14 @@ pub(super) struct Heard {
     pub wrong_key: u64,
 }
 
-/// Runs a simulation with a listener that speaks once (so that the flight starts) and may send more by `speak`.
+/// Runs a simulation with a companion that speaks once (so that the flight starts) and may send more by `speak`.
 pub(super) fn fly_and_listen(
     settings: SimSettings,
     folder: &Path,
     reference: Option<&Path>,
     signer: Signer,
     speak: impl FnOnce(&mut Channel<SerialLink>),
-) -> (SessionReport, Heard) {
+) -> (SessionReport, Handled) {
     let (tell, told) = channel();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
@@ -69,7 +69,7 @@ pub(super) fn fly_and_listen(
         let mut line = Channel::new(SerialLink::open(&path, 921_600).expect("opens"), 1, 191, signer);
         line.send(&HEARTBEAT_DATA::default()).expect("sent");
         speak(&mut line);
-        let mut heard = Heard::default();
+        let mut heard = Handled::default();
         let begun = Instant::now();
         while !running.is_finished() && begun.elapsed() < Duration::from_secs(60) {
             if !line.fill(Duration::from_millis(20)).unwrap_or(false) {

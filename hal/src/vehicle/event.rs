@@ -17,7 +17,7 @@ pub enum Event {
     /// An exposure was announced.
     Trigger(Trigger),
     /// A picture with its pose.
-    Frame(Frame),
+    Posed(PosedPicture),
     /// A picture or an exposure that will not become a frame.
     Unmatched(Unmatched),
     /// The autopilot is silent, or the link is closed; it is being reopened.
@@ -56,7 +56,7 @@ pub struct CameraPose {
 
 /// A picture with its pose.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Frame {
+pub struct PosedPicture {
     /// Counter of the exposure's announcement.
     pub sequence: u32,
     /// Mid-exposure on the companion's clock, ns.
@@ -65,6 +65,8 @@ pub struct Frame {
     pub pose: CameraPose,
     /// Speed at the exposure, m/s.
     pub speed_m_s: f32,
+    /// How sure it is that the picture is this exposure's, 0 … 1; 1 when they were matched in flight.
+    pub confidence: f32,
     /// The picture, as it came; see [`Picture::load`] for undistorted pixels.
     pub picture: Picture,
 }

@@ -1,23 +1,44 @@
-//! Exposures on their way to frames: their poses are looked up as soon as the track reaches past them, their pictures when
-//! they come.
+//! Exposures on their way to posed pictures: their poses are looked up as soon as the track reaches past them and kept for the
+//! whole flight, their pictures when they come. What found no partner in flight is compared once more at its end.
 
-use heapless::Deque;
+use std::collections::VecDeque;
+use std::path::PathBuf;
 
-use super::{CameraPose, Event, Frame, Unmatched, UnmatchedReason, Vehicle};
+use super::{CameraPose, Event, PosedPicture, Unmatched, UnmatchedReason, Vehicle};
 use crate::camera::{Picture, exif_pose};
 use crate::error::Error;
 use crate::error::{ErrorKind, HalError};
+use crate::matcher::reconcile::reconcile;
 use crate::matcher::{Outcome, Reason};
 use crate::pose::{BodyPose, PoseError};
 use crate::traits::{Camera, Clock, Link, PictureClues, PoseSource};
 use crate::trigger::{Trigger, TriggerKind};
 
-/// Exposures whose pose is kept: more than the matcher keeps waiting.
-const EXPOSURES: usize = 96;
+/// Exposures of one flight that are kept with their pose, and pictures put aside: an hour at one a second.
+const EXPOSURES: usize = 4096;
+const PUT_ASIDE: usize = 4096;
+/// Poses are found within seconds: only so many of the newest exposures can still be without.
+const UNPOSED: usize = 128;
 /// A pose that is still in the future of the track after this is taken from what there is, ns.
 const POSE_PATIENCE_NS: u64 = 1_000_000_000;
 /// Uncertainty of a free-running picture's time, s.
 const FREE_RUNNING_SIGMA_NS: u64 = 50_000_000;
+/// In flight what was put aside is compared this often, and believed only when it is all but certain.
+const RECONCILE_EVERY_NS: u64 = 10_000_000_000;
+const CERTAIN: f32 = 0.999;
+/// Late pictures and their like are handed out while at most so many events wait.
+const EVENTS_WAITING: usize = 64;
+
+/// What an exposure waits for.
+#[derive(Clone, Copy, PartialEq)]
+enum Partner {
+    /// Its picture.
+    Awaited,
+    /// Nothing: pictures of this camera are posed by their own time.
+    Unneeded,
+    /// Nothing: this was its picture.
+    Found(PictureClues),
+}
 
 #[derive(Clone, Copy)]
 struct Exposure {
@@ -26,35 +47,96 @@ struct Exposure {
     mid_boot_ns: u64,
     heard_ns: u64,
     pose: Option<Result<BodyPose, PoseError>>,
+    partner: Partner,
 }
 
-/// The exposures whose pose is sought or known.
-#[derive(Default)]
-pub(super) struct Exposures {
-    ring: Deque<Exposure, EXPOSURES>,
-}
-
-impl Exposures {
-    pub(super) fn push(&mut self, trigger: Trigger, mid_boot_ns: u64, heard_ns: u64) {
-        if self.ring.is_full() {
-            self.ring.pop_front();
-        }
-        let _ = self.ring.push_back(Exposure { trigger, mid_boot_ns, heard_ns, pose: None });
-    }
-
-    fn find(&self, trigger: &Trigger) -> Option<&Exposure> {
-        let same = |e: &&Exposure| e.trigger.sequence == trigger.sequence && e.trigger.boot_ns == trigger.boot_ns;
-        self.ring.iter().rev().find(same)
-    }
+/// A picture that found no exposure yet.
+struct PutAside {
+    clues: PictureClues,
+    picture: Picture,
+    reason: Reason,
 }
 
 /// A picture whose exposure is known and whose pose may not be yet.
-pub(super) struct PendingFrame {
+pub(super) struct PendingPicture {
     trigger: Trigger,
     picture: Picture,
+    confidence: f32,
 }
 
-fn path_of(picture: &Picture) -> Option<std::path::PathBuf> {
+/// The exposures of the flight, and the pictures that found none.
+pub(super) struct Exposures {
+    all: VecDeque<Exposure>,
+    aside: Vec<PutAside>,
+    next_reconcile_ns: u64,
+    /// Decided at the end of the flight and not reported yet.
+    closing: VecDeque<Event>,
+}
+
+impl Default for Exposures {
+    fn default() -> Self {
+        Self {
+            all: VecDeque::with_capacity(EXPOSURES),
+            aside: Vec::with_capacity(PUT_ASIDE),
+            next_reconcile_ns: 0,
+            closing: VecDeque::new(),
+        }
+    }
+}
+
+impl Exposures {
+    /// One more exposure; the oldest one without a picture when there is no more room.
+    pub(super) fn push(
+        &mut self,
+        trigger: Trigger,
+        mid_boot_ns: u64,
+        heard_ns: u64,
+        awaits_picture: bool,
+    ) -> Option<Trigger> {
+        let evicted = if self.all.len() >= EXPOSURES { self.all.pop_front() } else { None };
+        let partner = if awaits_picture { Partner::Awaited } else { Partner::Unneeded };
+        self.all.push_back(Exposure { trigger, mid_boot_ns, heard_ns, pose: None, partner });
+        evicted.filter(|e| e.partner == Partner::Awaited).map(|e| e.trigger)
+    }
+
+    fn find(&mut self, trigger: &Trigger) -> Option<&mut Exposure> {
+        let same = |e: &&mut Exposure| e.trigger.sequence == trigger.sequence && e.trigger.boot_ns == trigger.boot_ns;
+        self.all.iter_mut().rev().find(same)
+    }
+
+    fn awaited(&self) -> impl Iterator<Item = &Exposure> {
+        self.all.iter().filter(|e| e.partner == Partner::Awaited)
+    }
+
+    /// Whether pictures are still to come.
+    pub(super) fn await_pictures(&self) -> bool {
+        self.awaited().next().is_some()
+    }
+
+    /// Everything is decided and reported.
+    pub(super) fn is_closed(&self) -> bool {
+        self.closing.is_empty()
+    }
+
+    /// Pictures put aside and their exposures, all with all: those paired with at least this confidence.
+    fn reconcile(&mut self, least: f32) -> Vec<(Trigger, PutAside, f32)> {
+        let triggers: Vec<Trigger> = self.awaited().map(|e| e.trigger).collect();
+        let clues: Vec<PictureClues> = self.aside.iter().map(|a| a.clues).collect();
+        let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
+        let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
+        let mut pairs = reconcile(&triggers, &clues, &known);
+        pairs.retain(|p| p.confidence >= least);
+        // From the back, so that indices stay valid.
+        pairs.sort_unstable_by_key(|p| std::cmp::Reverse(p.picture));
+        let take =
+            |p: &crate::matcher::reconcile::Pairing| (triggers[p.exposure], self.aside.remove(p.picture), p.confidence);
+        let mut taken: Vec<(Trigger, PutAside, f32)> = pairs.iter().map(take).collect();
+        taken.sort_by_key(|t| t.0.boot_ns);
+        taken
+    }
+}
+
+fn path_of(picture: &Picture) -> Option<PathBuf> {
     match picture {
         Picture::Path(path) => Some(path.clone()),
         Picture::Jpeg(_) | Picture::Rgb(_) => None,
@@ -73,15 +155,16 @@ where
             match self.camera.next_picture(now_ns) {
                 Ok(Some((clues, picture))) => {
                     self.counters.pictures += 1;
+                    self.pictureless = 0;
                     if self.is_free_running() {
                         self.take_free_running(&clues, picture, now_ns);
                     } else if let Some(outcome) = self.matcher.push_picture(clues, picture) {
-                        self.take_outcome(outcome, now_ns);
+                        self.take_outcome(outcome);
                     }
                 }
                 Ok(None) => break,
                 Err(e) => {
-                    self.service.complain(&e, now_ns);
+                    self.service.warn_seldom(&e, now_ns);
                     if e.kind() != ErrorKind::Device {
                         break; // the camera, not a picture
                     }
@@ -109,14 +192,14 @@ where
         let sequence = u32::try_from(self.counters.pictures).unwrap_or(u32::MAX);
         let trigger =
             Trigger { sequence, boot_ns, time_ns, sigma_ns: FREE_RUNNING_SIGMA_NS, kind: TriggerKind::Command };
-        self.exposures.push(trigger, boot_ns, now_ns);
-        self.wait_for_pose(trigger, picture);
+        self.exposures.push(trigger, boot_ns, now_ns, false);
+        self.wait_for_pose(PendingPicture { trigger, picture, confidence: 1.0 });
     }
 
     /// Everything that can be decided now.
     pub(super) fn settle(&mut self, now_ns: u64) {
         self.take_triggers(now_ns);
-        for exposure in self.exposures.ring.iter_mut().filter(|e| e.pose.is_none()) {
+        for exposure in self.exposures.all.iter_mut().rev().take(UNPOSED).filter(|e| e.pose.is_none()) {
             exposure.pose = match self.autopilot.pose_at(exposure.mid_boot_ns) {
                 Err(PoseError::NotYet | PoseError::Empty) => {
                     let given_up = now_ns.saturating_sub(exposure.heard_ns) > POSE_PATIENCE_NS;
@@ -126,9 +209,28 @@ where
             };
         }
         while let Some(outcome) = self.matcher.poll(now_ns) {
-            self.take_outcome(outcome, now_ns);
+            self.take_outcome(outcome);
+        }
+        if now_ns >= self.exposures.next_reconcile_ns {
+            self.exposures.next_reconcile_ns = now_ns.saturating_add(RECONCILE_EVERY_NS);
+            if !self.exposures.aside.is_empty() && self.exposures.await_pictures() {
+                self.reconcile(CERTAIN);
+            }
         }
         self.hand_out(false);
+    }
+
+    /// Compares what was put aside all with all, and takes what pairs with at least this confidence.
+    fn reconcile(&mut self, least: f32) {
+        for (trigger, aside, confidence) in self.exposures.reconcile(least) {
+            tracing::debug!(
+                "exposure {} and {} paired late, {confidence:.2}",
+                trigger.sequence,
+                aside.picture.name().display()
+            );
+            self.counters.pictures_reconciled += 1;
+            self.found(trigger, aside.picture, aside.clues, confidence);
+        }
     }
 
     /// The flight is over: decides everything that waits, so that no picture and no exposure goes unaccounted for.
@@ -137,61 +239,100 @@ where
             return;
         }
         let now_ns = self.now_ns();
+        // Whatever the camera has by now.
+        for _ in 0..PUT_ASIDE {
+            let before = self.counters.pictures;
+            self.take_pictures(now_ns);
+            if self.counters.pictures == before {
+                break;
+            }
+        }
         self.settle(now_ns);
-        for exposure in self.exposures.ring.iter_mut().filter(|e| e.pose.is_none()) {
+        for exposure in self.exposures.all.iter_mut().filter(|e| e.pose.is_none()) {
             exposure.pose = Some(self.autopilot.pose_near(exposure.mid_boot_ns));
         }
         while let Some(outcome) = self.matcher.flush() {
-            self.take_outcome(outcome, now_ns);
+            self.take_outcome(outcome);
         }
-        self.hand_out(true);
+        self.reconcile(0.0);
+        for PutAside { clues, picture, reason } in std::mem::take(&mut self.exposures.aside) {
+            let taken =
+                |e: &Exposure| matches!(e.partner, Partner::Found(c) if c.number.is_some() && c.number == clues.number);
+            if self.exposures.all.iter().any(taken) {
+                self.counters.picture_duplicates += 1;
+                self.unmatched(None, path_of(&picture), UnmatchedReason::Matching(Reason::Duplicate));
+            } else {
+                self.picture_alone(&picture, reason);
+            }
+        }
+        let missing: Vec<u32> = self.exposures.awaited().map(|e| e.trigger.sequence).collect();
+        for sequence in missing {
+            self.counters.triggers_unmatched += 1;
+            self.unmatched(Some(sequence), None, UnmatchedReason::Matching(Reason::NoPicture));
+        }
         self.finished = true;
     }
 
-    pub(super) fn take_outcome(&mut self, outcome: Outcome<Picture>, _now_ns: u64) {
+    pub(super) fn take_outcome(&mut self, outcome: Outcome<Picture>) {
         match outcome {
-            Outcome::Matched { trigger, picture, late } => {
+            Outcome::Matched { trigger, picture, clues, late } => {
                 self.counters.pictures_late += u64::from(late);
-                self.pictureless = 0;
-                self.wait_for_pose(trigger, picture);
+                self.found(trigger, picture, clues, 1.0);
             }
-            Outcome::Picture { picture, reason, .. } => {
-                if reason == Reason::Duplicate {
-                    self.counters.picture_duplicates += 1;
-                } else if self.use_exif(None, &picture) {
-                    return;
-                } else {
-                    self.counters.pictures_unmatched += 1;
-                }
-                self.unmatched(None, path_of(&picture), UnmatchedReason::Matching(reason));
+            Outcome::Picture { picture, reason: Reason::Duplicate, .. } => {
+                self.counters.picture_duplicates += 1;
+                self.unmatched(None, path_of(&picture), UnmatchedReason::Matching(Reason::Duplicate));
             }
-            Outcome::Trigger { trigger, reason } => {
-                self.counters.triggers_unmatched += 1;
-                self.pictureless = self.pictureless.saturating_add(1);
-                self.unmatched(Some(trigger.sequence), None, UnmatchedReason::Matching(reason));
+            // Its exposure may be among those whose picture has not come; pixels in memory cannot wait for that.
+            Outcome::Picture { picture: picture @ Picture::Path(_), clues, reason }
+                if self.exposures.await_pictures() && self.exposures.aside.len() < PUT_ASIDE =>
+            {
+                self.exposures.aside.push(PutAside { clues, picture, reason });
             }
+            Outcome::Picture { picture, reason, .. } => self.picture_alone(&picture, reason),
+            // Its picture may still come: it counts as missing at the end of the flight.
+            Outcome::Trigger { .. } => self.pictureless = self.pictureless.saturating_add(1),
         }
     }
 
-    fn wait_for_pose(&mut self, trigger: Trigger, picture: Picture) {
-        if self.pending.is_full()
+    /// A picture and its exposure have found each other.
+    fn found(&mut self, trigger: Trigger, picture: Picture, clues: PictureClues, confidence: f32) {
+        if let Some(exposure) = self.exposures.find(&trigger) {
+            exposure.partner = Partner::Found(clues);
+        }
+        self.wait_for_pose(PendingPicture { trigger, picture, confidence });
+    }
+
+    fn picture_alone(&mut self, picture: &Picture, reason: Reason) {
+        if !self.use_exif(None, picture) {
+            self.counters.pictures_unmatched += 1;
+            self.unmatched(None, path_of(picture), UnmatchedReason::Matching(reason));
+        }
+    }
+
+    fn wait_for_pose(&mut self, waiting: PendingPicture) {
+        if self.pending.len() >= EXPOSURES
             && let Some(oldest) = self.pending.pop_front()
         {
             self.counters.poseless += 1;
             self.unmatched(Some(oldest.trigger.sequence), path_of(&oldest.picture), UnmatchedReason::Overflow);
         }
-        let _ = self.pending.push_back(PendingFrame { trigger, picture });
+        self.pending.push_back(waiting);
     }
 
-    fn hand_out(&mut self, at_end: bool) {
+    /// Pictures whose pose is known become events, while somebody fetches them.
+    pub(super) fn hand_out(&mut self, at_end: bool) {
         for _ in 0..self.pending.len() {
+            if self.events.len() >= EVENTS_WAITING {
+                return;
+            }
             let Some(waiting) = self.pending.pop_front() else { break };
             let (pose, mid_boot_ns) = match self.exposures.find(&waiting.trigger) {
                 Some(exposure) => (exposure.pose, exposure.mid_boot_ns),
                 None => (Some(Err(PoseError::TooOld)), waiting.trigger.boot_ns),
             };
             match pose {
-                None if !at_end => drop(self.pending.push_back(waiting)),
+                None if !at_end => self.pending.push_back(waiting),
                 None => self.give_up(waiting, UnmatchedReason::Pose(PoseError::NotYet)),
                 Some(Err(e)) => self.give_up(waiting, UnmatchedReason::Pose(e)),
                 Some(Ok(body)) if self.mount.is_tilted(&body) => {
@@ -202,32 +343,35 @@ where
                 Some(Ok(body)) => {
                     let sigma_s = waiting.trigger.sigma_ns as f64 * 1e-9;
                     match self.mount.camera_pose(&body, sigma_s) {
-                        Some(pose) => {
-                            let speed = body.velocity.length() as f32;
-                            self.frame(&waiting.trigger, mid_boot_ns, pose, speed, waiting.picture);
-                        }
+                        Some(pose) => self.posed(waiting, mid_boot_ns, pose, body.velocity.length() as f32),
                         None => self.give_up(waiting, UnmatchedReason::NoGimbal),
                     }
                 }
             }
         }
+        while self.events.len() < EVENTS_WAITING {
+            let Some(event) = self.exposures.closing.pop_front() else { break };
+            self.emit(event);
+        }
     }
 
-    fn frame(&mut self, trigger: &Trigger, mid_boot_ns: u64, pose: CameraPose, speed_m_s: f32, picture: Picture) {
+    fn posed(&mut self, waiting: PendingPicture, mid_boot_ns: u64, pose: CameraPose, speed_m_s: f32) {
+        let PendingPicture { trigger, picture, confidence } = waiting;
         let time_ns = self.autopilot.clock().to_companion_ns(mid_boot_ns).unwrap_or(trigger.time_ns);
         self.counters.posed_frames += 1;
         self.service.captured(trigger.sequence, mid_boot_ns, &pose, self.settings.origin);
-        self.emit(Event::Frame(Frame { sequence: trigger.sequence, time_ns, pose, speed_m_s, picture }));
+        let sequence = trigger.sequence;
+        self.emit(Event::Posed(PosedPicture { sequence, time_ns, pose, speed_m_s, confidence, picture }));
     }
 
-    fn give_up(&mut self, waiting: PendingFrame, reason: UnmatchedReason) {
+    fn give_up(&mut self, waiting: PendingPicture, reason: UnmatchedReason) {
         if !self.use_exif(Some(&waiting.trigger), &waiting.picture) {
             self.counters.poseless += 1;
             self.unmatched(Some(waiting.trigger.sequence), path_of(&waiting.picture), reason);
         }
     }
 
-    /// A frame with the picture's own pose, when the mission allows it and the picture has one.
+    /// A picture with its own pose, when the mission allows it and it has one.
     fn use_exif(&mut self, trigger: Option<&Trigger>, picture: &Picture) -> bool {
         let Picture::Path(path) = picture else { return false };
         if !self.settings.link.exif_pose {
@@ -236,18 +380,27 @@ where
         let Some(pose) = exif_pose(path).and_then(|e| self.mount.exif_pose(&e)) else { return false };
         self.counters.exif_poses += 1;
         self.counters.posed_frames += 1;
-        let frame = Frame {
+        self.report(Event::Posed(PosedPicture {
             sequence: trigger.map_or(0, |t| t.sequence),
             time_ns: trigger.map_or(self.now_ns(), |t| t.time_ns),
             pose,
             speed_m_s: 0.0,
+            confidence: 1.0,
             picture: picture.clone(),
-        };
-        self.emit(Event::Frame(frame));
+        }));
         true
     }
 
-    fn unmatched(&mut self, sequence: Option<u32>, picture: Option<std::path::PathBuf>, reason: UnmatchedReason) {
-        self.emit(Event::Unmatched(Unmatched { sequence, picture, reason }));
+    fn unmatched(&mut self, sequence: Option<u32>, picture: Option<PathBuf>, reason: UnmatchedReason) {
+        self.report(Event::Unmatched(Unmatched { sequence, picture, reason }));
+    }
+
+    /// At once, or, when the end of the flight decides many things at the same time, as there is room.
+    fn report(&mut self, event: Event) {
+        if self.events.len() < EVENTS_WAITING {
+            self.emit(event);
+        } else {
+            self.exposures.closing.push_back(event);
+        }
     }
 }

@@ -5,12 +5,12 @@ use config::geodesy::{EnuFrame, Geodetic};
 
 use super::{CameraPose, Vehicle, VehicleSettings};
 use crate::camera::Picture;
-use crate::component::{CameraComponent, CameraInfo, Reply, Request};
 use crate::error::HalError;
 use crate::mavlink::channel::Channel;
 use crate::mavlink::dialect::{CAMERA_IMAGE_CAPTURED_DATA, MavBool, MavSeverity, MavType, STATUSTEXT_DATA};
 use crate::mavlink::signing_store::{self, SigningStore};
 use crate::mavlink::{MessageData, Signer};
+use crate::mavlink_camera::{CameraInfo, MavlinkCamera, Reply, Request};
 use crate::traits::{Camera, Clock, Link};
 
 /// Heartbeats at 1 Hz, as the protocol asks.
@@ -19,18 +19,18 @@ const HEARTBEAT_NS: u64 = 1_000_000_000;
 const FAST_TIMESYNC_NS: u64 = 250_000_000;
 const SLOW_TIMESYNC_NS: u64 = 1_000_000_000;
 const FAST_REQUESTS: u32 = 16;
-/// The same complaint is logged this often at most.
-const COMPLAIN_EVERY_NS: u64 = 5_000_000_000;
+/// Warnings about pictures and the camera are logged this often at most.
+const WARN_EVERY_NS: u64 = 5_000_000_000;
 
 /// Timers and answers.
 pub(super) struct Service {
-    pub(super) component: CameraComponent,
+    pub(super) component: MavlinkCamera,
     store: Option<SigningStore>,
     announces: bool,
     next_heartbeat_ns: u64,
     next_timesync_ns: u64,
     requests: u32,
-    next_complaint_ns: u64,
+    next_warning_ns: u64,
     /// Restarts and steps of the autopilot's clock that were answered with fast TIMESYNC requests.
     clock_events: u64,
     last_free_ns: Option<u64>,
@@ -41,13 +41,13 @@ impl Service {
         let (signer, store) = signing_store::open(&settings.link)?;
         let info = CameraInfo { width: settings.lens.width, height: settings.lens.height };
         let service = Self {
-            component: CameraComponent::new(info, settings.link.own_component),
+            component: MavlinkCamera::new(info, settings.link.own_component),
             store,
             announces: settings.link.act_as_camera,
             next_heartbeat_ns: 0,
             next_timesync_ns: 0,
             requests: 0,
-            next_complaint_ns: 0,
+            next_warning_ns: 0,
             clock_events: 0,
             last_free_ns: None,
         };
@@ -55,23 +55,23 @@ impl Service {
     }
 
     /// Says in the log that a picture or the camera failed, not more often than is useful.
-    pub(super) fn complain(&mut self, error: &HalError, now_ns: u64) {
-        if self.may_complain(now_ns) {
+    pub(super) fn warn_seldom(&mut self, error: &HalError, now_ns: u64) {
+        if self.may_warn(now_ns) {
             tracing::warn!("{error}");
         }
     }
 
     /// Whether the last complaint is long enough ago for another one.
-    pub(super) fn may_complain(&mut self, now_ns: u64) -> bool {
-        let may = now_ns >= self.next_complaint_ns;
+    pub(super) fn may_warn(&mut self, now_ns: u64) -> bool {
+        let may = now_ns >= self.next_warning_ns;
         if may {
-            self.next_complaint_ns = now_ns + COMPLAIN_EVERY_NS;
+            self.next_warning_ns = now_ns + WARN_EVERY_NS;
         }
         may
     }
 
     /// An exposure was announced or asked for: the next free-running picture is due whatever its time.
-    pub(super) fn hurry(&mut self) {
+    pub(super) fn make_due(&mut self) {
         self.last_free_ns = None;
     }
 
@@ -149,7 +149,7 @@ where
         if let Some(store) = &mut self.service.store
             && let Err(e) = store.keep(self.channel.signer_mut())
         {
-            self.service.complain(&e, now_ns);
+            self.service.warn_seldom(&e, now_ns);
         }
         if now_ns >= self.service.next_heartbeat_ns {
             self.service.next_heartbeat_ns = now_ns + HEARTBEAT_NS;

@@ -2,6 +2,7 @@
 
 use std::time::SystemTime;
 
+use config::failsafe::FailsafeSettings;
 use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission, MountSettings};
@@ -20,6 +21,8 @@ pub struct VehicleSettings {
     pub system_id: u8,
     /// Link, signing and matching.
     pub link: LinkSettings,
+    /// From when on position, camera and battery count as poor.
+    pub failsafe: FailsafeSettings,
     /// Where pictures come from; `None` = poses and triggers only.
     pub camera: Option<CameraSource>,
     /// A continued flight: pictures of the folder that were written after this are taken as well, with the pose in their own
@@ -44,6 +47,7 @@ impl VehicleSettings {
             patient: false,
             system_id: aircraft.system_id,
             link: mission.link.clone(),
+            failsafe: mission.failsafe,
             camera: Some(aircraft.camera.clone()),
             pictures_since: None,
             lens: mission.camera,

@@ -1,4 +1,4 @@
-//! A vehicle whose autopilot is silent and whose pictures bring their own pose.
+//! A vehicle whose autopilot is silent and whose pictures bring their own pose; and one that a stranger talks to.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,9 +12,9 @@ use exif::{Field, In, Rational, Tag, Value};
 
 use super::*;
 use crate::camera::FolderCamera;
-use crate::link::{LinkAddress, WireLink};
-use crate::mavlink::Framer;
-use crate::mavlink::dialect::STATUSTEXT_DATA;
+use crate::link::{LinkAddress, UdpLink, WireLink};
+use crate::mavlink::dialect::{GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, STATUSTEXT_DATA};
+use crate::mavlink::{Encoder, Framer};
 use crate::time::ManualClock;
 use crate::traits::Received;
 
@@ -36,6 +36,7 @@ fn settings() -> VehicleSettings {
         patient: false,
         system_id: 1,
         link: LinkSettings::default(),
+        failsafe: config::failsafe::FailsafeSettings::default(),
         camera: None,
         pictures_since: None,
         lens: LENS,
@@ -98,11 +99,11 @@ fn ten_seconds(vehicle: &mut Still, clock: &ManualClock) -> Vec<Event> {
 }
 
 fn still(folder: &Path, since: Option<SystemTime>, clock: &Arc<ManualClock>) -> Still {
-    overheard(folder, since, clock).0
+    with_line(folder, since, clock).0
 }
 
 /// As [`still`], with the other end of its line.
-fn overheard(folder: &Path, since: Option<SystemTime>, clock: &Arc<ManualClock>) -> (Still, WireLink) {
+fn with_line(folder: &Path, since: Option<SystemTime>, clock: &Arc<ManualClock>) -> (Still, WireLink) {
     let camera = FolderCamera::open_since(folder, since).expect("the folder").on_simulated_clock();
     let (line, other) = WireLink::pair();
     (Vehicle::new(line, camera, clock.clone(), &settings()).expect("a vehicle"), other)
@@ -131,7 +132,7 @@ fn a_continued_flight_takes_pictures_it_missed_with_the_pose_in_their_own_data()
     let clock = Arc::new(ManualClock::default());
     let mut vehicle = still(folder.path(), Some(stopped), &clock);
     let events = ten_seconds(&mut vehicle, &clock);
-    let [Event::Frame(frame)] = &events[..] else { panic!("{events:?}") };
+    let [Event::Posed(frame)] = &events[..] else { panic!("{events:?}") };
     assert!((frame.pose.position - glam::DVec3::new(12.0, -7.0, 40.0)).length() < 0.01, "{}", frame.pose.position);
     assert!((frame.pose.rotation * glam::DVec3::Z + glam::DVec3::Z).length() < 1e-6, "looks straight down");
     let up = frame.pose.rotation * -glam::DVec3::Y;
@@ -153,7 +154,7 @@ fn three_black_pictures_are_counted_refused_and_raise_the_flag() {
     let events = ten_seconds(&mut vehicle, &clock);
     let mut flags = Vec::new();
     for event in &events {
-        let Event::Frame(frame) = event else { panic!("{event:?}") };
+        let Event::Posed(frame) = event else { panic!("{event:?}") };
         let loaded = vehicle.load(frame);
         assert_eq!(loaded.is_ok(), flags.len() == 3, "{loaded:?}");
         flags.push(vehicle.flags().pictures_poor);
@@ -166,7 +167,7 @@ fn three_black_pictures_are_counted_refused_and_raise_the_flag() {
 fn bursts_of_black_and_overexposed_pictures_are_told_once_each_with_their_count() {
     let folder = tempfile::tempdir().expect("a folder");
     let clock = Arc::new(ManualClock::default());
-    let (mut vehicle, mut line) = overheard(folder.path(), None, &clock);
+    let (mut vehicle, mut line) = with_line(folder.path(), None, &clock);
     // Four black ones, a good one, three overexposed ones, a good one.
     let lights = [0, 0, 0, 0, 2, 255, 255, 255, 2];
     for (k, light) in lights.into_iter().enumerate() {
@@ -176,7 +177,7 @@ fn bursts_of_black_and_overexposed_pictures_are_told_once_each_with_their_count(
     let _ = texts(&mut line);
     let mut said = Vec::new();
     for (k, event) in events.iter().enumerate() {
-        let Event::Frame(frame) = event else { panic!("{event:?}") };
+        let Event::Posed(frame) = event else { panic!("{event:?}") };
         // A picture every two seconds: a burst lasts longer than complaints are kept back.
         clock.set(20_000_000_000 + k as u64 * 2_000_000_000);
         assert_eq!(vehicle.load(frame).is_ok(), lights[k] == 2);
@@ -191,4 +192,66 @@ fn bursts_of_black_and_overexposed_pictures_are_told_once_each_with_their_count(
     ];
     assert_eq!(said, expected.map(|(k, severity, text)| (k, severity, text.to_owned())));
     assert_eq!((vehicle.counters().pictures_black, vehicle.counters().pictures_overexposed), (4, 3));
+}
+
+/// A sender with the autopilot's ids.
+struct Speaker {
+    socket: std::net::UdpSocket,
+    encoder: Encoder,
+}
+
+impl Speaker {
+    fn to(port: std::net::SocketAddr) -> Self {
+        let socket = std::net::UdpSocket::bind("127.0.0.1:0").expect("a port");
+        socket.connect(port).expect("connects");
+        Self { socket, encoder: Encoder::new(1, 1) }
+    }
+
+    fn heartbeat(&mut self, armed: bool) {
+        let mut message =
+            HEARTBEAT_DATA { autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA, ..HEARTBEAT_DATA::default() };
+        message.base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, armed);
+        self.socket.send(self.encoder.encode(&message, None)).expect("sent");
+    }
+
+    fn position(&mut self, time_boot_ms: u32, height_m: i32, speed_m_s: i16) {
+        let (lat, lon) = ((ORIGIN.lat_deg * 1e7) as i32, (ORIGIN.lon_deg * 1e7) as i32);
+        let (relative_alt, vx) = (height_m * 1000, speed_m_s * 100);
+        let message = GLOBAL_POSITION_INT_DATA { time_boot_ms, lat, lon, relative_alt, vx, ..Default::default() };
+        self.socket.send(self.encoder.encode(&message, None)).expect("sent");
+    }
+}
+
+#[test]
+fn a_stranger_who_says_disarmed_from_another_address_ends_no_flight() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let clock = Arc::new(ManualClock::default());
+    let link = UdpLink::listen("127.0.0.1:0").expect("a port");
+    let port = link.local().expect("its port");
+    let camera = FolderCamera::open(folder.path()).expect("the folder").on_simulated_clock();
+    let mut vehicle = Vehicle::new(link, camera, clock.clone(), &settings()).expect("a vehicle");
+    let (mut autopilot, mut stranger) = (Speaker::to(port), Speaker::to(port));
+    let mut landed_s = None;
+    for tenth in 0..700u32 {
+        clock.set(u64::from(tenth) * 100_000_000);
+        let s = tenth / 10;
+        let aloft = (5..50).contains(&s);
+        autopilot.position(30_000 + tenth * 100, if aloft { 40 } else { 0 }, if aloft { 5 } else { 0 });
+        if tenth % 10 == 0 {
+            autopilot.heartbeat((2..52).contains(&s));
+            if s >= 15 {
+                // As often as the autopilot, and with a position to match.
+                stranger.heartbeat(false);
+                stranger.position(30_000 + tenth * 100 + 50, 0, 0);
+            }
+        }
+        for _ in 0..8 {
+            let _ = vehicle.poll(Duration::ZERO).expect("a socket does not fail");
+        }
+        if vehicle.autopilot().landed {
+            landed_s.get_or_insert(s);
+        }
+    }
+    assert_eq!(landed_s, Some(55), "three seconds after the autopilot itself has said so");
+    assert_eq!(vehicle.counters().refused_peers, 2 * 55);
 }

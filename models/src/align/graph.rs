@@ -17,8 +17,8 @@ pub struct PointMap {
 }
 
 impl PointMap {
-    /// The point and confidence at `at` when both are sound.
-    pub fn sound(&self, at: usize) -> Option<(Vec3, f32)> {
+    /// The point and confidence at `at` when both are finite and the confidence is positive.
+    pub fn get(&self, at: usize) -> Option<(Vec3, f32)> {
         let (p, c) = (self.points[at], self.confidence[at]);
         (p.is_finite() && c.is_finite() && c > 0.0).then_some((p, c))
     }

@@ -43,9 +43,6 @@ pub enum Undetermined {
     /// All on one line or in one spot.
     #[error("alignment points lie on a line or in one spot: rotation or scale is not determined")]
     Degenerate,
-    /// Point-to-plane on surfaces that let the points slide.
-    #[error("surface normals leave a direction free (one plane, a cylinder, a sphere): use point-to-point")]
-    Sliding,
     /// The iteration left all bounds.
     #[error("ICP diverged: no correspondences within the gate")]
     Diverged,

@@ -1,113 +1,64 @@
-//! From a description on disc to frames: the two layouts that data sets come in, and decoding with bounds.
+//! From a description on disc to frames: the layouts that data sets come in.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use config::geodesy::Geodetic;
-use image::{ImageReader, Limits, RgbImage};
-
-use super::{DatasetError, DatasetFrame};
-use crate::camera::{Intrinsics, Pose, View};
-use crate::formats::transforms::{Focal, Lens};
-use crate::formats::{FormatError, colmap, transforms};
-
-/// Largest picture edge taken; 16384² × 3 bytes is also what the decoder may allocate at most.
-const MAX_EDGE: u32 = 16_384;
-
-/// A JPEG or PNG as RGB, refused before decoding when it is too large.
-pub fn decode(path: &Path) -> Result<RgbImage, DatasetError> {
-    let bad = |what: String| DatasetError::Picture { path: path.to_owned(), what };
-    let mut reader = open_picture(path)?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_EDGE);
-    limits.max_image_height = Some(MAX_EDGE);
-    limits.max_alloc = Some(u64::from(MAX_EDGE) * u64::from(MAX_EDGE) * 3);
-    reader.limits(limits);
-    reader.decode().map(|i| i.into_rgb8()).map_err(|e| bad(format!("cannot be decoded ({e}); copy it again")))
-}
-
-fn open_picture(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, DatasetError> {
-    let bad = |e: std::io::Error| DatasetError::Picture {
-        path: path.to_owned(),
-        what: format!("cannot be opened ({e}); is the picture folder complete?"),
-    };
-    ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(bad)
-}
+use super::error::DatasetError;
+use super::frame::DatasetFrame;
+use crate::camera::View;
+use crate::formats::reconstruction::Reconstruction;
+use crate::formats::{colmap, opensfm, transforms};
+use crate::picture::{Orientation, dimensions};
 
 pub(super) fn file_name(path: &str) -> &str {
     path.rsplit(['/', '\\']).next().unwrap_or(path)
 }
 
-fn intrinsics(lens: &Lens, path: &Path) -> Result<Intrinsics, DatasetError> {
-    let (width, height) = match lens.size {
-        Some(size) => size,
-        None => open_picture(path)?
-            .into_dimensions()
-            .map_err(|e| DatasetError::Picture { path: path.to_owned(), what: format!("cannot be decoded ({e})") })?,
-    };
-    let (fx, fy) = match lens.focal {
-        Focal::Pixels(x, y) => (x, y),
-        Focal::FieldOfView(angle) => {
-            let f = 0.5 * f64::from(width) / (0.5 * angle).tan();
-            (f, f)
-        }
-    };
-    let (cx, cy) = lens.centre.unwrap_or((0.5 * f64::from(width), 0.5 * f64::from(height)));
-    Ok(Intrinsics { width, height, fx: fx as f32, fy: fy as f32, cx: cx as f32, cy: cy as f32 })
-}
-
-/// Frames and origin of `transforms.json`.
-pub(super) fn from_transforms(root: &Path) -> Result<(Vec<DatasetFrame>, Option<Geodetic>), DatasetError> {
-    let file = transforms::read(&root.join("transforms.json"))?;
-    let listed = file.frames.into_iter().map(|f| (f.file_path, f.lens, f.pose)).collect();
-    Ok((frames(root, listed)?, file.origin))
-}
-
-/// Frames of `sparse/0`.
-pub(super) fn from_colmap(root: &Path) -> Result<Vec<DatasetFrame>, DatasetError> {
-    let folder = root.join("sparse/0");
-    let cameras = colmap::read_cameras(&folder.join("cameras.bin"))?;
-    let path = folder.join("images.bin");
-    let mut images = colmap::read_images(&path)?;
-    // COLMAP writes them in order of registration; names follow the capture.
-    images.sort_by(|a, b| a.name.cmp(&b.name));
-    let mut listed = Vec::with_capacity(images.len());
-    for image in images {
-        let Some(lens) = cameras.get(&image.camera_id) else {
-            let what =
-                format!("image {:?} refers to camera {}, which cameras.bin does not have", image.name, image.camera_id);
-            return Err(FormatError::invalid(&path, what).into());
-        };
-        listed.push((format!("images/{}", image.name), *lens, image.pose));
+/// The description in `root`: nerfstudio's, COLMAP's, OpenSfM's; `None` where there is none.
+pub(super) fn reconstruction(root: &Path) -> Result<Option<Reconstruction>, DatasetError> {
+    let file = root.join("transforms.json");
+    if file.is_file() {
+        return Ok(Some(transforms::read(&file)?));
     }
-    frames(root, listed)
+    if let Some(model) = colmap::Model::find(root) {
+        return Ok(Some(model.read()?));
+    }
+    Ok(opensfm::find(root).map(|file| opensfm::read(&file)).transpose()?)
 }
 
-fn frames(root: &Path, listed: Vec<(String, Lens, Pose)>) -> Result<Vec<DatasetFrame>, DatasetError> {
+/// Where the picture that a description calls `name` lies: as written, or in the folder of pictures; Blender data sets
+/// leave the extension out.
+fn locate(root: &Path, name: &str) -> PathBuf {
+    let places = [root.join(name), root.join("images").join(name), root.join("images").join(file_name(name))];
+    let there = |path: &PathBuf| match path.extension() {
+        Some(_) => path.is_file().then(|| path.clone()),
+        None => ["png", "jpg", "jpeg"].iter().map(|e| path.with_extension(e)).find(|p| p.is_file()),
+    };
+    places.iter().find_map(there).unwrap_or_else(|| places[0].clone())
+}
+
+pub(super) fn frames(root: &Path, found: Reconstruction) -> Result<Vec<DatasetFrame>, DatasetError> {
     let mut seen = HashMap::new();
-    for (path, ..) in &listed {
-        *seen.entry(file_name(path).to_owned()).or_insert(0usize) += 1;
+    for shot in &found.shots {
+        *seen.entry(file_name(&shot.path).to_owned()).or_insert(0usize) += 1;
     }
     let unique = seen.values().all(|&n| n == 1);
-    listed
+    found
+        .shots
         .into_iter()
-        .map(|(file_path, lens, pose)| {
-            let mut path = root.join(&file_path);
-            // Blender data sets leave the extension out.
-            if path.extension().is_none() {
-                path =
-                    ["png", "jpg", "jpeg"].iter().map(|e| path.with_extension(e)).find(|p| p.is_file()).unwrap_or(path);
-            }
+        .map(|shot| {
+            let path = locate(root, &shot.path);
             let full = path.strip_prefix(root).unwrap_or(&path).to_string_lossy().into_owned();
             let name = if unique { file_name(&full).to_owned() } else { full };
-            let intrinsics = intrinsics(&lens, &path)?;
-            Ok(DatasetFrame {
-                name,
-                path,
-                view: View { intrinsics, pose },
-                distortion: lens.distortion,
-                telemetry: None,
-            })
+            let size = match shot.lens.size {
+                Some(size) => size,
+                None => dimensions(&path)?,
+            };
+            let view = View { intrinsics: shot.lens.intrinsics(size), pose: shot.pose };
+            // The programs that write reconstructions do not obey orientation tags; their lenses are of the stored picture.
+            let orientation = Orientation::default();
+            let distortion = shot.lens.distortion;
+            Ok(DatasetFrame { name, path, view, distortion, orientation, prior: None, telemetry: None })
         })
         .collect()
 }

@@ -1,150 +1,146 @@
-//! COLMAP's binary sparse model (`cameras.bin`, `images.bin`, `points3D.bin`): OpenCV axes, world-to-camera
-//! rotations stored w x y z. Keypoints are skipped; points keep which images saw them.
+//! COLMAP's sparse model, binary and text: OpenCV axes, world-to-camera rotations stored w x y z. Keypoints are skipped,
+//! points come one at a time with the images that saw them: a model of any size needs the memory of what is kept of it.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use glam::{DQuat, DVec3};
+use super::FormatError;
+use super::reconstruction::{LensDescription, Reconstruction, Shot};
 
-use super::transforms::{Focal, Lens};
-use super::{Bytes, FormatError, read_bounded};
-use crate::camera::Pose;
-use config::lens::Distortion;
+mod binary;
+mod entries;
+mod origin;
+mod text;
+mod write;
 
-/// A gigabyte holds some ten million points with their tracks, more than a board has room for.
-const LIMIT: u64 = 1 << 30;
+pub use entries::{ColmapImage, ColmapPoint};
+pub use write::{Point, write};
 
-/// A registered image.
-#[derive(Clone, Debug)]
-pub struct ColmapImage {
-    /// COLMAP's own number.
-    pub id: u32,
-    /// Path below the image folder.
-    pub name: String,
-    /// Number of the camera in `cameras.bin`.
-    pub camera_id: u32,
-    /// Camera (OpenCV axes) → world.
-    pub pose: Pose,
+/// Where a model lies below the folder of a data set, the usual place first.
+const PLACES: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."];
+/// The files of a model.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Model {
+    folder: PathBuf,
+    extension: &'static str,
 }
 
-/// A triangulated point.
-#[derive(Clone, Debug)]
-pub struct ColmapPoint {
-    /// World position.
-    pub position: DVec3,
-    /// Mean colour of its keypoints.
-    pub color: [u8; 3],
-    /// Mean reprojection error, pixels.
-    pub error: f64,
-    /// Numbers of the images that saw it, sorted, each once; may be empty when the writer left tracks out.
-    pub images: Vec<u32>,
-}
+impl Model {
+    /// The model that belongs to the data set in `root`: in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap/sparse` or
+    /// `root` itself, binary before text.
+    pub fn find(root: &Path) -> Option<Self> {
+        PLACES.iter().find_map(|place| {
+            let folder = if *place == "." { root.to_owned() } else { root.join(place) };
+            let there = |e: &&str| ["cameras", "images"].iter().all(|f| folder.join(f).with_extension(e).is_file());
+            let extension = ["bin", "txt"].into_iter().find(there)?;
+            Some(Self { folder, extension })
+        })
+    }
 
-/// Lenses by camera number.
-pub fn read_cameras(path: &Path) -> Result<HashMap<u32, Lens>, FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let mut r = Bytes::new(path, &bytes);
-    let n = r.count(24, "the number of cameras")?;
-    let mut cameras = HashMap::with_capacity(n);
-    for _ in 0..n {
-        let id = r.u32("a camera")?;
-        let model = r.u32("a camera")?;
-        let (w, h) = (r.u64("a camera")?, r.u64("a camera")?);
-        if !(1..=65_536).contains(&w) || !(1..=65_536).contains(&h) {
-            return Err(FormatError::invalid(path, format!("camera {id} has the size {w} x {h}")));
+    /// One of its files: `cameras`, `images` or `points3D`.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.folder.join(name).with_extension(self.extension)
+    }
+
+    /// Lenses by camera number.
+    ///
+    /// # Errors
+    /// The file cannot be read, is damaged, or holds a camera model that is not supported.
+    pub fn cameras(&self) -> Result<HashMap<u32, LensDescription>, FormatError> {
+        match self.extension {
+            "bin" => binary::cameras(&self.file("cameras")),
+            _ => text::cameras(&self.file("cameras")),
         }
-        let mut p = [0.0; 8];
-        // COLMAP's camera model numbers and their parameters (src/colmap/sensor/models.h).
-        let parameters = match model {
-            0 => 3,
-            1 | 2 => 4,
-            3 => 5,
-            4 => 8,
-            _ => {
+    }
+
+    /// Registered images in file order.
+    ///
+    /// # Errors
+    /// The file cannot be read or is damaged.
+    pub fn images(&self) -> Result<Vec<ColmapImage>, FormatError> {
+        match self.extension {
+            "bin" => binary::images(&self.file("images")),
+            _ => text::images(&self.file("images")),
+        }
+    }
+
+    /// Gives every point at a finite position to `take`, in file order; returns how many were not at one. None when the
+    /// model has no file of points.
+    ///
+    /// # Errors
+    /// The file cannot be read or is damaged.
+    pub fn points(&self, take: &mut dyn FnMut(ColmapPoint)) -> Result<u64, FormatError> {
+        let path = self.file("points3D");
+        match self.extension {
+            _ if !path.is_file() => Ok(0),
+            "bin" => read_points(&path, take),
+            _ => finite(take, |finite| text::points(&path, finite)),
+        }
+    }
+
+    /// Poses and lenses, sorted by name: COLMAP writes images in order of registration, names follow the capture.
+    ///
+    /// # Errors
+    /// As [`Model::cameras`] and [`Model::images`]; an image refers to a camera that is not there.
+    pub fn read(&self) -> Result<Reconstruction, FormatError> {
+        let cameras = self.cameras()?;
+        let mut images = self.images()?;
+        images.sort_by(|a, b| a.name.cmp(&b.name));
+        let mut shots = Vec::with_capacity(images.len());
+        for image in images {
+            let Some(lens) = cameras.get(&image.camera_id) else {
                 let what = format!(
-                    "camera {id} has COLMAP model number {model}; supported are SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV: run colmap image_undistorter"
+                    "image {:?} refers to camera {}, which {} does not have",
+                    image.name,
+                    image.camera_id,
+                    self.file("cameras").display()
                 );
-                return Err(FormatError::invalid(path, what));
-            }
-        };
-        for v in &mut p[..parameters] {
-            *v = r.f64("a camera")?;
+                return Err(FormatError::invalid(&self.file("images"), what));
+            };
+            shots.push(Shot { path: image.name, lens: *lens, pose: image.pose });
         }
-        let mut distortion = Distortion::default();
-        let (fx, fy, cx, cy) =
-            if model == 1 || model == 4 { (p[0], p[1], p[2], p[3]) } else { (p[0], p[0], p[1], p[2]) };
-        match model {
-            2 => distortion.k1 = p[3],
-            3 => (distortion.k1, distortion.k2) = (p[3], p[4]),
-            4 => (distortion.k1, distortion.k2, distortion.p1, distortion.p2) = (p[4], p[5], p[6], p[7]),
-            _ => {}
-        }
-        if p.iter().any(|v| !v.is_finite()) || fx <= 0.0 || fy <= 0.0 {
-            return Err(FormatError::invalid(
-                path,
-                format!("camera {id} has impossible parameters {:?}", &p[..parameters]),
-            ));
-        }
-        let lens =
-            Lens { size: Some((w as u32, h as u32)), focal: Focal::Pixels(fx, fy), centre: Some((cx, cy)), distortion };
-        cameras.insert(id, lens);
+        Ok(Reconstruction { shots, origin: origin::read(&self.folder)? })
     }
-    Ok(cameras)
 }
 
-/// Registered images in file order.
+/// Lenses of a binary `cameras.bin`.
+///
+/// # Errors
+/// See [`Model::cameras`].
+pub fn read_cameras(path: &Path) -> Result<HashMap<u32, LensDescription>, FormatError> {
+    binary::cameras(path)
+}
+
+/// Images of a binary `images.bin`.
+///
+/// # Errors
+/// See [`Model::images`].
 pub fn read_images(path: &Path) -> Result<Vec<ColmapImage>, FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let mut r = Bytes::new(path, &bytes);
-    let n = r.count(73, "the number of images")?;
-    let mut images = Vec::with_capacity(n);
-    for _ in 0..n {
-        let id = r.u32("an image")?;
-        let mut v = [0.0; 7];
-        for x in &mut v {
-            *x = r.f64("an image")?;
-        }
-        let camera_id = r.u32("an image")?;
-        let name = r.c_str("an image's name")?.to_owned();
-        let keypoints = r.count(24, "an image's number of keypoints")?;
-        r.take(keypoints * 24, "an image's keypoints")?;
-        let q = DQuat::from_xyzw(v[1], v[2], v[3], v[0]);
-        let t = DVec3::new(v[4], v[5], v[6]);
-        if !t.is_finite() || !(1e-6..1e6).contains(&q.length()) {
-            return Err(FormatError::invalid(path, format!("image {name:?} has no usable pose")));
-        }
-        let rotation = q.normalize().conjugate();
-        images.push(ColmapImage { id, name, camera_id, pose: Pose { rotation, center: -(rotation * t) } });
-    }
-    Ok(images)
+    binary::images(path)
 }
 
-/// Coloured points with the images that saw them. Points at a position that is not finite are dropped; their
-/// number is the second value.
-pub fn read_points(path: &Path) -> Result<(Vec<ColmapPoint>, usize), FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let mut r = Bytes::new(path, &bytes);
-    let n = r.count(51, "the number of points")?;
-    let mut points = Vec::with_capacity(n);
+/// Points of a binary `points3D.bin`, one by one; returns how many were left out.
+///
+/// # Errors
+/// See [`Model::points`].
+pub fn read_points(path: &Path, take: &mut dyn FnMut(ColmapPoint)) -> Result<u64, FormatError> {
+    finite(take, |finite| binary::points(path, finite))
+}
+
+/// Passes on points at finite positions, their images sorted and each once; counts the others.
+fn finite(
+    take: &mut dyn FnMut(ColmapPoint),
+    read: impl FnOnce(&mut dyn FnMut(ColmapPoint)) -> Result<(), FormatError>,
+) -> Result<u64, FormatError> {
     let mut dropped = 0;
-    for _ in 0..n {
-        r.u64("a point")?;
-        let position = DVec3::new(r.f64("a point")?, r.f64("a point")?, r.f64("a point")?);
-        let color = [r.u8("a point")?, r.u8("a point")?, r.u8("a point")?];
-        let error = r.f64("a point")?;
-        let track = r.count(8, "a point's track length")?;
-        let mut images = Vec::with_capacity(track);
-        for _ in 0..track {
-            images.push(r.u32("a point's track")?);
-            r.u32("a point's track")?;
-        }
-        images.sort_unstable();
-        images.dedup();
-        if position.is_finite() {
-            points.push(ColmapPoint { position, color, error, images });
-        } else {
+    read(&mut |mut point| {
+        if !point.position.is_finite() {
             dropped += 1;
+            return;
         }
-    }
-    Ok((points, dropped))
+        point.images.sort_unstable();
+        point.images.dedup();
+        take(point);
+    })?;
+    Ok(dropped)
 }

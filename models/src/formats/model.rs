@@ -13,6 +13,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Write};
 use std::path::Path;
 
+use config::disk::Disk;
 use config::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
@@ -26,6 +27,8 @@ const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 100 bytes per view; this is room for 100,000 of them and long names.
 const MAX_HEADER: u64 = 64 << 20;
+/// Corners of a region taken, far more than any field has.
+const MAX_CORNERS: usize = 4096;
 /// Floats moved at a time.
 const CHUNK: usize = 16 << 10;
 
@@ -44,7 +47,8 @@ pub struct ModelHeader {
     pub views: Vec<(String, View)>,
     /// Optimiser steps taken so far, over all continuations.
     pub steps: u64,
-    /// Seconds of training so far, over all continuations.
+    /// Seconds of training, in files of earlier versions; 0 since: the same seed gives the same bytes, but not the same
+    /// seconds, which are in `run.json`.
     pub train_seconds: f64,
     /// Seed of the random choices.
     pub seed: u64,
@@ -52,8 +56,47 @@ pub struct ModelHeader {
     pub finished: bool,
 }
 
-/// Writes a model, atomically.
+/// Writes a model whole or not at all.
+///
+/// # Errors
+/// [`FormatError::Invalid`] for a cloud whose columns differ in length and for a header that [`read`] would refuse, else the
+/// operating system's.
 pub fn write(path: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result<(), FormatError> {
+    let content = content(path, header, cloud)?;
+    write_atomic(path, content)
+}
+
+/// As [`write()`], through `disk`, and the checkpoint before stays as the older of two generations.
+///
+/// # Errors
+/// Those of [`write()`].
+pub fn write_checkpoint(
+    disk: &Disk,
+    path: &Path,
+    header: &ModelHeader,
+    cloud: &GaussianCloud,
+) -> Result<(), FormatError> {
+    let content = content(path, header, cloud)?;
+    disk.replace_keeping(path, content).map_err(|e| FormatError::disk(path, e))
+}
+
+/// The newest of the two generations that [`write_checkpoint`] keeps and that can be read. What cannot be read is set aside
+/// and named in a warning.
+///
+/// # Errors
+/// A damaged file that cannot be set aside: the folder is not writable.
+pub fn read_checkpoint(disk: &Disk, path: &Path) -> Result<Option<(ModelHeader, GaussianCloud)>, FormatError> {
+    let newest = disk.newest(path, read).map_err(|e| FormatError::io(path, "setting aside", e))?;
+    newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));
+    Ok(newest.found)
+}
+
+/// What fills the file of a model.
+fn content<'a>(
+    path: &Path,
+    header: &ModelHeader,
+    cloud: &'a GaussianCloud,
+) -> Result<impl FnOnce(&mut dyn Write) -> std::io::Result<()> + use<'a>, FormatError> {
     let n = cloud.len();
     let columns_fit = cloud.log_scales.len() == n
         && cloud.rotations.len() == n
@@ -63,13 +106,14 @@ pub fn write(path: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result
     if !columns_fit {
         return Err(FormatError::invalid(path, "not written: the cloud's columns differ in length"));
     }
+    check_header(path, header)?;
     let head = postcard::to_allocvec(header)
         .map_err(|e| FormatError::invalid(path, format!("not written: its header cannot be encoded ({e})")))?;
     if head.len() as u64 > MAX_HEADER {
         let (size, limit) = (head.len() as u64, MAX_HEADER);
         return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size, limit });
     }
-    write_atomic(path, |file| {
+    Ok(move |file: &mut dyn Write| {
         let mut out = Hashing { inner: file, hasher: blake3::Hasher::new() };
         out.write_all(&MAGIC)?;
         out.write_all(&VERSION.to_le_bytes())?;
@@ -88,6 +132,9 @@ pub fn write(path: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result
 }
 
 /// Reads and verifies a model. Gaussians that hold a number that is not finite are dropped and their number logged.
+///
+/// # Errors
+/// As [`FormatError`] says; nothing is allocated that the file's own size and stated bounds do not cover.
 pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
     let mut opened = open(path)?;
     let header = read_header_of(path, &mut opened)?;
@@ -106,7 +153,7 @@ pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
         return Err(FormatError::Damaged { path: path.to_owned() });
     }
     let header = decode_header(path, &header)?;
-    let dropped = cloud.drop_unsound();
+    let dropped = cloud.drop_invalid();
     if dropped > 0 {
         tracing::warn!("{}: {dropped} Gaussians hold numbers that are not finite and were left out", path.display());
     }
@@ -114,6 +161,9 @@ pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
 }
 
 /// The header and the number of Gaussians alone, without the time to verify the columns: enough to list models.
+///
+/// # Errors
+/// As [`read`]; the checksum is not compared.
 pub fn read_header(path: &Path) -> Result<(ModelHeader, usize), FormatError> {
     let mut opened = open(path)?;
     let header = read_header_of(path, &mut opened)?;
@@ -177,7 +227,29 @@ fn read_header_of(path: &Path, opened: &mut Opened) -> Result<Vec<u8>, FormatErr
 }
 
 fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
-    postcard::from_bytes(bytes).map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))
+    let header: ModelHeader = postcard::from_bytes(bytes)
+        .map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))?;
+    check_header(path, &header)?;
+    Ok(header)
+}
+
+/// Refuses what a later stage would size a buffer by, or place something at: a model comes from another machine.
+fn check_header(path: &Path, header: &ModelHeader) -> Result<(), FormatError> {
+    let bad = |what: String| Err(FormatError::invalid(path, format!("{what}; a dgtr does not write such a model")));
+    if let Some((name, view)) = header.views.iter().find(|(_, view)| !view.is_usable()) {
+        let k = &view.intrinsics;
+        return bad(format!("its view {name:?} of {} x {} pixels has no usable camera or pose", k.width, k.height));
+    }
+    if header.region.len() > MAX_CORNERS || header.region.iter().flatten().any(|v| !v.is_finite()) {
+        return bad(format!("its region has {} corners, or one that is not a number", header.region.len()));
+    }
+    if header.origin.is_some_and(|o| !o.is_valid()) {
+        return bad("its origin is no place on the earth".to_owned());
+    }
+    if !header.train_seconds.is_finite() {
+        return bad("its training time is not a number".to_owned());
+    }
+    Ok(())
 }
 
 fn triples(flat: Vec<f32>) -> Vec<[f32; 3]> {
@@ -228,5 +300,14 @@ impl<T: Read> Read for Hashing<T> {
         let n = self.inner.read(bytes)?;
         self.hasher.update(&bytes[..n]);
         Ok(n)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_page_on_formats_states_this_version() {
+        let row = format!("| `.dgtr` model file | {} |", super::VERSION);
+        assert!(include_str!("../../FORMATS.md").contains(&row), "{row}");
     }
 }

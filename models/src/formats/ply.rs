@@ -2,7 +2,7 @@
 //! rest channel by channel (all red, all green, all blue), which is the transpose of [`GaussianCloud::sh`].
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use config::geodesy::Geodetic;
@@ -28,6 +28,9 @@ pub struct PlyModel {
 }
 
 /// Writes `cloud`, atomically, with its georeference as a comment.
+///
+/// # Errors
+/// The operating system's.
 pub fn write(path: &Path, cloud: &GaussianCloud, origin: Option<Geodetic>) -> Result<(), FormatError> {
     let d = sh_coefficients(cloud.sh_degree);
     let mut names: Vec<String> =
@@ -66,6 +69,9 @@ pub fn write(path: &Path, cloud: &GaussianCloud, origin: Option<Geodetic>) -> Re
 }
 
 /// Reads a 3DGS PLY (binary, little-endian; properties in any order, unknown ones skipped).
+///
+/// # Errors
+/// As [`FormatError`] says; what is allocated is bounded by the file's own size.
 pub fn read(path: &Path) -> Result<PlyModel, FormatError> {
     let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
@@ -73,10 +79,17 @@ pub fn read(path: &Path) -> Result<PlyModel, FormatError> {
     let header = read_header(path, &mut input)?;
     let find = |name: &str| header.properties.iter().find(|p| p.name == name).cloned();
     let need = |name: &str| {
-        find(name).ok_or_else(|| {
+        let property = find(name).ok_or_else(|| {
             let hint = if name.starts_with("f_dc") { " (a plain point cloud is not a Gaussian model)" } else { "" };
             FormatError::invalid(path, format!("has no vertex property {name:?}{hint}; give a 3DGS .ply"))
-        })
+        })?;
+        match property.kind {
+            // A byte for each number would make the cloud four times the file.
+            Kind::Other(_) => {
+                Err(FormatError::invalid(path, format!("vertex property {name:?} is no float or double")))
+            }
+            _ => Ok(property),
+        }
     };
     let rest = header.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
     let Some(degree) = (0..=3u8).find(|&d| 3 * (sh_coefficients(d) - 1) == rest) else {
@@ -110,7 +123,7 @@ pub fn read(path: &Path) -> Result<PlyModel, FormatError> {
         let v = &values;
         cloud.push([v[0], v[1], v[2]], [v[3], v[4], v[5]], [v[6], v[7], v[8], v[9]], v[10], &v[11..]);
     }
-    let dropped = cloud.drop_unsound();
+    let dropped = cloud.drop_invalid();
     Ok(PlyModel { cloud, origin: header.origin, dropped })
 }
 
@@ -156,7 +169,6 @@ impl Property {
         match self.kind {
             Kind::F32 => bytes.first_chunk().map_or(f32::NAN, |b| f32::from_le_bytes(*b)),
             Kind::F64 => bytes.first_chunk().map_or(f32::NAN, |b| f64::from_le_bytes(*b) as f32),
-            // An integer where a Gaussian's number belongs: the row is dropped and counted.
             Kind::Other(_) => f32::NAN,
         }
     }

@@ -21,6 +21,9 @@ const VERSION: u32 = 3;
 const HEADER_BYTES: usize = 16;
 /// Most Gaussians read, 640 MiB unpacked at SH degree 3: ten times the largest scene of the paper.
 const MAX_GAUSSIANS: u64 = 10_000_000;
+/// Gaussians that a file of any size may hold, 20 MiB with the buffers of reading; beyond them a file has at least a byte for
+/// each (real scenes: 9 to 20 bytes), so that a small file of zeros cannot claim the memory of a city.
+const FREE_GAUSSIANS: u64 = 1 << 16;
 /// Fractional bits of a coordinate where the scene allows it: 0.24 mm over ±2 km.
 const FRACTIONAL_BITS: u8 = 12;
 /// Greatest 24-bit coordinate.
@@ -83,9 +86,10 @@ pub fn write(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatError> {
 /// Reads an SPZ file.
 ///
 /// # Errors
-/// As [`FormatError`] says; nothing is allocated before the header was checked.
+/// As [`FormatError`] says; nothing is allocated before the header was checked against the file's size.
 pub fn read(path: &Path) -> Result<SpzModel, FormatError> {
     let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let mut input = GzDecoder::new(BufReader::new(file));
     let mut head = [0u8; HEADER_BYTES];
     input.read_exact(&mut head).map_err(|e| read_error(path, "its header", e))?;
@@ -100,9 +104,10 @@ pub fn read(path: &Path) -> Result<SpzModel, FormatError> {
     if degree > 3 || bits > 23 {
         return Err(FormatError::invalid(path, format!("has SH degree {degree} and {bits} fractional bits; damaged?")));
     }
-    if count > MAX_GAUSSIANS {
+    let limit = size.clamp(FREE_GAUSSIANS, MAX_GAUSSIANS);
+    if count > limit {
         let what = "its number of Gaussians";
-        return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit: MAX_GAUSSIANS });
+        return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
     }
     let (n, rest) = (count as usize, 3 * sh_coefficients(degree) - 3);
     let turn = if version == 2 { 3 } else { 4 };
@@ -145,7 +150,7 @@ pub fn read(path: &Path) -> Result<SpzModel, FormatError> {
             &sh,
         );
     }
-    let dropped = cloud.drop_unsound();
+    let dropped = cloud.drop_invalid();
     Ok(SpzModel { cloud, dropped })
 }
 

@@ -8,7 +8,7 @@ use config::geodesy::{EnuFrame, Geodetic};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::{FormatError, read_bounded};
-use crate::camera::{Pose, PoseSigma};
+use crate::camera::{Pose, PosePrior, PoseSigma};
 
 const LIMIT: u64 = 64 << 20;
 
@@ -17,18 +17,12 @@ const LIMIT: u64 = 64 << 20;
 pub struct Telemetry {
     /// GPS position as recorded.
     pub position: Geodetic,
-    /// Height above the take-off point, metres, where recorded.
-    pub relative_alt_m: Option<f64>,
     /// Yaw (clockwise from north), pitch, roll of the airframe, degrees, where recorded.
     pub flight_ypr_deg: Option<[f64; 3]>,
     /// Yaw (clockwise from north), pitch (−90 = straight down), roll of the camera, degrees.
     pub gimbal_ypr_deg: [f64; 3],
-    /// Exposure on the camera's own clock, nanoseconds since 1970 were it UTC; 0 where not recorded.
-    pub time_ns: u64,
     /// GPS and gimbal as a camera pose in the data set's ENU frame.
-    pub pose: Pose,
-    /// What such a pose is worth.
-    pub sigma: PoseSigma,
+    pub prior: PosePrior,
 }
 
 /// Standard deviations of consumer GPS and gimbal angles: twice the rms that the two surveys in the reference data
@@ -66,7 +60,7 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<HashMap<String, Tel
     let gimbal = [needed("gimbal_yaw_deg")?, needed("gimbal_pitch_deg")?, needed("gimbal_roll_deg")?];
     let flight = [column("flight_yaw_deg"), column("flight_pitch_deg"), column("flight_roll_deg")];
     let enu = [column("gps_e_m"), column("gps_n_m"), column("gps_u_m")];
-    let (rel_alt, timestamp) = (column("rel_alt_m"), column("timestamp"));
+    let timestamp = column("timestamp");
     let frame = origin.map(EnuFrame::new);
     let mut rows = HashMap::new();
     for (line, text) in lines {
@@ -94,7 +88,7 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<HashMap<String, Tel
                 _ => None,
             })
         };
-        let (Some([lat_deg, lon_deg, alt_m]), Some(gimbal_ypr_deg)) =
+        let (Some([lat_deg, lon_deg, alt_m]), Some([y, p, r])) =
             (three([Some(lat), Some(lon), Some(alt)])?, three(gimbal.map(Some))?)
         else {
             continue;
@@ -113,16 +107,12 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<HashMap<String, Tel
                 None => continue,
             },
         };
-        let [y, p, r] = gimbal_ypr_deg;
-        let row = Telemetry {
-            position,
-            relative_alt_m: number(rel_alt)?,
-            flight_ypr_deg: three(flight)?,
-            gimbal_ypr_deg,
+        let prior = PosePrior {
             time_ns: timestamp.and_then(|i| exif_time_ns(cells[i])).unwrap_or(0),
             pose: Pose { rotation: dji_rotation(y, p, r), center },
             sigma: TELEMETRY_SIGMA,
         };
+        let row = Telemetry { position, flight_ypr_deg: three(flight)?, gimbal_ypr_deg: [y, p, r], prior };
         rows.insert(cells[image].to_owned(), row);
     }
     Ok(rows)

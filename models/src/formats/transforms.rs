@@ -1,66 +1,24 @@
 //! nerfstudio / instant-ngp `transforms.json`: OpenGL camera-to-world matrices (x right, y up, the camera looks
-//! along −z), converted here and nowhere else to OpenCV axes.
+//! along −z), converted here and nowhere else to OpenCV axes. Lens fields stand once for all frames or in each; the
+//! camera model is the file's, or the frame's own.
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
+use config::lens::Distortion;
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
+use serde_json::{Value, json};
 
-use super::{FormatError, read_bounded};
+use super::reconstruction::{Focal, LensDescription, Reconstruction, Shot, check_count, origin, picture_size};
+use super::{FormatError, read_bounded, write_atomic};
 use crate::camera::Pose;
-use config::lens::Distortion;
 
 /// A hundred thousand frames at 2 KiB of JSON each.
 const LIMIT: u64 = 200 << 20;
-/// More pictures than one flight takes; bounds what later stages allocate per frame.
-const MAX_FRAMES: u64 = 100_000;
-
-/// The file, as far as this project needs it.
-#[derive(Clone, Debug)]
-pub struct Transforms {
-    /// Frames in file order.
-    pub frames: Vec<TransformsFrame>,
-    /// WGS-84 origin of the world frame, when the file tells it.
-    pub origin: Option<Geodetic>,
-}
-
-/// One picture of the file.
-#[derive(Clone, Debug)]
-pub struct TransformsFrame {
-    /// As written in the file.
-    pub file_path: String,
-    /// Lens at the size the file speaks of.
-    pub lens: Lens,
-    /// Camera (OpenCV axes) → world.
-    pub pose: Pose,
-}
-
-/// A lens whose picture size may have to be read from the picture.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Lens {
-    /// Width and height, where the file has them.
-    pub size: Option<(u32, u32)>,
-    /// Focal lengths in pixels, or the horizontal field of view in radians.
-    pub focal: Focal,
-    /// Principal point; `None` = the middle.
-    pub centre: Option<(f64, f64)>,
-    /// Brown–Conrady coefficients, all zero for a pinhole.
-    pub distortion: Distortion,
-}
-
-/// How the file states the focal length.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Focal {
-    /// fx, fy.
-    Pixels(f64, f64),
-    /// Horizontal field of view (`camera_angle_x` of Blender data sets).
-    FieldOfView(f64),
-}
-
 /// The lens fields, which the file may give once for all frames or for each.
-#[derive(Clone, Copy, Default, Deserialize)]
+#[derive(Clone, Default, Deserialize)]
 struct RawLens {
+    camera_model: Option<String>,
     fl_x: Option<f64>,
     fl_y: Option<f64>,
     cx: Option<f64>,
@@ -72,8 +30,13 @@ struct RawLens {
     k2: Option<f64>,
     k3: Option<f64>,
     k4: Option<f64>,
+    k5: Option<f64>,
+    k6: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
+    sx1: Option<f64>,
+    sy1: Option<f64>,
+    is_fisheye: Option<bool>,
 }
 
 #[derive(Deserialize)]
@@ -94,90 +57,145 @@ struct RawOrigin {
 #[derive(Deserialize)]
 struct RawFile {
     frames: Vec<RawFrame>,
-    camera_model: Option<String>,
     enu_origin_wgs84: Option<RawOrigin>,
     #[serde(flatten)]
     lens: RawLens,
 }
 
 /// Reads `transforms.json`.
-pub fn read(path: &Path) -> Result<Transforms, FormatError> {
+///
+/// # Errors
+/// The file cannot be read, is no such file, or says something impossible of a frame.
+pub fn read(path: &Path) -> Result<Reconstruction, FormatError> {
     let bytes = read_bounded(path, LIMIT)?;
     let raw: RawFile = serde_json::from_slice(&bytes)
         .map_err(|e| FormatError::invalid(path, format!("not a transforms.json of nerfstudio: {e}")))?;
-    if raw.frames.len() as u64 > MAX_FRAMES {
-        let size = raw.frames.len() as u64;
-        return Err(FormatError::TooLarge {
-            path: path.to_owned(),
-            what: "its number of frames",
-            size,
-            limit: MAX_FRAMES,
-        });
-    }
-    if let Some(model) = raw.camera_model.as_deref()
-        && !["PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "perspective"].contains(&model)
-    {
-        return Err(FormatError::invalid(
-            path,
-            format!("camera_model {model:?} is not supported; undistort the pictures to PINHOLE"),
-        ));
-    }
-    let origin = match raw.enu_origin_wgs84 {
-        None => None,
-        Some(o) => {
-            let o = Geodetic { lat_deg: o.lat, lon_deg: o.lon, alt_m: o.alt };
-            if !o.is_valid() {
-                return Err(FormatError::invalid(path, "enu_origin_wgs84 is not a position on the earth"));
-            }
-            Some(o)
-        }
-    };
-    let mut frames = Vec::with_capacity(raw.frames.len());
+    check_count(path, raw.frames.len() as u64)?;
+    let origin = raw.enu_origin_wgs84.map(|o| origin(path, "enu_origin_wgs84", o.lat, o.lon, o.alt)).transpose()?;
+    let mut shots = Vec::with_capacity(raw.frames.len());
     for frame in raw.frames {
         let bad = |what: String| FormatError::invalid(path, format!("frame {:?}: {what}", frame.file_path));
         let pose = opengl_to_pose(&frame.transform_matrix).map_err(|e| bad(e.to_owned()))?;
-        let lens = lens(&frame.lens, &raw.lens).map_err(|e| bad(e.to_owned()))?;
-        frames.push(TransformsFrame { file_path: frame.file_path, lens, pose });
+        let lens = lens(&frame.lens, &raw.lens).map_err(bad)?;
+        shots.push(Shot { path: frame.file_path, lens, pose });
     }
-    Ok(Transforms { frames, origin })
+    Ok(Reconstruction { shots, origin })
 }
 
-fn lens(own: &RawLens, all: &RawLens) -> Result<Lens, &'static str> {
-    let pick = |f: fn(&RawLens) -> Option<f64>| f(own).or_else(|| f(all));
-    let coefficient = |f: fn(&RawLens) -> Option<f64>| pick(f).unwrap_or(0.0);
-    if coefficient(|l| l.k4) != 0.0 {
-        return Err("k4 is a fisheye or rational coefficient, which is not supported; undistort the pictures first");
+/// nerfstudio's camera models (`nerfstudio/cameras/cameras.py`), COLMAP's names, and Blender's "perspective".
+fn is_fisheye(model: &str) -> Result<bool, String> {
+    match model {
+        "PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "FULL_OPENCV" | "RADIAL" | "SIMPLE_RADIAL" | "perspective" => {
+            Ok(false)
+        }
+        "OPENCV_FISHEYE" | "RADIAL_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" | "THIN_PRISM_FISHEYE" | "fisheye" => Ok(true),
+        _ => Err(format!(
+            "camera_model {model:?} is not supported (perspective and fisheye models are); undistort the pictures to PINHOLE"
+        )),
     }
+}
+
+fn lens(own: &RawLens, all: &RawLens) -> Result<LensDescription, String> {
+    let pick = |f: fn(&RawLens) -> Option<f64>| f(own).or_else(|| f(all));
+    let term = |f: fn(&RawLens) -> Option<f64>| pick(f).unwrap_or(0.0);
+    let model = own.camera_model.as_deref().or(all.camera_model.as_deref());
+    let fisheye = match model {
+        Some(model) => is_fisheye(model)?,
+        None => own.is_fisheye.or(all.is_fisheye).unwrap_or(false),
+    };
+    // OpenCV's k4, k5, k6 stand below the fraction bar; in every other model k4 is the term after k3.
+    let rational = !fisheye && (model == Some("FULL_OPENCV") || pick(|l| l.k5).is_some() || pick(|l| l.k6).is_some());
+    let k4 = term(|l| l.k4);
     let distortion = Distortion {
-        k1: coefficient(|l| l.k1),
-        k2: coefficient(|l| l.k2),
-        k3: coefficient(|l| l.k3),
-        p1: coefficient(|l| l.p1),
-        p2: coefficient(|l| l.p2),
+        fisheye,
+        k1: term(|l| l.k1),
+        k2: term(|l| l.k2),
+        k3: term(|l| l.k3),
+        k4: if rational { 0.0 } else { k4 },
+        p1: term(|l| l.p1),
+        p2: term(|l| l.p2),
+        q1: if rational { k4 } else { 0.0 },
+        q2: if rational { term(|l| l.k5) } else { 0.0 },
+        q3: if rational { term(|l| l.k6) } else { 0.0 },
+        sx1: term(|l| l.sx1),
+        sy1: term(|l| l.sy1),
     };
     let size = match (pick(|l| l.w), pick(|l| l.h)) {
-        (Some(w), Some(h)) if (1.0..=65_536.0).contains(&w) && (1.0..=65_536.0).contains(&h) => {
-            Some((w as u32, h as u32))
-        }
+        (Some(w), Some(h)) => Some(picture_size(w, h).ok_or("w and h must be between 1 and 65536")?),
         (None, None) => None,
-        _ => return Err("w and h must both be there and between 1 and 65536"),
+        _ => return Err("w and h must both be there".to_owned()),
     };
     let focal = match (pick(|l| l.fl_x), pick(|l| l.fl_y), pick(|l| l.camera_angle_x)) {
         (Some(x), y, _) => Focal::Pixels(x, y.unwrap_or(x)),
-        (None, _, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => Focal::FieldOfView(angle),
-        _ => return Err("neither fl_x nor a camera_angle_x between 0 and pi is given"),
+        (None, _, Some(angle)) => Focal::FieldOfView(angle),
+        _ => return Err("neither fl_x nor a camera_angle_x between 0 and pi is given".to_owned()),
     };
-    if let Focal::Pixels(x, y) = focal
-        && !(x > 0.0 && y > 0.0 && x.is_finite() && y.is_finite())
-    {
-        return Err("fl_x and fl_y must be positive numbers");
-    }
-    let centre = match (pick(|l| l.cx), pick(|l| l.cy)) {
-        (Some(x), Some(y)) if x.is_finite() && y.is_finite() => Some((x, y)),
+    let principal = match (pick(|l| l.cx), pick(|l| l.cy)) {
+        (Some(x), Some(y)) => Some((x, y)),
         (None, None) => None,
-        _ => return Err("cx and cy must both be numbers"),
+        _ => return Err("cx and cy must both be numbers".to_owned()),
     };
-    Ok(Lens { size, focal, centre, distortion })
+    let lens = LensDescription { size, focal, principal, distortion };
+    match lens.fault() {
+        None => Ok(lens),
+        Some(fault) => Err(fault.to_owned()),
+    }
+}
+
+/// Writes `transforms.json`; every frame has its own lens, as nerfstudio allows.
+///
+/// # Errors
+/// The file cannot be written, or a lens has no size.
+pub fn write(path: &Path, reconstruction: &Reconstruction) -> Result<(), FormatError> {
+    let mut frames = Vec::with_capacity(reconstruction.shots.len());
+    for shot in &reconstruction.shots {
+        let Some((w, h)) = shot.lens.size else {
+            return Err(FormatError::invalid(path, format!("{}: its size is not known", shot.path)));
+        };
+        let (lens, d) = (shot.lens.lens((w, h)), shot.lens.distortion);
+        let rational = d.q1 != 0.0 || d.q2 != 0.0 || d.q3 != 0.0;
+        if rational && d.k4 != 0.0 {
+            let what = format!("{}: nerfstudio has no model with both k4 and a denominator", shot.path);
+            return Err(FormatError::invalid(path, what));
+        }
+        let model = match (d.fisheye, rational) {
+            (true, _) if d.p1 != 0.0 || d.p2 != 0.0 || d.sx1 != 0.0 || d.sy1 != 0.0 => "THIN_PRISM_FISHEYE",
+            (true, _) => "OPENCV_FISHEYE",
+            (false, true) => "FULL_OPENCV",
+            (false, false) => "OPENCV",
+        };
+        let mut frame = json!({
+            "file_path": shot.path, "transform_matrix": pose_to_opengl(&shot.pose), "camera_model": model, "w": w, "h": h,
+            "fl_x": lens.focal[0], "fl_y": lens.focal[1], "cx": lens.principal[0], "cy": lens.principal[1],
+        });
+        let k4 = if rational { d.q1 } else { d.k4 };
+        let terms = [
+            ("k1", d.k1),
+            ("k2", d.k2),
+            ("k3", d.k3),
+            ("k4", k4),
+            ("k5", d.q2),
+            ("k6", d.q3),
+            ("p1", d.p1),
+            ("p2", d.p2),
+            ("sx1", d.sx1),
+            ("sy1", d.sy1),
+        ];
+        for (name, value) in terms.into_iter().filter(|(_, v)| *v != 0.0) {
+            frame[name] = value.into();
+        }
+        frames.push(frame);
+    }
+    let mut file = json!({ "frames": frames });
+    if let Some(o) = reconstruction.origin {
+        file["enu_origin_wgs84"] = json!({ "lat": o.lat_deg, "lon": o.lon_deg, "alt": o.alt_m });
+    }
+    write_json(path, &file)
+}
+
+/// Pretty JSON, written whole or not at all.
+pub(super) fn write_json(path: &Path, value: &Value) -> Result<(), FormatError> {
+    write_atomic(path, |w| serde_json::to_writer_pretty(w, value).map_err(std::io::Error::other))
 }
 
 /// A 3×4 or 4×4 camera-to-world matrix with OpenGL axes → pose with OpenCV axes: y and z change sign.

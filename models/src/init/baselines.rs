@@ -94,10 +94,10 @@ mod tests {
     }
 
     #[test]
-    fn duplicates_single_points_and_nan_are_sound() {
+    fn duplicates_single_points_and_nan_leave_a_valid_cloud() {
         for points in [vec![[1.0; 3]; 5], vec![[1.0; 3]], vec![[f32::NAN; 3], [0.0; 3], [1.0; 3]]] {
             let mut cloud = from_sfm(&points, &vec![[9; 3]; points.len()], 100).unwrap();
-            assert_eq!(cloud.drop_unsound(), 0);
+            assert_eq!(cloud.drop_invalid(), 0);
         }
         assert!(from_sfm(&[[f32::NAN; 3]], &[[0; 3]], 10).is_err());
     }

@@ -4,7 +4,9 @@
 
 use rayon::prelude::*;
 
-use super::frame::{DepthGrid, Frame, Projector, Unprojector};
+use crate::camera::{Projector, Unprojector};
+
+use super::depth_frame::{DepthFrame, DepthGrid};
 
 /// Depths in front of another view's surface by more than this many tolerances contradict it.
 const CONFLICT: f32 = 2.5;
@@ -39,7 +41,7 @@ pub struct ConsistencyCount {
 ///
 /// `tolerance` is a share of the depth; `fill` holds depths for places that nobody knows (0 = none).
 pub fn resolve(
-    frames: &[Frame],
+    frames: &[DepthFrame],
     r: usize,
     others: &[usize],
     tolerance: f32,
@@ -165,12 +167,12 @@ mod tests {
     use glam::{DQuat, DVec3};
     use image::RgbImage;
 
-    fn frame(x: f64, depth: impl Fn(usize) -> f32) -> Frame {
+    fn frame(x: f64, depth: impl Fn(usize) -> f32) -> DepthFrame {
         let intrinsics = Intrinsics { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let rotation = DQuat::from_rotation_x(std::f64::consts::PI);
         let depths: Vec<f32> = (0..64 * 48).map(&depth).collect();
         let grid = DepthGrid { width: 64, height: 48, stride: 1, depth: depths, confidence: vec![0.6; 64 * 48] };
-        Frame {
+        DepthFrame {
             name: x.to_string(),
             image: RgbImage::new(64, 48),
             view: View { intrinsics, pose: Pose { rotation, center: DVec3::new(x, 0.0, 50.0) } },

@@ -2,7 +2,7 @@
 //! plane, so the picture's ground plane plus smoothly spread residuals continues what is known. Used only where no other
 //! picture knows better; where the plane recedes beyond the depth range (sky), nothing is invented.
 
-use super::frame::DepthGrid;
+use super::depth_frame::DepthGrid;
 
 /// Confidence from which a depth takes part in the fit.
 const TRUSTED: f32 = 0.3;

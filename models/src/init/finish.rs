@@ -32,7 +32,7 @@ pub fn axes(covariance: Mat3) -> ([f32; 3], Quat) {
     (deviation.map(|d| d.max(least)), rotation)
 }
 
-/// The cloud, and how many Gaussians were removed as abnormal: longer than `max_ratio` medians, or unsound.
+/// The cloud, and how many Gaussians were removed as abnormal: longer than `max_ratio` medians, or not finite.
 pub fn cloud(merged: &[Merged], max_ratio: f32) -> (GaussianCloud, usize) {
     let shapes: Vec<([f32; 3], Quat)> = merged.par_iter().map(|g| axes(g.covariance)).collect();
     let mut longest: Vec<f32> = shapes.iter().map(|s| s.0[0]).filter(|v| v.is_finite()).collect();
@@ -57,7 +57,7 @@ pub fn cloud(merged: &[Merged], max_ratio: f32) -> (GaussianCloud, usize) {
             &sh.to_array(),
         );
     }
-    cloud.drop_unsound();
+    cloud.drop_invalid();
     let removed = merged.len() - cloud.len();
     (cloud, removed)
 }
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn abnormal_and_unsound_gaussians_are_removed_and_counted() {
+    fn abnormal_and_invalid_gaussians_are_removed_and_counted() {
         let mut all = vec![merged(Mat3::IDENTITY * 0.01); 10];
         all.push(merged(Mat3::IDENTITY * 4.0));
         all.push(merged(Mat3::from_diagonal(Vec3::new(f32::NAN, 1.0, 1.0))));

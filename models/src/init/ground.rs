@@ -4,7 +4,7 @@
 use glam::{DVec3, Vec3};
 use nalgebra::{Matrix3, Vector3};
 
-use crate::camera::View;
+use crate::camera::{Pinhole, View};
 
 /// Points needed before a plane is believed.
 const MIN_POINTS: usize = 60;
@@ -75,19 +75,17 @@ impl Ground {
     pub fn depths(&self, view: &View) -> Option<[f32; 2]> {
         let height = self.over(view.pose.center);
         let limit = (HIGHEST * height) as f32;
-        let sound = &self.above[self.above.partition_point(|h| *h < -limit)..];
-        let sound = &sound[..sound.partition_point(|h| *h < limit)];
-        if height <= 0.0 || 2 * sound.len() < self.above.len() {
+        let heights = &self.above[self.above.partition_point(|h| *h < -limit)..];
+        let heights = &heights[..heights.partition_point(|h| *h < limit)];
+        if height <= 0.0 || 2 * heights.len() < self.above.len() {
             return None;
         }
-        let at = |share: f64| f64::from(sound[((sound.len() - 1) as f64 * share) as usize]);
+        let at = |share: f64| f64::from(heights[((heights.len() - 1) as f64 * share) as usize]);
         let (low, high) = (at(QUANTILE), at(1.0 - QUANTILE));
         let k = &view.intrinsics;
         let (mut near, mut far) = (f64::INFINITY, 0.0f64);
         for (u, v) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
-            let x = (u * f64::from(k.width) - f64::from(k.cx)) / f64::from(k.fx);
-            let y = (v * f64::from(k.height) - f64::from(k.cy)) / f64::from(k.fy);
-            let ray = view.pose.rotation * DVec3::new(x, y, 1.0);
+            let ray = Pinhole::from(view).world_ray([u * k.width as f32, v * k.height as f32]);
             let fall = self.plane[1] * ray.x + self.plane[2] * ray.y - ray.z;
             if fall.is_nan() || fall < GRAZING {
                 return None;

@@ -3,20 +3,24 @@
 //! refined afterwards, and only depths whose geometry really changed are made again.
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 use config::init::InitSettings;
+use config::settings::SettingError;
 use rayon::prelude::*;
 
 use crate::camera::{Pose, PosedImage, View};
 use crate::onnx::features::{FeatureNetwork, Features};
-use crate::onnx::manifest::{Manifest, Poses};
+use crate::onnx::manifest::{Contract, Poses};
+use crate::onnx::network::{LazySession, Network};
 use crate::onnx::picture::{center_crop, resized};
+use crate::onnx::session::check_library;
 
 use super::InitError;
-use super::frame::{Frame, shift};
+use super::depth_frame::{DepthFrame, shift};
 use super::pairs::{Relation, SkippedPairs, partners, relate};
-use super::posed::{NetworkBytes, PosedNetwork, Request};
+use super::posed::{PosedNetwork, Request};
 use super::range::DepthRange;
 use super::report::{InitReport, Initialisation};
 use super::unposed::{Appearance, Heads, PairNetwork, align_frames, appearance, keep_better};
@@ -35,21 +39,14 @@ const STALE_PX: f32 = 0.7;
 /// Finest voxels per Gaussian of the budget.
 const VOXELS_PER_GAUSSIAN: usize = 4;
 
-/// Whether the network is told the poses.
+/// A pair network at work: told the poses, or not.
 #[derive(Debug)]
-enum Network {
+enum Pairs {
     Posed(PosedNetwork),
-    Unposed(PairNetwork),
+    Unposed(Box<PairNetwork>),
 }
 
-impl Network {
-    fn manifest(&self) -> &Manifest {
-        match self {
-            Self::Posed(n) => n.manifest(),
-            Self::Unposed(n) => n.manifest(),
-        }
-    }
-
+impl Pairs {
     fn sources(&self) -> usize {
         match self {
             Self::Posed(n) => n.sources(),
@@ -69,11 +66,12 @@ impl Network {
 #[derive(Debug)]
 pub struct Initialiser {
     settings: InitSettings,
-    network: Network,
+    network: Arc<Network>,
+    pairs: Pairs,
     features: Option<FeatureNetwork>,
     /// Of the last picture that was looked at, with its camera at the size that features were found in.
     last_features: Option<(usize, View, Features)>,
-    frames: Vec<Frame>,
+    frames: Vec<DepthFrame>,
     range: DepthRange,
     /// Depth range of each picture, as [`Self::build`] found it.
     ranges: Vec<Option<[f32; 2]>>,
@@ -83,27 +81,32 @@ pub struct Initialiser {
 }
 
 impl Initialiser {
-    /// With the embedded network, or the user's own (a manifest of contract `pair`).
+    /// With the embedded network, or the user's own (a manifest of contract `pair`), which is compared with its manifest
+    /// and run once on blank pictures of the largest size: a network that does not work is known before a flight.
     ///
     /// # Errors
     /// A setting, the manifest, the network's file or ONNX Runtime is bad.
     pub fn open(settings: &InitSettings, manifest: Option<&Path>) -> Result<Self, InitError> {
-        settings.check().map_err(|(field, reason)| InitError::Setting { field, reason })?;
-        let (manifest, bytes) = match manifest {
-            Some(path) => {
-                let manifest = Manifest::read(path)?;
-                let bytes = manifest.read_network()?;
-                (manifest, NetworkBytes::Read(bytes))
-            }
+        settings.check()?;
+        check_library()?;
+        let network = Arc::new(match manifest {
+            Some(path) => Network::read_as(path, Contract::Pair)?,
             None => super::embedded()?,
-        };
-        let network = match manifest.pair.clone() {
+        });
+        if !network.is_embedded() {
+            let size = (settings.max_side, settings.max_side * 3 / 4);
+            LazySession::new(Arc::clone(&network), settings.threads).check(size)?;
+        }
+        let pairs = match &network.manifest().pair {
             Some(pair) if pair.poses == Poses::None => {
-                Network::Unposed(PairNetwork::new(manifest, pair, bytes, settings.threads))
+                Pairs::Unposed(Box::new(PairNetwork::new(Arc::clone(&network), pair.clone(), settings.threads)))
             }
-            _ => Network::Posed(PosedNetwork::new(manifest, bytes, settings.threads)?),
+            // The manifest was refused without its [pair] table.
+            pair => {
+                let views = pair.as_ref().map_or(2, |p| p.views);
+                Pairs::Posed(PosedNetwork::new(Arc::clone(&network), views, settings.threads))
+            }
         };
-        crate::onnx::session::find_library()?;
         let features = match settings.depth_m {
             Some(_) => None,
             None => Some(FeatureNetwork::open(None, settings.threads)?),
@@ -112,6 +115,7 @@ impl Initialiser {
         Ok(Self {
             settings: settings.clone(),
             network,
+            pairs,
             features,
             last_features: None,
             frames: Vec::new(),
@@ -128,12 +132,20 @@ impl Initialiser {
     /// # Errors
     /// A setting is out of range, or `stride` differs after depths were made.
     pub fn reconfigure(&mut self, settings: &InitSettings) -> Result<(), InitError> {
-        settings.check().map_err(|(field, reason)| InitError::Setting { field, reason })?;
+        settings.check()?;
         if settings.stride != self.settings.stride && self.frames.iter().any(|f| f.depth.is_some()) {
-            return Err(InitError::Setting { field: "stride", reason: "cannot change after depths were made" });
+            let wanted = "as it was when depths were made";
+            return Err(SettingError::new("stride", &settings.stride, wanted).into());
         }
         self.settings = settings.clone();
         Ok(())
+    }
+
+    /// The size at which the network sees pictures of this one.
+    fn network_size(&self, (width, height): (u32, u32)) -> (u32, u32) {
+        let shrink = (f64::from(self.settings.max_side) / f64::from(width.max(height))).min(1.0);
+        let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
+        self.network.manifest().input_size(fit(width), fit(height))
     }
 
     /// Takes a picture in; its pixels are copied at the network's size.
@@ -156,15 +168,13 @@ impl Initialiser {
         if !(p.center.is_finite() && p.rotation.is_finite() && p.rotation.length_squared() > 1e-12) {
             return Err(InitError::Picture { name: picture.name.clone(), reason: "its pose is not finite" });
         }
-        let shrink = (f64::from(self.settings.max_side) / f64::from(k.width.max(k.height))).min(1.0);
-        let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
-        let (w, h) = self.network.manifest().input_size(fit(k.width), fit(k.height));
-        let (image, intrinsics) = match &self.network {
-            Network::Posed(_) => (resized(&picture.image, w, h), k.resized(w, h)),
+        let (w, h) = self.network_size((k.width, k.height));
+        let (image, intrinsics) = match &self.pairs {
+            Pairs::Posed(_) => (resized(&picture.image, w, h), k.resized(w, h)),
             // What knows no intrinsics was trained on square pixels: crop to its shape, never stretch.
-            Network::Unposed(_) => center_crop(&picture.image, k, w, h),
+            Pairs::Unposed(_) => center_crop(&picture.image, k, w, h),
         };
-        self.frames.push(Frame {
+        self.frames.push(DepthFrame {
             name: picture.name.clone(),
             image,
             view: View { intrinsics, pose: picture.view.pose },
@@ -195,7 +205,7 @@ impl Initialiser {
     /// # Errors
     /// The network fails.
     pub fn advance(&mut self, most: usize) -> Result<usize, InitError> {
-        if matches!(self.network, Network::Unposed(_)) {
+        if matches!(self.pairs, Pairs::Unposed(_)) {
             return Ok(0);
         }
         // Ranges of an earlier build know less than what has been measured since.
@@ -223,14 +233,14 @@ impl Initialiser {
                 partners(i, &views, depth, &self.settings, &mut self.report.skipped);
             }
         }
-        match self.network {
-            Network::Posed(_) => {
+        match self.pairs {
+            Pairs::Posed(_) => {
                 let stale: Vec<usize> = (0..self.frames.len()).filter(|&i| self.is_stale(i)).collect();
                 self.make_depths(&stale)?;
             }
-            Network::Unposed(_) => self.align_pairs(&views)?,
+            Pairs::Unposed(_) => self.align_pairs(&views)?,
         }
-        self.network.close();
+        self.pairs.close();
         self.report.depth_ms += started.elapsed().as_secs_f64() * 1e3;
         if self.frames.iter().all(|f| f.depth.is_none()) {
             return Err(InitError::NoDepth { pictures: self.frames.len(), skipped: self.report.skipped.total() });
@@ -276,7 +286,7 @@ impl Initialiser {
     fn sources_of(&self, i: usize, depth: f64) -> Vec<(usize, f64)> {
         let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
         let mut best = partners(i, &views, depth, &self.settings, &mut SkippedPairs::default());
-        best.truncate(self.network.sources());
+        best.truncate(self.pairs.sources());
         best
     }
 
@@ -308,7 +318,7 @@ impl Initialiser {
             };
             chosen.push((i, range, self.sources_of(i, middle(range))));
         }
-        let Network::Posed(network) = &mut self.network else { return Ok(()) };
+        let Pairs::Posed(network) = &mut self.pairs else { return Ok(()) };
         let frames = &self.frames;
         let requests: Vec<Request<'_>> = chosen
             .iter()
@@ -325,7 +335,7 @@ impl Initialiser {
             let made_with = sources.iter().map(|s| (s.0, self.frames[s.0].view)).collect();
             let made = if sources.is_empty() { None } else { made.next() };
             if let Some(made) = &made {
-                self.report.unsound_depths += made.unsound;
+                self.report.non_finite_depths += made.non_finite;
                 self.report.runs += 1;
                 self.report.run_ms += made.run_ms;
                 self.report.searched(range);
@@ -351,7 +361,7 @@ impl Initialiser {
         }
         pairs.sort_unstable();
         pairs.dedup();
-        let Network::Unposed(network) = &mut self.network else { return Ok(()) };
+        let Pairs::Unposed(network) = &mut self.pairs else { return Ok(()) };
         let mut edges = Vec::with_capacity(pairs.len());
         let mut heads: Vec<Option<Heads>> = vec![None; views.len()];
         for (e, pair) in pairs.into_iter().enumerate() {

@@ -90,11 +90,11 @@ impl VoxelMerge {
         let cell = (sample.position - self.origin) / self.edge;
         let limit = (1u32 << BITS) as f32;
         let inside = cell.min_element() >= 0.0 && cell.max_element() < limit;
-        let sound = sample.weight > 0.0
+        let finite = sample.weight > 0.0
             && sample.weight.is_finite()
             && sample.color.is_finite()
             && sample.covariance.is_finite();
-        if !(inside && sound) {
+        if !(inside && finite) {
             self.outside += 1;
             return;
         }

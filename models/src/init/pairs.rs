@@ -1,12 +1,11 @@
 //! Which pictures are looked at together: sliding-window and co-visible pairs, scored by overlap and baseline. Pairs
 //! that cannot give depth are skipped before the network sees them, and counted.
 
-use glam::DVec3;
 use serde::Serialize;
 
 use config::init::InitSettings;
 
-use crate::camera::View;
+use crate::camera::{Pinhole, View};
 
 /// Baseline ÷ depth at which multi-view networks are best (MVSNet's view selection peaks at a triangulation
 /// angle of 5–10°; aerial surveys at 75 % overlap fly 0.2–0.4).
@@ -92,18 +91,13 @@ pub fn overlap(reference: &View, source: &View, depth: f64) -> f64 {
     const COLUMNS: usize = 8;
     const ROWS: usize = 6;
     let (k, s) = (&reference.intrinsics, &source.intrinsics);
-    let to_source = source.pose.rotation.conjugate();
+    let (from, to) = (Pinhole::from(reference), Pinhole::from(source));
     let mut seen = 0;
     for j in 0..ROWS {
         for i in 0..COLUMNS {
-            let u = (i as f64 + 0.5) / COLUMNS as f64 * f64::from(k.width);
-            let v = (j as f64 + 0.5) / ROWS as f64 * f64::from(k.height);
-            let ray = DVec3::new((u - f64::from(k.cx)) / f64::from(k.fx), (v - f64::from(k.cy)) / f64::from(k.fy), 1.0);
-            let p = to_source * (reference.pose.rotation * (ray * depth) + reference.pose.center - source.pose.center);
-            let (x, y) = (p.x / p.z * f64::from(s.fx) + f64::from(s.cx), p.y / p.z * f64::from(s.fy) + f64::from(s.cy));
-            if p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < f64::from(s.width) && y < f64::from(s.height) {
-                seen += 1;
-            }
+            let u = (i as f32 + 0.5) / COLUMNS as f32 * k.width as f32;
+            let v = (j as f32 + 0.5) / ROWS as f32 * k.height as f32;
+            seen += usize::from(to.project(from.unproject([u, v], depth)).is_some_and(|q| s.contains(q)));
         }
     }
     seen as f64 / (COLUMNS * ROWS) as f64
@@ -140,7 +134,7 @@ pub fn partners(
 mod tests {
     use super::*;
     use crate::camera::{Intrinsics, Pose};
-    use glam::DQuat;
+    use glam::{DQuat, DVec3};
 
     fn nadir(x: f64) -> View {
         let intrinsics = Intrinsics { width: 640, height: 480, fx: 400.0, fy: 400.0, cx: 320.0, cy: 240.0 };

@@ -3,12 +3,11 @@
 
 use std::sync::OnceLock;
 
-use glam::{DVec3, Vec3};
+use glam::Vec3;
 
-use crate::camera::View;
+use crate::camera::{Pinhole, Projector, View};
 use crate::onnx::features::Features;
 
-use super::frame::Projector;
 use super::ground::Ground;
 
 /// Cosine similarity below which a mutual nearest neighbour is no match (XFeat's own matcher: 0.82).
@@ -102,19 +101,19 @@ impl DepthRange {
                 }
             }
         }
-        let mut sound = without_odd_ones(&seen, (w, h));
+        let mut typical = without_odd_ones(&seen, (w, h));
         if let Some([near, far]) =
             self.ground.get_or_init(|| Ground::fit(&self.points)).as_ref().and_then(|g| g.depths(view))
         {
-            sound.sort_by(f32::total_cmp);
-            let at = |share: f32| sound.get((sound.len().saturating_sub(1) as f32 * share) as usize).copied();
+            typical.sort_by(f32::total_cmp);
+            let at = |share: f32| typical.get((typical.len().saturating_sub(1) as f32 * share) as usize).copied();
             // What this picture sees of towers and pits counts, where it sees enough to tell.
-            let known = sound.len() >= MIN_POINTS;
+            let known = typical.len() >= MIN_POINTS;
             let near = at(QUANTILE).filter(|_| known).map_or(near, |z| z.min(near));
             let far = at(1.0 - QUANTILE).filter(|_| known).map_or(far, |z| z.max(far));
             return Some([near * GROUND_MARGIN[0], far * GROUND_MARGIN[1]]);
         }
-        let depths = if sound.len() >= MIN_POINTS { &mut sound } else { &mut any };
+        let depths = if typical.len() >= MIN_POINTS { &mut typical } else { &mut any };
         if depths.len() < MIN_POINTS {
             return None;
         }
@@ -202,12 +201,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 
 /// Midpoint of the shortest connection of two viewing rays; `None` when they are near parallel or diverge.
 fn triangulate(a: &View, ka: [f32; 2], b: &View, kb: [f32; 2]) -> Option<Vec3> {
-    let ray = |v: &View, k: [f32; 2]| {
-        let i = &v.intrinsics;
-        let d = DVec3::new(f64::from((k[0] - i.cx) / i.fx), f64::from((k[1] - i.cy) / i.fy), 1.0);
-        (v.pose.rotation * d).normalize()
-    };
-    let (da, db) = (ray(a, ka), ray(b, kb));
+    let (da, db) = (Pinhole::from(a).world_ray(ka).normalize(), Pinhole::from(b).world_ray(kb).normalize());
     let cross = da.cross(db);
     let sine2 = cross.length_squared();
     if sine2.is_nan() || sine2 <= MIN_ANGLE * MIN_ANGLE {
@@ -223,7 +217,7 @@ fn triangulate(a: &View, ka: [f32; 2], b: &View, kb: [f32; 2]) -> Option<Vec3> {
 mod tests {
     use super::*;
     use crate::camera::{Intrinsics, Pose};
-    use glam::DQuat;
+    use glam::{DQuat, DVec3};
 
     fn view(x: f64) -> View {
         let intrinsics = Intrinsics { width: 640, height: 480, fx: 400.0, fy: 400.0, cx: 320.0, cy: 240.0 };

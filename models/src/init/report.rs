@@ -42,7 +42,7 @@ pub struct InitReport {
     /// Nearest and farthest depth that any picture was looked at for, metres.
     pub depth_m: [f32; 2],
     /// Depths claimed by the network that were not positive finite numbers.
-    pub unsound_depths: usize,
+    pub non_finite_depths: usize,
     /// Samples another view agrees with.
     pub supported: usize,
     /// Samples no other view confirms or denies.

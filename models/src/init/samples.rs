@@ -7,10 +7,10 @@ use rayon::prelude::*;
 
 use config::init::InitSettings;
 
-use super::frame::{DepthGrid, Frame, Unprojector};
+use super::depth_frame::{DepthFrame, DepthGrid};
 use super::merge::Sample;
 use super::unposed::Appearance;
-use crate::camera::View;
+use crate::camera::{Unprojector, View};
 
 /// Standard deviation of a sample as a share of the distance to its neighbours: discs of 0.5 spacings on a grid
 /// add up to an even surface (ripple below 2 %).
@@ -34,7 +34,7 @@ fn unit_extent(view: &View, stride: usize) -> f32 {
 /// `appearance` is what an unposed network says about the Gaussians; without it extent and colour come from the grid and the
 /// picture.
 pub fn samples(
-    frame: &Frame,
+    frame: &DepthFrame,
     grid: &DepthGrid,
     appearance: Option<&Appearance>,
     settings: &InitSettings,
@@ -64,7 +64,7 @@ pub fn samples(
 
 /// A depth grid with its points in the world.
 struct Scene<'a> {
-    frame: &'a Frame,
+    frame: &'a DepthFrame,
     grid: &'a DepthGrid,
     points: Vec<Vec3>,
     appearance: Option<&'a Appearance>,

@@ -144,6 +144,32 @@ fn an_unposed_network_runs_the_whole_way_and_its_plane_is_put_at_its_height() {
 }
 
 #[test]
+fn a_pair_network_that_is_not_what_its_manifest_says_is_refused_when_it_is_opened() {
+    if no_runtime() {
+        return;
+    }
+    let networks = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("networks");
+    let good = std::fs::read_to_string(networks.join("random_pair.toml")).unwrap();
+    let good = good.replace("\"random_pair.onnx\"", &format!("{:?}", networks.join("random_pair.onnx")));
+    let folder = tempfile::tempdir().unwrap();
+    let open = |text: &str| {
+        let path = folder.path().join("n.toml");
+        std::fs::write(&path, text).unwrap();
+        Initialiser::open(&settings(), Some(&path)).map(drop).map_err(|e| e.to_string())
+    };
+    open(&good).unwrap();
+    let refused = |text: String, words: &str| {
+        let e = open(&text).unwrap_err();
+        assert!(e.contains(words) && !e.contains('\n'), "{e}");
+    };
+    refused(good.replace("sh_degree = 0", "sh_degree = 1"), "output `sh_1` is f32 [1,48,64,3,1]");
+    refused(good.replace("contract = \"pair\"", "contract = \"metric\""), "is `metric`, needed is `pair`");
+    refused(format!("sha256 = \"00\"\n{good}"), "sha256");
+    let text: String = good.lines().filter(|l| !l.starts_with("blake3")).map(|l| format!("{l}\n")).collect();
+    refused(text.replace("random_pair.onnx", "mean_square.onnx"), "input `img1` is missing (there are: a, b)");
+}
+
+#[test]
 fn the_scale_switches_of_the_ablation_set_the_extent_of_the_gaussians() {
     if no_runtime() {
         return;

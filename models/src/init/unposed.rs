@@ -2,22 +2,24 @@
 //! camera's frame, at a scale of its own. Global alignment turns them into one χ per picture in the aircraft's frame;
 //! of the heads, each picture keeps those of its most confident pair, so that memory does not grow with the pairs.
 
+use std::sync::Arc;
+
 use glam::{Mat3, Quat, Vec3};
 
 use config::init::InitSettings;
 
 use crate::align::graph::{Edge, PointMap};
-use crate::align::icp::{Metric, icp};
+use crate::align::icp::icp;
 use crate::align::solve::{Alignment, align};
-use crate::camera::View;
+use crate::camera::{Pose, Unprojector, View};
 use crate::cloud::SH_C0;
-use crate::onnx::manifest::{Manifest, OpacityUnit, PairSettings, QuaternionOrder, ScaleUnit};
+use crate::onnx::OnnxError;
+use crate::onnx::manifest::{OpacityUnit, PairSettings, QuaternionOrder, ScaleUnit};
+use crate::onnx::network::{LazySession, Network};
 use crate::onnx::picture::push_planes;
-use crate::onnx::session::{NetworkSession, Tensor};
-use crate::onnx::{OnnxError, network};
+use crate::onnx::session::Tensor;
 
-use super::frame::{DepthGrid, Frame};
-use super::posed::NetworkBytes;
+use super::depth_frame::{DepthFrame, DepthGrid};
 
 /// Points that ICP compares, at most.
 const ICP_POINTS: usize = 1500;
@@ -55,22 +57,15 @@ pub struct Appearance {
 /// An unposed pair network.
 #[derive(Debug)]
 pub struct PairNetwork {
-    manifest: Manifest,
+    session: LazySession,
     pair: PairSettings,
-    bytes: NetworkBytes,
-    threads: usize,
-    session: Option<((u32, u32), NetworkSession)>,
+    file_bytes: u64,
 }
 
 impl PairNetwork {
-    /// Of a manifest with `poses = "none"`.
-    pub fn new(manifest: Manifest, pair: PairSettings, bytes: NetworkBytes, threads: usize) -> Self {
-        Self { manifest, pair, bytes, threads, session: None }
-    }
-
-    /// Its manifest.
-    pub fn manifest(&self) -> &Manifest {
-        &self.manifest
+    /// Of a network whose `pair` table says `poses = "none"`.
+    pub fn new(network: Arc<Network>, pair: PairSettings, threads: usize) -> Self {
+        Self { file_bytes: network.file_bytes(), session: LazySession::new(network, threads), pair }
     }
 
     /// Its conventions.
@@ -83,12 +78,12 @@ impl PairNetwork {
     pub fn planned_bytes(&self, pixels: u64) -> u64 {
         let degree = u64::from(self.pair.sh_degree) + 1;
         let floats = 2 * (3 + 3 + 1 + 3 + 4 + 3 * degree * degree + 1);
-        2 * self.bytes.get().len() as u64 + 2 * pixels * floats * 4
+        2 * self.file_bytes + 2 * pixels * floats * 4
     }
 
     /// Gives the session's memory back.
     pub fn close(&mut self) {
-        self.session = None;
+        self.session.close();
     }
 
     /// Looks at a pair; `stride` thins the outputs to the depth grid. Returns the edge and both pictures' heads.
@@ -97,46 +92,45 @@ impl PairNetwork {
     /// ONNX Runtime or the contract fails.
     pub fn run(
         &mut self,
-        frames: &[Frame],
+        frames: &[DepthFrame],
         pair: [usize; 2],
         stride: usize,
         edge: usize,
     ) -> Result<(Edge, [Heads; 2]), OnnxError> {
         let [first, second] = pair.map(|i| &frames[i]);
         let (w, h) = first.image.dimensions();
-        let session = match &mut self.session {
-            Some((size, session)) if *size == (w, h) => session,
-            slot => {
-                &mut slot.insert(((w, h), network::open(&self.manifest, self.bytes.get(), (w, h), self.threads)?)).1
-            }
-        };
         let mut planes = [Vec::new(), Vec::new()];
-        push_planes(&first.image, w, h, &self.manifest.input, &mut planes[0]);
-        push_planes(&second.image, w, h, &self.manifest.input, &mut planes[1]);
-        let shape = [1, 3, h as usize, w as usize];
-        let names = ["pts3d", "conf", "scales", "rotations", "sh", "opacities"];
-        let wanted: Vec<String> = ["1", "2"].iter().flat_map(|v| names.map(|n| format!("{n}_{v}"))).collect();
-        let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
-        let out = session.run(&[("img1", &shape, &planes[0]), ("img2", &shape, &planes[1])], &wanted)?;
-        let size = (w as usize, h as usize);
-        let (map1, heads1) = self.thin(&out[..6], size, stride, edge, None);
-        // A network whose second pointmap is in the second camera's own frame is moved by the known poses.
-        let own_frame = (!self.pair.first_camera_frame).then(|| {
-            let r = first.view.pose.rotation.conjugate() * second.view.pose.rotation;
-            r.as_quat()
-        });
-        let (map2, heads2) = self.thin(&out[6..], size, stride, edge, own_frame);
+        push_planes(&first.image, w, h, &self.session.manifest().input, &mut planes[0]);
+        push_planes(&second.image, w, h, &self.session.manifest().input, &mut planes[1]);
+        let out = self.session.run((w, h), &[&planes[0], &planes[1]])?;
+        let thin = Thinning { pair: &self.pair, size: (w as usize, h as usize), stride, edge };
+        let (map1, heads1) = thin.outputs(&out[..6], None);
+        // The second pointmap of a network that states metres may be in its own camera's frame.
+        let own_frame = (!self.pair.first_camera_frame).then(|| relative(&first.view.pose, &second.view.pose));
+        let (map2, heads2) = thin.outputs(&out[6..], own_frame);
         Ok((Edge { first: pair[0], second: pair[1], maps: [map1, map2] }, [heads1, heads2]))
     }
+}
 
-    fn thin(
-        &self,
-        out: &[Tensor],
-        (w, h): (usize, usize),
-        stride: usize,
-        edge: usize,
-        turn: Option<Quat>,
-    ) -> (PointMap, Heads) {
+/// Second camera → first camera: rotation, translation in metres.
+fn relative(first: &Pose, second: &Pose) -> (Quat, Vec3) {
+    let to_first = first.rotation.conjugate();
+    ((to_first * second.rotation).as_quat(), (to_first * (second.center - first.center)).as_vec3())
+}
+
+/// From a network's full maps to the depth grid.
+struct Thinning<'a> {
+    pair: &'a PairSettings,
+    size: (usize, usize),
+    stride: usize,
+    edge: usize,
+}
+
+impl Thinning<'_> {
+    /// Pointmap and heads of one picture, moved by `motion` into the first camera's frame.
+    fn outputs(&self, out: &[Tensor], motion: Option<(Quat, Vec3)>) -> (PointMap, Heads) {
+        let (&Self { pair, size: (w, h), stride, edge }, (turn, shift)) =
+            (self, motion.unwrap_or((Quat::IDENTITY, Vec3::ZERO)));
         let (gw, gh) = ((w / stride).max(1), (h / stride).max(1));
         let n = gw * gh;
         let mut map =
@@ -150,26 +144,25 @@ impl PairNetwork {
             opacities: Vec::with_capacity(n),
             trust: 0.0,
         };
-        let d = usize::from(self.pair.sh_degree + 1).pow(2);
-        let turn = turn.unwrap_or(Quat::IDENTITY);
+        let d = usize::from(pair.sh_degree + 1).pow(2);
         for k in 0..n {
             let (i, j) = ((k % gw * stride + stride / 2).min(w - 1), (k / gw * stride + stride / 2).min(h - 1));
             let at = j * w + i;
             let three = |t: &Tensor| Vec3::from_slice(&t.data[3 * at..3 * at + 3]);
-            map.points.push(turn * three(&out[0]));
-            map.confidence.push((out[1].data[at] - self.pair.confidence_offset).max(0.0));
+            map.points.push(turn * three(&out[0]) + shift);
+            map.confidence.push((out[1].data[at] - pair.confidence_offset).max(0.0));
             let scale = three(&out[2]);
-            heads.scales.push(if self.pair.scales == ScaleUnit::Log { scale.exp() } else { scale });
+            heads.scales.push(if pair.scales == ScaleUnit::Log { scale.exp() } else { scale });
             let q: [f32; 4] = [0, 1, 2, 3].map(|c| out[3].data[4 * at + c]);
-            let q = match self.pair.quaternion {
+            let q = match pair.quaternion {
                 QuaternionOrder::Xyzw => Quat::from_array(q),
                 QuaternionOrder::Wxyz => Quat::from_xyzw(q[1], q[2], q[3], q[0]),
             };
             heads.rotations.push(turn * if q.length_squared() > 1e-12 { q.normalize() } else { Quat::IDENTITY });
             let dc = Vec3::new(out[4].data[at * 3 * d], out[4].data[at * 3 * d + d], out[4].data[at * 3 * d + 2 * d]);
-            heads.colors.push(dc * SH_C0 + if self.pair.sh_residual { 0.0 } else { 0.5 });
+            heads.colors.push(dc * SH_C0 + if pair.sh_residual { 0.0 } else { 0.5 });
             let o = out[5].data[at];
-            heads.opacities.push(if self.pair.opacity == OpacityUnit::Logit { 1.0 / (1.0 + (-o).exp()) } else { o });
+            heads.opacities.push(if pair.opacity == OpacityUnit::Logit { 1.0 / (1.0 + (-o).exp()) } else { o });
         }
         heads.points.clone_from(&map.points);
         heads.trust = map.confidence.iter().filter(|c| c.is_finite()).map(|c| f64::from(*c)).sum();
@@ -216,7 +209,7 @@ pub fn grid_view(view: &View, stride: usize) -> View {
 }
 
 /// Aligns all edges and writes χ into the frames' depth grids; returns the alignment.
-pub fn align_frames(frames: &mut [Frame], edges: &[Edge], settings: &InitSettings) -> Alignment {
+pub fn align_frames(frames: &mut [DepthFrame], edges: &[Edge], settings: &InitSettings) -> Alignment {
     let stride = settings.stride as usize;
     let views: Vec<View> = frames.iter().map(|f| grid_view(&f.view, stride)).collect();
     let alignment = align(&views, edges, settings.align_steps);
@@ -237,7 +230,7 @@ pub fn align_frames(frames: &mut [Frame], edges: &[Edge], settings: &InitSetting
 /// neighbours before and after. `first` is the camera of [`Heads::edge`]'s first picture.
 pub fn appearance(
     heads: &Heads,
-    frame: &Frame,
+    frame: &DepthFrame,
     first: &View,
     alignment: &Alignment,
     settings: &InitSettings,
@@ -246,7 +239,7 @@ pub fn appearance(
     let (grid, view) = (frame.depth.as_ref()?, &frame.view);
     let sigma = alignment.sigma.get(heads.edge).copied().flatten()? as f32;
     let turn = first.pose.rotation.normalize().as_quat();
-    let unproject = super::frame::Unprojector::new(view);
+    let unproject = Unprojector::new(view);
     let aligned: Vec<Vec3> = (0..grid.depth.len())
         .map(|at| {
             let (x, y) = grid.pixel(at % grid.width, at / grid.width);
@@ -277,7 +270,7 @@ fn icp_scale(original: &[Vec3], aligned: &[Vec3]) -> Option<f32> {
     let step = original.len().div_ceil(ICP_POINTS).max(1);
     let chosen: Vec<usize> = (0..original.len()).step_by(step).filter(|&i| aligned[i].is_finite()).collect();
     let pick = |from: &[Vec3]| chosen.iter().map(|&i| from[i]).collect::<Vec<_>>();
-    icp(&pick(original), &pick(aligned), Metric::PointToPoint, None).ok().map(|r| r.similarity.scale as f32)
+    icp(&pick(original), &pick(aligned)).ok().map(|r| r.similarity.scale as f32)
 }
 
 /// Mean distance to the right and lower (else left and upper) neighbours.
@@ -286,4 +279,61 @@ fn spacing(points: &[Vec3], grid: &DepthGrid, at: usize) -> f32 {
     let across = if i + 1 < grid.width { at + 1 } else { at.saturating_sub(1) };
     let down = if j + 1 < grid.height { at + grid.width } else { at.saturating_sub(grid.width) };
     0.5 * (points[at].distance(points[across]) + points[at].distance(points[down]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Intrinsics;
+    use glam::{DQuat, DVec3};
+
+    const W: usize = 32;
+    const H: usize = 24;
+
+    /// Metric pointmaps of the plane z = 0, each in its own camera's frame.
+    fn own_frame_map(view: &View) -> Vec<Tensor> {
+        let camera = crate::camera::Pinhole::from(view);
+        let n = W * H;
+        let points = (0..n).flat_map(|at| {
+            let ray = camera.ray([(at % W) as f32 + 0.5, (at / W) as f32 + 0.5]);
+            let depth = view.pose.center.z / -(view.pose.rotation * ray).z;
+            (ray * depth).as_vec3().to_array()
+        });
+        let tensor = |channels: usize, data: Vec<f32>| Tensor { shape: vec![1, H, W, channels], data };
+        vec![
+            tensor(3, points.collect()),
+            tensor(1, vec![1.0; n]),
+            tensor(3, vec![0.1; 3 * n]),
+            tensor(4, [0.0, 0.0, 0.0, 1.0].repeat(n)),
+            tensor(3, vec![0.0; 3 * n]),
+            tensor(1, vec![0.9; n]),
+        ]
+    }
+
+    #[test]
+    fn a_second_pointmap_in_its_own_cameras_frame_is_turned_and_moved_into_the_firsts() {
+        let view = |x: f64, y: f64, heading: f64, tilt: f64| {
+            let intrinsics = Intrinsics { width: W as u32, height: H as u32, fx: 24.0, fy: 24.0, cx: 16.0, cy: 12.0 };
+            let down = DQuat::from_rotation_x(std::f64::consts::PI - tilt);
+            let rotation = DQuat::from_rotation_z(heading) * down;
+            View { intrinsics, pose: Pose { rotation, center: DVec3::new(x, y, 60.0) } }
+        };
+        let views = [view(0.0, 0.0, 0.3, 0.0), view(11.0, -5.0, -0.4, 0.1)];
+        let text =
+            "name='n'\ncontract='pair'\nfile='n'\nlicence='x'\n[input]\nrange=[0,1]\n[pair]\nposes='none'\nviews=2\n";
+        let text = format!("{text}metric=true\nfirst_camera_frame=false\n");
+        let pair = crate::onnx::manifest::Manifest::parse(&text, "test").unwrap().pair.unwrap();
+        let thin = Thinning { pair: &pair, size: (W, H), stride: 1, edge: 0 };
+        let (map1, _) = thin.outputs(&own_frame_map(&views[0]), None);
+        let (map2, _) = thin.outputs(&own_frame_map(&views[1]), Some(relative(&views[0].pose, &views[1].pose)));
+        let first = &views[0].pose;
+        for p in map1.points.iter().chain(&map2.points) {
+            let world = first.rotation * p.as_dvec3() + first.center;
+            assert!(world.z.abs() < 1e-3, "the plane z = 0 came out at {world}");
+        }
+        // Only turned, not moved, the second map would contradict the first by the whole baseline.
+        let edge = Edge { first: 0, second: 1, maps: [map1, map2] };
+        let aligned = align(&views, &[edge], 100);
+        assert!((aligned.sigma[0].unwrap() - 1.0).abs() < 1e-3, "{:?}", aligned.sigma);
+    }
 }

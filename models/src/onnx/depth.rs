@@ -2,37 +2,40 @@
 //! scale and offset, so relative depth is enough; inverse depth is given with its sign turned, its linear part.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use image::RgbImage;
 
 use super::OnnxError;
 use super::manifest::Contract;
-use super::named::NamedNetwork;
+use super::network::{LazySession, Network};
 use super::picture::push_planes;
 use crate::camera::DepthPrior;
 
 /// An opened depth network.
 #[derive(Debug)]
 pub struct DepthNetwork {
-    network: NamedNetwork,
+    session: LazySession,
     max_side: u32,
     planes: Vec<f32>,
 }
 
 impl DepthNetwork {
-    /// Reads the manifest and compares the network with it for pictures of `size`, whose longer side a network of any
+    /// Reads the manifest and checks the network against it for pictures of `size`, whose longer side a network of any
     /// size is shown at `max_side` pixels at most.
     ///
     /// # Errors
-    /// A file is missing or damaged, or the network does not follow contract `depth`.
+    /// As [`LazySession::check`]; a file is missing or damaged, or the network follows another contract.
     pub fn open(path: &Path, size: (u32, u32), max_side: u32, threads: usize) -> Result<Self, OnnxError> {
-        let network = NamedNetwork::open(path, Contract::Depth, fit(size, max_side), threads)?;
-        Ok(Self { network, max_side, planes: Vec::new() })
+        let network = Network::read_as(path, Contract::Depth)?;
+        let mut session = LazySession::new(Arc::new(network), threads);
+        session.check(fit(size, max_side))?;
+        Ok(Self { session, max_side, planes: Vec::new() })
     }
 
     /// Name for reports.
     pub fn name(&self) -> &str {
-        &self.network.manifest().name
+        &self.session.manifest().name
     }
 
     /// Depth up to a positive factor and an offset, at the network's size. A picture of another shape is squeezed, as
@@ -42,20 +45,13 @@ impl DepthNetwork {
     /// ONNX Runtime fails, or the output has another size than the input.
     pub fn estimate(&mut self, image: &RgbImage) -> Result<DepthPrior, OnnxError> {
         let fitted = fit(image.dimensions(), self.max_side);
-        let manifest = self.network.manifest();
+        let manifest = self.session.manifest();
         let (width, height) = manifest.input_size(fitted.0, fitted.1);
         let sign = if manifest.depth.as_ref().is_some_and(|d| d.inverse) { -1.0 } else { 1.0 };
         self.planes.clear();
         push_planes(image, width, height, &manifest.input, &mut self.planes);
-        let (rows, columns) = (height as usize, width as usize);
-        let out = self
-            .network
-            .at((width, height))?
-            .run(&[("image", &[1, 3, rows, columns], &self.planes)], &["depth"])?
-            .pop();
-        let Some(out) = out.filter(|t| t.shape == [1, rows, columns]) else {
-            return Err(self.network.broken("depth", format!("[1,{rows},{columns}]"), "of another size".to_owned()));
-        };
+        let mut out = self.session.run((width, height), &[&self.planes])?;
+        let out = out.swap_remove(0);
         let confidence = out.data.iter().map(|d| if d.is_finite() { 1.0 } else { 0.0 }).collect();
         let depth = out.data.iter().map(|d| sign * d).collect();
         Ok(DepthPrior { width, height, depth, confidence })
@@ -63,7 +59,7 @@ impl DepthNetwork {
 
     /// Gives the session's memory back; the next picture opens it again.
     pub fn close(&mut self) {
-        self.network.close();
+        self.session.close();
     }
 }
 

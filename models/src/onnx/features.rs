@@ -1,21 +1,22 @@
 //! XFeat features: keypoints at local maxima of the heat map, descriptors sampled bilinearly from the ⅛ map, score =
 //! heat × reliability (as XFeat's own detector). The network ships inside the binary (Apache-2.0).
 
+use std::path::Path;
+use std::sync::Arc;
+
 use image::RgbImage;
 
-use super::manifest::{Contract, Manifest};
+use super::OnnxError;
+use super::manifest::Contract;
+pub use super::network::DESCRIPTOR;
+use super::network::{LazySession, Network};
 use super::picture::push_planes;
-use super::session::{NetworkSession, Tensor};
-use super::{OnnxError, network};
+use super::session::{Tensor, check_library};
 
-/// Floats per descriptor.
-pub const DESCRIPTOR: usize = 64;
 /// Heat below this is no keypoint (XFeat's default).
 const MIN_HEAT: f32 = 0.05;
 /// Half of the window in which a keypoint is the only one (XFeat: 5×5).
 const NMS_RADIUS: usize = 2;
-/// The network halves its input five times.
-const MULTIPLE: u32 = 32;
 
 const EMBEDDED: &[u8] = include_bytes!("../../networks/xfeat.onnx");
 const EMBEDDED_MANIFEST: &str = include_str!("../../networks/xfeat.toml");
@@ -38,79 +39,59 @@ impl Features {
     }
 }
 
-/// An opened features network; the session is rebuilt when the picture size changes, so keep to one size.
+/// A features network; its session is opened again when the picture size changes, so keep to one size.
 #[derive(Debug)]
 pub struct FeatureNetwork {
-    manifest: Manifest,
-    bytes: Option<Vec<u8>>,
-    threads: usize,
-    session: Option<((u32, u32), NetworkSession)>,
+    session: LazySession,
     planes: Vec<f32>,
 }
 
 impl FeatureNetwork {
-    /// The embedded network, or the user's.
+    /// The embedded network, or the user's, which is [checked](Self::check).
     ///
     /// # Errors
-    /// The manifest or its file is bad; ONNX Runtime is missing (found here, not at the first picture).
-    pub fn open(manifest: Option<&std::path::Path>, threads: usize) -> Result<Self, OnnxError> {
-        super::session::find_library()?;
-        let (manifest, bytes) = match manifest {
-            None => (Manifest::parse(EMBEDDED_MANIFEST, "xfeat (embedded)")?, None),
-            Some(path) => {
-                let manifest = Manifest::read(path)?;
-                let bytes = manifest.read_network()?;
-                (manifest, Some(bytes))
-            }
+    /// The manifest or its file is bad, or the network is not what the manifest says; ONNX Runtime is missing or cannot be
+    /// used (found here, not at the first picture).
+    pub fn open(manifest: Option<&Path>, threads: usize) -> Result<Self, OnnxError> {
+        check_library()?;
+        let network = match manifest {
+            None => Network::embedded(EMBEDDED_MANIFEST, EMBEDDED)?,
+            Some(path) => Network::read_as(path, Contract::Features)?,
         };
-        if manifest.contract != Contract::Features {
-            return Err(OnnxError::Manifest {
-                manifest: manifest.name,
-                field: "contract",
-                reason: format!("is `{}`, needed is `features`", manifest.contract.name()),
-            });
+        let mut features = Self { session: LazySession::new(Arc::new(network), threads), planes: Vec::new() };
+        if manifest.is_some() {
+            features.check()?;
         }
-        Ok(Self { manifest, bytes, threads, session: None, planes: Vec::new() })
+        Ok(features)
+    }
+
+    /// Runs the network once on a blank picture of 640 × 480.
+    ///
+    /// # Errors
+    /// As [`LazySession::check`].
+    pub fn check(&mut self) -> Result<(), OnnxError> {
+        self.session.check((640, 480))
     }
 
     /// Gives the session's memory back; the next picture opens it again.
     pub fn close(&mut self) {
-        (self.session, self.planes) = (None, Vec::new());
+        self.session.close();
+        self.planes = Vec::new();
     }
 
-    /// Finds at most `max` features, best first.
+    /// Finds at most `max` features, best first; none in a picture smaller than the network takes.
     ///
     /// # Errors
     /// ONNX Runtime failed, or the network's outputs are not XFeat's.
     pub fn extract(&mut self, image: &RgbImage, max: usize) -> Result<Features, OnnxError> {
-        if image.width() < MULTIPLE || image.height() < MULTIPLE {
+        let input = &self.session.manifest().input;
+        if input.width.is_none() && image.width().min(image.height()) < input.multiple {
             return Ok(Features::default());
         }
-        let (w, h) = self.manifest.input_size(image.width(), image.height());
-        let session = match &mut self.session {
-            Some((size, session)) if *size == (w, h) => session,
-            slot => {
-                let bytes = self.bytes.as_deref().unwrap_or(EMBEDDED);
-                &mut slot.insert(((w, h), network::open(&self.manifest, bytes, (w, h), self.threads)?)).1
-            }
-        };
+        let (w, h) = self.session.manifest().input_size(image.width(), image.height());
         self.planes.clear();
-        push_planes(image, w, h, &self.manifest.input, &mut self.planes);
-        let out =
-            session.run(&[("image", &[1, 3, h as usize, w as usize], &self.planes)], &["feats", "heat", "rel"])?;
-        let (w, h) = (w as usize, h as usize);
-        let sizes = [(&out[0], DESCRIPTOR, h / 8, w / 8), (&out[1], 1, h, w), (&out[2], 1, h / 8, w / 8)];
-        for (tensor, c, rows, columns) in sizes {
-            if tensor.shape != [1, c, rows, columns] {
-                return Err(OnnxError::Contract {
-                    network: self.manifest.name.clone(),
-                    contract: "features",
-                    tensor: "an output".into(),
-                    expected: format!("[1,{c},{rows},{columns}]"),
-                    found: format!("{:?}", tensor.shape),
-                });
-            }
-        }
+        push_planes(image, w, h, input, &mut self.planes);
+        let out = self.session.run((w, h), &[&self.planes])?;
         let scale = [image.width() as f32 / w as f32, image.height() as f32 / h as f32];
         Ok(select(&out[0], &out[1], &out[2], max, scale))
     }

@@ -7,9 +7,15 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::OnnxError;
-use super::session::MAX_NETWORK_BYTES;
+use crate::formats::{FormatError, read_bounded};
+
+/// Networks larger than this are refused before they are read: nothing a companion computer can run is larger.
+const MAX_NETWORK_BYTES: u64 = 4 << 30;
+/// The same of manifests.
+const MAX_MANIFEST_BYTES: u64 = 1 << 16;
 
 /// Which inputs and outputs a network promises.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
@@ -135,10 +141,11 @@ pub struct PairSettings {
     /// Subtracted from `conf` to get a weight from 0 (DUSt3R's confidence is 1 + exp(x): offset 1).
     #[serde(default)]
     pub confidence_offset: f32,
-    /// `pts3d` is in metres; false = every pair has its own scale.
+    /// `pts3d` is in metres; false = every pair has its own scale. Its scale is estimated either way.
     #[serde(default)]
     pub metric: bool,
-    /// Both views' pointmaps are in the first camera's frame (DUSt3R, Splatt3R); false = each in its own.
+    /// Both views' pointmaps are in the first camera's frame (DUSt3R, Splatt3R); false = each in its
+    /// own, which needs `metric`.
     #[serde(default = "yes")]
     pub first_camera_frame: bool,
 }
@@ -182,6 +189,9 @@ pub struct Manifest {
     /// BLAKE3 of the ONNX file, hexadecimal; checked when present.
     #[serde(default)]
     pub blake3: Option<String>,
+    /// SHA-256 of the ONNX file, hexadecimal; checked when present.
+    #[serde(default)]
+    pub sha256: Option<String>,
     /// How pictures become inputs.
     pub input: InputSettings,
     /// What the file calls an input or output of the contract, where it calls it otherwise.
@@ -201,9 +211,8 @@ impl Manifest {
     /// # Errors
     /// The file is unreadable, no TOML, or contradicts itself.
     pub fn read(path: &Path) -> Result<Self, OnnxError> {
-        let text = read_bounded(path, 1 << 16)?;
-        let text = String::from_utf8(text)
-            .map_err(|e| OnnxError::File { path: path.to_owned(), reason: format!("not UTF-8: {e}") })?;
+        let text = read_bounded(path, MAX_MANIFEST_BYTES)?;
+        let text = String::from_utf8(text).map_err(|e| FormatError::invalid(path, format!("is not UTF-8: {e}")))?;
         let mut manifest = Self::parse(&text, &path.display().to_string())?;
         manifest.file = path.parent().unwrap_or(Path::new("")).join(&manifest.file);
         Ok(manifest)
@@ -221,6 +230,11 @@ impl Manifest {
             let wanted = if pair.poses == Poses::None { 2..=2 } else { 2..=8 };
             if !wanted.contains(&pair.views) {
                 return Err(fail("pair.views", format!("{} is not within {wanted:?}", pair.views)));
+            }
+            if !(pair.first_camera_frame || pair.metric) {
+                let reason = "false needs `metric = true`: a pointmap in its own camera's frame and at a scale of its own \
+                              cannot be moved into the first's; export `pts3d_in_other_view`";
+                return Err(fail("pair.first_camera_frame", reason.into()));
             }
             if pair.sh_degree > 3 {
                 return Err(fail("pair.sh_degree", format!("{} is above 3", pair.sh_degree)));
@@ -256,24 +270,24 @@ impl Manifest {
         Ok(bytes)
     }
 
-    /// Compares the hash of the network's bytes with the manifest's.
+    /// Compares the hashes of the network's bytes with those that the manifest states.
     ///
     /// # Errors
     /// They differ.
     pub fn check_hash(&self, bytes: &[u8]) -> Result<(), OnnxError> {
-        let Some(expected) = &self.blake3 else { return Ok(()) };
-        let found = blake3::hash(bytes).to_hex();
-        if expected.eq_ignore_ascii_case(found.as_str()) {
-            return Ok(());
+        let blake3 = |bytes: &[u8]| blake3::hash(bytes).to_hex().to_string();
+        let sha256 = |bytes: &[u8]| Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect();
+        let hashes: [fn(&[u8]) -> String; 2] = [blake3, sha256];
+        for ((field, expected), hash) in [("blake3", &self.blake3), ("sha256", &self.sha256)].into_iter().zip(hashes) {
+            let Some(expected) = expected else { continue };
+            let found = hash(bytes);
+            if !expected.eq_ignore_ascii_case(&found) {
+                let file = self.file.display();
+                let reason = format!("{file} has {found}, the manifest says {expected}: another file, or damaged");
+                return Err(OnnxError::Manifest { manifest: self.name.clone(), field, reason });
+            }
         }
-        Err(OnnxError::Manifest {
-            manifest: self.name.clone(),
-            field: "blake3",
-            reason: format!(
-                "{} has {found}, the manifest says {expected}: another file, or damaged",
-                self.file.display()
-            ),
-        })
+        Ok(())
     }
 
     /// The size at which a picture of `width` × `height` enters the network.
@@ -286,15 +300,6 @@ impl Manifest {
             }
         }
     }
-}
-
-fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, OnnxError> {
-    let fail = |reason: String| OnnxError::File { path: path.to_owned(), reason };
-    let length = std::fs::metadata(path).map_err(|e| fail(e.to_string()))?.len();
-    if length > limit {
-        return Err(fail(format!("{length} bytes are more than the {limit} allowed")));
-    }
-    std::fs::read(path).map_err(|e| fail(e.to_string()))
 }
 
 #[cfg(test)]
@@ -317,6 +322,9 @@ mod tests {
         refused(&PAIR.replace("views=3", "views=3\nviewz=3"), "viewz");
         refused(PAIR.split("[pair]").next().unwrap(), "[pair]");
         refused("contract", "syntax");
+        let unposed = PAIR.replace("poses='given'\nviews=3", "poses='none'\nviews=2\nfirst_camera_frame=false");
+        refused(&unposed, "pair.first_camera_frame");
+        assert!(Manifest::parse(&format!("{unposed}metric=true\n"), "m.toml").is_ok());
     }
 
     #[test]
@@ -328,6 +336,12 @@ mod tests {
         let manifest = Manifest::read(&folder.path().join("a.toml")).unwrap();
         let e = manifest.read_network().unwrap_err().to_string();
         assert!(e.contains("000000") && e.contains(blake3::hash(b"abc").to_hex().as_str()), "{e}");
+        // FIPS 180-2, appendix B.1.
+        let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        for (hash, fits) in [(abc.to_owned(), true), (abc.replace('b', "c"), false)] {
+            std::fs::write(folder.path().join("a.toml"), format!("sha256='{hash}'\n{PAIR}")).unwrap();
+            assert_eq!(Manifest::read(&folder.path().join("a.toml")).unwrap().read_network().is_ok(), fits);
+        }
     }
 
     #[test]

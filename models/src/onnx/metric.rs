@@ -2,34 +2,36 @@
 //! It is reported under the name in its manifest: distances of different networks cannot be compared.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use image::RgbImage;
 
 use super::OnnxError;
 use super::manifest::Contract;
-use super::named::NamedNetwork;
+use super::network::{LazySession, Network};
 use super::picture::push_planes;
 
 /// An opened metric.
 #[derive(Debug)]
 pub struct PerceptualMetric {
-    network: NamedNetwork,
+    session: LazySession,
     planes: [Vec<f32>; 2],
 }
 
 impl PerceptualMetric {
-    /// Reads the manifest and compares the network with it for pictures of `size`.
+    /// Reads the manifest and checks the network against it for pictures of `size`.
     ///
     /// # Errors
-    /// A file is missing or damaged, or the network does not follow contract `metric`.
+    /// As [`LazySession::check`]; a file is missing or damaged, or the network follows another contract.
     pub fn open(path: &Path, size: (u32, u32), threads: usize) -> Result<Self, OnnxError> {
-        let network = NamedNetwork::open(path, Contract::Metric, size, threads)?;
-        Ok(Self { network, planes: [Vec::new(), Vec::new()] })
+        let mut session = LazySession::new(Arc::new(Network::read_as(path, Contract::Metric)?), threads);
+        session.check(size)?;
+        Ok(Self { session, planes: [Vec::new(), Vec::new()] })
     }
 
     /// Name under which its distances are reported.
     pub fn name(&self) -> &str {
-        &self.network.manifest().name
+        &self.session.manifest().name
     }
 
     /// Distance of two pictures of one size, in the network's own unit; pictures of another size than the network's are
@@ -38,24 +40,22 @@ impl PerceptualMetric {
     /// # Errors
     /// ONNX Runtime fails, or what comes out is not one finite number.
     pub fn distance(&mut self, truth: &RgbImage, rendering: &RgbImage) -> Result<f64, OnnxError> {
-        let (w, h) = self.network.manifest().input_size(truth.width(), truth.height());
+        let (w, h) = self.session.manifest().input_size(truth.width(), truth.height());
         for (planes, image) in self.planes.iter_mut().zip([truth, rendering]) {
             planes.clear();
-            push_planes(image, w, h, &self.network.manifest().input, planes);
+            push_planes(image, w, h, &self.session.manifest().input, planes);
         }
-        let shape = [1, 3, h as usize, w as usize];
-        let inputs = [("image0", &shape[..], &self.planes[0][..]), ("image1", &shape[..], &self.planes[1][..])];
-        let out = self.network.at((w, h))?.run(&inputs, &["distance"])?;
-        match out.first().map(|t| t.data.as_slice()) {
-            Some([d]) if d.is_finite() => Ok(f64::from(*d)),
-            other => Err(self.network.broken(
-                "distance",
-                "one finite number".to_owned(),
-                other.map_or("missing".to_owned(), |d| match d {
-                    [d] => d.to_string(),
-                    many => format!("{} numbers", many.len()),
-                }),
-            )),
+        let out = self.session.run((w, h), &[&self.planes[0], &self.planes[1]])?;
+        let distance = f64::from(out[0].data[0]);
+        if !distance.is_finite() {
+            return Err(OnnxError::Contract {
+                network: self.name().to_owned(),
+                contract: Contract::Metric.name(),
+                tensor: "output `distance`".to_owned(),
+                expected: "one finite number".to_owned(),
+                found: distance.to_string(),
+            });
         }
+        Ok(distance)
     }
 }

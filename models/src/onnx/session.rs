@@ -14,9 +14,6 @@ use ort::value::{TensorElementType, TensorRef, ValueType};
 
 use super::{OnnxError, one_line};
 
-/// Networks larger than this are refused before they are read: nothing a companion computer can run is larger.
-pub const MAX_NETWORK_BYTES: u64 = 4 << 30;
-
 /// Name, element type and shape of an input or output as the file declares it; −1 where the file leaves it open.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TensorSpec {
@@ -201,4 +198,31 @@ fn environment() -> Result<&'static Environment, OnnxError> {
         .map_err(|e| unusable(one_line(e)))?;
     environment.set_log_level(ort::logging::LogLevel::Error);
     Ok(ENVIRONMENT.get_or_init(|| environment))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_library_that_is_there_but_cannot_be_opened_is_not_called_found() {
+        const NAME: &str = "onnx::session::tests::a_library_that_is_there_but_cannot_be_opened_is_not_called_found";
+        const CHILD: &str = "DGTR_TEST_CHILD";
+        if std::env::var_os(CHILD).is_some() {
+            let e = check_library().unwrap_err();
+            assert!(matches!(e, OnnxError::Library { .. }) && !e.to_string().contains('\n'), "{e}");
+            return;
+        }
+        // As another architecture's library is, to the loader.
+        let folder = tempfile::tempdir().unwrap();
+        let library = folder.path().join("libonnxruntime.so");
+        std::fs::write(&library, b"\x7fELF and nothing that this machine could run").unwrap();
+        let child = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", NAME])
+            .envs([(CHILD, "1".as_ref()), ("ORT_DYLIB_PATH", library.as_os_str())])
+            .output()
+            .unwrap();
+        assert!(child.status.success(), "{}", String::from_utf8_lossy(&child.stdout));
+        assert!(String::from_utf8_lossy(&child.stdout).contains("1 passed"), "the child ran another test");
+    }
 }

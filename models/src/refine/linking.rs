@@ -1,15 +1,15 @@
 //! A new key frame is linked to those before it: candidates by predicted overlap, guided matches, a verified
 //! relative pose, and what that says about the new frame's rotation.
 
-use super::frames::{Camera, Frame};
+use super::keyframe::KeyFrame;
 use super::matching::{Guide, Match, MatchLimits, match_frames};
 use super::overlap::{Ground, overlap, predict, search_radius};
-use super::polish::{Side, polish};
+use super::photometric::{Side, align_patch};
 use super::so3;
 use super::triangulate::triangulate;
 use super::twoview::{ROUNDS, RayPair, RelativePose, TwoView, TwoViewLimits, verify};
 use super::{AddReport, Refiner};
-use crate::camera::Pose;
+use crate::camera::{Pinhole, Pose};
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
@@ -43,8 +43,8 @@ const WIDE_TILT: f64 = 0.12;
 const PAIR_GROUNDS: usize = 15;
 
 impl Refiner {
-    pub(super) fn camera_of(&self, frame: &Frame) -> Camera {
-        Camera::new(frame.pose, &frame.intrinsics, self.shared.log_focal.exp())
+    pub(super) fn camera_of(&self, frame: &KeyFrame) -> Pinhole {
+        Pinhole::new(frame.pose, &frame.intrinsics, self.shared.log_focal.exp())
     }
 
     /// Ground under `frame`, as far as known.
@@ -53,7 +53,7 @@ impl Refiner {
     }
 
     /// Earlier frames that should see the same ground as the camera, best overlap first.
-    pub(super) fn candidates(&self, camera: &Camera, lens: &crate::camera::Intrinsics) -> Vec<u32> {
+    pub(super) fn candidates(&self, camera: &Pinhole, lens: &crate::camera::Intrinsics) -> Vec<u32> {
         let mut found: Vec<(f64, u32)> = self
             .frames
             .iter()
@@ -133,7 +133,7 @@ impl Refiner {
         let length = if coarse.rotation_only { 0.0 } else { baseline };
         let rotation = (fa.pose.rotation * coarse.pose.rotation.conjugate()).normalize();
         let center = fa.pose.center - rotation * coarse.pose.translation * length;
-        let cb = Camera::new(Pose { rotation, center }, &fb.intrinsics, self.shared.log_focal.exp());
+        let cb = Pinhole::new(Pose { rotation, center }, &fb.intrinsics, self.shared.log_focal.exp());
         let predicted: Vec<_> = fb.keypoints.iter().map(|p| predict(&cb, &ca, ground, *p)).collect();
         let unguided = vec![Some(ca.c); fb.keypoints.len()];
         let known = ground.0.is_some() && !any_heading;
@@ -164,7 +164,7 @@ impl Refiner {
         &mut self,
         a: usize,
         b: usize,
-        cb: &Camera,
+        cb: &Pinhole,
         ground: Ground,
         matches: Vec<Match>,
         mut found: TwoView,
@@ -179,7 +179,7 @@ impl Refiner {
             .map(|i| {
                 let m = matches[*i as usize];
                 let from = Side { grey: ga, camera: &ca, at: fa.keypoints[m.a as usize] };
-                polish(&from, &Side { grey: gb, camera: cb, at: fb.keypoints[m.b as usize] }, ground)
+                align_patch(&from, &Side { grey: gb, camera: cb, at: fb.keypoints[m.b as usize] }, ground)
             })
             .collect();
         let inliers = std::mem::take(&mut found.inliers);
@@ -188,12 +188,12 @@ impl Refiner {
             let Some(place) = place else { continue };
             let k = matches[i as usize].b as usize;
             let apart = (place[0] - frame.keypoints[k][0]).hypot(place[1] - frame.keypoints[k][1]);
-            if frame.polished[k] && apart > SETTLED_PX {
+            if frame.settled[k] && apart > SETTLED_PX {
                 continue;
             }
-            if !frame.polished[k] {
+            if !frame.settled[k] {
                 frame.keypoints[k] = place;
-                frame.polished[k] = true;
+                frame.settled[k] = true;
             }
             found.inliers.push(i);
         }
@@ -242,7 +242,7 @@ impl Refiner {
         let ca = self.camera_of(fa);
         let rotation: DQuat = (fa.pose.rotation * found.pose.rotation.conjugate()).normalize();
         let center = fa.pose.center - rotation * found.pose.translation * baseline;
-        let cb = Camera::new(Pose { rotation, center }, &fb.intrinsics, self.shared.log_focal.exp());
+        let cb = Pinhole::new(Pose { rotation, center }, &fb.intrinsics, self.shared.log_focal.exp());
         let mut heights: Vec<f64> = found
             .inliers
             .iter()
@@ -260,7 +260,7 @@ impl Refiner {
 }
 
 /// Lines in `a` on which the key points of `b` must lie: unit normal and offset, pixels.
-fn epipolar_lines(pose: &RelativePose, a: &Camera, b: &Camera, keypoints: &[[f32; 2]]) -> Vec<DVec3> {
+fn epipolar_lines(pose: &RelativePose, a: &Pinhole, b: &Pinhole, keypoints: &[[f32; 2]]) -> Vec<DVec3> {
     keypoints
         .iter()
         .map(|p| {

@@ -1,7 +1,7 @@
 //! Mutual nearest neighbours between the descriptors of two key frames, each key point compared only with those
 //! near its predicted place. That prunes some nine tenths of the work and most wrong matches with it.
 
-use super::frames::{DESCRIPTOR, Frame};
+use super::keyframe::{DESCRIPTOR, KeyFrame};
 use glam::{DVec2, DVec3};
 
 /// One match: key point of the first and of the second frame.
@@ -38,7 +38,7 @@ const CELL: f32 = 32.0;
 const SAME_PLACE: f32 = 12.0;
 
 /// Matches `b` against `a`.
-pub(crate) fn match_frames(a: &Frame, b: &Frame, guide: &Guide, limits: MatchLimits) -> Vec<Match> {
+pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: MatchLimits) -> Vec<Match> {
     let (of_a, of_b) = (a.keypoints.len().min(limits.features), b.keypoints.len().min(limits.features));
     let grid = Buckets::new(a, of_a);
     let mut best_of_a = vec![(i32::MIN, u32::MAX); of_a];
@@ -102,7 +102,7 @@ struct Buckets {
 }
 
 impl Buckets {
-    fn new(frame: &Frame, count: usize) -> Self {
+    fn new(frame: &KeyFrame, count: usize) -> Self {
         let columns = (frame.intrinsics.width as f32 / CELL).ceil().max(1.0) as usize;
         let rows = (frame.intrinsics.height as f32 / CELL).ceil().max(1.0) as usize;
         let cell = |p: &[f32; 2]| {

@@ -1,8 +1,7 @@
 //! Which pictures see the same ground, and where a pixel of one should lie in the other: both predicted from
 //! poses and a ground height, before any descriptor is compared.
 
-use super::frames::Camera;
-use crate::camera::{Intrinsics, Pose};
+use crate::camera::{Intrinsics, Pinhole, Pose};
 use glam::{DVec2, DVec3};
 
 /// Ground points sampled per side of a picture.
@@ -25,7 +24,7 @@ impl Ground {
     }
 
     /// World point at which the pixel's ray meets the ground.
-    pub fn meet(&self, camera: &Camera, pixel: [f32; 2]) -> DVec3 {
+    pub fn meet(&self, camera: &Pinhole, pixel: [f32; 2]) -> DVec3 {
         let ray = camera.world_ray(pixel);
         let height = self.height(&camera.pose);
         let along =
@@ -35,19 +34,15 @@ impl Ground {
 }
 
 /// Share of the two footprints that both see, 0..1 (the smaller of the two shares).
-pub(crate) fn overlap(a: (&Camera, &Intrinsics), b: (&Camera, &Intrinsics), ground: Ground) -> f64 {
-    let seen = |from: (&Camera, &Intrinsics), to: (&Camera, &Intrinsics)| {
+pub(crate) fn overlap(a: (&Pinhole, &Intrinsics), b: (&Pinhole, &Intrinsics), ground: Ground) -> f64 {
+    let seen = |from: (&Pinhole, &Intrinsics), to: (&Pinhole, &Intrinsics)| {
         let mut inside = 0u32;
         for y in 0..GRID {
             for x in 0..GRID {
                 let px = (x as f32 + 0.5) / GRID as f32 * from.1.width as f32;
                 let py = (y as f32 + 0.5) / GRID as f32 * from.1.height as f32;
                 let world = ground.meet(from.0, [px, py]);
-                let hit = to
-                    .0
-                    .project(world)
-                    .is_some_and(|q| q.x >= 0.0 && q.y >= 0.0 && q.x < to.1.width as f64 && q.y < to.1.height as f64);
-                inside += u32::from(hit);
+                inside += u32::from(to.0.project(world).is_some_and(|q| to.1.contains(q)));
             }
         }
         f64::from(inside) / f64::from(GRID * GRID)
@@ -56,13 +51,13 @@ pub(crate) fn overlap(a: (&Camera, &Intrinsics), b: (&Camera, &Intrinsics), grou
 }
 
 /// Where the scene at `pixel` of `from` should appear in `to`.
-pub(crate) fn predict(from: &Camera, to: &Camera, ground: Ground, pixel: [f32; 2]) -> Option<DVec2> {
+pub(crate) fn predict(from: &Pinhole, to: &Pinhole, ground: Ground, pixel: [f32; 2]) -> Option<DVec2> {
     to.project(ground.meet(from, pixel))
 }
 
 /// How far a prediction may be off, pixels: three sigma of both poses, and relief of ±20 % of the height times
 /// the parallax of the baseline.
-pub(crate) fn search_radius(a: &Camera, b: &Camera, rotation_sigma: f64, position_sigma: f64, ground: Ground) -> f64 {
+pub(crate) fn search_radius(a: &Pinhole, b: &Pinhole, rotation_sigma: f64, position_sigma: f64, ground: Ground) -> f64 {
     let f = a.f.max_element().max(b.f.max_element());
     let height = ground.height(&b.pose).min(ground.height(&a.pose));
     let baseline = (a.pose.center - b.pose.center).length();
@@ -76,11 +71,11 @@ mod tests {
     use super::*;
     use glam::{DMat3, DQuat};
 
-    fn nadir(center: DVec3) -> Camera {
+    fn nadir(center: DVec3) -> Pinhole {
         // x east, y south, z down.
         let r = DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z);
         let pose = Pose { rotation: DQuat::from_mat3(&r), center };
-        Camera::new(pose, &K, 1.0)
+        Pinhole::new(pose, &K, 1.0)
     }
     const K: Intrinsics = Intrinsics { width: 640, height: 480, fx: 400.0, fy: 400.0, cx: 320.0, cy: 240.0 };
 

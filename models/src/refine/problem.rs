@@ -1,9 +1,8 @@
 //! The bundle adjustment's unknowns and residuals: key-frame poses, points, and the few parameters all frames
 //! share; reprojection errors against telemetry priors, each with a robust loss.
 
-use super::frames::Camera;
 use super::so3;
-use crate::camera::{Intrinsics, Pose};
+use crate::camera::{Intrinsics, Pinhole, Pose};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 /// Shared parameters: mount misalignment (3), delay of positions, log focal scale.
@@ -94,8 +93,8 @@ pub(crate) struct PriorRows {
 }
 
 impl Problem {
-    pub fn camera(&self, i: usize) -> Camera {
-        Camera::new(self.poses[i], &self.intrinsics[i], self.shared.log_focal.exp())
+    pub fn camera(&self, i: usize) -> Pinhole {
+        Pinhole::new(self.poses[i], &self.intrinsics[i], self.shared.log_focal.exp())
     }
 
     pub fn sightings(&self, point: usize) -> &[Observation] {
@@ -103,13 +102,13 @@ impl Problem {
     }
 
     /// Residual in pixels, when the point is in front.
-    pub fn residual(&self, camera: &Camera, point: DVec3, o: &Observation) -> Option<DVec2> {
+    pub fn residual(&self, camera: &Pinhole, point: DVec3, o: &Observation) -> Option<DVec2> {
         Some(camera.project(point)? - DVec2::new(o.pixel[0].into(), o.pixel[1].into()))
     }
 
     /// Total robust cost.
     pub fn cost(&self, loss: Loss) -> f64 {
-        let cameras: Vec<Camera> = (0..self.poses.len()).map(|i| self.camera(i)).collect();
+        let cameras: Vec<Pinhole> = (0..self.poses.len()).map(|i| self.camera(i)).collect();
         let mut sum = self.shared_residuals().iter().map(|r| r * r).sum::<f64>();
         for i in 0..self.poses.len() {
             sum += self.prior_rows(i).cost;

@@ -1,16 +1,15 @@
 //! Pose of one frame from points whose place is known: for frames whose telemetry position is far off.
 
-use super::frames::Camera;
 use super::problem::Loss;
 use super::so3;
 use super::triangulate::pixel_by_local;
-use crate::camera::Pose;
+use crate::camera::{Pinhole, Pose};
 use glam::{DVec2, DVec3};
 use nalgebra::{SMatrix, SVector};
 
 /// Gauss–Newton on the reprojection error with a convex robust loss. `None` when fewer than half of the points
 /// end up within `inlier_px`: then telemetry is the better guess.
-pub(crate) fn resect(start: Camera, seen: &[(DVec3, [f32; 2])], inlier_px: f64) -> Option<Pose> {
+pub(crate) fn resect(start: Pinhole, seen: &[(DVec3, [f32; 2])], inlier_px: f64) -> Option<Pose> {
     let mut camera = start;
     for _ in 0..20 {
         let mut h = SMatrix::<f64, 6, 6>::zeros();
@@ -71,7 +70,7 @@ mod tests {
     #[test]
     fn a_position_off_by_30_metres_is_found_from_points() {
         let truth = Pose { rotation: DQuat::IDENTITY, center: DVec3::new(1.0, 2.0, 3.0) };
-        let camera = Camera::new(truth, &K, 1.0);
+        let camera = Pinhole::new(truth, &K, 1.0);
         let mut seen: Vec<_> =
             points().iter().map(|p| (*p, camera.project(*p).unwrap().as_vec2().to_array())).collect();
         for s in seen.iter_mut().take(8) {
@@ -79,13 +78,13 @@ mod tests {
         }
         let start =
             Pose { rotation: so3::exp(DVec3::new(0.02, 0.0, 0.05)), center: truth.center - DVec3::new(4.0, 0.0, 30.0) };
-        let found = resect(Camera::new(start, &K, 1.0), &seen, 12.0).unwrap();
+        let found = resect(Pinhole::new(start, &K, 1.0), &seen, 12.0).unwrap();
         assert!((found.center - truth.center).length() < 0.7, "{found:?}");
     }
 
     #[test]
     fn points_that_agree_with_no_place_are_refused() {
-        let camera = Camera::new(Pose { rotation: DQuat::IDENTITY, center: DVec3::ZERO }, &K, 1.0);
+        let camera = Pinhole::new(Pose { rotation: DQuat::IDENTITY, center: DVec3::ZERO }, &K, 1.0);
         let seen: Vec<_> =
             points().iter().enumerate().map(|(i, p)| (*p, [(i * 199 % 640) as f32, (i * 83 % 480) as f32])).collect();
         assert!(resect(camera, &seen, 12.0).is_none());

@@ -1,10 +1,10 @@
 //! Normal equations with the points eliminated: the 3×3 block of every point is inverted on the spot, so that
 //! only frames and shared parameters remain. Blocks exist only for pairs of frames that see a common point.
 
-use super::frames::Camera;
 use super::problem::{FOCAL, Loss, Problem, SHARED};
 use super::so3::skew;
 use super::triangulate::pixel_by_local;
+use crate::camera::Pinhole;
 use glam::DVec3;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
@@ -65,7 +65,7 @@ impl Reduced {
 
     /// Linearises `problem` where it stands, with Levenberg–Marquardt damping `lambda` on every diagonal.
     pub fn fill(&mut self, problem: &Problem, loss: Loss, lambda: f64) {
-        let cameras: Vec<Camera> = (0..problem.poses.len()).map(|i| problem.camera(i)).collect();
+        let cameras: Vec<Pinhole> = (0..problem.poses.len()).map(|i| problem.camera(i)).collect();
         self.clear();
         let n = problem.points.len();
         let parts: Vec<(Self, Vec<Block>)> = (0..PARTS)
@@ -143,7 +143,7 @@ impl Reduced {
     fn eliminate(
         &mut self,
         problem: &Problem,
-        cameras: &[Camera],
+        cameras: &[Pinhole],
         point: usize,
         loss: Loss,
         lambda: f64,
@@ -200,7 +200,7 @@ struct PointEquation {
 }
 
 impl PointEquation {
-    fn new(problem: &Problem, cameras: &[Camera], point: usize, loss: Loss, lambda: f64, rows: &mut Vec<Row>) -> Self {
+    fn new(problem: &Problem, cameras: &[Pinhole], point: usize, loss: Loss, lambda: f64, rows: &mut Vec<Row>) -> Self {
         rows.clear();
         let world = problem.points[point];
         let per_px = 1.0 / problem.pixel_sigma;
@@ -239,7 +239,7 @@ impl PointEquation {
 
 /// Steps of the points that belong to the given steps of frames and focal length.
 pub(crate) fn point_steps(problem: &Problem, loss: Loss, lambda: f64, frames: &[FrameVec], focal: f64) -> Vec<DVec3> {
-    let cameras: Vec<Camera> = (0..problem.poses.len()).map(|i| problem.camera(i)).collect();
+    let cameras: Vec<Pinhole> = (0..problem.poses.len()).map(|i| problem.camera(i)).collect();
     (0..problem.points.len())
         .into_par_iter()
         .with_min_len(256)

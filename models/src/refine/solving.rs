@@ -2,7 +2,6 @@
 //! shared parameters where the pictures can tell them, and the points and depth ranges that come out.
 
 use super::adjust::{Limits, adjust, shared_sigma};
-use super::frames::Camera;
 use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::problem::{Loss, Observation, PosePrior, Problem, SHARED};
@@ -10,7 +9,7 @@ use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
 use super::triangulate::{Triangulated, triangulate};
 use super::{RefineError, RefineReport, RefinedPoint, Refiner, SharedEstimate};
-use crate::camera::Pose;
+use crate::camera::{Pinhole, Pose};
 use glam::DVec3;
 use std::time::{Duration, Instant};
 
@@ -125,17 +124,17 @@ impl Refiner {
         problem
     }
 
-    fn cameras(&self) -> Vec<Camera> {
+    fn cameras(&self) -> Vec<Pinhole> {
         self.frames.iter().map(|f| self.camera_of(f)).collect()
     }
 
     /// Triangulates a track; while it does not fit, the sighting furthest off is left out, down to two.
     fn robust_point(
         &self,
-        cameras: &[Camera],
+        cameras: &[Pinhole],
         seen: &mut Vec<Sighting>,
         max_px: f64,
-        views: &mut Vec<(Camera, [f32; 2])>,
+        views: &mut Vec<(Pinhole, [f32; 2])>,
     ) -> Option<Triangulated> {
         let min_angle = self.settings.min_angle_deg.to_radians();
         loop {
@@ -145,7 +144,7 @@ impl Refiner {
                 (cameras[frame], self.frames[frame].keypoints[s.feature as usize])
             }));
             let found = triangulate(views, min_angle)?;
-            let error = |v: &(Camera, [f32; 2])| match v.0.project(found.world) {
+            let error = |v: &(Pinhole, [f32; 2])| match v.0.project(found.world) {
                 Some(q) => (q - glam::DVec2::new(v.1[0].into(), v.1[1].into())).length(),
                 None => f64::INFINITY,
             };

@@ -1,6 +1,6 @@
 //! Matches of many pairs joined into tracks: one track is one point of the scene seen in several key frames.
 
-use super::frames::Frame;
+use super::keyframe::KeyFrame;
 
 /// Union–find over all key points ever added, with path halving. A set never holds two key points of one picture:
 /// a match that would make it so is wrong, or an earlier one is, and is refused.
@@ -8,7 +8,7 @@ pub(crate) struct Union {
     parent: Vec<u32>,
     /// Next member of the same set, around in a circle.
     next: Vec<u32>,
-    /// Frame of each node.
+    /// KeyFrame of each node.
     frame: Vec<u32>,
 }
 
@@ -95,7 +95,7 @@ pub(crate) struct Tracks {
 
 impl Tracks {
     /// Groups the key points of `frames` by their root.
-    pub fn build(union: &mut Union, frames: &[Frame], max_observations: usize) -> Self {
+    pub fn build(union: &mut Union, frames: &[KeyFrame], max_observations: usize) -> Self {
         let nodes = union.parent.len();
         let mut size = vec![0u32; nodes];
         for node in 0..nodes as u32 {

@@ -1,6 +1,6 @@
 //! The point where the rays of one track come closest, with the checks that keep nonsense out.
 
-use super::frames::Camera;
+use crate::camera::Pinhole;
 use glam::{DMat3, DVec2, DVec3};
 
 /// A triangulated point.
@@ -18,7 +18,7 @@ const MAX_RAYS: usize = 12;
 
 /// Least-squares meeting point of the rays, then two Gauss–Newton steps on the reprojection error. `None` when
 /// the rays are parallel to below `min_angle` (radians), or the point lies behind a camera or is not finite.
-pub(crate) fn triangulate(views: &[(Camera, [f32; 2])], min_angle: f64) -> Option<Triangulated> {
+pub(crate) fn triangulate(views: &[(Pinhole, [f32; 2])], min_angle: f64) -> Option<Triangulated> {
     if views.len() < 2 {
         return None;
     }
@@ -73,13 +73,13 @@ pub(crate) fn triangulate(views: &[(Camera, [f32; 2])], min_angle: f64) -> Optio
 }
 
 /// Rows of d(pixel)/d(world point), for the point at `p` in camera axes.
-pub(crate) fn pixel_by_world(camera: &Camera, p: DVec3) -> (DVec3, DVec3) {
+pub(crate) fn pixel_by_world(camera: &Pinhole, p: DVec3) -> (DVec3, DVec3) {
     let (x, y) = pixel_by_local(camera, p);
     (camera.pose.rotation * x, camera.pose.rotation * y)
 }
 
 /// Rows of d(pixel)/d(point in camera axes).
-pub(crate) fn pixel_by_local(camera: &Camera, p: DVec3) -> (DVec3, DVec3) {
+pub(crate) fn pixel_by_local(camera: &Pinhole, p: DVec3) -> (DVec3, DVec3) {
     let z = 1.0 / p.z;
     let x = DVec3::new(camera.f.x * z, 0.0, -camera.f.x * p.x * z * z);
     let y = DVec3::new(0.0, camera.f.y * z, -camera.f.y * p.y * z * z);
@@ -93,12 +93,12 @@ mod tests {
     use crate::camera::{Intrinsics, Pose};
     use glam::DQuat;
 
-    fn at(x: f64) -> Camera {
+    fn at(x: f64) -> Pinhole {
         let k = Intrinsics { width: 640, height: 480, fx: 400.0, fy: 400.0, cx: 320.0, cy: 240.0 };
-        Camera::new(Pose { rotation: DQuat::IDENTITY, center: DVec3::new(x, 0.0, 0.0) }, &k, 1.0)
+        Pinhole::new(Pose { rotation: DQuat::IDENTITY, center: DVec3::new(x, 0.0, 0.0) }, &k, 1.0)
     }
 
-    fn views(point: DVec3, xs: &[f64]) -> Vec<(Camera, [f32; 2])> {
+    fn views(point: DVec3, xs: &[f64]) -> Vec<(Pinhole, [f32; 2])> {
         xs.iter().map(|x| (at(*x), at(*x).project(point).unwrap().as_vec2().to_array())).collect()
     }
 

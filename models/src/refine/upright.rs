@@ -1,9 +1,8 @@
 //! Pictures turned by quarter turns before features are extracted. Survey lines are flown back and forth and
 //! across; XFeat's descriptors bear some 30° of rotation, not 180°. Quarter turns cost no resampling.
 
-use super::frames::Camera;
 use super::overlap::{Ground, predict};
-use crate::camera::Intrinsics;
+use crate::camera::{Intrinsics, Pinhole};
 use image::{RgbImage, imageops};
 use std::borrow::Cow;
 
@@ -38,7 +37,7 @@ pub(crate) fn restore(p: [f32; 2], width: u32, height: u32, quarter_turns: u8, o
 }
 
 /// Quarter turns that bring picture `b` into the direction of `a`, itself turned by `a_turns`.
-pub(crate) fn turns_like(a: &Camera, a_turns: u8, b: &Camera, b_lens: &Intrinsics, ground: Ground) -> u8 {
+pub(crate) fn turns_like(a: &Pinhole, a_turns: u8, b: &Pinhole, b_lens: &Intrinsics, ground: Ground) -> u8 {
     let (x, y) = (b_lens.width as f32 / 2.0, b_lens.height as f32 / 2.0);
     let across = match (predict(b, a, ground, [x - 1.0, y]), predict(b, a, ground, [x + 1.0, y])) {
         (Some(left), Some(right)) => right - left,
@@ -81,7 +80,7 @@ mod tests {
         let nadir = DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z);
         let camera = |heading_deg: f64| {
             let rotation = DQuat::from_rotation_z(-heading_deg.to_radians()) * DQuat::from_mat3(&nadir);
-            Camera::new(Pose { rotation, center: DVec3::new(0.0, 0.0, 50.0) }, &lens, 1.0)
+            Pinhole::new(Pose { rotation, center: DVec3::new(0.0, 0.0, 50.0) }, &lens, 1.0)
         };
         let north = camera(0.0);
         // Heading east (clockwise by 90°): what points right in it points down in the north-up picture.

@@ -10,11 +10,11 @@ use models::formats::model;
 use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, Trainer};
 
-use crate::cli::CliError;
-use crate::evaluate::{Perceptual, Scores, evaluate, open_metric, stem};
-use crate::renderer;
+use crate::engine::device::renderer;
+use crate::error::JobError;
+use crate::evaluate::{Perceptual, Scores, evaluate, open_metric};
 use crate::report::{Comparison, ReportData};
-use crate::transfer::PoseTransfer;
+use crate::transfer::{PoseTransfer, stem};
 
 /// A global model this much worse than a local one on its own ground is worth a warning, dB.
 const WORTH_A_WARNING_DB: f64 = 0.3;
@@ -38,13 +38,13 @@ struct Opened {
 }
 
 impl Opened {
-    fn new(path: &Path, set: &Dataset, size: (u32, u32), device: Option<&str>) -> Result<Self, CliError> {
+    fn new(path: &Path, set: &Dataset, size: (u32, u32), device: Option<&str>) -> Result<Self, JobError> {
         let (header, cloud) = model::read(path)?;
-        let trainer = renderer::open(device, &cloud, size.0, size.1)?;
+        let trainer = renderer(device, &cloud, size.0, size.1)?;
         Ok(Self { trainer, transfer: PoseTransfer::between(set, &header.views) })
     }
 
-    fn picture(&mut self, view: &View) -> Result<RgbImage, CliError> {
+    fn picture(&mut self, view: &View) -> Result<RgbImage, JobError> {
         let mut into = Rendering::default();
         let view = View { intrinsics: view.intrinsics, pose: self.transfer.apply(&view.pose) };
         self.trainer.render(&view, &mut into)?;
@@ -65,7 +65,7 @@ pub fn compare(
     global: &Path,
     metric: Option<&Path>,
     device: Option<&str>,
-) -> Result<Vec<Held>, CliError> {
+) -> Result<Vec<Held>, JobError> {
     let frames = set.select(split, None)?;
     let Some(first) = frames.first() else { return Ok(Vec::new()) };
     let size = set.load(*first, scale)?.image.dimensions();
@@ -90,7 +90,7 @@ fn by_nearest_training_view(
     set: &Dataset,
     frames: &[usize],
     locals: &[(String, PathBuf)],
-) -> Result<Vec<Vec<usize>>, CliError> {
+) -> Result<Vec<Vec<usize>>, JobError> {
     let mut centers = Vec::new();
     for (m, (_, path)) in locals.iter().enumerate() {
         let names: Vec<String> = model::read_header(path)?.0.views.iter().map(|(n, _)| stem(n)).collect();

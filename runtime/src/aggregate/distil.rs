@@ -9,19 +9,17 @@ use std::ops::ControlFlow;
 use std::time::Instant;
 
 use config::ground::GroundSettings;
-use config::plan::{Plan, PlanRequest};
 use config::training::{RateSettings, Strategy, TrainSettings};
 use image::RgbImage;
 use models::camera::{Intrinsics, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::metrics;
-use vulkan::gpu::Gpu;
 use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::merge::{Merged, opacity};
 use super::seam::Seams;
 use super::{AggregateError, LocalModel};
-use crate::kernels;
+use crate::engine::device::DeviceRequest;
 
 /// Views of each aircraft kept as pictures for the report.
 const SAMPLES_PER_MODEL: usize = 1;
@@ -120,24 +118,20 @@ pub fn distil(
         return Ok(report);
     }
     report.used = lessons.len();
-    let gpu = Gpu::open(settings.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
     let largest = models.iter().map(|m| m.cloud.len()).max().unwrap_or(0).max(merged.cloud.len());
-    let plan = Plan::new(&PlanRequest {
+    let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);
+    let request = DeviceRequest {
+        device: settings.device.clone(),
         device_mib: settings.device_mib,
-        width: lessons.iter().map(|l| l.view.intrinsics.width).max().unwrap_or(1),
-        height: lessons.iter().map(|l| l.view.intrinsics.height).max().unwrap_or(1),
-        views: lessons.len() as u32,
-        sh_degree: merged.cloud.sh_degree,
+        size: (side(|k| k.width), side(|k| k.height)),
+        views: lessons.len(),
         max_gaussians: Some(largest),
-        sort_lanes: gpu.info().sort_lanes(),
-        ..Default::default()
-    })?;
-    report.over_plan = merged.keep_most_important(plan.gaussians);
-    report.device = gpu.info().name.clone();
+    };
     let steps = settings.epochs.saturating_mul(lessons.len() as u32);
-    let mut trainer =
-        Trainer::with_shape(&gpu, &plan, &recipe(settings, merged.cloud.sh_degree, steps), kernels::shape_of(&gpu))?;
-    report.device_bytes = [plan.total_bytes, trainer.device_bytes()];
+    let mut trainer: Trainer = request.open::<AggregateError>(&recipe(settings, merged.cloud.sh_degree, steps))?;
+    report.over_plan = merged.keep_most_important(trainer.plan().gaussians);
+    report.device = trainer.gpu().info().name.clone();
+    report.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
 
     let start = Instant::now();
     for (m, model) in models.iter().enumerate() {
@@ -156,7 +150,7 @@ pub fn distil(
     for lesson in &lessons {
         trainer.add_view(&lesson.picture(), None)?;
     }
-    let (best, after) = school(&mut trainer, merged, &lessons, &before, settings, &mut report, go_on)?;
+    let (best, after) = distil_in_stages(&mut trainer, merged, &lessons, &before, settings, &mut report, go_on)?;
     report.seconds[1] = start.elapsed().as_secs_f64();
     report.agreement = agreement(models.len(), &lessons, &before, &after);
     report.reverted = best.is_none();
@@ -174,7 +168,7 @@ pub fn distil(
 ///
 /// Adam starts without a memory of gradients and moves everything by its rate at first. How far that may be depends on how
 /// good the models are: coarse ones gain from a rate that would spoil fine ones, so the rate is found by trying.
-fn school(
+fn distil_in_stages(
     trainer: &mut Trainer,
     merged: &Merged,
     lessons: &[Lesson],

@@ -15,7 +15,7 @@ use vulkan::trainer::{Rendering, Trainer};
 
 use super::LocalModel;
 use super::frame::Motion;
-use crate::renderer;
+use crate::engine::device::renderer;
 
 /// Views of one model that are looked at through the other.
 const VIEWS: usize = 8;
@@ -97,8 +97,7 @@ fn fit(
         return Ok(None);
     }
     let open = |m: &LocalModel| {
-        renderer::open(device, &m.cloud, views[0].intrinsics.width, views[0].intrinsics.height)
-            .map_err(|e| e.to_string())
+        renderer(device, &m.cloud, views[0].intrinsics.width, views[0].intrinsics.height).map_err(|e| e.to_string())
     };
     let (mut a, mut b) = (open(anchor)?, open(free)?);
     let mut pairs: Vec<(DVec3, DVec3)> = Vec::new();

@@ -72,10 +72,8 @@ pub fn report(outcome: &Outcome) -> ReportData {
             views: Some(header.views.len() as u64),
             gaussians: Some(outcome.kept[i].gaussians as u64),
             steps: Some(header.steps),
-            seconds: Some(header.train_seconds),
             ..Default::default()
         });
-        data.timings.push(Timing { name: "train".into(), of: name.clone(), seconds: header.train_seconds });
     }
     data.models.push(ModelRow {
         name: "global".into(),

@@ -5,7 +5,9 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-use crate::cli::CliError;
+use config::error::ErrorKind;
+
+use crate::error::JobError;
 use crate::run_json::RunReport;
 
 /// How a child ended.
@@ -19,13 +21,24 @@ pub struct Ended {
     pub seconds: f64,
 }
 
+impl Ended {
+    /// The report of the child called `name`.
+    ///
+    /// # Errors
+    /// It failed.
+    pub fn report(self, name: &str) -> Result<RunReport, JobError> {
+        let failed = || JobError::Child { kind: ErrorKind::Failed, line: format!("{name}: {}", self.last_line) };
+        self.report.ok_or_else(failed)
+    }
+}
+
 /// Runs `dgtr ARGUMENTS --out OUT` to its end, its standard error in `OUT/log.txt`. A child that fails is a result, too;
 /// its exit code 3 (no device) and a request to stop are not.
 ///
 /// # Errors
 /// The child cannot be started, found no device, or was interrupted.
-pub fn run(arguments: &[String], out: &Path, limit_mib: Option<u64>) -> Result<Ended, CliError> {
-    let failed = |what: std::io::Error| CliError::failed(format!("{}: {what}", out.display()));
+pub fn run(arguments: &[String], out: &Path, limit_mib: Option<u64>) -> Result<Ended, JobError> {
+    let failed = |source| JobError::Io { path: out.into(), source };
     std::fs::create_dir_all(out).map_err(failed)?;
     let log = out.join("log.txt");
     let mut command = Command::new(std::env::current_exe().map_err(failed)?);
@@ -44,8 +57,11 @@ pub fn run(arguments: &[String], out: &Path, limit_mib: Option<u64>) -> Result<E
         said.lines().rfind(|l| !l.starts_with("note: ")).unwrap_or_default().trim_start_matches("dgtr: ").to_owned();
     match status.code() {
         Some(0) => Ok(Ended { report: Some(RunReport::read(out)?), last_line, seconds }),
-        Some(3) => Err(CliError::device(last_line)),
-        Some(4) | Some(130) => Err(CliError::interrupted("stopped on request; what was measured so far is kept")),
+        Some(3) => Err(JobError::Child { kind: ErrorKind::Device, line: last_line }),
+        Some(4) | Some(130) => {
+            let line = "stopped on request; what was measured so far is kept".into();
+            Err(JobError::Child { kind: ErrorKind::Interrupted, line })
+        }
         _ => Ok(Ended { report: None, last_line, seconds }),
     }
 }

@@ -1,12 +1,11 @@
 //! One table, four ways out: Markdown on standard output, CSV, JSON and (through [`crate::report`]) HTML.
 
-use std::io::Write;
 use std::path::Path;
 
 use models::formats::write_atomic;
 use serde::Serialize;
 
-use crate::cli::CliError;
+use crate::error::JobError;
 use crate::report::Table;
 
 /// The table as GitHub writes tables: first column text, the others right-aligned figures.
@@ -53,7 +52,7 @@ pub fn csv(table: &Table) -> String {
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write_text(path: &Path, text: &str) -> Result<(), CliError> {
+pub fn write_text(path: &Path, text: &str) -> Result<(), JobError> {
     Ok(write_atomic(path, |out| out.write_all(text.as_bytes()))?)
 }
 
@@ -61,8 +60,8 @@ pub fn write_text(path: &Path, text: &str) -> Result<(), CliError> {
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), CliError> {
-    let text = serde_json::to_string_pretty(value).map_err(CliError::failed)?;
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), JobError> {
+    let text = serde_json::to_string_pretty(value)?;
     write_text(path, &(text + "\n"))
 }
 

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::child;
 use super::figures::short;
-use crate::cli::CliError;
+use crate::error::JobError;
 use crate::report::{Table, bytes, count};
 
 /// How every budget is trained.
@@ -57,7 +57,7 @@ impl BudgetFigures {
 ///
 /// # Errors
 /// No device, or stopped on request.
-pub fn measure(budget_mib: u32, recipe: &Recipe, out: &Path) -> Result<BudgetFigures, CliError> {
+pub fn measure(budget_mib: u32, recipe: &Recipe, out: &Path) -> Result<BudgetFigures, JobError> {
     let limit_mib = u64::from(budget_mib) + recipe.host_mib;
     let mut arguments = vec!["train".to_owned()];
     arguments.extend(recipe.train.iter().cloned());

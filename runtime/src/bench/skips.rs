@@ -10,7 +10,7 @@ use toml::{Table as Toml, Value};
 use super::child;
 use super::figures::{short, write_text};
 use crate::capture::KeyframeSelector;
-use crate::cli::CliError;
+use crate::error::JobError;
 use crate::report::Table;
 
 /// A skip that saves less than this share of the time …
@@ -50,7 +50,7 @@ pub const SKIPS: &[Skip] = &[
     skip!("culling by opacity", false, "training.skips.opacity": true => false),
     skip!("exact tile-ellipse lists", false, "training.skips.exact_tiles": true => false),
     skip!("early end of opaque tiles", false, "training.skips.early_end": true => false),
-    skip!("deferred moments of the unseen", false, "training.skips.deferred_moments": true => false),
+    skip!("lazy Adam outside the view", false, "training.skips.deferred_moments": true => false),
     skip!(
         "SH degree raised late", false,
         "training.sh.raise_at": vec![0.033, 0.067, 0.1] => vec![0.0, 0.0, 0.0]
@@ -119,7 +119,7 @@ pub fn train(
     on: impl Fn(usize) -> bool,
     arguments: &[String],
     out: &Path,
-) -> Result<Run, CliError> {
+) -> Result<Run, JobError> {
     let mut settings = base.clone();
     for (i, skip) in SKIPS.iter().enumerate() {
         for (path, value) in if on(i) { skip.on } else { skip.off } {
@@ -132,9 +132,10 @@ pub fn train(
     all.extend(arguments.iter().cloned());
     all.extend(["--settings".to_owned(), file.display().to_string(), "--fresh".to_owned()]);
     let ended = child::run(&all, out, None)?;
-    let report = ended.report.ok_or_else(|| CliError::failed(format!("{name}: {}", ended.last_line)))?;
+    let report = ended.report(name)?;
     let work = |what: &str| report.more.get("work").and_then(|w| w.get(what)?.as_u64()).unwrap_or(0);
-    let psnr = report.psnr.ok_or_else(|| CliError::input("the data set has no held-out pictures (split `test`)"))?;
+    let psnr =
+        report.psnr.ok_or_else(|| JobError::Request("the data set has no held-out pictures (split `test`)".into()))?;
     Ok(Run {
         name: name.to_owned(),
         seconds: report.wall_s - report.stage_ms.get("evaluate").copied().unwrap_or(0.0) * 1e-3,
@@ -148,13 +149,13 @@ pub fn train(
 }
 
 /// Sets `path` (names joined by dots), making the tables on the way.
-fn put(settings: &mut Toml, path: &str, value: Value) -> Result<(), CliError> {
+fn put(settings: &mut Toml, path: &str, value: Value) -> Result<(), JobError> {
     let mut names: Vec<&str> = path.split('.').collect();
     let last = names.pop().unwrap_or_default();
     let mut at = settings;
     for name in names {
         let below = at.entry(name).or_insert_with(|| Value::Table(Toml::new()));
-        at = below.as_table_mut().ok_or_else(|| CliError::input(format!("settings: {name} is not a table")))?;
+        at = below.as_table_mut().ok_or_else(|| JobError::Request(format!("settings: {name} is not a table")))?;
     }
     at.insert(last.to_owned(), value);
     Ok(())

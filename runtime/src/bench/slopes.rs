@@ -31,7 +31,7 @@ impl Driver {
             Stage::Target => (Self::Pixels, "one lane per pixel unpacks the picture"),
             Stage::Project => (Self::Gaussians, "every Gaussian is projected before it is known to be out of view"),
             Stage::Sort => (Self::Visible, "four radix passes over the visible depths, a histogram per lane besides"),
-            Stage::Shade => (Self::Visible, "SH of the visible, and the steps they missed are made up for"),
+            Stage::Shade => (Self::Visible, "SH of the visible, and lazy Adam's missed steps"),
             Stage::Count => (Self::Instances, "walks each visible Gaussian's tiles"),
             Stage::Emit => (Self::Instances, "walks them again and writes each once"),
             Stage::Rasterise => (Self::Evaluations, "an exponential for every pixel of every instance in front"),

@@ -4,7 +4,7 @@
 use std::ops::ControlFlow;
 use std::path::Path;
 
-use config::plan::{Plan, PlanRequest, sh_columns};
+use config::plan::{Plan, sh_columns};
 use config::training::{Strategy, TrainSettings};
 use models::camera::PosedImage;
 use models::cloud::GaussianCloud;
@@ -20,7 +20,8 @@ use vulkan::trainer::{Counters, RunBudget, Trainer};
 use super::figures::short;
 use super::slopes::{DRIVERS, Driver, Line, fit};
 use super::synthetic;
-use crate::cli::CliError;
+use crate::engine::device::DeviceRequest;
+use crate::error::JobError;
 use crate::report::Table;
 
 /// Steps before the measured ones: the first compiles the kernels, the second finds the number of counting rounds.
@@ -105,7 +106,7 @@ impl Scene {
     ///
     /// # Errors
     /// The data set cannot be read or has no sparse points.
-    pub fn of_dataset(root: &Path, scale: f64) -> Result<Self, CliError> {
+    pub fn of_dataset(root: &Path, scale: f64) -> Result<Self, JobError> {
         let set = Dataset::open(root)?;
         let frames = set.select("train", None)?;
         let pictures = frames.iter().map(|&i| set.load(i, scale)).collect::<Result<Vec<_>, _>>()?;
@@ -128,25 +129,23 @@ pub fn measure(
     ceiling: &Ceiling,
     scene: &Scene,
     steps: u32,
-) -> Result<SizeFigures, CliError> {
+) -> Result<SizeFigures, JobError> {
     let largest = scene.pictures.iter().map(|p| p.image.dimensions()).max_by_key(|(w, h)| w * h);
     let Some((width, height)) = largest else {
-        return Err(CliError::input(format!("{}: no training pictures", scene.name)));
+        return Err(JobError::Request(format!("{}: no training pictures", scene.name)));
     };
-    let plan = Plan::new(&PlanRequest {
-        device_mib: MOST_MIB,
-        width,
-        height,
-        views: scene.pictures.len() as u32,
-        sh_degree: 3,
-        max_gaussians: Some(scene.cloud.len()),
-        sort_lanes: gpu.info().sort_lanes(),
-        ..Default::default()
-    })?;
     let mut settings = TrainSettings { steps: WARM_UP + steps, ..TrainSettings::default() };
     settings.density.strategy = Strategy::None;
     (settings.resolution.quarter_until, settings.resolution.half_until) = (0.0, 0.0);
     settings.stop.enabled = false;
+    let request = DeviceRequest {
+        device: None,
+        device_mib: MOST_MIB,
+        size: (width, height),
+        views: scene.pictures.len(),
+        max_gaussians: Some(scene.cloud.len()),
+    };
+    let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().sort_lanes()))?;
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
     trainer.load(&scene.cloud)?;
     for p in &scene.pictures {

@@ -82,9 +82,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_seed_is_one_scene_and_every_row_is_sound() {
+    fn a_seed_is_one_scene_and_every_is_valid() {
         let a = cloud(500, 64, 48, 7);
-        assert!((0..a.len()).all(|i| a.row_is_sound(i)) && a.len() == 500);
+        assert!((0..a.len()).all(|i| a.is_valid(i)) && a.len() == 500);
         assert_eq!(a, cloud(500, 64, 48, 7));
         assert_ne!(a, cloud(500, 64, 48, 8));
         let v = view(64, 48, 0.0);

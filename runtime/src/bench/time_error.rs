@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::child;
 use super::figures::short;
 use super::front::{Group, Speedup, mark_front, speedup};
-use crate::cli::CliError;
+use crate::error::JobError;
 use crate::report::chart::{Chart, ChartPoint, Series};
 use crate::report::{Table, count};
 use crate::run_json::RunReport;
@@ -71,7 +71,7 @@ pub struct Point {
 ///
 /// # Errors
 /// No device, a child that fails, or stopped on request; the points so far lie in `out` and are not measured again.
-pub fn measure(request: &Request, each: &mut dyn FnMut(&Point)) -> Result<Vec<Point>, CliError> {
+pub fn measure(request: &Request, each: &mut dyn FnMut(&Point)) -> Result<Vec<Point>, JobError> {
     let mut points = Vec::new();
     for (i, dataset) in request.datasets.iter().enumerate() {
         let sfm = *request.sfm_seconds.get(i).or(request.sfm_seconds.last()).unwrap_or(&0.0);
@@ -99,7 +99,7 @@ fn one(
     asked_s: f64,
     seed: u64,
     offset: f64,
-) -> Result<Point, CliError> {
+) -> Result<Point, JobError> {
     let name = dataset.file_name().map_or_else(|| "data".into(), |n| n.to_string_lossy().into_owned());
     let out = request.out.join(format!("{name}-{init}-{budget_mib}mib-{asked_s}s-seed{seed}"));
     let kept = if request.again { None } else { RunReport::read(&out).ok().filter(|r| r.outcome == "done") };
@@ -117,13 +117,12 @@ fn one(
             }
             arguments.push("--fresh".to_owned());
             arguments.extend(request.train.iter().cloned());
-            let ended = child::run(&arguments, &out, None)?;
-            ended.report.ok_or_else(|| CliError::failed(format!("{}: {}", out.display(), ended.last_line)))?
+            child::run(&arguments, &out, None)?.report(&out.display().to_string())?
         }
     };
     let stage = |stage: &str| report.stage_ms.get(stage).copied().unwrap_or(0.0) * 1e-3;
     let (Some(psnr), Some(ssim)) = (report.psnr, report.ssim) else {
-        return Err(CliError::input(format!("{name}: has no held-out pictures (split `test`)")));
+        return Err(JobError::Request(format!("{name}: has no held-out pictures (split `test`)")));
     };
     Ok(Point {
         dataset: name,

@@ -8,7 +8,7 @@ use models::camera::Pose;
 use models::formats::transforms::pose_to_opengl;
 
 use super::figures::write_json;
-use crate::cli::CliError;
+use crate::error::JobError;
 use crate::evaluate::save_png;
 
 /// Height of flight above the world's zero, metres.
@@ -22,12 +22,12 @@ const SIZE: [u32; 2] = [320, 240];
 /// Focal length, pixels.
 const FOCAL: f64 = 260.0;
 
-/// Writes [`GRID`] nadir pictures with their true poses to `root`; every 8th is held out, as in any data set without
+/// Writes `GRID` nadir pictures with their true poses to `root`; every 8th is held out, as in any data set without
 /// `split.json`.
 ///
 /// # Errors
 /// The folder cannot be written to.
-pub fn write_data_set(root: &Path, seed: u64) -> Result<(), CliError> {
+pub fn write_data_set(root: &Path, seed: u64) -> Result<(), JobError> {
     let world = World::new(seed, &WorldSettings { half_extent_m: 60.0, ..WorldSettings::default() });
     let (cx, cy) = (f64::from(SIZE[0]) / 2.0, f64::from(SIZE[1]) / 2.0);
     // Camera axes right, down, forward; the picture's top is north.

@@ -3,11 +3,12 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use config::error::{Error, ErrorKind};
 use config::ground::GroundSettings;
 use models::dataset::Dataset;
 
 use crate::aggregate::compare::{add_to, compare, perceptual};
-use crate::aggregate::{self, AggregateError, LocalModel, Outcome, summary};
+use crate::aggregate::{self, LocalModel, Outcome, summary};
 use crate::interrupt::Interrupt;
 use crate::report::ReportData;
 use crate::run_json::RunReport;
@@ -81,7 +82,7 @@ impl Settings {
         to.all_views |= self.all_views;
         to.device = self.device.clone().or(to.device.take());
         to.seed = self.seed.unwrap_or(to.seed);
-        to.validate().map_err(CliError::input)
+        Ok(to.check()?)
     }
 
     /// Measures the models on the held-out pictures of `--compare`, when given; `metric` is the mission's.
@@ -112,21 +113,11 @@ impl Settings {
     }
 }
 
-impl From<AggregateError> for CliError {
-    fn from(e: AggregateError) -> Self {
-        match e {
-            e if e.is_device() => Self::device(e),
-            AggregateError::Train(e) => Self::failed(e),
-            e => Self::input(e),
-        }
-    }
-}
-
 /// Runs `dgtr aggregate`.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut settings = GroundSettings::default();
     args.settings.apply(&mut settings)?;
-    let stop = Interrupt::install().map_err(CliError::failed)?;
+    let stop = Interrupt::install()?;
     let models = args.models.iter().map(|p| LocalModel::read(p)).collect::<Result<Vec<_>, _>>()?;
     let outcome = aggregate::run(models, &settings, None, &args.out, &|| !stop.requested())?;
     let mut run = summary::run_report("aggregate", &outcome, settings.seed);
@@ -149,16 +140,16 @@ pub(super) fn finish(
 ) -> Result<(), CliError> {
     let page = out.join("report.html");
     data.files.push(("figures".into(), run.write(out)?));
-    data.write(&page).map_err(CliError::failed)?;
+    data.write(&page)?;
     for warning in &data.warnings {
         tracing::warn!("{warning}");
     }
     println!("{}: {} Gaussians out of {} models", outcome.path.display(), outcome.gaussians, outcome.models.len());
     println!("{}", page.display());
     if let Some(e) = outcome.not_distilled {
-        let device = e.is_device();
-        let what = format!("{} is merged but not distilled: {e}", outcome.path.display());
-        return Err(if device { CliError::device(what) } else { CliError::failed(what) });
+        // The input made a model, so what went wrong since is not the input's fault.
+        let kind = if e.kind() == ErrorKind::Input { ErrorKind::Failed } else { e.kind() };
+        return Err(CliError::new(kind, format!("{} is merged but not distilled: {e}", outcome.path.display())));
     }
     if outcome.interrupted {
         return Err(CliError::interrupted(format!("stopped on request; {} is valid", outcome.path.display())));

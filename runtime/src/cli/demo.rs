@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::CliError;
-use crate::demo::{DemoError, DemoOptions, run as run_demo};
+use crate::demo::{DemoOptions, run as run_demo};
 use crate::interrupt::Interrupt;
 
 /// Two simulated aircraft and a ground station, each a process of its own, from MAVLink and pictures to one merged model.
@@ -29,18 +29,8 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: Args) -> Result<(), CliError> {
     let Args { out, seconds, seed, process_mib: limit_mib, speed } = args;
-    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+    let interrupt = Interrupt::install()?;
     let summary = run_demo(&DemoOptions { out, seconds, seed, limit_mib, speed }, &interrupt)?;
     print!("{summary}");
     Ok(())
-}
-
-impl From<DemoError> for CliError {
-    fn from(e: DemoError) -> Self {
-        match e {
-            DemoError::Device(_) => Self::device(e),
-            DemoError::Interrupted(_) => Self::interrupted(e),
-            _ => Self::failed(e),
-        }
-    }
 }

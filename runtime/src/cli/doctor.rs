@@ -2,20 +2,30 @@
 
 use std::path::{Path, PathBuf};
 
+use config::error::ErrorKind;
 use config::kernels::{KernelChoice, VARIABLE};
-use models::onnx::{features::FeatureNetwork, session};
+use config::mission::Mission;
+use config::plan::{Plan, PlanRequest};
+use models::onnx::network::{LazySession, Network};
+use models::onnx::{OnnxError, features::FeatureNetwork, session};
 use vulkan::gpu::{Gpu, GpuInfo};
+use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
 use super::CliError;
 use crate::kernels::{self, Source};
 use crate::resources;
 
+mod trust;
+
 /// Arguments of `dgtr doctor`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Also check this network manifest (may be given more than once).
+    /// Also check this network against its manifest, and run it once (may be given more than once).
     #[arg(long, value_name = "FILE")]
     pub model: Vec<PathBuf>,
+    /// Also say what protects the deliveries of this mission, and what does not.
+    #[arg(long, value_name = "FILE")]
+    pub mission: Option<PathBuf>,
     /// Measure anew which shape of the kernels is the fastest on each Vulkan device, and remember it. Hardware is measured
     /// at its first training anyway, software renderers only here.
     #[arg(long)]
@@ -56,26 +66,31 @@ pub fn run(args: Args) -> Result<(), CliError> {
                     format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
                 tell("vulkan", Finding::Ok(text));
                 tell("kernels", kernel_shape(&d, args.calibrate));
+                tell("device", computes(&d));
+                tell("memory plan", takes_a_plan(&d));
             }
         }
     }
-    match session::find_library() {
+    match session::check_library() {
         Ok(library) => {
             tell("onnx runtime", Finding::Ok(library.display().to_string()));
-            match FeatureNetwork::open(None, 1) {
-                Ok(_) => tell("features", Finding::Ok("embedded XFeat opens".to_owned())),
+            match FeatureNetwork::open(None, 1).and_then(|mut network| network.check()) {
+                Ok(()) => tell("features", Finding::Ok("embedded XFeat runs".to_owned())),
                 Err(e) => tell("features", Finding::Missing(e.to_string())),
             }
         }
         Err(e) => tell("onnx runtime", Finding::Missing(e.to_string())),
     }
     for path in &args.model {
-        let read = models::onnx::manifest::Manifest::read(path).and_then(|m| m.read_network().map(|b| (m, b)));
-        match read {
-            Ok((m, bytes)) => {
-                tell("network", Finding::Ok(format!("{} ({} bytes, hash as stated)", m.name, bytes.len())))
-            }
+        match checked(path) {
+            Ok(text) => tell("network", Finding::Ok(text)),
             Err(e) => tell("network", Finding::Missing(e.to_string())),
+        }
+    }
+    if let Some(path) = &args.mission {
+        let mission = Mission::read(path).map_err(CliError::input)?;
+        for (what, finding) in trust::findings(&mission) {
+            tell(what, finding);
         }
     }
     for finding in serial_ports() {
@@ -98,9 +113,56 @@ pub fn run(args: Args) -> Result<(), CliError> {
             None => Finding::Note("not known on this system".to_owned()),
         },
     );
+    tell(
+        "disk",
+        match resources::free_disk_bytes(Path::new(".")) {
+            Some(bytes) if bytes < 256 << 20 => {
+                Finding::Note(format!("{} MiB free here; make room or lower keyframes.max (dgtr plan)", bytes >> 20))
+            }
+            Some(bytes) => Finding::Ok(format!("{} MiB free here", bytes >> 20)),
+            None => Finding::Note("free space is not known on this system".to_owned()),
+        },
+    );
     match missing {
         0 => Ok(()),
-        n => Err(CliError::device(format!("{n} of the checks above failed; each line says how to mend it"))),
+        n => Err(CliError::new(
+            ErrorKind::Device,
+            format!("{n} of the checks above failed; each line says how to mend it"),
+        )),
+    }
+}
+
+/// A user's network, compared with its manifest and run once on blank pictures.
+fn checked(manifest: &Path) -> Result<String, OnnxError> {
+    let network = std::sync::Arc::new(Network::read(manifest)?);
+    let mut session = LazySession::new(std::sync::Arc::clone(&network), 1);
+    session.check((640, 480))?;
+    let (name, contract) = (&network.manifest().name, network.manifest().contract.name());
+    Ok(format!("{name} follows contract `{contract}` and runs ({} bytes)", network.file_bytes()))
+}
+
+/// Whether a kernel computes on the device what its twin says.
+fn computes(info: &GpuInfo) -> Finding {
+    match Gpu::open(Some(&info.name)).map_err(TrainError::from).and_then(|gpu| check_device(&gpu)) {
+        Ok(agreed) => Finding::Ok(format!("{}: a kernel and its twin agree on {agreed} Gaussians", info.name)),
+        Err(e) => Finding::Missing(format!("{}: {e}", info.name)),
+    }
+}
+
+/// Whether the device takes the plan that `dgtr plan` makes by default.
+fn takes_a_plan(info: &GpuInfo) -> Finding {
+    let request = PlanRequest { sort_lanes: info.sort_lanes(), ..PlanRequest::default() };
+    let plan = match Plan::new(&request) {
+        Ok(plan) => plan,
+        Err(e) => return Finding::Missing(e.to_string()),
+    };
+    let what = format!("{}: {} MiB, {} Gaussians", info.name, request.device_mib, plan.gaussians);
+    match Gpu::open(Some(&info.name)).and_then(|gpu| check_plan(&gpu, &plan)) {
+        Ok(PlanFit::Whole) => Finding::Ok(format!("{what} fit")),
+        Ok(PlanFit::StorageReads) => {
+            Finding::Note(format!("{what} fit, read from storage buffers (slower): few texels"))
+        }
+        Err(e) => Finding::Missing(format!("{what}: {e}")),
     }
 }
 

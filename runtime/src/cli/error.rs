@@ -1,120 +1,135 @@
-//! Why a command did not end well, sorted by what the caller can do about it: that is the exit code.
+//! Why a command did not end well, and the exit codes that scripts may rely on.
 
 use std::process::ExitCode;
 
-use models::dataset::DatasetError;
-use models::formats::FormatError;
+use config::error::{Error, ErrorKind};
 
-/// One line: what, where, how to mend.
+/// What the process returns for an error of each kind (0 is a job that is done). The one place that knows.
+pub const EXIT_CODES: [(ErrorKind, u8, &str); 4] = [
+    (ErrorKind::Failed, 1, "failed"),
+    (ErrorKind::Input, 2, "usage or bad input"),
+    (ErrorKind::Device, 3, "device, driver or library missing"),
+    (ErrorKind::Interrupted, 4, "interrupted with a valid checkpoint"),
+];
+
+/// The exit code of an error of this kind.
+pub fn exit_code(kind: ErrorKind) -> ExitCode {
+    EXIT_CODES.iter().find(|row| row.0 == kind).map_or(ExitCode::FAILURE, |row| ExitCode::from(row.1))
+}
+
+/// One line (what, where, how to mend) and its kind.
 #[derive(Debug, thiserror::Error)]
-pub enum CliError {
-    /// Usage or input: exit code 2.
-    #[error("{0}")]
-    Input(String),
-    /// No device, driver or library to work with: exit code 3.
-    #[error("{0}")]
-    Device(String),
-    /// Stopped on request; what is saved is valid and can be continued: exit code 4.
-    #[error("{0}")]
-    Interrupted(String),
-    /// Anything else: exit code 1.
-    #[error("{0}")]
-    Failed(String),
+#[error("{line}")]
+pub struct CliError {
+    kind: ErrorKind,
+    line: String,
 }
 
 impl CliError {
-    /// Usage or input.
-    pub fn input(what: impl std::fmt::Display) -> Self {
-        Self::Input(one_line(what))
+    /// An error of the command line itself, or another's error in its words.
+    pub fn new(kind: ErrorKind, what: impl std::fmt::Display) -> Self {
+        Self { kind, line: what.to_string().split_whitespace().collect::<Vec<_>>().join(" ") }
     }
 
-    /// No device, driver or library.
-    pub fn device(what: impl std::fmt::Display) -> Self {
-        Self::Device(one_line(what))
+    /// Usage or input.
+    pub fn input(what: impl std::fmt::Display) -> Self {
+        Self::new(ErrorKind::Input, what)
     }
 
     /// Stopped on request.
     pub fn interrupted(what: impl std::fmt::Display) -> Self {
-        Self::Interrupted(one_line(what))
+        Self::new(ErrorKind::Interrupted, what)
     }
 
     /// Anything else.
     pub fn failed(what: impl std::fmt::Display) -> Self {
-        Self::Failed(one_line(what))
+        Self::new(ErrorKind::Failed, what)
     }
 
     /// What the process returns.
     pub fn exit_code(&self) -> ExitCode {
-        ExitCode::from(match self {
-            Self::Failed(_) => 1,
-            Self::Input(_) => 2,
-            Self::Device(_) => 3,
-            Self::Interrupted(_) => 4,
-        })
+        exit_code(self.kind)
     }
 }
 
-fn one_line(what: impl std::fmt::Display) -> String {
-    what.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
-}
-
-impl From<FormatError> for CliError {
-    fn from(e: FormatError) -> Self {
-        Self::input(e)
+impl<E: Error> From<E> for CliError {
+    fn from(e: E) -> Self {
+        Self::new(e.kind(), e)
     }
 }
 
-impl From<DatasetError> for CliError {
-    fn from(e: DatasetError) -> Self {
-        Self::input(e)
-    }
-}
+#[cfg(test)]
+mod tests {
+    use std::io::{Error as IoError, ErrorKind as Io};
 
-impl From<config::plan::PlanError> for CliError {
-    fn from(e: config::plan::PlanError) -> Self {
-        Self::input(e)
-    }
-}
+    use config::plan::{Plan, PlanRequest};
+    use hal::error::HalError;
+    use models::formats::FormatError;
+    use models::init::InitError;
+    use models::onnx::OnnxError;
+    use models::refine::RefineError;
+    use vulkan::gpu::GpuError;
+    use vulkan::trainer::TrainError;
 
-impl From<vulkan::gpu::GpuError> for CliError {
-    fn from(e: vulkan::gpu::GpuError) -> Self {
-        Self::device(e)
-    }
-}
+    use super::*;
+    use crate::aggregate::AggregateError;
+    use crate::error::JobError;
+    use crate::serve::ServeError;
+    use crate::upload::UploadError;
 
-impl From<vulkan::trainer::TrainError> for CliError {
-    fn from(e: vulkan::trainer::TrainError) -> Self {
-        match e {
-            vulkan::trainer::TrainError::Gpu(e) => e.into(),
-            other => Self::input(other),
+    #[test]
+    fn every_kind_has_one_row_and_the_documented_code() {
+        assert_eq!(EXIT_CODES.map(|row| row.0), ErrorKind::ALL);
+        assert_eq!(EXIT_CODES.map(|row| row.1), [1, 2, 3, 4]);
+        let readme = include_str!("../../../README.md").split_whitespace().collect::<Vec<_>>().join(" ");
+        for (kind, code, meaning) in EXIT_CODES {
+            assert_eq!(exit_code(kind), ExitCode::from(code));
+            assert!(
+                readme.contains(&format!("{code} {}", meaning.split(" or").next().unwrap_or(meaning))),
+                "{meaning}"
+            );
         }
     }
-}
 
-impl From<models::onnx::OnnxError> for CliError {
-    fn from(e: models::onnx::OnnxError) -> Self {
-        use models::onnx::OnnxError as E;
-        match e {
-            E::LibraryMissing { .. } | E::Library { .. } => Self::device(e),
-            _ => Self::input(e),
-        }
+    fn lost() -> GpuError {
+        GpuError::DeviceLost { during: "vkQueueSubmit" }
     }
-}
 
-impl From<models::init::InitError> for CliError {
-    fn from(e: models::init::InitError) -> Self {
-        match e {
-            models::init::InitError::Network(e) => e.into(),
-            other => Self::input(other),
-        }
+    fn no_library() -> OnnxError {
+        OnnxError::LibraryMissing { searched: "nowhere".into() }
     }
-}
 
-impl From<models::refine::RefineError> for CliError {
-    fn from(e: models::refine::RefineError) -> Self {
-        match e {
-            models::refine::RefineError::Network(e) => e.into(),
-            other => Self::input(other),
+    fn io(kind: Io) -> FormatError {
+        FormatError::Io { path: "x".into(), action: "writing", source: IoError::from(kind) }
+    }
+
+    /// The same cause has the same code, whichever job met it.
+    #[test]
+    fn an_error_keeps_its_kind_through_every_job() {
+        use ErrorKind::{Device, Failed, Input, Interrupted};
+        let open = |kind| HalError::Open { address: "serial:x".into(), source: IoError::from(kind) };
+        let closed = || HalError::Closed { address: "udpin:x".into() };
+        let plan = || Plan::new(&PlanRequest { device_mib: 1, ..PlanRequest::default() }).unwrap_err();
+        let cases: [(CliError, ErrorKind); 16] = [
+            (lost().into(), Device),
+            (TrainError::from(lost()).into(), Device),
+            (JobError::from(TrainError::from(lost())).into(), Device),
+            (AggregateError::from(TrainError::from(lost())).into(), Device),
+            (ServeError::from(AggregateError::from(TrainError::from(lost()))).into(), Device),
+            (JobError::from(RefineError::from(no_library())).into(), Device),
+            (JobError::from(InitError::from(no_library())).into(), Device),
+            (JobError::from(RefineError::Duplicate("x".into())).into(), Input),
+            (JobError::from(plan()).into(), Input),
+            (AggregateError::from(plan()).into(), Input),
+            (JobError::from(open(Io::NotFound)).into(), Input),
+            (JobError::from(open(Io::AddrInUse)).into(), Failed),
+            (JobError::from(closed()).into(), Failed),
+            (JobError::from(io(Io::StorageFull)).into(), Failed),
+            (ServeError::from(UploadError::NoTransport("connect")).into(), Input),
+            (ServeError::Nothing("mission".into()).into(), Interrupted),
+        ];
+        for (error, kind) in cases {
+            assert_eq!(error.kind, kind, "{error}");
         }
     }
 }

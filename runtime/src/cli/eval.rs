@@ -9,9 +9,9 @@ use serde::Serialize;
 
 use super::CliError;
 use super::plan::largest;
-use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, open_metric, stem};
-use crate::renderer;
-use crate::transfer::PoseTransfer;
+use crate::engine::device::renderer;
+use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, open_metric};
+use crate::transfer::{PoseTransfer, stem};
 
 /// Arguments of `dgtr eval`.
 #[derive(Debug, clap::Args)]
@@ -70,7 +70,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let (header, cloud) = model::read(&args.model)?;
     let (width, height) = largest(&set, &frames, args.scale)?;
     let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
-    let mut trainer = renderer::open(args.device.as_deref(), &cloud, width, height)?;
+    let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
     let transfer = PoseTransfer::between(&set, &header.views);
     let scores = evaluate(&mut trainer, &set, &frames, args.scale, &transfer, metric.as_mut(), args.save.as_deref())?;
     let naive = match args.baselines {

@@ -3,12 +3,14 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use config::disk::Disk;
 use config::mission::Mission;
 
 use super::CliError;
-use crate::fly::{EndOfFlight, Ended, FlyError, FlyOptions, FlyOutcome, fly};
+use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly, training_lens};
 use crate::interrupt::Interrupt;
 use crate::run_json::RunReport;
+use crate::session::{Owner, Session};
 
 /// Reads pose and triggers from the autopilot and pictures from the camera, and builds the model while flying.
 #[derive(Debug, clap::Args)]
@@ -25,9 +27,10 @@ pub struct Args {
     /// Another link than the mission's, e.g. `serial:/dev/ttyAMA0:921600`.
     #[arg(long, value_name = "ADDRESS")]
     link: Option<String>,
-    /// Take the aircraft for landed when nothing was heard for this many seconds after it flew.
-    #[arg(long, value_name = "S", default_value_t = 20.0)]
-    silence: f64,
+    /// End a flight whose landing nobody saw after this many seconds without a sign of life; the mission's
+    /// `link.silence_limit_s` when left out.
+    #[arg(long, value_name = "S")]
+    silence: Option<f64>,
     /// Give up when nothing was ever heard for this many seconds; 0 waits for ever.
     #[arg(long, value_name = "S", default_value_t = 0.0)]
     patience: f64,
@@ -36,8 +39,8 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: Args) -> Result<(), CliError> {
     let started = Instant::now();
-    let mission = Mission::read(&args.mission).map_err(CliError::input)?;
-    let mut aircraft = mission.aircraft(args.aircraft.as_deref()).map_err(CliError::input)?.clone();
+    let mission = Mission::read(&args.mission)?;
+    let mut aircraft = mission.aircraft(args.aircraft.as_deref())?.clone();
     if let Some(link) = args.link {
         aircraft.link = link;
     }
@@ -45,22 +48,31 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Duration::try_from_secs_f64(s)
             .map_err(|_| CliError::input(format!("--{name} {s}: must be zero or more seconds")))
     };
+    let silence = args.silence.unwrap_or(mission.link.silence_limit_s.into());
     let patience = seconds(args.patience, "patience")?;
     let end =
-        EndOfFlight { silence: seconds(args.silence, "silence")?, patience: (!patience.is_zero()).then_some(patience) };
-    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+        EndOfFlight { silence: seconds(silence, "silence")?, patience: (!patience.is_zero()).then_some(patience) };
+    let interrupt = Interrupt::install()?;
+    let lens = training_lens(&mission);
+    let owner = Owner {
+        command: "fly".into(),
+        mission: mission.name.clone(),
+        aircraft: aircraft.id.clone(),
+        origin: [mission.origin.lat_deg, mission.origin.lon_deg, mission.origin.alt_m],
+        picture: [lens.width, lens.height],
+    };
+    let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
     let options = FlyOptions { out: args.out.clone(), end };
     let outcome = fly(&mission, &aircraft, &options, &interrupt)?;
     let mut report = report(&outcome);
-    report.seed = mission.training.seed;
     report.wall_s = started.elapsed().as_secs_f64();
-    let path = report.write(&args.out).map_err(CliError::failed)?;
+    let path = report.write(&args.out)?;
     println!(
         "{}: {} Gaussians from {} key frames after {} steps; {}",
         outcome.model.display(),
         outcome.gaussians,
         outcome.keyframes,
-        outcome.progress.steps,
+        report.steps,
         path.display()
     );
     match (outcome.finished, outcome.ended) {
@@ -73,18 +85,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
 }
 
 fn report(outcome: &FlyOutcome) -> RunReport {
-    let mut r = RunReport::new("fly");
+    let mut r = outcome.report.clone();
     r.outcome = if outcome.finished { "done" } else { "interrupted" }.into();
-    r.steps = outcome.progress.steps;
     r.gaussians = outcome.gaussians as u64;
     r.views = outcome.keyframes as u64;
-    r.device = outcome.device.clone();
-    [r.device_bytes_planned, r.device_bytes_peak] = outcome.device_bytes;
-    for (name, ms) in &outcome.stage_ms {
-        r.stage_ms.insert((*name).to_owned(), *ms);
-    }
-    r.stage_ms.insert("initialise".into(), outcome.progress.init_s * 1e3);
-    r.stage_ms.insert("train".into(), outcome.progress.train_s * 1e3);
     let k = outcome.flight.keyframes;
     for (name, count) in [
         ("pictures_too_close", k.too_close),
@@ -97,30 +101,11 @@ fn report(outcome: &FlyOutcome) -> RunReport {
     ] {
         r.skip(name, u64::from(count));
     }
-    if let Some(i) = &outcome.progress.initialised {
-        r.skip("pairs_not_sent_to_the_network", i.skipped.total() as u64);
-    }
     let counters = serde_json::to_value(outcome.flight.hal).unwrap_or_default();
     r.more.insert("hal".into(), counters);
     r.more.insert("ended".into(), format!("{:?}", outcome.ended).into());
     r.more.insert("delivered".into(), outcome.delivered.into());
-    r.more.insert("builds".into(), outcome.progress.builds.into());
+    r.more.insert("pictures_decoded".into(), outcome.flight.decoded.into());
     r.more.insert("links_lost".into(), outcome.flight.links_lost.into());
-    if let Some(refined) = &outcome.progress.refined {
-        r.more.insert("reprojection_rms_px".into(), refined.reprojection_rms_px.into());
-    }
     r
-}
-
-impl From<FlyError> for CliError {
-    fn from(e: FlyError) -> Self {
-        match e {
-            FlyError::Mission(_) | FlyError::Plan(_) | FlyError::TooFewKeyframes { .. } => Self::input(e),
-            FlyError::Gpu(_) => Self::device(e),
-            FlyError::Refine(models::refine::RefineError::Network(_)) => Self::device(e),
-            FlyError::Init(e) => e.into(),
-            FlyError::Hal(_) => Self::input(e),
-            _ => Self::failed(e),
-        }
-    }
 }

@@ -2,15 +2,23 @@
 
 use std::path::PathBuf;
 
-use config::plan::{Plan, PlanRequest, SORT_LANES_SOFTWARE};
+use config::disk::plan::{DiskPlan, DiskRequest};
+use config::mission::Mission;
+use config::plan::{Plan, SORT_LANES_SOFTWARE};
+use config::training::ShSettings;
 use models::dataset::{Dataset, scaled};
 use vulkan::gpu::Gpu;
 
 use super::CliError;
+use crate::engine::device::DeviceRequest;
 
 /// Arguments of `dgtr plan`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
+    /// The plan of an aircraft of this mission, instead of the numbers below.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "scale", "budget_mib", "width", "height", "views",
+        "sh_degree", "max_gaussians", "half_moments"])]
+    pub mission: Option<PathBuf>,
     /// Take picture size and number of views from this data set instead of --width, --height and --views.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
@@ -54,14 +62,9 @@ pub struct Args {
 
 /// Runs `dgtr plan`.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let (width, height, views) = match &args.dataset {
-        None => (args.width, args.height, args.views),
-        Some(root) => {
-            let set = Dataset::open(root)?;
-            let chosen = set.select(&args.split, args.region.as_deref())?;
-            let (w, h) = largest(&set, &chosen, args.scale)?;
-            (w, h, chosen.len() as u32)
-        }
+    let (wanted, sh) = match &args.mission {
+        Some(path) => of_mission(&Mission::read(path)?),
+        None => of_arguments(&args)?,
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
     let sort_lanes = match (Gpu::open(args.device.as_deref()), &args.device) {
@@ -69,25 +72,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
         (Err(_), None) => SORT_LANES_SOFTWARE,
         (Err(e), Some(_)) => return Err(e.into()),
     };
-    let request = PlanRequest {
-        device_mib: args.budget_mib,
-        width,
-        height,
-        views,
-        sh_degree: args.sh_degree,
-        max_gaussians: args.max_gaussians,
-        half_moments: args.half_moments,
-        sort_lanes,
-    };
-    let plan = Plan::new(&request)?;
+    let plan = Plan::new(&wanted.plan_request(&sh, sort_lanes))?;
     if args.json {
         println!("{}", serde_json::to_string(&plan).map_err(CliError::failed)?);
         return Ok(());
     }
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     println!(
-        "{} views of {width} x {height}, SH degree {}, {} MiB allowed",
-        plan.views, plan.sh_degree, args.budget_mib
+        "{} views of {} x {}, SH degree {}, {} MiB allowed",
+        plan.views, wanted.size.0, wanted.size.1, plan.sh_degree, wanted.device_mib
     );
     println!(
         "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n  sort lanes{:>10}\n",
@@ -97,7 +90,43 @@ pub fn run(args: Args) -> Result<(), CliError> {
         println!("  {name:<18} {:>9.2} MiB", mib(*bytes));
     }
     println!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
+    let ((width, height), key_frames) = (wanted.size, plan.views as u32);
+    let (gaussians, sh_degree) = (plan.gaussians, plan.sh_degree);
+    let disk = DiskPlan::new(&DiskRequest { width, height, key_frames, gaussians, sh_degree });
+    println!("\n  on disk, for a flight:");
+    for (name, bytes) in &disk.sections {
+        println!("  {name:<18} {:>9.2} MiB", mib(*bytes));
+    }
+    println!("  {:<18} {:>9.2} MiB at most, {:.2} MiB to begin", "total", mib(disk.total_bytes), mib(disk.min_bytes));
     Ok(())
+}
+
+fn of_arguments(args: &Args) -> Result<(DeviceRequest, ShSettings), CliError> {
+    let (size, views) = match &args.dataset {
+        None => ((args.width, args.height), args.views as usize),
+        Some(root) => {
+            let set = Dataset::open(root)?;
+            let chosen = set.select(&args.split, args.region.as_deref())?;
+            (largest(&set, &chosen, args.scale)?, chosen.len())
+        }
+    };
+    let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
+    let (device_mib, max_gaussians) = (args.budget_mib, args.max_gaussians);
+    Ok((DeviceRequest { device: None, device_mib, size, views, max_gaussians }, sh))
+}
+
+/// As `dgtr fly` plans: pictures at the working size, and as many views as there may be key frames.
+fn of_mission(mission: &Mission) -> (DeviceRequest, ShSettings) {
+    let Mission { camera, memory, keyframes, training, .. } = mission;
+    let scaled = |side: u32| ((side as f32 * memory.image_scale).round() as u32).max(1);
+    let request = DeviceRequest {
+        device: None,
+        device_mib: memory.device_mib,
+        size: (scaled(camera.width), scaled(camera.height)),
+        views: keyframes.max as usize,
+        max_gaussians: memory.max_gaussians.map(|n| n as usize),
+    };
+    (request, training.sh)
 }
 
 /// The widest and the highest picture of `frames` at `scale`.

@@ -1,18 +1,19 @@
 //! `dgtr render MODEL --cameras FILE --out DIR`: colour and depth of any cameras.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use image::{ImageBuffer, Luma};
-use models::camera::{Intrinsics, View};
-use models::formats::transforms::{self, Focal, TransformsFrame};
-use models::formats::{FormatError, model, write_atomic};
+use models::camera::View;
+use models::formats::reconstruction::Shot;
+use models::formats::{FormatError, model, transforms, write_atomic};
 use models::metrics::to_rgb8;
 use vulkan::trainer::Rendering;
 
 use super::CliError;
-use crate::evaluate::{save_png, stem};
-use crate::{console, interrupt, renderer};
+use crate::engine::device::renderer;
+use crate::evaluate::save_png;
+use crate::transfer::stem;
+use crate::{console, interrupt};
 
 /// Where less than this share of a pixel is covered, it has no depth.
 const LEAST_COVER: f32 = 0.5;
@@ -42,16 +43,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Err(CliError::input(format!("--depth-unit {} must be a positive number of metres", args.depth_unit)));
     }
     let cameras = transforms::read(&args.cameras)?;
-    let views: Vec<(String, View)> = cameras
-        .frames
-        .iter()
-        .map(|f| Ok((stem(&f.file_path), view(&args.cameras, f)?)))
-        .collect::<Result<_, CliError>>()?;
+    let views: Vec<(String, View)> =
+        cameras.shots.iter().map(|s| Ok((stem(&s.path), view(&args.cameras, s)?))).collect::<Result<_, CliError>>()?;
     let width = views.iter().map(|v| v.1.intrinsics.width).max().unwrap_or(1);
     let height = views.iter().map(|v| v.1.intrinsics.height).max().unwrap_or(1);
     let (_, cloud) = model::read(&args.model)?;
-    let mut trainer = renderer::open(args.device.as_deref(), &cloud, width, height)?;
-    let stop = interrupt::Interrupt::install().map_err(CliError::failed)?;
+    let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
+    let stop = interrupt::Interrupt::install()?;
     let mut progress = console::Progress::new("rendering", views.len() as u64);
     let mut rendering = Rendering::default();
     for (i, (name, view)) in views.iter().enumerate() {
@@ -74,27 +72,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
     Ok(())
 }
 
-fn view(file: &Path, frame: &TransformsFrame) -> Result<View, CliError> {
+fn view(file: &Path, shot: &Shot) -> Result<View, CliError> {
     let bad = |what: &str| {
-        CliError::from(FormatError::Invalid {
-            path: file.to_owned(),
-            what: format!("frame {:?}: {what}", frame.file_path),
-        })
+        CliError::from(FormatError::Invalid { path: file.to_owned(), what: format!("frame {:?}: {what}", shot.path) })
     };
-    let Some((width, height)) = frame.lens.size else { return Err(bad("w and h are needed")) };
-    if !frame.lens.distortion.is_none() {
+    let Some(size) = shot.lens.size else { return Err(bad("w and h are needed")) };
+    if !shot.lens.distortion.is_none() {
         return Err(bad("only pinhole cameras can be rendered; leave k1, k2, p1, p2 out"));
     }
-    let (fx, fy) = match frame.lens.focal {
-        Focal::Pixels(x, y) => (x, y),
-        Focal::FieldOfView(angle) => {
-            let f = 0.5 * f64::from(width) / (0.5 * angle).tan();
-            (f, f)
-        }
-    };
-    let (cx, cy) = frame.lens.centre.unwrap_or((0.5 * f64::from(width), 0.5 * f64::from(height)));
-    let intrinsics = Intrinsics { width, height, fx: fx as f32, fy: fy as f32, cx: cx as f32, cy: cy as f32 };
-    Ok(View { intrinsics, pose: frame.pose })
+    Ok(View { intrinsics: shot.lens.intrinsics(size), pose: shot.pose })
 }
 
 /// Alpha-blended depth divided by cover, in units of `unit` metres.

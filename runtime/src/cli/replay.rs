@@ -71,7 +71,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Some(("tcp", rest)) => format!("tcpin:{rest}"),
         _ => args.link.clone(),
     };
-    let address = link.parse().map_err(CliError::input)?;
+    let address = link.parse()?;
     let session = SessionSettings { speed: args.speed, linger_s: args.linger, ..SessionSettings::default() };
     let stop = stop_flag()?;
     let mut ready = |pty: Option<&Path>| {
@@ -92,8 +92,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             faults: config::faults::FaultSettings::default(),
         };
         let reference = args.reference.as_deref();
-        let r = play_tlog(&args.dataset, &settings, &address, camera_dir, reference, &stop, &mut ready)
-            .map_err(CliError::input)?;
+        let r = play_tlog(&args.dataset, &settings, &address, camera_dir, reference, &stop, &mut ready)?;
         tracing::info!("{} frames, {} exposures, {} pictures", r.frames_sent, r.exposures, r.pictures.delivered);
         if r.truncated || r.damaged > 0 {
             tracing::warn!(
@@ -114,7 +113,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             session,
             ..ReplaySettings::default()
         };
-        let r = play(&list, &settings, &address, camera_dir, &stop, &mut ready).map_err(CliError::input)?;
+        let r = play(&list, &settings, &address, camera_dir, &stop, &mut ready)?;
         tracing::info!("{} exposures, {} pictures", r.triggers, r.pictures.delivered);
         r.completed
     };
@@ -139,7 +138,7 @@ fn playlist(args: &Args) -> Result<Playlist, CliError> {
 }
 
 fn item(frame: &DatasetFrame, number: usize, home: Geodetic, poses: Poses) -> Result<PlaylistItem, CliError> {
-    let recorded = frame.telemetry.filter(|t| t.time_ns > 0).map(|t| t.time_ns as f64 * 1e-9);
+    let recorded = frame.prior.filter(|p| p.time_ns > 0).map(|p| p.time_ns as f64 * 1e-9);
     let time_s = recorded.unwrap_or(number as f64 * DEFAULT_INTERVAL_S);
     let picture = frame.path.clone();
     let source = if poses == Poses::Telemetry { PoseSource::Telemetry } else { PoseSource::Dataset };

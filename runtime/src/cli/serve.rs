@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use config::disk::Disk;
 use config::mission::Mission;
 
 use crate::aggregate::summary;
@@ -11,6 +12,7 @@ use crate::console::Progress;
 use crate::interrupt::Interrupt;
 use crate::report::{ReportData, Timing, bytes};
 use crate::serve::{self, Reception, ServeError};
+use crate::session::{Owner, Session};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};
@@ -32,25 +34,23 @@ pub struct Args {
     pub settings: Settings,
 }
 
-impl From<ServeError> for CliError {
-    fn from(e: ServeError) -> Self {
-        match e {
-            ServeError::Aggregate(e) => e.into(),
-            ServeError::Upload(e) => Self::input(e),
-            ServeError::Nothing(_) => Self::interrupted(e),
-        }
-    }
-}
-
 /// Runs `dgtr serve`.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let mut mission = Mission::read(&args.mission).map_err(CliError::input)?;
+    let mut mission = Mission::read(&args.mission)?;
     args.settings.apply(&mut mission.ground)?;
     let timeout = match args.timeout {
         Some(s) => Some(Duration::try_from_secs_f64(s).map_err(|e| CliError::input(format!("--timeout {s}: {e}")))?),
         None => None,
     };
-    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+    let interrupt = Interrupt::install()?;
+    let owner = Owner {
+        command: "serve".into(),
+        mission: mission.name.clone(),
+        aircraft: String::new(),
+        origin: [mission.origin.lat_deg, mission.origin.lon_deg, mission.origin.alt_m],
+        picture: [0; 2],
+    };
+    let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
     let stop = AtomicBool::new(false);
     let mut bar = Progress::new("receive", mission.aircraft.len() as u64);
     let reception = serve::receive(&mission, &args.out, timeout, &stop, &mut |p| {
@@ -67,20 +67,21 @@ pub fn run(args: Args) -> Result<(), CliError> {
         mission.aircraft.len()
     ));
     // A first Ctrl-C ends the reception; what is here is merged all the same, and a second one ends at once.
-    let (outcome, unreadable) = serve::merge(&mission, &reception, &args.out, &|| true)?;
+    let (outcome, left_out) = serve::merge(&mission, &reception, &args.out, &|| true)?;
     let mut run = summary::run_report("serve", &outcome, mission.ground.seed);
     run.wall_s += reception.seconds;
     run.stage_ms.insert("receive".into(), reception.seconds * 1e3);
     let counters = serde_json::to_value(reception.counters).unwrap_or_default();
     run.more.insert("received".into(), counters);
+    run.more.insert("refused".into(), serde_json::to_value(&reception.refusals).unwrap_or_default());
     run.more.insert("missing".into(), reception.missing.clone().into());
     let mut data = summary::report(&outcome);
     add_reception(&mut data, &reception);
-    let readable = reception.received.iter().filter(|r| unreadable.iter().all(|u| u.0 != r.path));
+    let readable = reception.received.iter().filter(|r| left_out.iter().all(|u| u.0 != r.path));
     let locals: Vec<_> = readable.map(|r| (r.aircraft.clone(), r.path.clone())).collect();
     let metric = mission.network.metric.as_deref();
     args.settings.compare(&locals, &outcome, metric, (&mut run, &mut data))?;
-    for (path, why) in unreadable {
+    for (path, why) in left_out {
         data.warnings.push(format!("{} was received but cannot be used: {why}", path.display()));
     }
     let missing = reception.missing;
@@ -107,6 +108,9 @@ fn add_reception(data: &mut ReportData, reception: &Reception) {
     for aircraft in &reception.missing {
         data.warnings.push(format!("The final model of {aircraft} has not arrived."));
     }
+    for (why, times) in reception.refusals.iter() {
+        data.warnings.push(format!("Refused {times} times: {why}."));
+    }
     let c = &reception.counters;
     for (what, n) in [
         ("corrupt chunks, fetched again", c.corrupt),
@@ -115,7 +119,7 @@ fn add_reception(data: &mut ReportData, reception: &Reception) {
         ("offers of other missions", c.foreign),
         ("offers from unknown aircraft", c.unknown),
         ("offers above max_model_mib", c.oversize),
-        ("unreadable offers", c.damaged),
+        ("left_out offers", c.damaged),
     ] {
         if n > 0 {
             data.skipped.push((what.into(), n));

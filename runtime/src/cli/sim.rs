@@ -12,6 +12,8 @@ use hal::sim::survey::SurveySettings;
 use hal::sim::world::WorldSettings;
 use hal::sim::{SessionSettings, SimSettings};
 
+mod card;
+
 use super::CliError;
 use crate::interrupt::Interrupt;
 
@@ -34,6 +36,9 @@ pub struct Args {
     /// Also write the truth here, as a data set with held-out views.
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
+    /// Instead of flying: write the survey's pictures here as a camera's card, with EXIF and XMP.
+    #[arg(long, value_name = "DIR")]
+    card: Option<PathBuf>,
     /// Seconds of flight per second of wall clock.
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     speed: f64,
@@ -86,10 +91,9 @@ impl From<Triggers> for Announcing {
 
 /// Runs the command.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let mission = Mission::read(&args.mission).map_err(CliError::input)?;
-    let aircraft = mission.aircraft(args.aircraft.as_deref()).map_err(CliError::input)?;
-    let camera_dir = camera_dir(args.camera_dir.clone(), &aircraft.camera)?;
-    let address = args.link.parse().map_err(CliError::input)?;
+    let mission = Mission::read(&args.mission)?;
+    let aircraft = mission.aircraft(args.aircraft.as_deref())?;
+    let address = args.link.parse()?;
     let number = mission.aircraft.iter().position(|a| a.id == aircraft.id).unwrap_or(0) as u64;
     let c = &mission.camera;
     let settings = SimSettings {
@@ -125,12 +129,17 @@ pub fn run(args: Args) -> Result<(), CliError> {
         prefix: format!("{}_", aircraft.id),
     };
     let stop = stop_flag()?;
+    if let Some(folder) = &args.card {
+        let written = card::write(&settings, folder, &stop)?;
+        println!("{}: {written} pictures", folder.display());
+        return Ok(());
+    }
+    let camera_dir = camera_dir(args.camera_dir.clone(), &aircraft.camera)?;
     let report = hal::sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut |pty| {
         if let Some(path) = pty {
             println!("{}", path.display());
         }
-    })
-    .map_err(CliError::input)?;
+    })?;
     tracing::info!(
         "{} exposures, {} pictures, {:.0} s of flight",
         report.triggers,
@@ -142,18 +151,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
 
 /// A flag that Ctrl-C sets.
 pub fn stop_flag() -> Result<Arc<AtomicBool>, CliError> {
-    let interrupt = Interrupt::install().map_err(CliError::failed)?;
+    let interrupt = Interrupt::install()?;
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);
-    std::thread::Builder::new()
-        .name("interrupt".into())
-        .spawn(move || {
-            while !interrupt.requested() {
-                std::thread::sleep(std::time::Duration::from_millis(50));
-            }
-            flag.store(true, Ordering::Relaxed);
-        })
-        .map_err(CliError::failed)?;
+    std::thread::Builder::new().name("interrupt".into()).spawn(move || {
+        while !interrupt.requested() {
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        flag.store(true, Ordering::Relaxed);
+    })?;
     Ok(stop)
 }
 

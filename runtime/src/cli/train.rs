@@ -3,17 +3,20 @@
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use config::init::InitSettings;
-use config::mission::NetworkSettings;
+use config::mission::{KeyframeSettings, NetworkSettings};
 use config::preset::Preset;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use models::card::CardOptions;
 use models::dataset::PoseSource;
 use models::formats::{FormatError, read_bounded};
 use serde::Deserialize;
 
 use super::CliError;
-use crate::train_job::{InitKind, TrainJob};
+use crate::engine::InitKind;
+use crate::train_job::{TrainJob, log};
 
 /// A settings file has a few KiB.
 const SETTINGS_LIMIT: u64 = 1 << 20;
@@ -41,8 +44,16 @@ enum Poses {
 /// Arguments of `dgtr train`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Folder of posed pictures: nerfstudio transforms.json, or a COLMAP model in sparse/0 beside images/.
-    pub dataset: PathBuf,
+    /// Folder of posed pictures (nerfstudio, COLMAP, OpenDroneMap), or folders of a camera's card (DCIM) with pictures that
+    /// say where they were taken.
+    #[arg(required = true, value_name = "FOLDER")]
+    pub folders: Vec<PathBuf>,
+    /// Positions of a card's pictures: geo.txt of OpenDroneMap, Mission Planner's list, geotags.csv of `dgtr fly`.
+    #[arg(long, value_name = "FILE")]
+    geotags: Option<PathBuf>,
+    /// The flight's log beside a card: MAVLink (.tlog) or ArduPilot (.BIN), matched to the pictures by order and time.
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
     /// Where the model (model.dgtr) and run.json go; an unfinished model there is continued.
     #[arg(long)]
     pub out: PathBuf,
@@ -52,6 +63,9 @@ pub struct Args {
     /// Only the pictures of this region.
     #[arg(long)]
     region: Option<String>,
+    /// Only key frames by the rule of a flight: [keyframes] of --settings, or its defaults.
+    #[arg(long)]
+    keyframes: bool,
     /// Where the first Gaussians come from.
     #[arg(long, value_enum, default_value = "feed-forward")]
     init: Init,
@@ -67,8 +81,8 @@ pub struct Args {
     /// Seconds of training; with --steps, whichever comes first.
     #[arg(long)]
     seconds: Option<f64>,
-    /// Budgets of a class of hardware, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
-    #[arg(long, value_parser = preset)]
+    /// Budgets of a size of job, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
+    #[arg(long, value_parser = presets())]
     preset: Option<Preset>,
     /// Device memory, MiB, allocated once [default: 512].
     #[arg(long)]
@@ -76,7 +90,7 @@ pub struct Args {
     /// Most Gaussians; default: what the budget holds.
     #[arg(long)]
     max_gaussians: Option<usize>,
-    /// Image scale, above 0 and at most 1 [default: 1].
+    /// Image scale, above 0 and at most 1 [default: as large as the budget holds].
     #[arg(long)]
     scale: Option<f64>,
     /// Seed of everything random; same seed and device, same model.
@@ -88,7 +102,8 @@ pub struct Args {
     /// Manifest of your own feed-forward network.
     #[arg(long = "model", value_name = "FILE")]
     network: Option<PathBuf>,
-    /// TOML file with any of the mission file's tables [training], [init], [refine], [network].
+    /// TOML file with any of the mission file's tables [training], [init], [refine], [network],
+    /// [keyframes].
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
     /// Seconds between two checkpoints.
@@ -110,11 +125,15 @@ struct Settings {
     init: InitSettings,
     refine: RefineSettings,
     network: NetworkSettings,
+    keyframes: KeyframeSettings,
 }
 
-fn preset(name: &str) -> Result<Preset, String> {
-    let known = || Preset::ALL.map(|p| p.0).join(", ");
-    Preset::named(name).ok_or_else(|| format!("known presets: {}", known()))
+/// The presets as clap shows them, each with its budgets.
+pub(super) fn presets() -> impl TypedValueParser<Value = Preset> {
+    let described =
+        |(name, preset): &(&'static str, Preset)| PossibleValue::new(*name).help(preset.values().to_string());
+    PossibleValuesParser::new(Preset::ALL.iter().map(described).collect::<Vec<_>>())
+        .try_map(|name| Preset::named(&name).ok_or("no such preset"))
 }
 
 /// Runs `dgtr train`.
@@ -130,17 +149,17 @@ pub fn run(args: Args) -> Result<(), CliError> {
             let bad = |what: String| CliError::from(FormatError::Invalid { path: path.clone(), what });
             let bytes = read_bounded(path, SETTINGS_LIMIT)?;
             let text = String::from_utf8(bytes).map_err(|_| bad("not UTF-8 text".to_owned()))?;
-            let mut settings: Settings = toml::from_str(&text).map_err(|e| bad(e.to_string()))?;
+            let mut settings: Settings = config::settings::parse(&text).map_err(|e| bad(e.to_string()))?;
             settings.network.anchor(path.parent().unwrap_or(Path::new("")));
             settings
         }
     };
+    settings.keyframes.check()?;
     if args.network.is_some() {
         settings.network.pair = args.network;
     }
     if let Some(seed) = args.seed {
         settings.training.seed = seed;
-        settings.init.seed = seed;
     }
     let preset = args.preset.map(Preset::values);
     // A schedule in steps or in a settings file is not cut short by a preset.
@@ -149,10 +168,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
         false => args.seconds.or(preset.map(|p| p.seconds)),
     };
     let job = TrainJob {
-        dataset: args.dataset,
+        folders: args.folders,
+        card: CardOptions {
+            geotags: args.geotags,
+            exposures: args.log.as_deref().map(log::exposures).transpose()?.unwrap_or_default(),
+        },
         out: args.out,
         split: args.split,
         region: args.region,
+        keyframes: args.keyframes.then_some(settings.keyframes),
         init: match args.init {
             Init::FeedForward => InitKind::FeedForward,
             Init::Sfm => InitKind::SparsePoints,
@@ -167,7 +191,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         seconds,
         budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)).unwrap_or(512),
         max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
-        scale: args.scale.or(preset.map(|p| p.image_scale.into())).unwrap_or(1.0),
+        scale: args.scale.or(preset.map(|p| p.image_scale.into())),
         device: args.device,
         network: settings.network,
         checkpoint_seconds: args.checkpoint_seconds,

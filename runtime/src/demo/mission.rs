@@ -1,5 +1,7 @@
 //! The mission file of the demo: written out, so that it also serves as an example to start from.
 
+use config::keys::PublicKey;
+
 use super::DemoOptions;
 
 /// A port of its own for the ground, from the ones the kernel would hand out; the demo's second run is not in the way of
@@ -9,8 +11,8 @@ fn free_port() -> u16 {
     bound.map_or(7447, |a| a.port())
 }
 
-/// The file's text.
-pub fn text(options: &DemoOptions) -> String {
+/// The file's text, with the public keys of the ground, west and east.
+pub fn text(options: &DemoOptions, [ground, west, east]: [PublicKey; 3]) -> String {
     let port = free_port();
     let DemoOptions { seconds, seed, .. } = options;
     format!(
@@ -46,11 +48,13 @@ connect = ["tcp/127.0.0.1:{port}"]
 listen = ["tcp/127.0.0.1:{port}"]
 
 [ground]
+public_key = "{ground}"
 device_mib = 256
 seconds = 15.0
 
 [[aircraft]]
 id = "west"
+public_key = "{west}"
 system_id = 1
 link = "serial:west/port:921600"
 camera = {{ folder = "west/camera" }}
@@ -58,6 +62,7 @@ region_enu = [[-44.0, -32.0], [0.0, -32.0], [0.0, 32.0], [-44.0, 32.0]]
 
 [[aircraft]]
 id = "east"
+public_key = "{east}"
 system_id = 2
 link = "serial:east/port:921600"
 camera = {{ folder = "east/camera" }}

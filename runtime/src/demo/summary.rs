@@ -7,9 +7,9 @@ use std::time::Instant;
 use super::evaluate::Figures;
 use super::processes::Process;
 use super::{AIRCRAFT, DemoError, DemoOptions};
-use crate::evaluate::stem;
 use crate::report::{Comparison, MapRegion, ModelRow, ReportData, Table, Timing, bytes};
 use crate::run_json::RunReport;
+use crate::transfer::stem;
 
 /// Views shown per aircraft.
 const SHOWN: usize = 2;
@@ -123,7 +123,7 @@ pub fn write(
         });
         for (name, ms) in &run.stage_ms {
             let stage = Timing { name: name.clone(), of: row.name.clone(), seconds: ms * 1e-3 };
-            if name == "initialise" || name == "train" {
+            if ["refine", "init", "train"].contains(&name.as_str()) {
                 data.timings.push(stage);
             }
         }

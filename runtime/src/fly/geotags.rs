@@ -1,13 +1,13 @@
 //! `geotags.csv`: where every matched picture was taken, as the HAL measured it, before any refinement. One line per
-//! picture, written at once, so that a power cut costs at most the last one; surveyors feed such files to other tools.
+//! picture, written at once; a line that a power cut tore is taken off at the next start. Surveyors feed such files to other tools.
 
 use std::fmt::Write as _;
-use std::fs::{File, OpenOptions};
 use std::io::{self, Write as _};
 use std::path::Path;
 
+use config::disk::{Disk, Output};
 use config::geodesy::{EnuFrame, Geodetic};
-use hal::vehicle::Frame;
+use hal::vehicle::PosedPicture;
 
 use crate::capture::Decision;
 
@@ -15,11 +15,11 @@ use crate::capture::Decision;
 pub const FILE: &str = "geotags.csv";
 /// Columns: angles in degrees, lengths in metres, camera (x right, y down, z forward) → east-north-up quaternion.
 const HEADER: &str = "picture,sequence,lat_deg,lon_deg,alt_m,east_m,north_m,up_m,qw,qx,qy,qz,\
-                      sigma_m,sigma_deg,speed_m_s,key_frame";
+                      sigma_m,sigma_deg,speed_m_s,key_frame,confidence";
 
 /// The open file.
 pub struct Geotags {
-    file: File,
+    file: Box<dyn Output>,
     frame: EnuFrame,
     /// The present line; reused.
     line: String,
@@ -32,17 +32,17 @@ impl Geotags {
     ///
     /// # Errors
     /// The folder cannot be written to.
-    pub fn open(out: &Path, origin: Geodetic) -> io::Result<Self> {
-        std::fs::create_dir_all(out)?;
-        let mut file = OpenOptions::new().create(true).append(true).open(out.join(FILE))?;
-        if file.metadata()?.len() == 0 {
+    pub fn open(disk: &Disk, out: &Path, origin: Geodetic) -> io::Result<Self> {
+        let path = out.join(FILE);
+        let mut file = disk.append_lines(&path)?;
+        if path.metadata().map_or(0, |m| m.len()) == 0 {
             writeln!(file, "{HEADER}")?;
         }
         Ok(Self { file, frame: EnuFrame::new(origin), line: String::with_capacity(512), failed: false })
     }
 
     /// Notes a matched picture. A full disk must not end a flight: the first failure is said, later ones are not.
-    pub fn note(&mut self, frame: &Frame, decision: Decision) {
+    pub fn note(&mut self, frame: &PosedPicture, decision: Decision) {
         if let Err(e) = self.write(frame, decision)
             && !std::mem::replace(&mut self.failed, true)
         {
@@ -50,7 +50,7 @@ impl Geotags {
         }
     }
 
-    fn write(&mut self, frame: &Frame, decision: Decision) -> io::Result<()> {
+    fn write(&mut self, frame: &PosedPicture, decision: Decision) -> io::Result<()> {
         let (p, q) = (frame.pose.position, frame.pose.rotation);
         let at = self.frame.to_geodetic(p);
         let name = frame.picture.name();
@@ -58,7 +58,7 @@ impl Geotags {
         self.line.clear();
         let written = writeln!(
             self.line,
-            "{},{},{:.9},{:.9},{:.3},{:.3},{:.3},{:.3},{:.6},{:.6},{:.6},{:.6},{:.3},{:.3},{:.2},{}",
+            "{},{},{:.9},{:.9},{:.3},{:.3},{:.3},{:.3},{:.6},{:.6},{:.6},{:.6},{:.3},{:.3},{:.2},{},{:.3}",
             name.file_name().unwrap_or(name.as_os_str()).to_string_lossy(),
             frame.sequence,
             at.lat_deg,
@@ -75,6 +75,7 @@ impl Geotags {
             largest(frame.pose.rotation_sigma_rad).to_degrees(),
             frame.speed_m_s,
             u8::from(decision == Decision::Key),
+            frame.confidence,
         );
         written.map_err(io::Error::other)?;
         // One call per line: the lines of a torn file are whole but for the last.

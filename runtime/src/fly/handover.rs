@@ -1,6 +1,7 @@
 //! Between the capture thread and the job: key frames one way, words for the ground control station the other, and what
 //! either has to know about the other without waiting for it.
 
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,10 +9,14 @@ use std::time::Duration;
 
 use hal::failsafe::Flags;
 use hal::mavlink::dialect::MavSeverity;
-use models::camera::PosedImage;
+use models::camera::{Pose, PosedImage};
+
+use crate::engine::PictureSource;
+use crate::error::JobError;
+use crate::keyframe_store::{KeyframeStore, Relief};
 
 /// Decoded key frames in the channel.
-const AHEAD: usize = 2;
+pub(super) const AHEAD: usize = 2;
 /// Lines waiting to be said.
 const WORDS: usize = 16;
 
@@ -23,8 +28,14 @@ struct Shared {
     flags: Mutex<Flags>,
 }
 
-/// The job's end.
+/// The job's end: an aircraft as a [`PictureSource`].
 pub struct Handover {
+    /// Where key frames are kept before they are used, and the checkpoint that shares the disk with them.
+    store: Option<(KeyframeStore, PathBuf)>,
+    /// Key frames that were used without being kept: the disk had no room.
+    without_room: u64,
+    /// Whether the last one was kept.
+    room: bool,
     frames: Receiver<PosedImage>,
     words: SyncSender<(MavSeverity, String)>,
     shared: Arc<Shared>,
@@ -42,30 +53,69 @@ pub(super) fn handover() -> (Handover, CaptureEnd) {
     let (to, frames) = sync_channel(AHEAD);
     let (words, inbox) = sync_channel(WORDS);
     let shared = Arc::new(Shared::default());
-    (Handover { frames, words, shared: shared.clone() }, CaptureEnd { frames: to, words: inbox, shared })
+    (
+        Handover { store: None, without_room: 0, room: true, frames, words, shared: shared.clone() },
+        CaptureEnd { frames: to, words: inbox, shared },
+    )
 }
 
 impl Handover {
-    /// The next key frame if one is ready, waiting `timeout` at most.
-    pub fn next(&self, timeout: Duration) -> Option<PosedImage> {
-        let frame = self.frames.recv_timeout(timeout).ok()?;
-        self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
-        Some(frame)
+    /// Keeps every key frame in `store` from now on, beside the checkpoint `model`.
+    pub fn keep_in(&mut self, store: KeyframeStore, model: PathBuf) {
+        self.store = Some((store, model));
     }
 
-    /// Key frames that wait to be taken.
-    pub fn waiting(&self) -> usize {
-        self.shared.waiting.load(Ordering::Acquire)
+    /// Makes room on the disk; false when there was nothing to give up.
+    pub fn relieve(&mut self, relief: Relief) -> bool {
+        self.store.as_mut().is_some_and(|(store, model)| store.relieve(relief, model))
+    }
+
+    /// Key frames that were used without being kept, for want of room.
+    pub fn without_room(&self) -> u64 {
+        self.without_room
+    }
+
+    /// Keeps a key frame. On a full disk what costs least is given up first; after that key frames are used and not kept,
+    /// each of which tries again, as room may have been made.
+    fn keep(&mut self, frame: &PosedImage) -> Result<(), JobError> {
+        let Some((store, model)) = &mut self.store else { return Ok(()) };
+        let kept = store.add_with_relief(frame, model);
+        let room = match kept {
+            Ok(()) => true,
+            Err(e) if e.may_pass() => {
+                tracing::debug!("{}: {e}", frame.name);
+                self.without_room += 1;
+                false
+            }
+            Err(e) => return Err(e.into()),
+        };
+        if std::mem::replace(&mut self.room, room) != room {
+            let (severity, line) = match room {
+                true => (MavSeverity::MAV_SEVERITY_INFO, "dgtr: room on disk again, key frames are kept"),
+                false => (MavSeverity::MAV_SEVERITY_WARNING, "dgtr: no room on disk, key frames are not kept"),
+            };
+            tracing::warn!("{line}");
+            self.say(severity, line.to_owned());
+        }
+        Ok(())
+    }
+
+    /// Poses of the key frames are known better: other programs that read the store should have them.
+    ///
+    /// # Errors
+    /// The store cannot be written.
+    pub fn refined(&mut self, pose: impl FnMut(&str) -> Option<Pose>) -> Result<(), JobError> {
+        match self.store.as_mut().map_or(Ok(()), |(store, _)| store.refine(pose)) {
+            // For other programs only; written again with the next key frame.
+            Err(e) if e.may_pass() => tracing::warn!("refined poses are not listed: {e}"),
+            other => other?,
+        }
+        Ok(())
     }
 
     /// What the HAL saw last, for the failsafe ladder.
     pub fn flags(&self) -> Flags {
         *self.shared.flags.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Whether capture goes on.
-    pub fn is_flying(&self) -> bool {
-        !self.shared.over.load(Ordering::Acquire)
     }
 
     /// Says a line to the ground control station (STATUSTEXT); dropped when the link cannot keep up.
@@ -76,6 +126,23 @@ impl Handover {
     /// Asks capture to end.
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+impl PictureSource for Handover {
+    fn next(&mut self, patience: Duration) -> Result<Option<PosedImage>, JobError> {
+        let Ok(frame) = self.frames.recv_timeout(patience) else { return Ok(None) };
+        self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
+        self.keep(&frame)?;
+        Ok(Some(frame))
+    }
+
+    fn waiting(&self) -> usize {
+        self.shared.waiting.load(Ordering::Acquire)
+    }
+
+    fn is_open(&self) -> bool {
+        !self.shared.over.load(Ordering::Acquire)
     }
 }
 

@@ -1,33 +1,105 @@
 //! Link and camera to key frames, one turn at a time on whatever clock: listens, picks, decodes, hands over, and decides when
-//! the flight is over. Never waits for the reconstruction: pictures wait as paths, only as many as the channel holds are
-//! decoded ahead.
+//! the flight is over: several signs agree that the aircraft is down, or nothing was heard for longer than it can fly. Never
+//! waits for the reconstruction: key frames wait decoded, as they will be trained on, as many as are planned for; those beyond
+//! wait as files and are decoded once more.
 
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::path::Path;
 use std::sync::mpsc::TrySendError;
 use std::time::Duration;
 
+use config::mission::KeyframeSettings;
 use hal::camera::Picture;
+use hal::counters::HalCounters;
 use hal::error::HalError;
 use hal::traits::{Camera, Clock, Link};
-use hal::vehicle::{Event, Frame, Vehicle};
-use models::camera::{Pose, PoseSigma, PosedImage, View};
+use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
+use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 
-use super::FlyError;
-use super::flight::{Ended, FlightCounters, FlightPlan};
+use super::geotags::Geotags;
 use super::handover::CaptureEnd;
-use crate::capture::{Decision, KeyframeSelector};
+use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
+use crate::error::JobError;
 
-/// After the aircraft has landed, pictures may still be on their way from the camera for this long.
+/// After the aircraft has landed, pictures that nobody announced may still be on their way from the camera for this long.
 const LATE_PICTURES_NS: u64 = 2_000_000_000;
+/// Key frames that wait decoded: what a rebuild of several seconds may hold up.
+pub(super) const DECODED_AHEAD: usize = 16;
 /// Events taken in one turn, so that the job's words are heard between them.
 const EVENTS_A_TURN: usize = 64;
+
+/// When the capture is over.
+#[derive(Clone, Copy, Debug)]
+pub struct EndOfFlight {
+    /// Silence of link and camera after which nobody can be flying any more.
+    pub silence: Duration,
+    /// Give up when nothing at all was heard for this long; None = wait for ever.
+    pub patience: Option<Duration>,
+}
+
+/// Why capture ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// The aircraft flew and is down again: several signs agreed for seconds.
+    Landed,
+    /// The recording is at its end.
+    RecordingOver,
+    /// Link and camera stayed silent for longer than the aircraft can fly.
+    LinkLost,
+    /// Nothing was ever heard.
+    NeverHeard,
+    /// Somebody asked.
+    Asked,
+}
+
+/// What capture has counted.
+#[derive(Clone, Debug, Default)]
+pub struct FlightCounters {
+    /// Fates of the matched pictures.
+    pub keyframes: KeyframeCounters,
+    /// Pictures decoded: each that became a key frame once, and each that turned out to show nothing.
+    pub decoded: u32,
+    /// Pictures that could not be decoded.
+    pub undecodable: u32,
+    /// Pictures or triggers that found no partner.
+    pub unmatched: u32,
+    /// Times the link was lost.
+    pub links_lost: u32,
+    /// The HAL's own counters.
+    pub hal: HalCounters,
+}
+
+/// What capture needs to know.
+pub struct FlightPlan {
+    /// Link, camera, lens, mount, origin.
+    pub vehicle: VehicleSettings,
+    /// Lens of the pictures that are trained on (undistorted, scaled).
+    pub intrinsics: Intrinsics,
+    /// The key-frame rule.
+    pub keyframes: KeyframeSettings,
+    /// Poses of earlier key frames.
+    pub earlier: Vec<Pose>,
+    /// Their names: no new one may take them.
+    pub earlier_names: HashSet<String>,
+    /// When it is over.
+    pub end: EndOfFlight,
+    /// Where every matched picture is noted.
+    pub geotags: Geotags,
+}
+
+/// A key frame that the job has not taken yet.
+enum Waiting {
+    Decoded(PosedImage),
+    File(PosedPicture),
+}
 
 #[derive(Clone, Copy)]
 enum Phase {
     Flying,
-    /// The flight is over; pictures may come until then.
+    /// The flight is over since then; pictures of announced exposures may still come.
     LatePictures(Ended, u64),
+    /// Nothing comes any more; what was decided at the end is reported.
+    Closing(Ended),
     /// What was chosen is handed over as long as somebody takes it.
     Emptying(Ended),
 }
@@ -38,14 +110,16 @@ pub(super) struct Intake<L: Link, C, K> {
     vehicle: Vehicle<L, C, K>,
     clock: K,
     selector: KeyframeSelector,
-    pending: VecDeque<Frame>,
-    ready: Option<PosedImage>,
+    pending: VecDeque<Waiting>,
     end: CaptureEnd,
     phase: Phase,
     started_ns: u64,
     /// When the autopilot last showed a sign of life.
     heard_ns: Option<u64>,
-    flown: bool,
+    /// Complete pictures seen, and when the last one came.
+    pictures: (u64, u64),
+    /// Names of all key frames, those of earlier runs too.
+    names: HashSet<String>,
     counters: FlightCounters,
 }
 
@@ -56,21 +130,21 @@ where
     K: Clock,
 {
     /// `clock` runs as the vehicle's own does.
-    pub(super) fn new(plan: FlightPlan, vehicle: Vehicle<L, C, K>, clock: K, end: CaptureEnd) -> Self {
+    pub(super) fn new(mut plan: FlightPlan, vehicle: Vehicle<L, C, K>, clock: K, end: CaptureEnd) -> Self {
         let mut selector = KeyframeSelector::new(plan.keyframes);
         plan.earlier.iter().for_each(|pose| selector.restore(*pose));
         Self {
             pending: VecDeque::with_capacity(plan.keyframes.max as usize),
+            names: std::mem::take(&mut plan.earlier_names),
             started_ns: clock.now_ns(),
+            pictures: (0, clock.now_ns()),
             plan,
             vehicle,
             clock,
             selector,
-            ready: None,
             end,
             phase: Phase::Flying,
             heard_ns: None,
-            flown: false,
             counters: FlightCounters::default(),
         }
     }
@@ -79,7 +153,7 @@ where
     ///
     /// # Errors
     /// A link or camera that will not come back.
-    pub(super) fn turn(&mut self, wait: Duration) -> Result<Option<Ended>, FlyError> {
+    pub(super) fn turn(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         let stop = self.end.stop_asked();
         match self.phase {
             Phase::Flying => {
@@ -87,20 +161,27 @@ where
                     return Ok(Some(Ended::Asked));
                 }
                 if let Some(ended) = self.fly(wait)? {
-                    self.phase = Phase::LatePictures(ended, self.clock.now_ns() + LATE_PICTURES_NS);
+                    self.phase = Phase::LatePictures(ended, self.clock.now_ns());
                 }
             }
-            Phase::LatePictures(ended, until_ns) => {
-                if stop || self.vehicle.is_finished() || self.clock.now_ns() >= until_ns {
+            Phase::LatePictures(ended, since_ns) => {
+                self.listen(wait)?;
+                let quiet_ns = self.clock.now_ns().saturating_sub(since_ns.max(self.pictures.1));
+                let late_ns = (f64::from(self.plan.vehicle.link.late_pictures_s) * 1e9) as u64;
+                let all_came = !self.vehicle.awaits_pictures() && quiet_ns >= LATE_PICTURES_NS;
+                if stop || self.vehicle.is_finished() || all_came || quiet_ns >= late_ns {
                     self.vehicle.finish();
-                    self.listen(Duration::ZERO)?;
+                    self.phase = Phase::Closing(ended);
+                }
+            }
+            Phase::Closing(ended) => {
+                self.listen(Duration::ZERO)?;
+                if self.vehicle.is_finished() {
                     self.phase = Phase::Emptying(ended);
-                } else {
-                    self.listen(wait)?;
                 }
             }
             Phase::Emptying(ended) => {
-                if stop || (self.ready.is_none() && self.pending.is_empty()) {
+                if stop || self.pending.is_empty() {
                     return Ok(Some(ended));
                 }
                 self.hand_over();
@@ -117,7 +198,7 @@ where
         self.counters
     }
 
-    fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, FlyError> {
+    fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         while let Ok((severity, text)) = self.end.words.try_recv() {
             self.vehicle.status_text(severity, &text);
         }
@@ -127,11 +208,9 @@ where
             self.heard_ns = Some(now_ns);
         }
         self.end.set_flags(self.vehicle.flags());
-        let armed = self.vehicle.autopilot().armed;
-        if self.flown && !armed {
+        if self.vehicle.autopilot().landed {
             return Ok(Some(Ended::Landed));
         }
-        self.flown |= armed;
         if self.vehicle.is_finished() {
             return Ok(Some(Ended::RecordingOver));
         }
@@ -144,14 +223,14 @@ where
     }
 
     /// Takes what link and camera have; true when the aircraft showed a sign of life.
-    fn listen(&mut self, wait: Duration) -> Result<bool, FlyError> {
+    fn listen(&mut self, wait: Duration) -> Result<bool, JobError> {
         let (mut alive, mut wait) = (false, wait);
         for _ in 0..EVENTS_A_TURN {
             let Some(event) = self.vehicle.poll(wait)? else { break };
             wait = Duration::ZERO;
-            alive |= matches!(event, Event::Pose(_) | Event::Trigger(_) | Event::Frame(_) | Event::LinkBack);
+            alive |= matches!(event, Event::Pose(_) | Event::Trigger(_) | Event::Posed(_) | Event::LinkBack);
             match event {
-                Event::Frame(frame) => self.choose(frame),
+                Event::Posed(frame) => self.choose(frame),
                 Event::Unmatched(what) => {
                     self.counters.unmatched += 1;
                     tracing::warn!("{what}");
@@ -164,15 +243,22 @@ where
                 Event::Pose(_) | Event::Trigger(_) => {}
             }
         }
+        let pictures = self.vehicle.pictures();
+        if pictures != self.pictures.0 {
+            self.pictures = (pictures, self.clock.now_ns());
+            // Somebody still photographs: the aircraft flies, whatever its line does.
+            alive |= self.heard_ns.is_some();
+        }
         self.hand_over();
         Ok(alive)
     }
 
     /// A picture is looked at before it counts: one that shows nothing must not keep its place from the next.
-    fn choose(&mut self, frame: Frame) {
+    fn choose(&mut self, frame: PosedPicture) {
         let pose = Pose { rotation: frame.pose.rotation, center: frame.pose.position };
         let mut decision = self.selector.consider(&pose);
-        let loaded = if decision == Decision::Key { Some(self.vehicle.load(&frame)) } else { None };
+        let loaded = (decision == Decision::Key).then(|| self.vehicle.load(&frame));
+        self.counters.decoded += u32::from(loaded.is_some());
         if let Some(Err(e)) = &loaded {
             tracing::warn!("{e}");
             decision = self.selector.retract();
@@ -180,43 +266,39 @@ where
         }
         tracing::debug!("picture {}: {decision:?}", frame.sequence);
         self.plan.geotags.note(&frame, decision);
-        match loaded {
-            None | Some(Err(_)) => {}
-            Some(Ok(image)) => {
-                self.end.count(true);
-                if self.ready.is_none() && self.pending.is_empty() {
-                    self.ready = Some(self.posed(&frame, image));
-                } else {
-                    self.pending.push_back(frame);
-                }
-            }
+        if let Some(Ok(image)) = loaded {
+            self.end.count(true);
+            let decoded = self.pending.iter().filter(|w| matches!(w, Waiting::Decoded(_))).count();
+            let waiting = match decoded < DECODED_AHEAD {
+                true => Waiting::Decoded(self.posed(&frame, image)),
+                false => Waiting::File(frame),
+            };
+            self.pending.push_back(waiting);
         }
     }
 
-    /// Decodes and hands over as much as the channel takes, without waiting.
+    /// Hands over as much as the channel takes, without waiting.
     fn hand_over(&mut self) {
-        loop {
-            if self.ready.is_none() {
-                let Some(frame) = self.pending.pop_front() else { return };
-                self.ready = self.load_again(&frame);
-            }
-            let Some(ready) = self.ready.take() else { continue };
+        while let Some(next) = self.pending.pop_front() {
+            let ready = match next {
+                Waiting::Decoded(ready) => Some(ready),
+                Waiting::File(frame) => self.load_again(&frame),
+            };
+            let Some(ready) = ready else { continue };
             match self.end.frames.try_send(ready) {
                 Ok(()) => {}
                 Err(TrySendError::Full(back)) => {
-                    self.ready = Some(back);
+                    self.pending.push_front(Waiting::Decoded(back));
                     return;
                 }
-                Err(TrySendError::Disconnected(_)) => {
-                    self.pending.clear();
-                    return;
-                }
+                Err(TrySendError::Disconnected(_)) => self.pending.clear(),
             }
         }
     }
 
-    /// A key frame that had to wait: its pixels were not kept.
-    fn load_again(&mut self, frame: &Frame) -> Option<PosedImage> {
+    /// A key frame that had to wait behind too many: its pixels were not kept.
+    fn load_again(&mut self, frame: &PosedPicture) -> Option<PosedImage> {
+        self.counters.decoded += 1;
         match self.vehicle.load(frame) {
             Ok(image) => Some(self.posed(frame, image)),
             Err(e) => {
@@ -228,7 +310,7 @@ where
         }
     }
 
-    fn posed(&self, frame: &Frame, image: image::RgbImage) -> PosedImage {
+    fn posed(&mut self, frame: &PosedPicture, image: image::RgbImage) -> PosedImage {
         let lens = self.plan.intrinsics;
         let image = if image.dimensions() == (lens.width, lens.height) {
             image
@@ -236,13 +318,23 @@ where
             image::imageops::resize(&image, lens.width, lens.height, image::imageops::FilterType::Triangle)
         };
         PosedImage {
-            name: picture_name(&frame.picture.name(), frame.sequence),
+            name: unused_name(&mut self.names, picture_name(&frame.picture.name(), frame.sequence)),
             time_ns: frame.time_ns,
             image,
             view: View { intrinsics: lens, pose: Pose { rotation: frame.pose.rotation, center: frame.pose.position } },
             sigma: PoseSigma { position_m: frame.pose.position_sigma_m, rotation_rad: frame.pose.rotation_sigma_rad },
         }
     }
+}
+
+/// `name`, or with a number behind it when it is taken: a camera that counts anew with every start takes other pictures under
+/// the same names.
+fn unused_name(taken: &mut HashSet<String>, name: String) -> String {
+    let stem = name.strip_suffix(".png").unwrap_or(&name);
+    let others = (2..).map(|k: u64| format!("{stem}-{k}.png"));
+    let unused = std::iter::once(name.clone()).chain(others).find(|name| !taken.contains(name)).unwrap_or(name);
+    taken.insert(unused.clone());
+    unused
 }
 
 /// The file's own name, or the trigger's number for pictures that never were a file; always `.png`, as it is stored.

@@ -8,15 +8,16 @@ use std::time::Duration;
 use hal::failsafe::{self, Action};
 use hal::mavlink::dialect::MavSeverity;
 use hal::traits::Clock;
-use vulkan::trainer::{RunBudget, StepReport};
+use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
-use super::flight::FlightCounters;
 use super::handover::Handover;
 use super::health::Health;
-use super::reconstruct::Reconstruct;
+use super::intake::FlightCounters;
 use super::shortage::likely_cause;
-use super::{FlyError, model_path};
+use crate::engine::{PictureSource, Reconstruct, model_path};
+use crate::error::JobError;
 use crate::interrupt::Interrupt;
+use crate::keyframe_store::Relief;
 use crate::upload::Offerer;
 
 /// Between two checkpoints: what a power cut may cost.
@@ -62,6 +63,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         out: &Path,
         budget: RunBudget,
         health: Health,
+        timing: failsafe::Timing,
         clock: K,
     ) -> Self {
         Self {
@@ -72,7 +74,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             health,
             saved_ns: clock.now_ns(),
             clock,
-            failsafe: failsafe::State::default(),
+            failsafe: failsafe::State::new(timing),
             training_failed: false,
             said_ns: None,
             for_a_frame: FOR_A_FRAME,
@@ -86,12 +88,12 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// One turn in flight; false when capture is over and everything it handed over is taken.
-    pub(super) fn turn(&mut self, capture: &Handover, interrupt: &Interrupt) -> Result<bool, FlyError> {
+    pub(super) fn turn(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<bool, JobError> {
         if interrupt.requested() {
             return Ok(false);
         }
         // Asked before looking into the channel: what was handed over before the end is still there.
-        let flying = capture.is_flying();
+        let flying = capture.is_open();
         let taken = self.take(capture)?;
         if !flying {
             return Ok(taken);
@@ -106,7 +108,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         Ok(true)
     }
 
-    fn reconstruct(&mut self, capture: &Handover, interrupt: &Interrupt) -> Result<(), FlyError> {
+    fn reconstruct(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
         if self.reconstruction.wants_build(false) {
             self.build(capture)?;
         }
@@ -114,40 +116,48 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// A device that fails in flight must not end the capture: once there is a checkpoint, it is offered instead.
-    fn survive(&mut self, worked: Result<(), FlyError>) -> Result<(), FlyError> {
+    fn survive(&mut self, worked: Result<(), JobError>) -> Result<(), JobError> {
         match worked {
-            Err(FlyError::Train(e)) if model_path(&self.out).is_file() => {
+            Err(JobError::Train(e)) if model_path(&self.out).is_file() => {
                 tracing::error!("{e}; training is over, the last checkpoint is kept");
                 self.training_failed = true;
-                self.offerer.offer(&model_path(&self.out));
+                self.offerer.offer_urgently(&model_path(&self.out));
                 Ok(())
             }
             other => other,
         }
     }
 
-    fn take(&mut self, capture: &Handover) -> Result<bool, FlyError> {
+    fn take(&mut self, capture: &mut Handover) -> Result<bool, JobError> {
         let patience = if self.reconstruction.has_model() { Duration::ZERO } else { self.for_a_frame };
-        let Some(frame) = capture.next(patience) else { return Ok(false) };
-        self.reconstruction.add(&frame)?;
-        tracing::info!("key frame {}: {}", self.reconstruction.keyframes(), frame.name);
+        let Some(frame) = capture.next(patience)? else { return Ok(false) };
+        tracing::info!("key frame {}: {}", self.reconstruction.keyframes() + 1, frame.name);
+        self.reconstruction.add(frame)?;
         Ok(true)
     }
 
     /// One step of the failsafe ladder; says and does what a new rung asks for.
-    fn watch(&mut self, capture: &Handover) -> Result<Action, FlyError> {
-        let flags = self.health.flags(capture.flags(), self.training_failed);
+    fn watch(&mut self, capture: &mut Handover) -> Result<Action, JobError> {
+        let flags =
+            self.health.flags(capture.flags(), self.training_failed, &self.budget, self.reconstruction.keyframes());
         let before = self.failsafe.action();
         self.failsafe = failsafe::update(self.clock.now_ns() / 1_000_000, &self.failsafe, &flags);
         let action = self.failsafe.action();
         if action != before {
-            let line = format!("dgtr: {} ({})", action.name(), self.failsafe.cause().unwrap_or("recovered"));
+            let line = format!(
+                "dgtr: {} ({})",
+                action.name(),
+                self.failsafe.cause().map_or("recovered", failsafe::Cause::name)
+            );
             tracing::warn!("{line}");
             let worse = action > before;
             let severity = if worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
             capture.say(severity, line);
             match action {
-                Action::UploadBest if self.reconstruction.has_model() && !self.training_failed => self.save(false)?,
+                Action::UploadBest if self.reconstruction.has_model() && !self.training_failed => {
+                    self.save(capture)?;
+                    self.offerer.offer_urgently(&model_path(&self.out));
+                }
                 Action::HalfResolution => self.reconstruction.halve_resolution(true),
                 Action::SmallerModel if self.reconstruction.has_model() => self.reconstruction.shrink()?,
                 Action::Nominal | Action::Warn => self.reconstruction.halve_resolution(false),
@@ -157,11 +167,14 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         Ok(action)
     }
 
-    fn build(&mut self, capture: &Handover) -> Result<(), FlyError> {
-        match self.reconstruction.build() {
-            Ok(()) => self.save(false),
+    fn build(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+        match self.reconstruction.build(&|| true) {
+            Ok(_) => {
+                capture.refined(|name| self.reconstruction.pose(name))?;
+                self.save(capture)
+            }
             // In flight more pictures may mend what too few of them could not do.
-            Err(FlyError::Init(e)) if capture.is_flying() => {
+            Err(e @ (JobError::Init(_) | JobError::Network(_))) if capture.is_open() => {
                 tracing::warn!("not built yet: {e}");
                 Ok(())
             }
@@ -170,7 +183,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// Trains until a key frame waits, a checkpoint is due, or capture ends.
-    fn train(&mut self, capture: &Handover, interrupt: &Interrupt) -> Result<(), FlyError> {
+    fn train(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
         if !self.reconstruction.has_model() || capture.waiting() > 0 {
             return Ok(());
         }
@@ -183,38 +196,52 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let clock = &self.clock;
         self.reconstruction.train(&self.budget, &mut |report: &StepReport| {
             last = Some(*report);
-            let undisturbed = capture.waiting() == 0 && capture.is_flying() && !interrupt.requested();
+            let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
             if undisturbed && clock.now_ns() < due_ns { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
         })?;
         if let Some(report) = last {
+            self.health.note_step(&report);
             self.say(capture, &report);
         }
-        if self.clock.now_ns() >= due_ns { self.save(false) } else { Ok(()) }
+        if self.clock.now_ns() >= due_ns { self.save(capture) } else { Ok(()) }
     }
 
     /// After capture, which counted `flight`: the last build, the rest of the schedule, and the model that remains.
     ///
     /// # Errors
     /// The device fails before there was a checkpoint; there are too few key frames for a model.
-    pub(super) fn land(mut self, flight: &FlightCounters, interrupt: &Interrupt) -> Result<JobEnd<R>, FlyError> {
+    pub(super) fn land(
+        mut self,
+        capture: &mut Handover,
+        flight: &FlightCounters,
+        interrupt: &Interrupt,
+    ) -> Result<JobEnd<R>, JobError> {
         if !self.training_failed {
-            let finished = self.finish_schedule(interrupt);
+            let finished = self.finish_schedule(capture, interrupt);
             self.survive(finished)?;
         }
         if !self.reconstruction.has_model() {
             let keyframes = self.reconstruction.keyframes();
-            return Err(FlyError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
+            return Err(JobError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
         }
         let spared = self.failsafe.forbids_training();
         if spared {
-            let cause = self.failsafe.cause().unwrap_or_default();
+            let cause = self.failsafe.cause().map_or("", failsafe::Cause::name);
             tracing::warn!("{cause}: the rest of the training is left; the same command continues it later");
         }
-        let finished = !interrupt.requested() && !self.training_failed && !spared;
+        let mut finished = !interrupt.requested() && !self.training_failed && !spared;
+        let before = (model_path(&self.out), self.reconstruction.gaussians());
         let (model, gaussians) = if self.training_failed {
-            (model_path(&self.out), self.reconstruction.gaussians())
+            before
         } else {
-            self.reconstruction.checkpoint(&self.out, finished)?
+            match self.checkpoint(capture, finished) {
+                Err(e) if e.may_pass() && before.0.is_file() => {
+                    tracing::error!("{e}; the last checkpoint is kept, make room and give the same command again");
+                    finished = false;
+                    before
+                }
+                other => other?,
+            }
         };
         if finished {
             self.offerer.offer_final(&model);
@@ -224,10 +251,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         Ok(JobEnd { reconstruction: self.reconstruction, offerer: self.offerer, model, gaussians, finished })
     }
 
-    fn finish_schedule(&mut self, interrupt: &Interrupt) -> Result<(), FlyError> {
+    fn finish_schedule(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
         if self.reconstruction.wants_build(true) && !interrupt.requested() {
-            self.reconstruction.build()?;
-            self.save(false)?;
+            self.build(capture)?;
         }
         if !self.reconstruction.has_model() || self.failsafe.forbids_training() {
             return Ok(());
@@ -235,34 +261,50 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let mut progress = crate::console::Progress::new("training", 100);
         while !self.reconstruction.is_done(&self.budget) && !interrupt.requested() {
             let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
-            let before = self.reconstruction.steps();
             let clock = &self.clock;
-            self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
+            let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
                 progress.set((r.progress * 100.0) as u64, || {
                     format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
                 });
-                let go_on = !interrupt.requested() && clock.now_ns() < due_ns;
+                // Only where saving leaves no trace, as in any training.
+                let go_on = !interrupt.requested() && (clock.now_ns() < due_ns || !r.settled);
                 if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             })?;
-            if self.reconstruction.steps() == before || self.clock.now_ns() < due_ns {
-                // Converged before its budget: no step was left to take.
+            if reason != StopReason::Caller || interrupt.requested() {
                 break;
             }
-            self.save(false)?;
+            self.save(capture)?;
         }
         Ok(())
     }
 
-    fn save(&mut self, finished: bool) -> Result<(), FlyError> {
-        let (path, gaussians) = self.reconstruction.checkpoint(&self.out, finished)?;
+    fn save(&mut self, capture: &mut Handover) -> Result<(), JobError> {
         self.saved_ns = self.clock.now_ns();
-        tracing::debug!("saved {} ({gaussians} Gaussians)", path.display());
-        if finished {
-            self.offerer.offer_final(&path)
-        } else {
-            self.offerer.offer(&path)
+        match self.checkpoint(capture, false) {
+            Ok((path, gaussians)) => {
+                tracing::debug!("saved {} ({gaussians} Gaussians)", path.display());
+                self.offerer.offer(&path);
+            }
+            // The one before is whole; the next is due in the usual time.
+            Err(e) if e.may_pass() => tracing::warn!("{e}; no checkpoint this time"),
+            Err(e) => return Err(e),
         }
         Ok(())
+    }
+
+    /// Writes a checkpoint; while there is no room, gives up what costs least and tries again.
+    fn checkpoint(&mut self, capture: &mut Handover, finished: bool) -> Result<(PathBuf, usize), JobError> {
+        let mut written = self.reconstruction.checkpoint(&self.out, finished);
+        for relief in Relief::LADDER {
+            if let Err(e) = &written
+                && e.may_pass()
+                && capture.relieve(relief)
+            {
+                tracing::warn!("{e}: gave up {}", relief.name());
+                written = self.reconstruction.checkpoint(&self.out, finished);
+            }
+        }
+        written
     }
 
     fn say(&mut self, capture: &Handover, report: &StepReport) {
@@ -283,18 +325,18 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// On a clock that stands still meanwhile there is nothing to wait for.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "lab"))]
     pub(super) fn without_waiting(self) -> Self {
         Self { for_a_frame: Duration::ZERO, idle: Duration::ZERO, ..self }
     }
 
-    #[cfg(test)]
+    #[cfg(all(test, feature = "lab"))]
     pub(super) fn reconstruction_mut(&mut self) -> &mut R {
         &mut self.reconstruction
     }
 
     /// Where the failsafe ladder stands, and why.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "lab"))]
     pub(super) fn failsafe(&self) -> failsafe::State {
         self.failsafe
     }

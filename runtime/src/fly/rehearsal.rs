@@ -7,53 +7,104 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use config::disk::Disk;
+use config::failsafe::FailsafeSettings;
+use config::geodesy::Geodetic;
 use config::mission::KeyframeSettings;
 use config::upload::UploadSettings;
 use hal::camera::FolderCamera;
-use hal::failsafe::Action;
+use hal::failsafe::{Action, Cause, Timing};
 use hal::sim::rehearsal::Rehearsal;
 use hal::sim::world::World;
 use hal::sim::{SessionReport, SimSettings};
 use hal::time::ManualClock;
 use hal::vehicle::{Vehicle, VehicleSettings};
-use models::camera::{Intrinsics, PosedImage, View};
+use models::camera::{Intrinsics, Pose, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
-use vulkan::trainer::{RunBudget, StepReport};
+use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
-use super::flight::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::geotags::Geotags;
 use super::handover::handover;
 use super::health::Health;
 use super::intake::Intake;
+use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::job::Job;
-use super::reconstruct::Reconstruct;
-use super::{FlyError, model_path};
+use crate::engine::{Reconstruct, model_path};
+use crate::error::JobError;
 use crate::interrupt::Interrupt;
-use crate::upload::Offerer;
+use crate::keyframe_store::KeyframeStore;
+use crate::upload::{Offerer, Source};
 
 /// Time between two turns; one training step is taken in each.
 const TURN_NS: u64 = 20_000_000;
 /// No rehearsal takes longer, turns: ten minutes.
 const MOST_TURNS: u32 = 30_000;
 
-/// What would have been reconstructed.
+/// What would have been reconstructed. Key frames and checkpoints are kept on disk as the real one keeps them.
 pub(super) struct Ledger {
+    disk: Disk,
     views: Vec<(String, View)>,
     built: usize,
     steps: u32,
+    /// Steps over all builds and starts.
+    steps_total: u64,
     /// In flight a turn has time for one step; afterwards there is all the time.
-    landed: bool,
+    pub(super) landed: bool,
+    /// What has been promised to be on disk, told to whoever cuts the power.
+    pub(super) promised: Box<dyn FnMut(Promise) + Send>,
+}
+
+/// What is on disk from now on, whatever happens.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Promise {
+    /// A key frame by its name.
+    KeyFrame(String),
+    /// A checkpoint after so many steps.
+    Checkpoint(u64),
+}
+
+impl Ledger {
+    /// Takes up what an earlier run left in `out`, as `fly` does; and the store of its key frames.
+    pub(super) fn open(
+        disk: &Disk,
+        lens: &Intrinsics,
+        origin: Geodetic,
+        out: &Path,
+    ) -> Result<(Self, KeyframeStore), JobError> {
+        let mut store = KeyframeStore::open(disk, &out.join("keyframes"), lens, origin)?;
+        let views: Vec<_> = (0..).map_while(|i| store.sound(i)).map(|frame| (frame.name, frame.view)).collect();
+        let before = model::read_checkpoint(disk, &model_path(out))?;
+        let steps_total = before.map_or(0, |(header, _)| header.steps);
+        let (disk, promised) = (disk.clone(), Box::new(|_| {}));
+        let ledger = Self { disk, views, built: 0, steps: 0, steps_total, landed: false, promised };
+        Ok((ledger, store))
+    }
+
+    /// Names of the key frames.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.views.iter().map(|(name, _)| name.as_str())
+    }
+
+    /// Steps over all builds and starts.
+    pub(super) fn steps_total(&self) -> u64 {
+        self.steps_total
+    }
 }
 
 impl Reconstruct for Ledger {
-    fn add(&mut self, frame: &PosedImage) -> Result<(), FlyError> {
-        self.views.push((frame.name.clone(), frame.view));
+    fn add(&mut self, frame: PosedImage) -> Result<(), JobError> {
+        (self.promised)(Promise::KeyFrame(frame.name.clone()));
+        self.views.push((frame.name, frame.view));
         Ok(())
     }
 
     fn keyframes(&self) -> usize {
         self.views.len()
+    }
+
+    fn pose(&self, _name: &str) -> Option<Pose> {
+        None
     }
 
     fn wants_build(&self, last: bool) -> bool {
@@ -66,26 +117,23 @@ impl Reconstruct for Ledger {
         self.built > 0
     }
 
-    fn build(&mut self) -> Result<(), FlyError> {
+    fn build(&mut self, _go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
         (self.built, self.steps) = (self.views.len(), 0);
-        Ok(())
+        Ok(true)
     }
 
     fn is_done(&self, budget: &RunBudget) -> bool {
         budget.steps.is_some_and(|s| self.steps >= s)
     }
 
-    fn steps(&self) -> u32 {
-        self.steps
-    }
-
     fn train(
         &mut self,
         budget: &RunBudget,
         each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
-    ) -> Result<(), FlyError> {
+    ) -> Result<StopReason, JobError> {
         while !self.is_done(budget) {
             self.steps += 1;
+            self.steps_total += 1;
             let report = StepReport {
                 step: self.steps,
                 view: 0,
@@ -103,15 +151,15 @@ impl Reconstruct for Ledger {
                 settled: true,
             };
             if each(&report).is_break() || !self.landed {
-                break;
+                return Ok(StopReason::Caller);
             }
         }
-        Ok(())
+        Ok(StopReason::Schedule)
     }
 
     fn halve_resolution(&mut self, _on: bool) {}
 
-    fn shrink(&mut self) -> Result<(), FlyError> {
+    fn shrink(&mut self) -> Result<(), JobError> {
         Ok(())
     }
 
@@ -119,11 +167,12 @@ impl Reconstruct for Ledger {
         0
     }
 
-    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), FlyError> {
+    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), JobError> {
         let views = self.views[..self.built].to_vec();
-        let header = ModelHeader { views, steps: self.steps.into(), finished, ..ModelHeader::default() };
+        let header = ModelHeader { views, steps: self.steps_total, finished, ..ModelHeader::default() };
         let path = model_path(out);
-        model::write(&path, &header, &GaussianCloud::default())?;
+        model::write_checkpoint(&self.disk, &path, &header, &GaussianCloud::default())?;
+        (self.promised)(Promise::Checkpoint(self.steps_total));
         Ok((path, 0))
     }
 }
@@ -134,8 +183,14 @@ pub(super) struct Script {
     pub(super) sim: SimSettings,
     pub(super) vehicle: VehicleSettings,
     pub(super) end: EndOfFlight,
+    /// Names of key frames that an earlier run has stored.
+    pub(super) earlier_names: Vec<String>,
     /// Somebody asks the program to end (Ctrl-C) at this time.
     pub(super) interrupt_at: Option<Duration>,
+    /// What the job writes to, for a flight whose files are in this folder.
+    pub(super) disk: fn(&Path) -> Disk,
+    /// What happened in the output folder before the flight.
+    pub(super) before: fn(&Path),
 }
 
 /// What became of it.
@@ -143,45 +198,62 @@ pub(super) struct Rehearsed {
     pub(super) happened: SessionReport,
     pub(super) ended: Ended,
     pub(super) counters: FlightCounters,
+    /// Key frames for which the disk had no room.
+    pub(super) without_room: u64,
     /// The rungs of the failsafe ladder that were climbed to, with their cause.
     pub(super) rungs: Vec<(Action, &'static str)>,
     /// Views and completeness of the model file that remained; else how many key frames there were, and why so few.
     pub(super) model: Result<(usize, bool), (usize, String)>,
+    /// Names of the model's views.
+    pub(super) names: Vec<String>,
 }
 
 /// Flies `script`, with its files in `folder`.
 pub(super) fn rehearse(script: &Script, world: Arc<World>, folder: &Path) -> Rehearsed {
+    let disk = (script.disk)(&folder.join("out"));
+    rehearse_on(&disk, script, world, folder, Box::new(|_| {}))
+}
+
+/// As [`rehearse`], with what is on disk told to `promised`.
+pub(super) fn rehearse_on(
+    disk: &Disk,
+    script: &Script,
+    world: Arc<World>,
+    folder: &Path,
+    promised: Box<dyn FnMut(Promise) + Send>,
+) -> Rehearsed {
     let (pictures, out) = (folder.join("pictures"), folder.join("out"));
     std::fs::create_dir_all(&pictures).expect("folder");
     std::fs::create_dir_all(&out).expect("folder");
+    (script.before)(&out);
     let clock = Arc::new(ManualClock::default());
     let (mut aircraft, wire) =
         Rehearsal::new(&script.sim, world, &pictures, clock.clone()).expect("a simulated aircraft");
     let camera = FolderCamera::open(&pictures).expect("the folder").on_simulated_clock();
     let vehicle = Vehicle::new(wire, camera, clock.clone(), &script.vehicle).expect("a vehicle");
-    let (capture, end) = handover();
+    let (mut capture, end) = handover();
     let lens = script.vehicle.lens;
+    let intrinsics =
+        Intrinsics { width: lens.width, height: lens.height, fx: lens.fx, fy: lens.fy, cx: lens.cx, cy: lens.cy };
+    let (mut ledger, store) = Ledger::open(disk, &intrinsics, script.vehicle.origin, &out).expect("opens");
+    ledger.promised = promised;
     let plan = FlightPlan {
         vehicle: script.vehicle.clone(),
-        intrinsics: Intrinsics {
-            width: lens.width,
-            height: lens.height,
-            fx: lens.fx,
-            fy: lens.fy,
-            cx: lens.cx,
-            cy: lens.cy,
-        },
+        intrinsics,
         keyframes: KeyframeSettings::default(),
-        earlier: Vec::new(),
+        earlier: store.poses(),
+        earlier_names: script.earlier_names.iter().cloned().collect(),
         end: script.end,
-        geotags: Geotags::open(&out, script.vehicle.origin).expect("a file"),
+        geotags: Geotags::open(disk, &out, script.vehicle.origin).expect("a file"),
     };
+    capture.keep_in(store, model_path(&out));
     let mut intake = Some(Intake::new(plan, vehicle, clock.clone(), end));
-    let offerer = Offerer::start(&UploadSettings::default(), "rehearsal", "one").expect("a thread");
-    let ledger = Ledger { views: Vec::new(), built: 0, steps: 0, landed: false };
+    let offerer = Offerer::start(&UploadSettings::default(), Source::unsigned("rehearsal", "one")).expect("a thread");
     let budget = RunBudget { steps: Some(200), seconds: None };
-    let health = Health::without_sensors(1 << 20);
-    let mut job = Job::new(ledger, offerer, &out, budget, health, clock.clone()).without_waiting();
+    let limits = FailsafeSettings { disk_low_mib: 0, ..FailsafeSettings::default() };
+    let health = Health::with_sensors(Path::new("/nonexistent"), limits, 1 << 20, &out);
+    let mut job =
+        Job::new(ledger, offerer, &out, budget, health, Timing::from(&limits), clock.clone()).without_waiting();
     let interrupt = Interrupt::default();
     let (mut flying, mut over, mut rungs) = (true, None, Vec::new());
     for turn in 1..=MOST_TURNS {
@@ -196,10 +268,10 @@ pub(super) fn rehearse(script: &Script, world: Arc<World>, folder: &Path) -> Reh
                 None => intake = Some(capturing),
             }
         }
-        let goes_on = job.turn(&capture, &interrupt).expect("the job goes on");
+        let goes_on = job.turn(&mut capture, &interrupt).expect("the job goes on");
         let state = job.failsafe();
         if rungs.last().map_or(Action::Nominal, |r: &(Action, _)| r.0) != state.action() {
-            rungs.push((state.action(), state.cause().unwrap_or("recovered")));
+            rungs.push((state.action(), state.cause().map_or("recovered", Cause::name)));
         }
         if !goes_on {
             break;
@@ -216,14 +288,17 @@ pub(super) fn rehearse(script: &Script, world: Arc<World>, folder: &Path) -> Reh
     let (ended, counters) = over.expect("the flight ends");
     assert!(ended != Ended::Asked || interrupt.requested(), "still flying after ten minutes");
     job.reconstruction_mut().landed = true;
-    let model = match job.land(&counters, &interrupt) {
+    let mut names = Vec::new();
+    let model = match job.land(&mut capture, &counters, &interrupt) {
         Ok(end) => {
             let (header, _) = model::read(&end.model).expect("a valid model file");
             assert_eq!(header.finished, end.finished);
+            names.extend(header.views.iter().map(|(name, _)| name.clone()));
             Ok((header.views.len(), header.finished))
         }
-        Err(FlyError::TooFewKeyframes { keyframes, cause }) => Err((keyframes, cause)),
+        Err(JobError::TooFewKeyframes { keyframes, cause }) => Err((keyframes, cause)),
         Err(e) => panic!("the job failed: {e}"),
     };
-    Rehearsed { happened: aircraft.finish().expect("a report"), ended, counters, rungs, model }
+    let without_room = capture.without_room();
+    Rehearsed { happened: aircraft.finish().expect("a report"), ended, counters, without_room, rungs, model, names }
 }

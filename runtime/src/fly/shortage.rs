@@ -1,7 +1,7 @@
 //! Why a flight brought too few key frames, by what was counted on the way: from the link over the poses and the exposures to
 //! the pictures, the first that explains it is the cause.
 
-use super::flight::FlightCounters;
+use super::intake::FlightCounters;
 
 /// One line with the count that gives it away and the remedy.
 pub(super) fn likely_cause(flight: &FlightCounters) -> String {

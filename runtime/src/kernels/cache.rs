@@ -1,7 +1,6 @@
 //! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the shape that was
 //! measured. It is only a cache: it may be deleted, be damaged or be somebody's handiwork at any time.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use models::formats::{FormatError, read_bounded, write_atomic};
@@ -138,7 +137,7 @@ mod tests {
             heap_bytes: 1 << 30,
             ids: (0x14e4, 42),
             driver_version: 7,
-            limits: DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27 },
+            limits: DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 },
         }
     }
 

@@ -3,7 +3,7 @@
 
 use std::fmt::Write;
 
-use super::html::escape;
+use super::text::escape;
 
 const WIDTH: f64 = 900.0;
 const HEIGHT: f64 = 460.0;

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::ReportData;
-use super::html::escape;
+use super::text::escape;
 
 /// Width of the drawing, SVG units; the height follows the mission's shape within bounds.
 const WIDTH: f64 = 900.0;

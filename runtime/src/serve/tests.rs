@@ -2,9 +2,9 @@
 
 use super::*;
 use crate::aggregate::testing::{carpet, model};
-use crate::upload::Offerer;
+use crate::upload::{Offerer, Source};
 
-fn mission(dir: &Path) -> Mission {
+pub(super) fn mission(dir: &Path) -> Mission {
     let text = r#"
 name = "park"
 origin = { lat_deg = 28.0, lon_deg = -82.0, alt_m = 0.0 }
@@ -29,7 +29,7 @@ fn fly(mission: &Mission, dir: &Path, id: &str) {
     let path = dir.join(format!("{id}.dgtr"));
     let local = model(id, &[], carpet([-40.0, -20.0], [40.0, 20.0], 1.0));
     models::formats::model::write(&path, &local.header, &local.cloud).expect("write");
-    let offerer = Offerer::start(&mission.upload, &mission.name, id).expect("offerer");
+    let offerer = Offerer::start(&mission.upload, Source::unsigned(&mission.name, id)).expect("offerer");
     offerer.offer_final(&path);
     assert!(offerer.wait_delivered(Duration::from_secs(30), || true));
     offerer.shutdown();
@@ -77,10 +77,18 @@ fn a_received_file_that_is_no_model_does_not_cost_the_others() {
     fly(&mission, dir.path(), "west");
     let path = dir.path().join("junk.dgtr");
     std::fs::write(&path, b"not a model").expect("write");
-    let offerer = Offerer::start(&mission.upload, &mission.name, "east").expect("offerer");
+    let offerer = Offerer::start(&mission.upload, Source::unsigned(&mission.name, "east")).expect("offerer");
     offerer.offer_final(&path);
     assert!(offerer.wait_delivered(Duration::from_secs(30), || true));
     let reception = receive(&mission, &out, None, &AtomicBool::new(false), &mut |_| {}).expect("received");
-    let (outcome, unreadable) = merge(&mission, &reception, &out, &|| true).expect("merged");
-    assert_eq!((outcome.models.len(), unreadable.len()), (1, 1));
+    assert_eq!((reception.missing.as_slice(), reception.counters.models_damaged), (&["east".to_owned()][..], 1));
+    assert!(reception.refusals.iter().any(|(why, n)| why.contains("east's model") && n == 1));
+    let (outcome, left_out) = merge(&mission, &reception, &out, &|| true).expect("merged");
+    assert_eq!((outcome.models.len(), left_out.len()), (1, 0));
+    // Damaged on the ground afterwards: left out, and the other one is merged all the same.
+    fly(&mission, dir.path(), "east");
+    let reception = receive(&mission, &out, None, &AtomicBool::new(false), &mut |_| {}).expect("received");
+    std::fs::write(&reception.received[1].path, b"not a model").expect("write");
+    let (outcome, left_out) = merge(&mission, &reception, &out, &|| true).expect("merged");
+    assert_eq!((outcome.models.len(), left_out.len()), (1, 1));
 }

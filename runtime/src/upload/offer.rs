@@ -1,7 +1,12 @@
 //! What an aircraft says about a model it holds, and the model file cut into content-hashed chunks.
 //!
-//! The offer is the only thing the ground has to believe before it can check everything else, so each field is
-//! bounded when it arrives, and the chunk list must add up to the stated size.
+//! The offer is the only thing the ground has to believe before it can check everything else: each field is bounded
+//! when it arrives, the chunk list must add up to the stated size, and the aircraft's signature covers every byte.
+//!
+//! ```text
+//! version u8 = 2 · mission · aircraft · flight · counter · finished · size · chunk bytes · model · chunks   (postcard)
+//! Ed25519 signature of "dgtr offer\0" and everything before (64; absent in missions without keys)
+//! ```
 
 use std::fs::File;
 use std::io::Read;
@@ -12,8 +17,11 @@ use serde::{Deserialize, Serialize};
 
 use config::upload::UploadSettings;
 
-/// Version of the wire format; another one is refused, not guessed at.
-const VERSION: u8 = 1;
+use super::Source;
+use crate::keys::{Domain, Identity, SignatureBytes, SignatureError};
+
+/// Version of the wire format; another one is refused, not guessed at. 1 was unsigned and ordered by the wall clock.
+const VERSION: u8 = 2;
 /// Longest mission or aircraft name on the wire (the mission file allows 32).
 const MAX_NAME: usize = 64;
 
@@ -25,6 +33,15 @@ pub fn hex(hash: &Hash) -> String {
     blake3::Hash::from_bytes(*hash).to_hex().to_string()
 }
 
+/// The order of one aircraft's models. Clocks do not enter: one that went back would hide every model that follows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Order {
+    /// Number of the flight, counted on the aircraft and kept over restarts.
+    pub flight: u64,
+    /// Number of the offer within the flight.
+    pub counter: u64,
+}
+
 /// One model on offer.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Offer {
@@ -33,8 +50,8 @@ pub struct Offer {
     pub mission: String,
     /// Aircraft that made it.
     pub aircraft: String,
-    /// Larger = newer, per aircraft; Unix milliseconds unless the clock went back.
-    pub sequence: u64,
+    /// Larger = newer, per aircraft.
+    pub order: Order,
     /// No further model of this flight will follow.
     pub finished: bool,
     /// Bytes of the model file.
@@ -45,6 +62,9 @@ pub struct Offer {
     pub model: Hash,
     /// blake3 of each chunk, in file order.
     pub chunks: Vec<Hash>,
+    /// The aircraft's signature of all the above.
+    #[serde(skip)]
+    pub signature: Option<SignatureBytes>,
 }
 
 /// Why an offer was not accepted.
@@ -62,6 +82,14 @@ pub enum OfferError {
     /// Not one of the mission's aircraft.
     #[error("offer is from aircraft {0:?}, which the mission does not know")]
     UnknownAircraft(String),
+    /// Made by somebody else than it says.
+    #[error("offer in the name of {aircraft:?} {source}")]
+    Forged {
+        /// The name it was made in.
+        aircraft: String,
+        /// What is wrong.
+        source: SignatureError,
+    },
     /// Above `upload.max_model_mib`.
     #[error("model of {size} bytes is above the limit of {limit} (upload.max_model_mib)")]
     Oversize {
@@ -82,13 +110,25 @@ pub fn is_safe_name(name: &str) -> bool {
 impl Offer {
     /// Most bytes an encoded offer can have under these settings.
     pub fn max_encoded(settings: &UploadSettings) -> u64 {
-        256 + 2 * MAX_NAME as u64 + 32 * settings.max_chunks()
+        320 + 2 * MAX_NAME as u64 + 32 * settings.max_chunks()
+    }
+
+    /// What is signed.
+    fn signed_bytes(&self) -> Vec<u8> {
+        // Plain integers, strings and byte arrays: serialising into a growing vector has no way to fail.
+        postcard::to_allocvec(self).unwrap_or_default()
     }
 
     /// Wire bytes.
     pub fn encode(&self) -> Vec<u8> {
-        // Plain integers, strings and byte arrays: serialising into a growing vector has no way to fail.
-        postcard::to_allocvec(self).unwrap_or_default()
+        let mut bytes = self.signed_bytes();
+        bytes.extend(self.signature.iter().flatten());
+        bytes
+    }
+
+    /// What tells this offer from every other one.
+    pub fn digest(&self) -> Hash {
+        *blake3::hash(&self.encode()).as_bytes()
     }
 
     /// Wire bytes → an offer whose every field is within bounds. Whether it concerns us is [`Offer::check`]'s job.
@@ -102,10 +142,12 @@ impl Offer {
             Some(&other) => return Err(OfferError::Version(other)),
             None => return damaged("empty"),
         }
-        let (offer, rest): (Self, _) =
+        let (mut offer, rest): (Self, _) =
             postcard::take_from_bytes(bytes).map_err(|e| OfferError::Damaged(e.to_string()))?;
-        if !rest.is_empty() {
-            return damaged("bytes after its end");
+        match SignatureBytes::try_from(rest) {
+            Ok(signature) => offer.signature = Some(signature),
+            Err(_) if rest.is_empty() => {}
+            Err(_) => return damaged("bytes after its end"),
         }
         if !is_safe_name(&offer.mission) || !is_safe_name(&offer.aircraft) {
             return damaged("mission or aircraft name");
@@ -124,15 +166,21 @@ impl Offer {
         Ok(offer)
     }
 
-    /// Whether the offer concerns this mission and one of its aircraft.
-    pub fn check(&self, mission: &str, aircraft: &[String]) -> Result<(), OfferError> {
+    /// Whether the offer concerns this mission, comes from one of its aircraft, and from nobody else.
+    ///
+    /// # Errors
+    /// The first of these that does not hold.
+    pub fn check(&self, mission: &str, aircraft: &[String], identity: &Identity) -> Result<(), OfferError> {
         if self.mission != mission {
             return Err(OfferError::ForeignMission(self.mission.clone()));
         }
         if !aircraft.contains(&self.aircraft) {
             return Err(OfferError::UnknownAircraft(self.aircraft.clone()));
         }
-        Ok(())
+        // Encoded anew, so that an offer has one encoding only.
+        identity
+            .verify(&self.aircraft, Domain::Offer, &self.signed_bytes(), self.signature.as_ref())
+            .map_err(|source| OfferError::Forged { aircraft: self.aircraft.clone(), source })
     }
 
     /// Bytes of chunk `index`.
@@ -152,15 +200,15 @@ pub struct OfferedModel {
 }
 
 impl OfferedModel {
-    /// Opens and hashes a model file. Reads it once, with one chunk in memory.
+    /// Opens, hashes and signs a model file. Reads it once, with one chunk in memory.
     ///
     /// # Errors
     /// The file cannot be read, is empty, or is larger than `max_model_mib`.
     pub fn open(
         path: &Path,
         settings: &UploadSettings,
-        (mission, aircraft): (&str, &str),
-        sequence: u64,
+        source: &Source,
+        order: Order,
         finished: bool,
     ) -> std::io::Result<Self> {
         let mut file = File::open(path)?;
@@ -187,16 +235,31 @@ impl OfferedModel {
         }
         let offer = Offer {
             version: VERSION,
-            mission: mission.into(),
-            aircraft: aircraft.into(),
-            sequence,
+            mission: source.mission.clone(),
+            aircraft: source.aircraft.clone(),
+            order,
             finished,
             size,
             chunk_bytes,
             model: *whole.finalize().as_bytes(),
             chunks,
+            signature: None,
         };
-        Ok(Self { offer, file })
+        Ok(Self { offer, file }.signed(&source.identity))
+    }
+
+    fn signed(mut self, identity: &Identity) -> Self {
+        self.offer.signature = identity.sign(Domain::Offer, &self.offer.signed_bytes());
+        self
+    }
+
+    /// The same model under another number.
+    ///
+    /// # Errors
+    /// The open file cannot be shared.
+    pub fn renumbered(&self, order: Order, identity: &Identity) -> std::io::Result<Self> {
+        let offer = Offer { order, ..self.offer.clone() };
+        Ok(Self { offer, file: self.file.try_clone()? }.signed(identity))
     }
 
     /// Bytes of chunk `index`, out of the open file.
@@ -213,8 +276,39 @@ impl OfferedModel {
 }
 
 #[cfg(test)]
+pub(super) mod testing {
+    use super::*;
+
+    /// An unsigned offer of a small model in flight 1.
+    pub(in crate::upload) fn offer(mission: &str, aircraft: &str, counter: u64) -> Offer {
+        let order = Order { flight: 1, counter };
+        let (mission, aircraft) = (mission.into(), aircraft.into());
+        let (model, chunks) = ([counter as u8; 32], vec![[counter as u8; 32]]);
+        let (size, chunk_bytes) = (100, 16 << 10);
+        Offer {
+            version: VERSION,
+            mission,
+            aircraft,
+            order,
+            finished: true,
+            size,
+            chunk_bytes,
+            model,
+            chunks,
+            signature: None,
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_page_on_formats_states_this_version() {
+        let row = format!("| offer of a model | {VERSION} |");
+        assert!(include_str!("../../../models/FORMATS.md").contains(&row), "{row}");
+    }
 
     fn settings() -> UploadSettings {
         UploadSettings { chunk_kib: 16, max_model_mib: 1, ..Default::default() }
@@ -224,7 +318,8 @@ mod tests {
         let dir = tempfile::tempdir().expect("temp dir");
         let path = dir.path().join("m.dgtr");
         std::fs::write(&path, vec![7; bytes]).expect("write");
-        OfferedModel::open(&path, &settings(), ("m", "a1"), 5, true).expect("offer").offer
+        let order = Order { flight: 2, counter: 5 };
+        OfferedModel::open(&path, &settings(), &Source::unsigned("m", "a1"), order, true).expect("offer").offer
     }
 
     #[test]
@@ -241,9 +336,10 @@ mod tests {
         for n in 0..bytes.len() {
             assert!(Offer::decode(&bytes[..n], &settings()).is_err(), "{n} of {}", bytes.len());
         }
-        let mut longer = bytes;
-        longer.push(0);
-        assert!(Offer::decode(&longer, &settings()).is_err());
+        // A signature may follow, and nothing else.
+        for more in (1..200).filter(|&n| n != 64) {
+            assert!(Offer::decode(&[&bytes[..], &vec![0; more]].concat(), &settings()).is_err());
+        }
     }
 
     #[test]
@@ -260,12 +356,12 @@ mod tests {
         assert!(matches!(edit(|o| o.chunks.truncate(1)), Err(OfferError::Damaged(_))));
         assert!(matches!(edit(|o| o.aircraft = "../../etc".into()), Err(OfferError::Damaged(_))));
         assert!(matches!(edit(|o| o.mission = "a/**".into()), Err(OfferError::Damaged(_))));
-        assert!(matches!(edit(|o| o.version = 2), Err(OfferError::Version(2))));
+        assert!(matches!(edit(|o| o.version = 1), Err(OfferError::Version(1))));
     }
 
     #[test]
     fn a_vast_chunk_count_does_not_allocate() {
-        // version, "m", "a", sequence, finished, size, chunk size, hash, then a length of 2^60 hashes.
+        // version, "m", "a", flight, counter, finished, size, chunk size, hash, then a length of 2^60 hashes.
         let mut o = offer(40_000);
         o.chunks.clear();
         let mut bytes = o.encode();
@@ -277,8 +373,33 @@ mod tests {
     #[test]
     fn foreign_missions_and_strangers_are_told_apart() {
         let o = offer(1);
-        assert_eq!(o.check("m", &["a1".into()]), Ok(()));
-        assert_eq!(o.check("other", &["a1".into()]), Err(OfferError::ForeignMission("m".into())));
-        assert_eq!(o.check("m", &["a2".into()]), Err(OfferError::UnknownAircraft("a1".into())));
+        let nobody = Identity::unsigned();
+        assert_eq!(o.check("m", &["a1".into()], &nobody), Ok(()));
+        assert_eq!(o.check("other", &["a1".into()], &nobody), Err(OfferError::ForeignMission("m".into())));
+        assert_eq!(o.check("m", &["a2".into()], &nobody), Err(OfferError::UnknownAircraft("a1".into())));
+    }
+
+    #[test]
+    fn every_changed_byte_of_a_signed_offer_is_noticed() {
+        let ids = crate::keys::testing::identities(["a1"]);
+        let check = |bytes: &[u8]| {
+            let offer = Offer::decode(bytes, &settings())?;
+            offer.check("m", &["a1".into()], &ids[1])
+        };
+        let mut o = offer(40_000);
+        o.signature = ids[0].sign(Domain::Offer, &o.signed_bytes());
+        let bytes = o.encode();
+        assert_eq!(check(&bytes), Ok(()));
+        for at in 0..bytes.len() {
+            for flip in [1, 0x80] {
+                let mut spoilt = bytes.clone();
+                spoilt[at] ^= flip;
+                assert!(check(&spoilt).is_err(), "byte {at}");
+            }
+        }
+        // Cut down to an unsigned one, or signed by the ground.
+        assert!(matches!(check(&bytes[..bytes.len() - 64]), Err(OfferError::Forged { .. })));
+        o.signature = ids[1].sign(Domain::Offer, &o.signed_bytes());
+        assert!(matches!(check(&o.encode()), Err(OfferError::Forged { .. })));
     }
 }

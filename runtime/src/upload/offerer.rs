@@ -3,14 +3,19 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use config::upload::UploadSettings;
 
-use super::UploadError;
+use super::flight_number::FlightNumber;
 use super::folder::FolderOutlet;
-use super::offer::{Hash, OfferedModel};
+use super::offer::{OfferedModel, Order};
+use super::receipt::Delivery;
 use super::transport::{Outlet, TransportError};
+use super::{Source, UploadError};
+
+/// A model that took so long to deliver keeps the next checkpoint back for so many times as long.
+const REST: f64 = 4.0;
 
 /// What has become of the offers so far.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -23,14 +28,27 @@ pub struct OffererStatus {
     pub failures: u64,
     /// The newest model has arrived on the ground, or lies complete in the folder.
     pub delivered: bool,
+    /// Why the ground will not take the newest model; empty while it has not said so.
+    pub refused: String,
     /// Why the last attempt failed; empty once one worked.
     pub last_error: String,
+}
+
+/// What is handed over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    /// May wait for its turn.
+    Checkpoint,
+    /// May be the last one ever: the aircraft is in trouble.
+    Urgent,
+    /// The last one of this flight.
+    Final,
 }
 
 #[derive(Default)]
 struct Inbox {
     /// The newest model not yet taken up; an older one it replaces was never sent, which is as it should be.
-    next: Option<(PathBuf, bool)>,
+    next: Option<(PathBuf, Kind)>,
     stop: bool,
     status: OffererStatus,
 }
@@ -40,6 +58,7 @@ pub struct Offerer {
     shared: Arc<(Mutex<Inbox>, Condvar)>,
     thread: Option<JoinHandle<()>>,
     configured: bool,
+    checkpoints: bool,
 }
 
 fn locked(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
@@ -55,19 +74,19 @@ impl Offerer {
     ///
     /// # Errors
     /// Settings that can never work; anything that may come right later (no link, no stick) is retried instead.
-    pub fn start(settings: &UploadSettings, mission: &str, aircraft: &str) -> Result<Self, UploadError> {
-        settings.validate()?;
+    pub fn start(settings: &UploadSettings, source: Source) -> Result<Self, UploadError> {
+        settings.check()?;
         let mut ways: Vec<Connect> = Vec::new();
         if let Some(folder) = settings.folder.clone() {
-            let (mission, aircraft) = (mission.to_owned(), aircraft.to_owned());
-            ways.push(Box::new(move || Ok(Box::new(FolderOutlet::new(&folder, &mission, &aircraft)))));
+            let source = source.clone();
+            ways.push(Box::new(move || Ok(Box::new(FolderOutlet::new(&folder, source.clone())))));
         }
         if !settings.connect.is_empty() {
             #[cfg(feature = "zenoh")]
             {
-                let (settings, mission, aircraft) = (settings.clone(), mission.to_owned(), aircraft.to_owned());
+                let (settings, source) = (settings.clone(), source.clone());
                 ways.push(Box::new(move || {
-                    let outlet = super::network::NetworkOutlet::open(&settings, &mission, &aircraft)?;
+                    let outlet = super::network::NetworkOutlet::open(&settings, source.clone())?;
                     Ok(Box::new(outlet))
                 }));
             }
@@ -77,36 +96,48 @@ impl Offerer {
         let configured = !ways.is_empty();
         let shared = Arc::new((Mutex::new(Inbox::default()), Condvar::new()));
         let worker = Worker {
+            flight: FlightNumber::begin(source.flight_number.as_deref()),
             settings: settings.clone(),
-            mission: mission.into(),
-            aircraft: aircraft.into(),
+            source,
             shared: shared.clone(),
             ways: ways.into_iter().map(|connect| Way { connect, outlet: None, behind: false }).collect(),
             model: None,
-            sequence: 0,
+            counter: 0,
+            delivered: false,
+            is_fetched: false,
+            offered: Instant::now(),
+            next_checkpoint: Instant::now(),
         };
         let thread = std::thread::Builder::new()
             .name("upload".into())
             .spawn(move || worker.run())
             .map_err(UploadError::Thread)?;
-        Ok(Self { shared, thread: Some(thread), configured })
+        Ok(Self { shared, thread: Some(thread), configured, checkpoints: settings.checkpoint_s > 0.0 })
     }
 
-    /// Offers a checkpoint in place of whatever was offered before. The file may be replaced (by renaming) at any
-    /// time afterwards.
+    /// Offers a checkpoint in place of whatever was offered before, as soon as that is not being fetched any more and
+    /// `checkpoint_s` has passed. The file may be replaced (by renaming) at any time afterwards.
     pub fn offer(&self, model: &Path) {
-        self.put(model, false);
+        if self.checkpoints {
+            self.put(model, Kind::Checkpoint);
+        }
+    }
+
+    /// Offers a checkpoint at once, because it may be the last one.
+    pub fn offer_urgently(&self, model: &Path) {
+        self.put(model, Kind::Urgent);
     }
 
     /// Offers the last model of this flight.
     pub fn offer_final(&self, model: &Path) {
-        self.put(model, true);
+        self.put(model, Kind::Final);
     }
 
-    fn put(&self, model: &Path, finished: bool) {
+    fn put(&self, model: &Path, kind: Kind) {
         let mut inbox = locked(&self.shared.0);
-        inbox.next = Some((model.into(), finished));
+        inbox.next = Some((model.into(), kind));
         inbox.status.delivered = false;
+        inbox.status.refused.clear();
         self.shared.1.notify_all();
     }
 
@@ -116,15 +147,16 @@ impl Offerer {
     }
 
     /// Waits until the newest model has arrived, at most `timeout`, and no longer than `go_on` holds (asked ten
-    /// times a second). Returns whether it arrived; at once when there is nowhere it could.
+    /// times a second). Returns whether it arrived; at once when there is nowhere it could, or the ground refused it.
     pub fn wait_delivered(&self, timeout: Duration, mut go_on: impl FnMut() -> bool) -> bool {
         if !self.configured {
             return false;
         }
         let until = Instant::now() + timeout;
         while go_on() && Instant::now() < until {
-            if locked(&self.shared.0).status.delivered {
-                return true;
+            let OffererStatus { delivered, refused, .. } = self.status();
+            if delivered || !refused.is_empty() {
+                return delivered;
             }
             std::thread::sleep(Duration::from_millis(100));
         }
@@ -162,12 +194,18 @@ struct Way {
 
 struct Worker {
     settings: UploadSettings,
-    mission: String,
-    aircraft: String,
+    source: Source,
+    flight: FlightNumber,
     shared: Arc<(Mutex<Inbox>, Condvar)>,
     ways: Vec<Way>,
     model: Option<Arc<OfferedModel>>,
-    sequence: u64,
+    counter: u64,
+    /// What became of `model`.
+    delivered: bool,
+    is_fetched: bool,
+    offered: Instant,
+    /// Before this time no further checkpoint is offered.
+    next_checkpoint: Instant,
 }
 
 impl Worker {
@@ -178,46 +216,66 @@ impl Worker {
             let failed = self.catch_up();
             pause = if failed { (2.0 * pause).min(self.settings.retry_max_s) } else { self.settings.retry_min_s };
             let waiting = self.model.is_some() && !self.note_delivery();
-            let nap = match (failed, waiting) {
+            let wait = match (failed, waiting) {
                 (true, _) => Duration::from_secs_f64(pause),
                 (false, true) => Duration::from_millis(200),
                 (false, false) => Duration::from_secs(3600),
             };
-            let Some(next) = self.sleep(nap) else { return };
-            if let Some((path, finished)) = next {
-                self.take_up(&path, finished);
+            let Some(next) = self.wait(wait) else { return };
+            if let Some((path, kind)) = next {
+                self.take_up(&path, kind);
             }
         }
     }
 
-    /// Sleeps until there is something to do; None = stop.
-    fn sleep(&self, nap: Duration) -> Option<Option<(PathBuf, bool)>> {
-        let (inbox, bell) = &*self.shared;
+    /// Waits until there is something to do; None = stop.
+    fn wait(&self, wait: Duration) -> Option<Option<(PathBuf, Kind)>> {
+        let (inbox, changed) = &*self.shared;
         let mut inbox = locked(inbox);
-        if inbox.next.is_none() && !inbox.stop {
-            inbox = bell.wait_timeout(inbox, nap).map_or_else(|e| e.into_inner().0, |(guard, _)| guard);
+        let due = |inbox: &Inbox| inbox.next.as_ref().is_some_and(|n| self.is_due(n.1) || inbox.stop);
+        if !due(&inbox) && !inbox.stop {
+            let held_back = inbox.next.is_some();
+            let left = self.next_checkpoint.saturating_duration_since(Instant::now());
+            let wait = if held_back { wait.min(left.max(Duration::from_millis(200))) } else { wait };
+            inbox = changed.wait_timeout(inbox, wait).map_or_else(|e| e.into_inner().0, |(guard, _)| guard);
         }
-        // A final model still in the inbox is put on offer even when asked to stop: a folder takes it at once.
-        if inbox.stop && inbox.next.is_none() { None } else { Some(inbox.next.take()) }
+        // What still lies in the inbox is put on offer even when asked to stop: a folder takes it at once.
+        match due(&inbox) {
+            true => Some(inbox.next.take()),
+            false if inbox.stop => None,
+            false => Some(None),
+        }
     }
 
-    fn take_up(&mut self, path: &Path, finished: bool) {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_millis() as u64);
-        let sequence = now.max(self.sequence + 1);
-        match OfferedModel::open(path, &self.settings, (&self.mission, &self.aircraft), sequence, finished) {
+    /// A checkpoint waits until the one before has been fetched, if somebody is about it, and for its share of the link.
+    fn is_due(&self, kind: Kind) -> bool {
+        let busy = self.is_fetched && !self.delivered;
+        kind != Kind::Checkpoint || (!busy && Instant::now() >= self.next_checkpoint)
+    }
+
+    fn take_up(&mut self, path: &Path, kind: Kind) {
+        let order = Order { flight: self.flight.get(), counter: self.counter + 1 };
+        match OfferedModel::open(path, &self.settings, &self.source, order, kind == Kind::Final) {
             Ok(model) => {
-                self.sequence = sequence;
-                for way in &mut self.ways {
-                    way.behind = true;
-                }
                 let mut inbox = locked(&self.shared.0);
                 inbox.status.offers += 1;
                 inbox.status.bytes = model.offer.size;
                 drop(inbox);
-                self.model = Some(Arc::new(model));
+                self.put_on_offer(model);
             }
             Err(e) => self.note_failure(&format!("{}: {e}", path.display())),
         }
+    }
+
+    fn put_on_offer(&mut self, model: OfferedModel) {
+        self.counter = model.offer.order.counter;
+        for way in &mut self.ways {
+            way.behind = true;
+        }
+        self.model = Some(Arc::new(model));
+        (self.delivered, self.is_fetched) = (false, false);
+        self.offered = Instant::now();
+        self.next_checkpoint = self.offered + Duration::from_secs_f64(self.settings.checkpoint_s);
     }
 
     /// Brings every way up to the newest model; returns whether one of them failed.
@@ -255,12 +313,41 @@ impl Worker {
         }
     }
 
-    fn note_delivery(&self) -> bool {
-        let Some(model) = &self.model else { return false };
-        let hash: Hash = model.offer.model;
-        let delivered = self.ways.iter().any(|w| w.outlet.as_ref().is_some_and(|o| !w.behind && o.is_delivered(&hash)));
+    /// Looks what has become of the model on offer; returns whether there is nothing to wait for any more.
+    fn note_delivery(&mut self) -> bool {
+        let Some(model) = self.model.clone() else { return true };
+        let caught_up = self.ways.iter_mut().filter(|w| !w.behind).filter_map(|w| w.outlet.as_mut());
+        let deliveries: Vec<Delivery> = caught_up.map(|o| o.delivery(&model.offer)).collect();
+        let newest =
+            deliveries.iter().filter_map(|d| if let Delivery::Behind(order) = d { Some(*order) } else { None });
+        if let Some(order) = newest.max() {
+            tracing::warn!("upload: the ground has a model of flight {} already; ours is numbered anew", order.flight);
+            self.flight.advance_beyond(order.flight);
+            let order = Order { flight: self.flight.get(), counter: 1 };
+            match model.renumbered(order, &self.source.identity) {
+                Ok(model) => self.put_on_offer(model),
+                Err(e) => self.note_failure(&e.to_string()),
+            }
+            return false;
+        }
+        let delivered = deliveries.contains(&Delivery::Delivered);
+        self.is_fetched |= delivered || deliveries.contains(&Delivery::Fetching);
+        if delivered && !self.delivered {
+            let rest = self.offered.elapsed().mul_f64(REST).as_secs_f64().max(self.settings.checkpoint_s);
+            self.next_checkpoint = self.offered + Duration::from_secs_f64(rest);
+        }
+        self.delivered = delivered;
+        let refused = deliveries.iter().find_map(|d| if let Delivery::Refused(why) = d { Some(why) } else { None });
         let mut inbox = locked(&self.shared.0);
-        inbox.status.delivered = delivered && inbox.next.is_none();
+        let current = inbox.next.is_none();
+        inbox.status.delivered = delivered && current;
+        if let Some(why) = refused
+            && current
+            && inbox.status.refused != *why
+        {
+            tracing::error!("upload: the ground refuses our model: {why}");
+            inbox.status.refused.clone_from(why);
+        }
         delivered
     }
 }

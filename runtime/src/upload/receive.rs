@@ -1,13 +1,15 @@
 //! The ground's side of a transfer: look at what is offered, decide what to fetch, fetch it chunk by chunk, verify,
 //! resume, and give up on nothing.
 //!
-//! One round asks every inlet for offers and then lets each aircraft's transfer advance for a bounded time, all at
-//! once, so that neither a slow link nor a vanished aircraft holds up the others.
+//! One round asks every inlet for offers and then lets each aircraft's transfer advance for a bounded time, all at once.
+//! Whoever waits for a chunk at its end goes on waiting in the next round, so that neither a slow link nor a vanished
+//! aircraft holds up the others.
 
-use std::collections::HashSet;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver as Wake, SyncSender, sync_channel};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
@@ -15,16 +17,18 @@ use serde::Serialize;
 use config::upload::UploadSettings;
 
 use super::UploadError;
+use super::admission::{Admission, Refusals};
 use super::folder::FolderInlet;
 use super::offer::{Offer, OfferError};
-use super::store::StoreError;
-use super::transport::Inlet;
-use slot::{Slot, Target};
+use super::transport::{Inlet, Patience};
+use slot::{Advance, Link, Slot};
 
 mod slot;
 
-/// Remembered refusals per kind, so that a repeated bad offer is reported once; beyond it everything is only counted.
-const MAX_REMEMBERED: usize = 256;
+/// Longest wait for everything that is not a chunk: two ways over a link of some seconds.
+const ANSWER: Duration = Duration::from_secs(10);
+/// How often a round looks whether a transfer has come to its end.
+const LOOK_UP: Duration = Duration::from_millis(2);
 
 /// What happened so far. Everything not received is in here.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -41,6 +45,8 @@ pub struct ReceiveCounters {
     pub corrupt: u64,
     /// Failed attempts that were or will be repeated.
     pub retries: u64,
+    /// Those of them that the ground's own disk failed.
+    pub disk: u64,
     /// Offers of other missions.
     pub foreign: u64,
     /// Offers from aircraft the mission does not know.
@@ -49,6 +55,14 @@ pub struct ReceiveCounters {
     pub oversize: u64,
     /// Offers that could not be read.
     pub damaged: u64,
+    /// Offers without the signature of the aircraft in whose name they were made.
+    pub forged: u64,
+    /// Offers older than what is complete already.
+    pub stale: u64,
+    /// Models that arrived whole and were no readable models.
+    pub models_damaged: u64,
+    /// Models that arrived whole and were not what their aircraft should have made.
+    pub models_refused: u64,
     /// Offers of what is complete already.
     pub duplicates: u64,
 }
@@ -66,19 +80,61 @@ pub struct Received {
     pub size: u64,
 }
 
+/// One aircraft's place: its transfer, here or at work in a thread of its own.
+struct Seat {
+    id: String,
+    place: Place,
+    received: Option<Received>,
+    /// Chunks here and chunks wanted of what is being fetched; (0, 0) when nothing is.
+    progress: (usize, usize),
+    is_over: bool,
+    is_told: bool,
+}
+
+enum Place {
+    Here(Box<Slot>),
+    AtWork(JoinHandle<(Box<Slot>, Advance)>),
+    /// Only while it is moved.
+    Between,
+}
+
+impl Seat {
+    fn new(slot: Slot) -> Self {
+        let id = slot.id.clone();
+        let place = Place::Between;
+        let mut seat = Self { id, place, received: None, progress: (0, 0), is_over: false, is_told: false };
+        seat.put_back(Box::new(slot));
+        seat
+    }
+
+    fn put_back(&mut self, slot: Box<Slot>) {
+        self.received = slot.received();
+        self.progress = slot.progress();
+        (self.is_over, self.is_told) = (slot.is_over(), slot.is_told());
+        self.place = Place::Here(slot);
+    }
+
+    fn wants_work(&self) -> bool {
+        matches!(&self.place, Place::Here(slot) if slot.wants_work())
+    }
+
+    fn is_at_work(&self) -> bool {
+        matches!(self.place, Place::AtWork(_))
+    }
+}
+
 /// Receives the models of one mission.
 pub struct Receiver {
-    settings: UploadSettings,
-    mission: String,
-    known: Vec<String>,
-    inlets: Vec<Box<dyn Inlet>>,
-    slots: Vec<Slot>,
+    link: Arc<Link>,
+    dir: PathBuf,
+    seats: Vec<Seat>,
     wake: Wake<()>,
     /// Keeps `wake` open when no inlet wakes us.
     _waker: SyncSender<()>,
-    reported: HashSet<String>,
     /// What happened so far.
     pub counters: ReceiveCounters,
+    /// What was not let in, and why.
+    pub refusals: Refusals,
 }
 
 impl Receiver {
@@ -86,20 +142,16 @@ impl Receiver {
     ///
     /// # Errors
     /// No inlet configured, an endpoint that cannot be listened on, or a folder that cannot be written.
-    pub fn open(
-        settings: &UploadSettings,
-        mission: &str,
-        aircraft: &[String],
-        dir: &Path,
-    ) -> Result<Self, UploadError> {
+    pub fn open(settings: &UploadSettings, admission: Admission, dir: &Path) -> Result<Self, UploadError> {
         let (sender, wake) = sync_channel(1);
         let mut inlets: Vec<Box<dyn Inlet>> = Vec::new();
         if let Some(folder) = &settings.folder {
-            inlets.push(Box::new(FolderInlet::new(folder, mission, Offer::max_encoded(settings))));
+            inlets.push(Box::new(FolderInlet::new(folder, &admission.mission, Offer::max_encoded(settings))));
         }
         #[cfg(feature = "zenoh")]
         if !settings.listen.is_empty() {
-            let inlet = super::network::NetworkInlet::open(settings, mission, 2 * aircraft.len(), sender.clone())?;
+            let (mission, aircraft) = (&admission.mission, &admission.aircraft);
+            let inlet = super::network::NetworkInlet::open(settings, mission, aircraft, sender.clone())?;
             inlets.push(Box::new(inlet));
         }
         #[cfg(not(feature = "zenoh"))]
@@ -109,124 +161,163 @@ impl Receiver {
         if inlets.is_empty() {
             return Err(UploadError::NoTransport("listen"));
         }
-        Self::with_inlets(settings, mission, aircraft, dir, inlets, (sender, wake))
+        Self::with_inlets(settings, admission, dir, inlets, (sender, wake))
     }
 
     fn with_inlets(
         settings: &UploadSettings,
-        mission: &str,
-        aircraft: &[String],
+        admission: Admission,
         dir: &Path,
         inlets: Vec<Box<dyn Inlet>>,
         (waker, wake): (SyncSender<()>, Wake<()>),
     ) -> Result<Self, UploadError> {
-        let slot = |id: &String| Slot::open(id, &dir.join(id), settings);
-        let slots = aircraft.iter().map(slot).collect::<Result<Vec<_>, StoreError>>()?;
+        let slot = |id: &String| Seat::new(Slot::open(id, &dir.join(id), settings, &admission));
+        let seats = admission.aircraft.iter().map(slot).collect();
+        let link = Link { settings: settings.clone(), admission, inlets, stop: AtomicBool::new(false) };
         Ok(Self {
-            settings: settings.clone(),
-            mission: mission.into(),
-            known: aircraft.into(),
-            inlets,
-            slots,
+            link: Arc::new(link),
+            dir: dir.into(),
+            seats,
             wake,
             _waker: waker,
-            reported: HashSet::new(),
             counters: ReceiveCounters::default(),
+            refusals: Refusals::default(),
         })
     }
 
     /// The complete models, in the mission's order of aircraft.
     pub fn received(&self) -> Vec<Received> {
-        let of = |s: &Slot| {
-            let offer = s.store.complete()?;
-            let path = s.store.model_path();
-            Some(Received { aircraft: s.id.clone(), path, finished: offer.finished, size: offer.size })
-        };
-        self.slots.iter().filter_map(of).collect()
+        self.seats.iter().filter_map(|s| s.received.clone()).collect()
     }
 
-    /// Whether the last model of every aircraft is here.
+    /// Whether the last word of every aircraft is here: its last model, or one that may not count.
     pub fn all_finished(&self) -> bool {
-        self.slots.iter().all(|s| s.target.is_none() && s.store.complete().is_some_and(|o| o.finished))
+        self.seats.iter().all(|s| !s.is_at_work() && s.is_over)
+    }
+
+    /// Whether every aircraft whose model is here has signed for the receipt.
+    pub fn all_told(&self) -> bool {
+        self.seats.iter().all(|s| !s.is_at_work() && s.is_told)
     }
 
     /// Per aircraft: chunks here and chunks wanted of what is being fetched now; (0, 0) when nothing is.
     pub fn progress(&self) -> Vec<(String, usize, usize)> {
-        let of = |s: &Slot| match &s.target {
-            Some(Target { offer, .. }) => {
-                let missing = s.store.missing(offer).len();
-                (s.id.clone(), offer.chunks.len().saturating_sub(missing), offer.chunks.len())
-            }
-            None => (s.id.clone(), 0, 0),
-        };
-        self.slots.iter().map(of).collect()
+        self.seats.iter().map(|s| (s.id.clone(), s.progress.0, s.progress.1)).collect()
     }
 
     /// Waits for an announcement, `poll_s` at most.
     pub fn wait(&self) {
         // Woken or not, the next round looks at everything.
-        let _ = self.wake.recv_timeout(Duration::from_secs_f64(self.settings.poll_s));
+        let _ = self.wake.recv_timeout(Duration::from_secs_f64(self.link.settings.poll_s));
     }
 
     /// Looks for offers once and lets every transfer advance. Returns true when there is more to fetch right away.
     ///
     /// # Errors
-    /// Only what cannot be mended by trying again: the ground's own disk.
+    /// None at present: whatever fails, one aircraft's disk included, is counted, said and tried again.
     pub fn round(&mut self, stop: &AtomicBool) -> Result<bool, UploadError> {
         self.look();
-        let until = Instant::now() + Duration::from_secs_f64(self.settings.poll_s);
-        let (settings, inlets) = (&self.settings, &self.inlets);
-        let outcomes: Vec<_> = std::thread::scope(|scope| {
-            let busy = self.slots.iter_mut().filter(|s| s.wants_work());
-            let workers: Vec<_> =
-                busy.map(|slot| scope.spawn(move || slot.advance(settings, inlets, until, stop))).collect();
-            workers.into_iter().map(|w| w.join()).collect()
-        });
-        let mut disk = None;
-        for outcome in outcomes {
-            match outcome {
-                Ok((counters, error)) => {
-                    self.counters.add(&counters);
-                    disk = disk.or(error);
-                }
-                Err(_) => self.counters.retries += 1,
-            }
+        let until = Instant::now() + Duration::from_secs_f64(self.link.settings.poll_s);
+        for seat in self.seats.iter_mut().filter(|s| s.wants_work()) {
+            let Place::Here(mut slot) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
+            let link = self.link.clone();
+            seat.place = Place::AtWork(std::thread::spawn(move || {
+                let advance = slot.advance(&link, until);
+                (slot, advance)
+            }));
         }
-        match disk {
-            Some(e) => Err(e.into()),
-            None => Ok(self.slots.iter().any(|s| s.target.is_some() && s.wants_work())),
+        loop {
+            if stop.load(Ordering::Relaxed) {
+                self.link.stop.store(true, Ordering::Relaxed);
+            }
+            self.collect();
+            if Instant::now() >= until || !self.seats.iter().any(Seat::is_at_work) {
+                break;
+            }
+            std::thread::sleep(LOOK_UP);
+        }
+        Ok(self.seats.iter().any(|s| s.is_at_work() || s.wants_work()))
+    }
+
+    /// Takes back the transfers that have come to the end of their turn.
+    fn collect(&mut self) {
+        for seat in &mut self.seats {
+            if !matches!(&seat.place, Place::AtWork(worker) if worker.is_finished()) {
+                continue;
+            }
+            let Place::AtWork(worker) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
+            let slot = match worker.join() {
+                Ok((slot, advance)) => {
+                    self.counters.add(&advance.counters);
+                    self.refusals.absorb(advance.refusals);
+                    slot
+                }
+                // What is on disk is whole at any time: go on from there.
+                Err(_) => {
+                    self.counters.retries += 1;
+                    let Link { settings, admission, .. } = &*self.link;
+                    Box::new(Slot::open(&seat.id, &self.dir.join(&seat.id), settings, admission))
+                }
+            };
+            seat.put_back(slot);
         }
     }
 
-    /// Reads the offers of every inlet and chooses a target for each aircraft.
+    /// Reads the offers of every inlet and chooses a target for each aircraft that is not at work.
     fn look(&mut self) {
         let mut seen: Vec<(Offer, usize)> = Vec::new();
-        for (index, inlet) in self.inlets.iter().enumerate() {
-            match inlet.offers() {
-                Ok(offers) => {
-                    for bytes in offers {
-                        let offer = Offer::decode(&bytes, &self.settings)
-                            .and_then(|o| o.check(&self.mission, &self.known).map(|()| o));
-                        match offer {
-                            Ok(offer) => seen.push((offer, index)),
-                            Err(e) => {
-                                self.counters.count_refusal(&e);
-                                if self.reported.len() < MAX_REMEMBERED && self.reported.insert(e.to_string()) {
-                                    tracing::warn!("serve: {e}; ignored");
-                                }
-                            }
-                        }
+        let Link { settings, admission, inlets, stop } = &*self.link;
+        for (index, inlet) in inlets.iter().enumerate() {
+            let outcome = inlet.offers(Patience { limit: ANSWER, stop }, &mut |bytes| {
+                match admission.offer(bytes, settings) {
+                    // Any number of the same, and the newest ones of each aircraft: more would be a flood.
+                    Ok(offer) if seen.iter().any(|(o, i)| *i == index && *o == offer) => {}
+                    Ok(offer) => keep_newest(&mut seen, offer, index),
+                    Err(e) => {
+                        self.counters.count_refusal(&e);
+                        self.refusals.count(e.to_string());
                     }
                 }
-                Err(e) => {
-                    self.counters.retries += 1;
-                    tracing::debug!("serve: {}: {e}", inlet.name());
-                }
+            });
+            if let Err(e) = outcome {
+                self.counters.retries += 1;
+                tracing::debug!("serve: {}: {e}", inlet.name());
             }
         }
-        for slot in &mut self.slots {
-            let id = slot.id.clone();
-            slot.choose(seen.iter().filter(|(o, _)| o.aircraft == id), &mut self.counters);
+        for seat in &mut self.seats {
+            if let Place::Here(slot) = &mut seat.place {
+                slot.choose(seen.iter().filter(|(o, _)| o.aircraft == seat.id), &mut self.counters);
+                seat.progress = slot.progress();
+                (seat.is_over, seat.is_told) = (slot.is_over(), slot.is_told());
+            }
+        }
+    }
+}
+
+/// Different offers of one aircraft that one inlet may show: an honest one shows one, replays of older ones may come with it.
+const PER_AIRCRAFT: usize = 4;
+
+fn keep_newest(seen: &mut Vec<(Offer, usize)>, offer: Offer, index: usize) {
+    let same = |(o, i): &(Offer, usize)| *i == index && o.aircraft == offer.aircraft;
+    if seen.iter().filter(|s| same(s)).count() >= PER_AIRCRAFT {
+        let oldest = seen.iter().enumerate().filter(|(_, s)| same(s)).min_by_key(|(_, s)| s.0.order).map(|(at, _)| at);
+        match oldest {
+            Some(at) if seen[at].0.order < offer.order => _ = seen.swap_remove(at),
+            _ => return,
+        }
+    }
+    seen.push((offer, index));
+}
+
+/// Transfers under way must not outlive us: the next receiver works in the same folders.
+impl Drop for Receiver {
+    fn drop(&mut self) {
+        self.link.stop.store(true, Ordering::Relaxed);
+        for seat in &mut self.seats {
+            if let Place::AtWork(worker) = std::mem::replace(&mut seat.place, Place::Between) {
+                // What it fetched is on disk.
+                let _ = worker.join();
+            }
         }
     }
 }
@@ -239,12 +330,16 @@ impl ReceiveCounters {
         self.models += o.models;
         self.corrupt += o.corrupt;
         self.retries += o.retries;
+        self.disk += o.disk;
+        self.models_damaged += o.models_damaged;
+        self.models_refused += o.models_refused;
     }
 
     fn count_refusal(&mut self, e: &OfferError) {
         match e {
             OfferError::ForeignMission(_) => self.foreign += 1,
             OfferError::UnknownAircraft(_) => self.unknown += 1,
+            OfferError::Forged { .. } => self.forged += 1,
             OfferError::Oversize { .. } => self.oversize += 1,
             OfferError::Damaged(_) | OfferError::Version(_) => self.damaged += 1,
         }

@@ -8,14 +8,23 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
+use config::disk::Disk;
+use config::error::{Error, ErrorKind};
 use config::upload::UploadSettings;
 
-use super::folder::{read_bounded, write_whole};
+use super::admission::{Admission, ModelRefusal};
+use super::folder::read_bounded;
 use super::offer::{Hash, Offer, hex};
+
+/// The offer of the model that lies complete.
+const NOTE: &str = "offer";
+/// That of the model which is just taking its place.
+const NEXT_NOTE: &str = "offer.next";
 
 /// One aircraft's models and chunks on the ground.
 #[derive(Debug)]
 pub struct Store {
+    disk: Disk,
     dir: PathBuf,
     /// The offer of the model that lies complete in `dir`.
     complete: Option<Offer>,
@@ -40,9 +49,26 @@ pub enum StoreError {
         /// Which chunk.
         index: usize,
     },
+    /// Whole, but it may not count.
+    #[error("{aircraft}'s model does not count: {why}")]
+    Refused {
+        /// Whose model.
+        aircraft: String,
+        /// What is wrong with it.
+        why: ModelRefusal,
+    },
     /// Every chunk is right but the whole is not: the offer itself is wrong.
     #[error("{0}'s model does not have the hash its offer promised; offer refused")]
     WrongWhole(String),
+}
+
+impl Error for StoreError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Io { source, .. } => Error::kind(source),
+            Self::Corrupt { .. } | Self::Refused { .. } | Self::WrongWhole(_) => ErrorKind::Failed,
+        }
+    }
 }
 
 fn io(path: &Path) -> impl FnOnce(std::io::Error) -> StoreError + '_ {
@@ -50,24 +76,31 @@ fn io(path: &Path) -> impl FnOnce(std::io::Error) -> StoreError + '_ {
 }
 
 impl Store {
-    /// Opens or creates the folder of one aircraft, and remembers a model received earlier if it is still whole.
-    pub fn open(dir: &Path, settings: &UploadSettings) -> Result<Self, StoreError> {
-        let chunks = dir.join("chunk");
-        std::fs::create_dir_all(&chunks).map_err(io(&chunks))?;
-        let mut store = Self { dir: dir.into(), complete: None };
-        if let Ok(bytes) = read_bounded(&dir.join("offer"), Offer::max_encoded(settings))
-            && let Ok(offer) = Offer::decode(&bytes, settings)
-        {
-            if store.hash_of_model().is_some_and(|h| h == offer.model) {
-                store.complete = Some(offer);
-            } else {
+    /// Opens the folder of one aircraft, which is made when there is something to put into it, and remembers a model received
+    /// earlier if it is still whole and its offer is still believed (keys may have changed since).
+    pub fn open(disk: &Disk, dir: &Path, settings: &UploadSettings, admission: &Admission) -> Self {
+        let mut store = Self { disk: disk.clone(), dir: dir.into(), complete: None };
+        for folder in [dir, &dir.join("chunk")] {
+            disk.sweep(folder);
+        }
+        let note = |name: &str| {
+            let bytes = read_bounded(&dir.join(name), Offer::max_encoded(settings)).ok()?;
+            admission.offer(&bytes, settings).ok()
+        };
+        if let Some(model) = store.hash_of_model() {
+            store.complete = [NOTE, NEXT_NOTE].into_iter().filter_map(note).find(|offer| offer.model == model);
+            if store.complete.as_ref().is_some_and(|offer| offer.finished) {
+                // Nothing follows: what is left of the transfer was in the way of a kill or a power cut.
+                store.keep_only(None);
+            }
+            if store.complete.is_none() {
                 tracing::warn!(
                     "serve: {} is not what was received; it will be fetched again",
                     store.model_path().display()
                 );
             }
         }
-        Ok(store)
+        store
     }
 
     /// Where the model lies once complete.
@@ -107,45 +140,57 @@ impl Store {
             .collect()
     }
 
-    /// Checks and keeps one chunk.
+    /// Keeps one chunk, whose hash has been checked.
+    ///
+    /// # Errors
+    /// The disk.
     pub fn put(&self, offer: &Offer, index: usize, bytes: &[u8]) -> Result<(), StoreError> {
-        let right =
-            bytes.len() as u64 == offer.chunk_len(index) && blake3::hash(bytes).as_bytes() == &offer.chunks[index];
-        if !right {
-            return Err(StoreError::Corrupt { aircraft: offer.aircraft.clone(), index });
-        }
         let path = self.chunk_path(&offer.chunks[index]);
-        write_whole(&path, bytes).map_err(io(&path))
+        self.disk.replace(&path, |out| out.write_all(bytes)).map_err(|e| io(&path)(e.into()))
     }
 
-    /// Puts the model together, verifies it, and makes it the complete one. Chunks that went bad on disk are
-    /// removed, so that the next [`Store::missing`] names them.
-    pub fn assemble(&mut self, offer: &Offer) -> Result<(), StoreError> {
+    /// Puts the model together, verifies it, and makes it the complete one if it may count; else the one before stays.
+    /// Chunks that went bad on disk are removed, so that the next [`Store::missing`] names them.
+    ///
+    /// # Errors
+    /// The disk, a chunk or the whole with other bytes than promised, or a model that does not count.
+    pub fn assemble(&mut self, offer: &Offer, admission: &Admission) -> Result<(), StoreError> {
         let path = self.model_path();
-        let mut file = tempfile::Builder::new().prefix(".tmp-").tempfile_in(&self.dir).map_err(io(&self.dir))?;
         let mut whole = blake3::Hasher::new();
-        for (index, hash) in offer.chunks.iter().enumerate() {
-            let chunk = self.chunk_path(hash);
-            let bytes = read_bounded(&chunk, offer.chunk_len(index)).unwrap_or_default();
-            if bytes.len() as u64 != offer.chunk_len(index) || blake3::hash(&bytes).as_bytes() != hash {
-                // Gone or unremovable: either way `missing` looks again.
-                let _ = std::fs::remove_file(&chunk);
-                return Err(StoreError::Corrupt { aircraft: offer.aircraft.clone(), index });
+        let mut wrong = None;
+        let fill = |out: &mut dyn Write| {
+            for (index, hash) in offer.chunks.iter().enumerate() {
+                let chunk = self.chunk_path(hash);
+                let bytes = read_bounded(&chunk, offer.chunk_len(index)).unwrap_or_default();
+                if bytes.len() as u64 != offer.chunk_len(index) || blake3::hash(&bytes).as_bytes() != hash {
+                    // Gone or unremovable: either way `missing` looks again.
+                    let _ = self.disk.remove(&chunk);
+                    wrong = Some(StoreError::Corrupt { aircraft: offer.aircraft.clone(), index });
+                    return Err(std::io::ErrorKind::InvalidData.into());
+                }
+                whole.update(&bytes);
+                out.write_all(&bytes)?;
             }
-            whole.update(&bytes);
-            file.write_all(&bytes).map_err(io(&path))?;
+            if whole.finalize().as_bytes() != &offer.model {
+                wrong = Some(StoreError::WrongWhole(offer.aircraft.clone()));
+                return Err(std::io::ErrorKind::InvalidData.into());
+            }
+            Ok(())
+        };
+        // The new model's note is there before the model, and takes its name after it: at any moment one of the two notes
+        // belongs to the model that is there.
+        let check = |model: &Path| match admission.model(&offer.aircraft, model) {
+            Ok(()) => self.write_note(NEXT_NOTE, offer),
+            Err(why) => {
+                self.keep_only(None);
+                Err(StoreError::Refused { aircraft: offer.aircraft.clone(), why })
+            }
+        };
+        let written = self.disk.replace_checked(&path, fill, check);
+        if let Some(wrong) = wrong {
+            return Err(wrong);
         }
-        if whole.finalize().as_bytes() != &offer.model {
-            return Err(StoreError::WrongWhole(offer.aircraft.clone()));
-        }
-        file.as_file().sync_all().map_err(io(&path))?;
-        // The old offer goes first: an offer must never vouch for a model it does not belong to.
-        let note = self.dir.join("offer");
-        match std::fs::remove_file(&note) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(io(&note)(e)),
-            _ => {}
-        }
-        file.persist(&path).map_err(|e| io(&path)(e.error))?;
+        written.map_err(|e| io(&path)(e.into()))??;
         self.note(offer)?;
         self.keep_only(None);
         Ok(())
@@ -153,10 +198,16 @@ impl Store {
 
     /// Writes down which offer the complete model came from (the same bytes may be offered again as final).
     pub fn note(&mut self, offer: &Offer) -> Result<(), StoreError> {
-        let note = self.dir.join("offer");
-        write_whole(&note, &offer.encode()).map_err(io(&note))?;
+        self.write_note(NOTE, offer)?;
+        // Left behind it vouches for the same model.
+        let _ = self.disk.remove(&self.dir.join(NEXT_NOTE));
         self.complete = Some(offer.clone());
         Ok(())
+    }
+
+    fn write_note(&self, name: &str, offer: &Offer) -> Result<(), StoreError> {
+        let note = self.dir.join(name);
+        self.disk.replace(&note, |out| out.write_all(&offer.encode())).map_err(|e| io(&note)(e.into()))
     }
 
     /// Removes chunks that belong to no model being fetched.
@@ -166,8 +217,11 @@ impl Store {
         for entry in entries.flatten() {
             if !entry.file_name().to_str().is_some_and(|name| keep.contains(name)) {
                 // Left-overs cost room, nothing else.
-                let _ = std::fs::remove_file(entry.path());
+                let _ = self.disk.remove(&entry.path());
             }
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

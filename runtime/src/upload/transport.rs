@@ -2,8 +2,13 @@
 //! what the bytes mean and whether they are right is checked once, by the receiver.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use config::error::{Error, ErrorKind};
 
 use super::offer::{Hash, Offer, OfferedModel, hex};
+use super::receipt::Delivery;
 
 /// Why a transport could not do what was asked. All of these are worth another attempt.
 #[derive(Debug, thiserror::Error)]
@@ -19,6 +24,9 @@ pub enum TransportError {
     /// The other side does not hold this chunk (any more).
     #[error("chunk {} is not on offer (any more)", &hex(.0)[..12])]
     NotHeld(Hash),
+    /// Every answer had other bytes than the offer promises.
+    #[error("chunk {} came with other bytes than were promised", &hex(.0)[..12])]
+    Corrupt(Hash),
     /// Longer than what was announced.
     #[error("{what} has {bytes} bytes, at most {limit} were expected")]
     TooLong {
@@ -32,6 +40,17 @@ pub enum TransportError {
     /// The network layer's own message.
     #[error("network: {0}")]
     Network(String),
+}
+
+impl Error for TransportError {
+    /// What is said of the network itself is said at its start: a port in use, a certificate that cannot be read.
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Io { source, .. } => Error::kind(source),
+            Self::Network(_) => ErrorKind::Input,
+            Self::NotHeld(_) | Self::Corrupt(_) | Self::TooLong { .. } => ErrorKind::Failed,
+        }
+    }
 }
 
 impl TransportError {
@@ -50,21 +69,43 @@ pub trait Outlet: Send {
     /// station that is just fetching them.
     fn offer(&mut self, model: &Arc<OfferedModel>) -> Result<(), TransportError>;
 
-    /// Whether the model with this hash has arrived where nothing can be lost any more.
-    fn is_delivered(&self, model: &Hash) -> bool;
+    /// What has become of the model on offer.
+    fn delivery(&mut self, offer: &Offer) -> Delivery;
 }
 
-/// The ground's end. Shared between the threads that fetch for different aircraft.
+/// How long the ground waits for one answer.
+#[derive(Clone, Copy)]
+pub struct Patience<'a> {
+    /// At most so long.
+    pub limit: Duration,
+    /// And not beyond this request to stop.
+    pub stop: &'a AtomicBool,
+}
+
+/// The ground's end. Shared between the threads that fetch for different aircraft. Several peers may answer, and whoever
+/// answers first may lie: every answer is shown to the caller, until one is accepted.
 pub trait Inlet: Send + Sync {
     /// For log lines.
     fn name(&self) -> String;
 
-    /// The encoded offers that can be seen now, unchecked, at most one per aircraft.
-    fn offers(&self) -> Result<Vec<Vec<u8>>, TransportError>;
+    /// Shows every encoded offer that can be seen now, unchecked.
+    fn offers(&self, patience: Patience, see: &mut dyn FnMut(&[u8])) -> Result<(), TransportError>;
 
-    /// The bytes of one chunk, unchecked but not longer than the offer says.
-    fn chunk(&self, offer: &Offer, index: usize) -> Result<Vec<u8>, TransportError>;
+    /// The first answer that `accept` takes for chunk `index`; none is longer than the offer says.
+    fn chunk(
+        &self,
+        offer: &Offer,
+        index: usize,
+        patience: Patience,
+        accept: &mut dyn FnMut(&[u8]) -> bool,
+    ) -> Result<Vec<u8>, TransportError>;
 
-    /// Tells the aircraft that its model has been received and verified.
-    fn confirm(&self, offer: &Offer) -> Result<(), TransportError>;
+    /// Gives the aircraft a receipt; `accept` says whether an answer proves that it was taken.
+    fn deliver_receipt(
+        &self,
+        aircraft: &str,
+        receipt: &[u8],
+        patience: Patience,
+        accept: &mut dyn FnMut(&[u8]) -> bool,
+    ) -> Result<(), TransportError>;
 }

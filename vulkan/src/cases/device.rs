@@ -32,7 +32,7 @@ pub(super) fn survive(
     let mut after = GaussianCloud::default();
     t.snapshot(&mut after)?;
     promise_eq!(after.len(), c.len(), "{case}");
-    promise!((0..after.len()).all(|i| after.row_is_sound(i)), "{case}: a row went bad");
+    promise!((0..after.len()).all(|i| after.is_valid(i)), "{case}: a row went bad");
     counted.scene(3, report.visible, report.instances);
     Ok((drawn, report))
 }
@@ -54,12 +54,12 @@ pub fn a_row_with_nan_or_infinity_in_any_slot_is_dropped_and_counted_at_load(gpu
             let mut c = base.clone();
             *parameter(&mut c, 5, k) = bad;
             let report = t.load(&c)?;
-            promise_eq!((report.loaded, report.dropped_unsound), (11, 1), "slot {k} = {bad}");
+            promise_eq!((report.loaded, report.dropped_non_finite), (11, 1), "slot {k} = {bad}");
         }
     }
     let mut none = base;
     none.means.iter_mut().for_each(|m| m[0] = f32::NAN);
-    promise_eq!(t.load(&none).err(), Some(TrainError::Empty { unsound: 12 }));
+    promise_eq!(t.load(&none).err(), Some(TrainError::Empty { non_finite: 12 }));
     Ok(counted.said())
 }
 
@@ -233,7 +233,7 @@ pub fn a_depth_prior_that_says_nothing_has_no_correlation(gpu: &Gpu) -> Outcome 
         promise!(report.loss.is_finite(), "{case}");
         let mut after = GaussianCloud::default();
         t.snapshot(&mut after)?;
-        promise!((0..after.len()).all(|i| after.row_is_sound(i)), "{case}");
+        promise!((0..after.len()).all(|i| after.is_valid(i)), "{case}");
     }
     Ok(counted.said())
 }
@@ -271,7 +271,7 @@ pub fn relocation_survives_all_dead_none_dead_and_fully_opaque(gpu: &Gpu) -> Out
         let summary = t.run(&few, &mut |_| ControlFlow::Continue(()))?;
         let mut after = GaussianCloud::default();
         t.snapshot(&mut after)?;
-        promise!(summary.gaussians == 30 && (0..30).all(|i| after.row_is_sound(i)), "{case}");
+        promise!(summary.gaussians == 30 && (0..30).all(|i| after.is_valid(i)), "{case}");
         let expected = if dead == 7 { 7 } else { 0 };
         promise_eq!(summary.counters.relocated, expected, "{case}");
     }

@@ -162,7 +162,7 @@ pub fn extreme_learning_rates_are_recovered_from_or_refused(gpu: &Gpu) -> Outcom
         promise!(last <= first, "rates × {factor}: with sane rates the loss rose from {first} to {last}");
         let mut after = GaussianCloud::default();
         t.snapshot(&mut after)?;
-        promise!((0..after.len()).all(|i| after.row_is_sound(i)), "rates × {factor}: a row went bad");
+        promise!((0..after.len()).all(|i| after.is_valid(i)), "rates × {factor}: a row went bad");
     }
     let mut t = ready(gpu, 0, &v, &plain())?;
     for bad in [f32::NAN, f32::INFINITY, -1.0] {
@@ -234,7 +234,7 @@ pub fn a_quaternion_of_length_zero_is_dropped_and_any_other_length_is_normalised
     }
     let mut c = base;
     c.rotations[2] = [0.0; 4];
-    promise_eq!(t.load(&c)?.dropped_unsound, 1);
+    promise_eq!(t.load(&c)?.dropped_non_finite, 1);
     Ok(counted.said())
 }
 
@@ -271,7 +271,7 @@ pub fn long_run(gpu: &Gpu, steps: u32) -> Result<String, Broken> {
         promise!(loss.is_finite(), "step {step}: loss {loss}");
         if step % 1000 == 0 || step == steps {
             t.snapshot(&mut after)?;
-            promise!((0..after.len()).all(|i| after.row_is_sound(i)), "step {step}: a row went bad");
+            promise!((0..after.len()).all(|i| after.is_valid(i)), "step {step}: a row went bad");
             let opacity = |logit: &f32| 1.0 / (1.0 + (-f64::from(*logit)).exp());
             let mean = after.opacity_logits.iter().map(opacity).sum::<f64>() / after.len() as f64;
             (low, high) = (low.min(mean), high.max(mean));

@@ -40,7 +40,7 @@ fn train(gpu: &Gpu, half_moments: bool, c: &GaussianCloud, steps: u32) -> Result
     let loss = t.run(&budget, &mut |_| ControlFlow::Continue(()))?.last.map_or(f32::NAN, |r| r.loss);
     let mut after = GaussianCloud::default();
     t.snapshot(&mut after)?;
-    promise!((0..after.len()).all(|i| after.row_is_sound(i)), "a row went bad");
+    promise!((0..after.len()).all(|i| after.is_valid(i)), "a row went bad");
     Ok((loss, after))
 }
 

@@ -145,7 +145,7 @@ fn faint_holds(transmittance: f32, depth: f32, truth: (f64, f64)) -> Outcome {
 pub fn light_and_contributions_below_sixteen_bits_are_still_summed(gpu: &Gpu) -> Outcome {
     let (c, v) = (faint_layers(), view(9, 9));
     let (drawn, after, _) = trained(gpu, &c, &v, 1 << 16, 3)?;
-    promise!((0..after.len()).all(|i| after.row_is_sound(i)), "a row went bad");
+    promise!((0..after.len()).all(|i| after.is_valid(i)), "a row went bad");
     let middle = drawn.transmittance.len() / 2;
     faint_holds(drawn.transmittance[middle], drawn.depth[middle], faint_truth(&c, &v))
 }

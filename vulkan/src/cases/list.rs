@@ -218,7 +218,7 @@ pub const ELSEWHERE: &[(&str, &str, &str)] = &[
     (
         "duplicate points, single points, NaN",
         "models/src/init/baselines.rs",
-        "duplicates_single_points_and_nan_are_sound",
+        "duplicates_single_points_and_nan_leave_a_valid_cloud",
     ),
     (
         "fewer than three points",
@@ -232,7 +232,7 @@ pub const ELSEWHERE: &[(&str, &str, &str)] = &[
     ),
     ("Umeyama: reflection", "models/src/align/similarity.rs", "a_mirror_image_gives_a_rotation_never_a_reflection"),
     ("Umeyama: no variance", "models/src/align/similarity.rs", "lines_spots_and_too_few_points_are_refused"),
-    ("singular ICP", "models/src/align/icp.rs", "planes_lines_and_spots_are_refused_where_they_leave_freedom"),
+    ("singular ICP", "models/src/align/icp.rs", "lines_spots_and_nan_are_refused_and_a_plane_is_not"),
     (
         "poses turned by 180°",
         "models/tests/refine_behaviour.rs",

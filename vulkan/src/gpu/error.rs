@@ -1,6 +1,7 @@
 //! What can go wrong between us and the driver, told apart where a caller can do something about it.
 
 use ash::vk;
+use config::error::{Error, ErrorKind};
 
 /// A device, driver or memory problem.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -35,8 +36,10 @@ pub enum GpuError {
         /// What was asked for.
         bytes: u64,
     },
-    /// The device needs more than the plan holds (an alignment above what Vulkan promises).
-    #[error("the driver wants {wanted} bytes for a plan of {planned}; report this device")]
+    /// The driver adds more to the buffer than the plan leaves room for.
+    #[error(
+        "the driver wants {wanted} bytes for a plan of {planned}, room for the driver included; report this device"
+    )]
     PlanMismatch {
         /// The driver's figure.
         wanted: u64,
@@ -64,6 +67,24 @@ pub enum GpuError {
         /// The device's `maxTexelBufferElements`.
         limit: u32,
     },
+    /// Kernels run and leave no trace.
+    #[error(
+        "this device computes nothing: kernels end without an effect; update its driver, or choose another with --device"
+    )]
+    ComputesNothing,
+    /// A kernel computes something else than its twin.
+    #[error(
+        "this device computes something else than it should: kernel '{kernel}' is wrong about {differ} of {of} Gaussians; \
+         update its driver, or choose another with --device"
+    )]
+    ComputesWrong {
+        /// The kernel.
+        kernel: &'static str,
+        /// Gaussians it is wrong about.
+        differ: usize,
+        /// Gaussians it was tried on.
+        of: usize,
+    },
     /// Anything else.
     #[error("{call} failed: {result}")]
     Vulkan {
@@ -83,5 +104,11 @@ impl GpuError {
             }
             other => Self::Vulkan { call, result: format!("{other:?}") },
         }
+    }
+}
+
+impl Error for GpuError {
+    fn kind(&self) -> ErrorKind {
+        ErrorKind::Device
     }
 }

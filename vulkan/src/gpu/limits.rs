@@ -10,6 +10,8 @@ pub struct DeviceLimits {
     pub workgroup_lanes: u32,
     /// Elements of one texel view (`maxTexelBufferElements`; at least 65,536, 2^27 on most).
     pub texel_elements: u32,
+    /// Storage buffers of one kernel (`maxPerStageDescriptorStorageBuffers`; at least 4, V3D has 8).
+    pub storage_buffers: u32,
 }
 
 impl DeviceLimits {
@@ -17,6 +19,7 @@ impl DeviceLimits {
         Self {
             workgroup_lanes: limits.max_compute_work_group_invocations.min(limits.max_compute_work_group_size[0]),
             texel_elements: limits.max_texel_buffer_elements,
+            storage_buffers: limits.max_per_stage_descriptor_storage_buffers,
         }
     }
 
@@ -38,9 +41,13 @@ impl DeviceLimits {
 mod tests {
     use super::*;
     use crate::gpu::Gpu;
+    use crate::synthetic::{cloud, photo, plain, posed, view};
     use crate::trainer::{TrainError, Trainer};
     use config::plan::{Plan, PlanRequest};
-    use config::training::TrainSettings;
+    use models::camera::DepthPrior;
+    use models::cloud::GaussianCloud;
+
+    const COMMON: DeviceLimits = DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 };
 
     /// A trainer of 10,000 Gaussians on this machine's device, were its limits these.
     fn under(limits: DeviceLimits) -> Option<Result<Trainer, TrainError>> {
@@ -58,13 +65,11 @@ mod tests {
             ..Default::default()
         };
         let plan = Plan::new(&request).unwrap();
-        Some(Trainer::new(&gpu.limited(limits), &plan, &TrainSettings::default()))
+        Some(Trainer::new(&gpu.limited(limits), &plan, &plain()))
     }
 
-    const COMMON: DeviceLimits = DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27 };
-
     #[test]
-    fn a_plan_beyond_the_device_s_texel_limit_is_refused_by_name() {
+    fn a_plan_beyond_the_device_s_texel_limit_is_refused_by_name_where_storage_buffers_are_few() {
         let Some(made) = under(DeviceLimits { texel_elements: 1 << 16, ..COMMON }) else { return };
         // Nine vec4 of geometry per Gaussian are the first to exceed it.
         match made.err() {
@@ -74,7 +79,23 @@ mod tests {
             }
             other => panic!("{other:?}"),
         }
-        assert!(under(COMMON).is_some_and(|made| made.is_ok()));
+    }
+
+    #[test]
+    fn beyond_the_texel_limit_kernels_read_storage_buffers_and_leave_the_same_bits() {
+        let trained = |limits| {
+            let mut trainer = under(limits)?.unwrap();
+            trainer.load(&cloud(8, 9_000, 3)).unwrap();
+            let v = view(64, 48);
+            let prior = DepthPrior { width: 2, height: 1, depth: vec![2.0, 3.0], confidence: vec![1.0; 2] };
+            trainer.add_view(&posed(&v, &photo(1, &v)), Some(&prior)).unwrap();
+            (0..3).for_each(|_| assert!(trainer.step().unwrap().loss.is_finite()));
+            let mut model = GaussianCloud::default();
+            trainer.snapshot(&mut model).unwrap();
+            Some(model)
+        };
+        let small = DeviceLimits { texel_elements: 1 << 16, storage_buffers: 16, ..COMMON };
+        assert!(trained(COMMON) == trained(small), "another model");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use super::{Gpu, GpuError};
 use crate::arena::Section;
+use crate::kernels::texel_bytes;
 use ash::vk;
 use std::io::Cursor;
 
@@ -60,14 +61,5 @@ impl Gpu {
             .range(section.bytes);
         // SAFETY: by this function's contract; the view is within the limit.
         unsafe { self.device().create_buffer_view(&info, None) }.map_err(|e| GpuError::from_vk("vkCreateBufferView", e))
-    }
-}
-
-/// Bytes of one element of the formats the kernels fetch.
-fn texel_bytes(format: vk::Format) -> u64 {
-    match format {
-        vk::Format::R32_UINT => 4,
-        vk::Format::R32G32_UINT | vk::Format::R16G16B16A16_SFLOAT => 8,
-        _ => 16,
     }
 }

@@ -1,13 +1,13 @@
 //! Bands: consecutive tiles whose instances fit the plan. One band is the rule; several give the same bits.
 
 use super::{TrainError, Trainer};
-use crate::commands::{Push, Recording};
+use crate::commands::Recording;
+use crate::gpu::GpuError;
 use crate::kernels::Kernel;
+use crate::layout::Push;
 use crate::stages::Stage;
 use config::plan::LOOP_LANES;
 
-/// Where the sorting lanes leave their cursors in `status` (`shaders/walk.glsl`).
-const WALK_CURSORS: usize = 1024;
 /// Rounds of counting and emitting to begin with; more are taken, and kept, when a frame needs them.
 pub(crate) const WALK_ROUNDS: u32 = 2;
 
@@ -72,23 +72,36 @@ impl Trainer {
 
     /// Reads the counts and cuts the tiles into bands. Counting is done again with twice the rounds for as long as some
     /// lane did not reach the end of its share.
+    ///
+    /// # Errors
+    /// [`GpuError::ComputesNothing`] when twice the rounds take no lane any further.
     pub(super) fn cut_bands(&mut self) -> Result<Counted, TrainError> {
+        let mut reached = None;
         while !self.walk_is_complete() {
+            let walked = self.walked();
+            if reached == Some(walked) {
+                return Err(GpuError::ComputesNothing.into());
+            }
+            reached = Some(walked);
             self.walk_rounds = self.walk_rounds.saturating_mul(2);
             let recording = self.take_recording()?;
             self.record_tiles(&recording);
             recording.submit()?;
         }
-        let status = self.arena.slice::<u32>(self.arena.section("status"));
-        let (visible, total) = (status[0] as usize, status[1]);
+        let (visible, total) = (self.status().visible as usize, self.status().instances);
         let starts = self.arena.slice::<u32>(self.arena.section("tile_starts"));
         let starts = &starts[..=self.frame.tiles() as usize];
         Ok(Counted { visible, instances: cut(starts, total, self.plan.instances, &mut self.bands) })
     }
 
+    /// How far all lanes together have come: grows with every round, because each goes on for at least a row of tiles.
+    fn walked(&self) -> u64 {
+        let (gaussians, instances) = (self.status().cursors.iter().map(|c| c.gaussian), self.status().lane_instances);
+        gaussians.chain(instances).map(u64::from).sum()
+    }
+
     fn walk_is_complete(&self) -> bool {
-        let status = self.arena.slice::<u32>(self.arena.section("status"));
-        (0..self.plan.sort_lanes as usize).all(|lane| status[WALK_CURSORS + 4 * lane + 3] == 1)
+        self.status().lane_counted[..self.plan.sort_lanes as usize].iter().all(|counted| *counted == 1)
     }
 }
 
@@ -119,6 +132,24 @@ fn cut(starts: &[u32], total: u32, capacity: usize, bands: &mut Vec<Band>) -> u6
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::{Forced, Gpu};
+    use crate::synthetic::{cloud, photo, plain, posed, view};
+    use config::plan::{Plan, PlanRequest};
+
+    #[test]
+    fn a_device_whose_kernels_have_no_effect_is_named_instead_of_counted_on_for_ever() {
+        let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+        let gpu = gpu.forced(Forced { computes_nothing: true, ..Forced::default() });
+        let v = view(32, 24);
+        let request = PlanRequest { width: 32, height: 24, views: 1, sh_degree: 0, ..Default::default() };
+        let plan = Plan::with_capacities(&request, 256, 4096);
+        let mut trainer =
+            Trainer::with_kernels(&gpu, &plan, &plain(), crate::shape::KernelShape::standard(gpu.info()), &[]).unwrap();
+        trainer.load(&cloud(1, 64, 0)).unwrap();
+        trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
+        assert_eq!(trainer.step().err(), Some(TrainError::Gpu(GpuError::ComputesNothing)));
+        assert_eq!(trainer.walk_rounds, 2 * WALK_ROUNDS, "one more try");
+    }
 
     /// Starts modulo 2^32 and the saturated total, as `tile_scan` leaves them.
     fn scanned(counts: &[u32]) -> (Vec<u32>, u32) {

@@ -1,16 +1,10 @@
-//! What a running job may change between steps: other views, fewer pixels.
+//! What a running job may change between steps: fewer pixels, other rates.
 
 use config::training::RateSettings;
 
 use super::{TrainError, Trainer};
 
 impl Trainer {
-    /// Forgets all resident views; their memory is used again by the next ones. The Gaussians stay.
-    pub fn clear_views(&mut self) {
-        self.views.clear();
-        self.sampler.forget();
-    }
-
     /// Trains on pictures of at most 1/`divisor` of their size from now on, whatever the schedule says (1 = as scheduled):
     /// the failsafe's way to a third of the work without touching the model.
     pub fn set_least_divisor(&mut self, divisor: u32) {

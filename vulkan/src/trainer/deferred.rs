@@ -1,10 +1,10 @@
-//! The table that makes up for Adam steps in which a Gaussian was not seen.
+//! The table of lazy Adam updates: what the steps amount to that a Gaussian missed outside the view.
 //!
-//! With a zero gradient the moments only decay: m β₁ᵏ, v β₂ᵏ, so the step j after the last sight moves a parameter by
+//! With a zero gradient the moments only decay: m β₁ᵏ, v β₂ᵏ, so the step j after it was last in view moves a parameter by
 //! (m/√v) · rʲ κ_s with r = β₁/√β₂ and κ_s = rate · √(1−β₂ˢ)/(1−β₁ˢ) (ε = 1e-15 left out). Their sum depends only on
 //! how many steps were missed and when, not on the Gaussian: one table serves all.
 
-use super::frame::DEFERRED_STEPS;
+use crate::layout::{DEFERRED_STEPS, MissedSteps};
 use config::training::AdamSettings;
 
 pub(crate) struct Deferred {
@@ -42,10 +42,11 @@ impl Deferred {
     }
 
     /// Writes the table the shaders read.
-    pub fn write(&self, table: &mut [[f32; 4]; DEFERRED_STEPS]) {
+    pub fn write(&self, table: &mut [MissedSteps; DEFERRED_STEPS]) {
         let (mut decay1, mut decay2) = (1.0f64, 1.0f64);
         for (entry, sums) in table.iter_mut().zip(&self.sums) {
-            *entry = [sums[0] as f32, sums[1] as f32, decay1 as f32, decay2 as f32];
+            let [mean, unit] = sums.map(|s| s as f32);
+            *entry = MissedSteps { mean, unit, first_decay: decay1 as f32, second_decay: decay2 as f32 };
             decay1 *= self.beta1;
             decay2 *= self.beta2;
         }
@@ -55,6 +56,7 @@ impl Deferred {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use bytemuck::Zeroable;
 
     #[test]
     fn the_table_equals_dense_adam_with_zero_gradients() {
@@ -72,12 +74,12 @@ mod tests {
                 p -= rate(s) * (m / (1.0 - b1.powi(s as i32))) / ((v / (1.0 - b2.powi(s as i32))).sqrt() + 1e-15);
             }
         }
-        let mut table = [[0.0; 4]; DEFERRED_STEPS];
+        let mut table = [MissedSteps::zeroed(); DEFERRED_STEPS];
         deferred.write(&mut table);
         let k = (now - seen) as usize;
-        let lazy = -0.7e-4 / 0.3e-6f64.sqrt() * f64::from(table[k][0]);
+        let lazy = -0.7e-4 / 0.3e-6f64.sqrt() * f64::from(table[k].mean);
         assert!((lazy - p).abs() < 1e-6 * p.abs(), "{lazy} {p}");
-        assert!((f64::from(table[k][2]) * 0.7e-4 - m).abs() < 1e-6 * m);
-        assert!((f64::from(table[k][3]) * 0.3e-6 - v).abs() < 1e-6 * v);
+        assert!((f64::from(table[k].first_decay) * 0.7e-4 - m).abs() < 1e-6 * m);
+        assert!((f64::from(table[k].second_decay) * 0.3e-6 - v).abs() < 1e-6 * v);
     }
 }

@@ -2,36 +2,14 @@
 //! raised, one degree at a time, where the residual asks for it: where a Gaussian's colour is pulled one way by some
 //! views and another way by others.
 
-use super::rows::{GEOMETRY, Rows};
+use super::parameters::Parameters;
+use super::state::{degree_of, with_degree};
 use super::{TrainError, Trainer};
 use crate::arena::Arena;
 use models::cloud::sh_coefficients;
 
 /// Progress from which the next raise is due, one after the other.
 const OCCASIONS: [f32; 6] = [0.05, 0.1, 0.2, 0.3, 0.4, 0.5];
-
-/// Bits of the state word (`shaders/deferred.glsl`).
-const DEGREE_SHIFT: u32 = 26;
-const ORDINARY: u32 = 1 << 29;
-
-/// The state word, as the float it travels as, of a row of `degree` that was never stepped.
-pub(super) fn state(degree: u8) -> f32 {
-    f32::from_bits(ORDINARY | u32::from(degree & 3) << DEGREE_SHIFT)
-}
-
-fn degree_of(state: f32) -> u8 {
-    (state.to_bits() >> DEGREE_SHIFT & 3) as u8
-}
-
-fn with_degree(state: f32, degree: u8) -> f32 {
-    f32::from_bits(state.to_bits() & !(3 << DEGREE_SHIFT) | u32::from(degree & 3) << DEGREE_SHIFT)
-}
-
-/// Degree of the highest coefficient (r, g, b each) that is not zero.
-pub(super) fn degree_in_use(coefficients: &[f32]) -> u8 {
-    let used = coefficients.iter().rposition(|c| *c != 0.0).map_or(0, |i| i / 3 + 1);
-    (0..3).find(|d| sh_coefficients(*d) >= used).unwrap_or(3)
-}
 
 /// Room for the ranking, allocated once, and how many raises are over.
 pub(crate) struct Degrees {
@@ -56,9 +34,9 @@ impl Trainer {
     /// Before the first step: where degrees are not raised by residual, every Gaussian has the highest at once.
     pub(super) fn open_degrees(&mut self) {
         if self.settings.sh.raise_share >= 1.0 {
-            let (n, degree) = (self.gaussians, self.plan.sh_degree);
-            for g in self.arena.slice_mut::<[f32; 4]>(self.rows.geometry).chunks_exact_mut(GEOMETRY).take(n) {
-                g[1][3] = with_degree(g[1][3], degree);
+            let degree = self.plan.sh_degree;
+            for g in &mut self.parameters.geometry_mut(&mut self.arena)[..self.gaussians] {
+                g.state = with_degree(g.state, degree);
             }
         }
         self.count_missing();
@@ -74,13 +52,13 @@ impl Trainer {
         self.degrees.raises = due;
         self.flush()?;
         let limit = self.settings.sh.degree.min(self.plan.sh_degree);
-        let (n, rows, t) = (self.gaussians, self.rows, self.steps as i32);
+        let (n, parameters, t) = (self.gaussians, self.parameters, self.steps as i32);
         let unbias = |beta: f32| 1.0 / (1.0 - f64::from(beta).powi(t)) as f32;
         let (first, second) = (unbias(self.settings.adam.beta1), unbias(self.settings.adam.beta2));
         let Degrees { asks, ranked, .. } = &mut self.degrees;
         asks.clear();
-        let scale = self.frame.adam[3];
-        asks.extend((0..n).map(|row| ask(&self.arena, &rows, row, limit, scale, [first, second])));
+        let scale = self.frame.moment_scale;
+        asks.extend((0..n).map(|i| ask(&self.arena, &parameters, i, limit, scale, [first, second])));
         ranked.clear();
         ranked.extend_from_slice(asks);
         let raised = ((n as f32 * share) as usize).min(n.saturating_sub(1));
@@ -88,10 +66,10 @@ impl Trainer {
         // No one is raised for asking more than others where all ask about the same.
         let mean = asks.iter().map(|a| f64::from(*a)).sum::<f64>() / n.max(1) as f64;
         let least = least.max(mean as f32);
-        for row in 0..n {
-            if self.degrees.asks[row] > least {
-                raise(&mut self.arena, &rows, row);
-                self.totals.counters.sh_raised += 1;
+        for index in 0..n {
+            if self.degrees.asks[index] > least {
+                raise(&mut self.arena, &parameters, index);
+                self.counters.sh_raised += 1;
             }
         }
         self.count_missing();
@@ -100,8 +78,9 @@ impl Trainer {
 
     fn count_missing(&mut self) {
         let most = sh_coefficients(self.plan.sh_degree);
-        let geometry = self.arena.slice::<[f32; 4]>(self.rows.geometry).chunks_exact(GEOMETRY).take(self.gaussians);
-        self.degrees.missing = geometry.map(|g| (most - sh_coefficients(degree_of(g[1][3])).min(most)) as u64).sum();
+        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
+        let missing = |state: f32| (most - sh_coefficients(degree_of(state)).min(most)) as u64;
+        self.degrees.missing = geometry.iter().map(|g| missing(g.state)).sum();
     }
 
     /// Coefficients that a step does not touch, because no Gaussian has them.
@@ -110,14 +89,15 @@ impl Trainer {
     }
 }
 
-/// How much of a row's colour gradient the views disagree on: the variance of Adam's moments of degree 0, which a colour
-/// that depends on the direction could follow. 0 for rows that have the highest degree, or were never seen.
-fn ask(arena: &Arena, rows: &Rows, row: usize, limit: u8, scale: f32, unbias: [f32; 2]) -> f32 {
-    if degree_of(arena.slice::<[f32; 4]>(rows.geometry)[row * GEOMETRY + 1][3]) >= limit {
+/// How much of a Gaussian's colour gradient the views disagree on: the variance of Adam's moments of degree 0, which a colour
+/// that depends on the direction could follow. 0 for those that have the highest degree, or were never in view.
+fn ask(arena: &Arena, parameters: &Parameters, index: usize, limit: u8, scale: f32, unbias: [f32; 2]) -> f32 {
+    if degree_of(parameters.geometry(arena)[index].state) >= limit {
         return 0.0;
     }
     let channel = |k: usize| {
-        let (m, v) = (rows.sh_first.first(arena, row, k, scale), rows.sh_second.second(arena, row, k, scale));
+        let m = parameters.sh_first.first(arena, index, k, scale);
+        let v = parameters.sh_second.second(arena, index, k, scale);
         (v * unbias[1] - (m * unbias[0]).powi(2)).max(0.0)
     };
     let variance: f32 = (0..3).map(channel).sum();
@@ -126,43 +106,10 @@ fn ask(arena: &Arena, rows: &Rows, row: usize, limit: u8, scale: f32, unbias: [f
 
 /// One degree more. The new coefficients are zero; their second moments start where degree 0's is, because the basis
 /// functions have the same mean square over the sphere: from zero, the first steps would be several times too long.
-fn raise(arena: &mut Arena, rows: &Rows, row: usize) {
-    let g = &mut arena.slice_mut::<[f32; 4]>(rows.geometry)[row * GEOMETRY + 1];
-    let degree = degree_of(g[3]) + 1;
-    g[3] = with_degree(g[3], degree);
+fn raise(arena: &mut Arena, parameters: &Parameters, index: usize) {
+    let g = &mut parameters.geometry_mut(arena)[index];
+    let degree = degree_of(g.state) + 1;
+    g.state = with_degree(g.state, degree);
     let new = sh_coefficients(degree - 1)..sh_coefficients(degree);
-    rows.sh_second.repeat_first_coefficient(arena, row, new);
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_state_word_is_an_ordinary_float_whatever_it_holds() {
-        for degree in 0..=3 {
-            for steps in [0u32, 1, 0x0FFF_FFFF & !(3 << DEGREE_SHIFT)] {
-                let word = f32::from_bits(state(degree).to_bits() | steps);
-                assert!(word.is_normal());
-                assert_eq!(degree_of(word), degree);
-                assert_eq!(degree_of(with_degree(word, 1)), 1);
-                assert_eq!(with_degree(word, 2).to_bits() & steps, steps);
-            }
-        }
-    }
-
-    #[test]
-    fn the_degree_in_use_is_that_of_the_last_coefficient_that_is_not_zero() {
-        let with = |i: usize| {
-            let mut c = [0.0; 48];
-            c[i] = -0.1;
-            degree_in_use(&c)
-        };
-        assert_eq!(degree_in_use(&[0.0; 48]), 0);
-        assert_eq!(
-            [with(0), with(2), with(3), with(11), with(12), with(26), with(27), with(47)],
-            [0, 0, 1, 1, 2, 2, 3, 3]
-        );
-        assert_eq!(degree_in_use(&[f32::NAN; 3]), 0);
-    }
+    parameters.sh_second.repeat_first_coefficient(arena, index, new);
 }

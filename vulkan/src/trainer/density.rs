@@ -1,10 +1,10 @@
-//! Density control under the hard cap, on the host between two steps: dead Gaussians move onto live ones and free rows
+//! Density control under the hard cap, on the host between two steps: dead Gaussians move onto live ones and free places
 //! are filled by splitting, both with the opacity and scale that leave the picture unchanged (3DGS-MCMC, Kheradmand et
 //! al. 2024, eq. 9) where they lie close together; or dead ones are only removed.
 
-use super::rows::GEOMETRY;
+use super::parameters::Geometry;
 use super::{TrainError, Trainer};
-use crate::trainer::frame::DEFERRED_STEPS;
+use crate::layout::DEFERRED_STEPS;
 use config::training::Strategy;
 use glam::{Quat, Vec3};
 use rand::Rng;
@@ -19,9 +19,9 @@ pub(crate) struct Scratch {
     dead: Vec<u32>,
     /// Running sum of the live Gaussians' opacities.
     cumulative: Vec<f64>,
-    /// How many copies of each row are wanted besides itself.
+    /// How many copies of each Gaussian are wanted besides itself.
     copies: Vec<u32>,
-    /// Rows to write and the rows they are copies of.
+    /// Gaussians to copy and where to.
     moves: Vec<[u32; 2]>,
     binomials: Vec<[f64; MOST_COPIES]>,
     pub last: u32,
@@ -63,7 +63,7 @@ impl Scratch {
     }
 }
 
-/// Steps after which Gaussians that were not in view make up for them. The result would be the same without, but not to
+/// Steps after which the lazy Adam updates of Gaussians outside the view are done. The result would be the same without, but not to
 /// the bit: a snapshot taken in between decides the rounding. So it is done at fixed steps, and who wants identical
 /// bytes takes snapshots there ([`StepReport::settled`](super::StepReport::settled)).
 const FLUSH_EVERY: u32 = 32;
@@ -81,6 +81,7 @@ fn logit(opacity: f64) -> f32 {
 impl Trainer {
     /// Runs density control when its time has come.
     pub(super) fn control_density(&mut self, progress: f32) -> Result<(), TrainError> {
+        let _phase = tracing::trace_span!("density control").entered();
         let since_flush = self.steps - self.density.last_flush;
         let d = self.settings.density;
         // With a budget in seconds the number of steps is what the pace so far promises.
@@ -101,7 +102,7 @@ impl Trainer {
         self.density.last_flush = self.steps;
         self.density.last = self.steps;
         self.decay_opacities(progress);
-        self.drop_unsound_rows();
+        self.drop_non_finite();
         match self.strategy {
             Strategy::Prune => self.prune(),
             _ => self.relocate_and_grow(),
@@ -114,41 +115,34 @@ impl Trainer {
         if amount <= 0.0 {
             return;
         }
-        let n = self.gaussians;
-        for g in self.arena.slice_mut::<[f32; 4]>(self.rows.geometry).chunks_exact_mut(GEOMETRY).take(n) {
-            g[0][3] = logit(opacity(g[0][3]) - amount);
+        for g in &mut self.parameters.geometry_mut(&mut self.arena)[..self.gaussians] {
+            g.opacity_logit = logit(opacity(g.opacity_logit) - amount);
         }
     }
 
-    /// Rows that went bad in spite of everything leave; the last rows take their places.
-    fn drop_unsound_rows(&mut self) {
-        let mut row = 0;
-        while row < self.gaussians && self.gaussians > 1 {
-            let g = &self.arena.slice::<[f32; 4]>(self.rows.geometry)[row * GEOMETRY..row * GEOMETRY + 3];
-            let numbers = g[0].iter().chain(&g[1][..3]).chain(&g[2]);
-            if numbers.into_iter().all(|v| v.is_finite()) {
-                row += 1;
-            } else {
-                self.remove(row);
-            }
-        }
-    }
-
-    fn remove(&mut self, row: usize) {
-        self.gaussians -= 1;
-        let rows = self.rows;
-        if row != self.gaussians {
-            rows.shift(&mut self.arena, self.gaussians, row);
-        }
-        self.totals.counters.pruned += 1;
+    /// Gaussians that went bad in spite of everything leave.
+    fn drop_non_finite(&mut self) {
+        self.remove_where(|g| !g.is_finite());
     }
 
     fn prune(&mut self) {
         let limit = f64::from(self.settings.density.dead_opacity);
-        let mut row = 0;
-        while row < self.gaussians && self.gaussians > 1 {
-            let dead = opacity(self.arena.slice::<[f32; 4]>(self.rows.geometry)[row * GEOMETRY][3]) < limit;
-            if dead { self.remove(row) } else { row += 1 }
+        self.remove_where(|g| opacity(g.opacity_logit) < limit);
+    }
+
+    /// Removes Gaussians, but never the last one; the last ones take the places of those removed.
+    fn remove_where(&mut self, leaves: impl Fn(&Geometry) -> bool) {
+        let mut index = 0;
+        while index < self.gaussians && self.gaussians > 1 {
+            if !leaves(&self.parameters.geometry(&self.arena)[index]) {
+                index += 1;
+                continue;
+            }
+            self.gaussians -= 1;
+            if index != self.gaussians {
+                self.parameters.shift(&mut self.arena, self.gaussians, index);
+            }
+            self.counters.pruned += 1;
         }
     }
 
@@ -160,9 +154,8 @@ impl Trainer {
         s.cumulative.clear();
         s.moves.clear();
         let mut sum = 0.0;
-        let geometry = self.arena.slice::<[f32; 4]>(self.rows.geometry);
-        for (i, g) in geometry.chunks_exact(GEOMETRY).take(n).enumerate() {
-            let o = opacity(g[0][3]);
+        for (i, g) in self.parameters.geometry(&self.arena)[..n].iter().enumerate() {
+            let o = opacity(g.opacity_logit);
             if o < limit {
                 s.dead.push(i as u32);
             } else {
@@ -193,50 +186,46 @@ impl Trainer {
     }
 
     fn apply_copies(&mut self, n: usize) {
-        let rows = self.rows;
-        for row in 0..n {
-            let copies = self.density.copies[row] as usize;
-            if copies > 0 {
-                let g = &mut self.arena.slice_mut::<[f32; 4]>(rows.geometry)[row * GEOMETRY..];
-                let (each, factor) = self.density.split(opacity(g[0][3]), copies + 1);
-                g[0][3] = logit(each.max(f64::from(self.settings.density.dead_opacity)));
-                for s in &mut g[1][..3] {
-                    *s += factor.ln() as f32;
-                }
+        let parameters = self.parameters;
+        for (g, copies) in parameters.geometry_mut(&mut self.arena)[..n].iter_mut().zip(&self.density.copies) {
+            if *copies > 0 {
+                let (each, factor) = self.density.split(opacity(g.opacity_logit), *copies as usize + 1);
+                g.opacity_logit = logit(each.max(f64::from(self.settings.density.dead_opacity)));
+                g.log_scale = g.log_scale.map(|s| s + factor.ln() as f32);
             }
         }
         for i in 0..self.density.moves.len() {
             let [from, to] = self.density.moves[i].map(|v| v as usize);
             let to = if to == u32::MAX as usize {
                 self.gaussians += 1;
-                self.totals.counters.added += 1;
+                self.counters.added += 1;
                 self.gaussians - 1
             } else {
-                self.totals.counters.relocated += 1;
+                self.counters.relocated += 1;
                 to
             };
-            rows.copy(&mut self.arena, from, to);
+            parameters.copy(&mut self.arena, from, to);
             self.displace(to);
         }
     }
 
     /// Moves a copy to a place drawn from the Gaussian it was copied from.
-    fn displace(&mut self, row: usize) {
+    fn displace(&mut self, index: usize) {
         let spread = self.settings.density.spread;
         if spread <= 0.0 {
             return;
         }
-        let g = &mut self.arena.slice_mut::<[f32; 4]>(self.rows.geometry)[row * GEOMETRY..row * GEOMETRY + 3];
-        let [w, x, y, z] = g[2];
+        let g = &mut self.parameters.geometry_mut(&mut self.arena)[index];
+        let [w, x, y, z] = g.rotation;
         let rotation = Quat::from_xyzw(x, y, z, w).normalize();
         let rng = self.sampler.rng();
         // A Gaussian larger than the scene (log scales may be 40) sends no copy out of it.
         let extent = self.extent;
-        let along = [0, 1, 2].map(|k| g[1][k].exp().min(extent) * normal(rng) * spread);
+        let along = g.log_scale.map(|s| s.exp().min(extent) * normal(rng) * spread);
         let offset = rotation * Vec3::from(along);
         // A zero quaternion has no direction: the copy then stays where its source is.
         if offset.is_finite() {
-            for (mean, offset) in g[0].iter_mut().zip(offset.to_array()) {
+            for (mean, offset) in g.mean.iter_mut().zip(offset.to_array()) {
                 *mean += offset;
             }
         }

@@ -1,7 +1,8 @@
 //! What can go wrong while training.
 
 use crate::gpu::GpuError;
-use config::training::TrainSettingsError;
+use config::error::{Error, ErrorKind};
+use config::settings::SettingError;
 
 /// Why a training call failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -10,13 +11,13 @@ pub enum TrainError {
     #[error(transparent)]
     Gpu(#[from] GpuError),
     /// A setting outside its range.
-    #[error(transparent)]
-    Settings(#[from] TrainSettingsError),
+    #[error("[training] {0}; mend it in the mission or settings file")]
+    Settings(#[from] SettingError),
     /// There is nothing to train.
-    #[error("no Gaussian to train: {unsound} rows were not finite; check the initialisation")]
+    #[error("no Gaussian to train: {non_finite} Gaussians were not finite; check the initialisation")]
     Empty {
-        /// Rows that were dropped.
-        unsound: usize,
+        /// Those that were dropped.
+        non_finite: usize,
     },
     /// There is nothing to train on.
     #[error("no view to train on; add at least one")]
@@ -43,4 +44,13 @@ pub enum TrainError {
         /// Pixels in the plan.
         pixels: usize,
     },
+}
+
+impl Error for TrainError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Gpu(e) => e.kind(),
+            _ => ErrorKind::Input,
+        }
+    }
 }

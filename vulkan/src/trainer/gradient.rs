@@ -1,7 +1,6 @@
 //! Gradients for inspection: what a step would follow, for every parameter, the camera and the exposure. The gradient
 //! checks compare them with the CPU twins and with central differences.
 
-use super::rows::GEOMETRY;
 use super::{TrainError, Trainer};
 use models::cloud::GaussianCloud;
 
@@ -24,7 +23,7 @@ impl Trainer {
     /// [`TrainError::Empty`], [`TrainError::BadView`] when there is no such view, [`TrainError::Gpu`].
     pub fn gradient(&mut self, index: usize, into: &mut GaussianCloud) -> Result<ViewGradients, TrainError> {
         if self.gaussians == 0 {
-            return Err(TrainError::Empty { unsound: 0 });
+            return Err(TrainError::Empty { non_finite: 0 });
         }
         if index >= self.views.len() {
             return Err(TrainError::BadView { name: format!("view {index}"), why: "does not exist".into() });
@@ -34,7 +33,7 @@ impl Trainer {
         self.open_degrees();
         self.forget_all();
         self.prepare_frame(index, 1.0);
-        self.frame.background = [0.0; 4];
+        (self.frame.background, self.frame.drop_share) = ([0.0; 3], 0.0);
         self.write_frame();
         self.forward_count(index)?;
         self.gradients_only = true;
@@ -43,27 +42,25 @@ impl Trainer {
         done?;
         let sums = self.partial_sums();
         let loss = self.weigh(&sums).loss;
-        let rows = self.rows;
-        super::rows::clear(into, self.plan.sh_degree);
-        let stride = into.sh_stride();
-        for g in self.arena.slice::<[f32; 4]>(rows.geometry).chunks_exact(GEOMETRY).take(self.gaussians) {
-            into.means.push([g[3][0], g[3][1], g[3][2]]);
-            into.opacity_logits.push(g[3][3]);
-            into.log_scales.push([g[4][0], g[4][1], g[4][2]]);
-            into.rotations.push(g[5]);
+        super::parameters::clear(into, self.plan.sh_degree);
+        for g in &self.parameters.geometry(&self.arena)[..self.gaussians] {
+            let [[x, y, z, opacity], [sx, sy, sz, _], rotation] = g.first;
+            into.means.push([x, y, z]);
+            into.opacity_logits.push(opacity);
+            into.log_scales.push([sx, sy, sz]);
+            into.rotations.push(rotation);
         }
-        for row in 0..self.gaussians {
-            into.sh.extend((0..stride).map(|k| rows.sh_first.first(&self.arena, row, k, self.frame.adam[3])));
+        let (sh, scale, stride) = (self.parameters.sh_first, self.frame.moment_scale, into.sh_stride());
+        for index in 0..self.gaussians {
+            into.sh.extend((0..stride).map(|k| sh.first(&self.arena, index, k, scale)));
         }
         self.forget_all();
-        let l = sums.loss;
-        Ok(ViewGradients { loss, pose: sums.pose, exposure: [l[1], l[2], l[3], l[4], l[5], l[6]] })
+        Ok(ViewGradients { loss, pose: sums.pose, exposure: sums.exposure })
     }
 
     fn forget_all(&mut self) {
-        let rows = self.rows;
-        for row in 0..self.gaussians {
-            rows.forget(&mut self.arena, row);
+        for index in 0..self.gaussians {
+            self.parameters.forget(&mut self.arena, index);
         }
     }
 }

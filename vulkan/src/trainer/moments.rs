@@ -6,59 +6,59 @@ use crate::arena::{Arena, Section};
 
 /// Where one of the two lies, and in how many bits.
 #[derive(Clone, Copy)]
-pub(crate) struct MomentRows {
+pub(crate) struct ShMoments {
     section: Section,
-    /// vec4 per row.
+    /// vec4 per Gaussian.
     columns: usize,
     half: bool,
 }
 
-impl MomentRows {
+impl ShMoments {
     pub fn new(section: Section, columns: usize, half: bool) -> Self {
         Self { section, columns, half }
     }
 
-    fn row_bytes(&self) -> usize {
+    fn bytes_each(&self) -> usize {
         self.columns * if self.half { 8 } else { 16 }
     }
 
-    pub fn forget(&self, arena: &mut Arena, row: usize) {
-        let bytes = self.row_bytes();
-        arena.slice_mut::<u8>(self.section)[row * bytes..(row + 1) * bytes].fill(0);
+    pub fn forget(&self, arena: &mut Arena, index: usize) {
+        let bytes = self.bytes_each();
+        arena.slice_mut::<u8>(self.section)[index * bytes..(index + 1) * bytes].fill(0);
     }
 
     pub fn copy(&self, arena: &mut Arena, from: usize, to: usize) {
-        let bytes = self.row_bytes();
+        let bytes = self.bytes_each();
         arena.slice_mut::<u8>(self.section).copy_within(from * bytes..(from + 1) * bytes, to * bytes);
     }
 
-    /// Number `k` of `row` as it is stored: in 16 bits scaled, the second moment as its root.
-    fn stored(&self, arena: &Arena, row: usize, k: usize) -> f32 {
-        let at = row * self.columns * 4 + k;
+    /// Number `k` of Gaussian `index` as it is stored: in 16 bits scaled, the second moment as its root.
+    fn stored(&self, arena: &Arena, index: usize, k: usize) -> f32 {
+        let at = index * self.columns * 4 + k;
         match self.half {
             true => f16::from_bits(arena.slice::<u16>(self.section)[at]).to_f32(),
             false => arena.slice::<f32>(self.section)[at],
         }
     }
 
-    /// Gives coefficients `range` of `row` the three numbers of its coefficient 0.
-    pub fn repeat_first_coefficient(&self, arena: &mut Arena, row: usize, range: std::ops::Range<usize>) {
+    /// Gives coefficients `range` of Gaussian `index` the three numbers of its coefficient 0.
+    pub fn repeat_first_coefficient(&self, arena: &mut Arena, index: usize, range: std::ops::Range<usize>) {
         let bytes = if self.half { 2 } else { 4 };
-        let (row, three) = (row * self.row_bytes(), 3 * bytes);
+        let (first, three) = (index * self.bytes_each(), 3 * bytes);
         let all = arena.slice_mut::<u8>(self.section);
         for i in range {
-            all.copy_within(row..row + three, row + i * three);
+            all.copy_within(first..first + three, first + i * three);
         }
     }
 
-    /// Number `k` of `row`, of first moments; `scale` is the frame's.
-    pub fn first(&self, arena: &Arena, row: usize, k: usize, scale: f32) -> f32 {
-        self.stored(arena, row, k) / if self.half { scale } else { 1.0 }
+    /// Number `k` of Gaussian `index`, of first moments; `scale` is the frame's.
+    pub fn first(&self, arena: &Arena, index: usize, k: usize, scale: f32) -> f32 {
+        self.stored(arena, index, k) / if self.half { scale } else { 1.0 }
     }
 
-    /// Number `k` of `row`, of second moments.
-    pub fn second(&self, arena: &Arena, row: usize, k: usize, scale: f32) -> f32 {
-        let stored = self.stored(arena, row, k);
+    /// Number `k` of Gaussian `index`, of second moments.
+    pub fn second(&self, arena: &Arena, index: usize, k: usize, scale: f32) -> f32 {
+        let stored = self.stored(arena, index, k);
         if self.half { (stored / scale).powi(2) } else { stored }
     }
 }

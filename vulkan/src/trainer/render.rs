@@ -1,7 +1,7 @@
 //! Rendering any camera at any size, in windows when it is larger than planned and in bands when it is too crowded.
 
 use super::frame::Window;
-use super::views::pose_is_sound;
+use super::views::is_usable;
 use super::{TrainError, Trainer};
 use models::camera::View;
 
@@ -29,7 +29,7 @@ impl Trainer {
         let lens = view.intrinsics;
         let numbers = [lens.fx, lens.fy, lens.cx, lens.cy];
         let whole = lens.width > 0 && lens.height > 0 && lens.fx > 0.0 && lens.fy > 0.0;
-        if !whole || !pose_is_sound(&view.pose) || numbers.iter().any(|v| !v.is_finite()) {
+        if !whole || !is_usable(&view.pose) || numbers.iter().any(|v| !v.is_finite()) {
             let why = "size, lens and pose of the camera must be finite and positive".to_owned();
             return Err(TrainError::BadView { name: "rendering".into(), why });
         }
@@ -43,8 +43,8 @@ impl Trainer {
         let f = &mut *self.frame;
         f.plain();
         let degree = self.settings.sh.degree_at(1.0).min(self.plan.sh_degree);
-        f.counts = [self.gaussians as u32, degree.into(), 0, 1];
-        f.step[0] = self.steps + 1;
+        (f.gaussians, f.sh_degree, f.divisor) = (self.gaussians as u32, degree.into(), 1);
+        f.step = self.steps + 1;
         f.look(view);
         let whole = Window::whole(lens.width, lens.height);
         let rows = self.rows_per_window(&whole, lens.width)?;
@@ -90,7 +90,7 @@ impl Trainer {
     }
 
     fn copy_out(&self, into: &mut Rendering) {
-        let [_, y, width, height] = self.frame.region;
+        let ([_, y], [width, height]) = (self.frame.region_origin, self.frame.region);
         let (first, pixels) = (y as usize * into.width as usize, width as usize * height as usize);
         let image = &self.arena.slice::<[f32; 4]>(self.arena.section("image"))[..pixels];
         let left = &self.arena.slice::<f32>(self.arena.section("transmittance"))[..pixels];

@@ -1,19 +1,17 @@
 //! One training step.
 
 use super::bands::Counted;
-use super::frame::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, flags_of};
+use super::frame::flags_of;
 use super::{StepReport, TrainError, Trainer};
-use crate::commands::Push;
 use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
 use crate::kernels::Kernel;
+use crate::layout::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, LossSums, PoseSums, Push};
 use config::plan::LOOP_LANES;
 use rand::Rng;
 use std::time::Instant;
 
 /// Rows of a strip in the loss kernels (`shaders/window.glsl`).
 const STRIP: usize = 8;
-/// Where `depth_finish` leaves the correlation, in 32-bit words.
-const STATUS_CORRELATION: usize = 515;
 
 impl Trainer {
     /// One gradient step on the next view.
@@ -25,8 +23,9 @@ impl Trainer {
             return Err(TrainError::NoViews);
         }
         if self.gaussians == 0 {
-            return Err(TrainError::Empty { unsound: 0 });
+            return Err(TrainError::Empty { non_finite: 0 });
         }
+        let _step = tracing::trace_span!("step", step = self.steps + 1).entered();
         let start = Instant::now();
         self.measure_extent();
         if self.steps == 0 {
@@ -42,7 +41,7 @@ impl Trainer {
         self.forward_backward()?;
         self.steps += 1;
         self.flushed = false;
-        self.deferred.push(self.steps, self.frame.rates[0], self.settings.rates.decay(progress));
+        self.deferred.push(self.steps, self.frame.mean_rate, self.settings.rates.decay(progress));
         self.elapsed_s += start.elapsed().as_secs_f64();
         let mut report = self.read_loss(index, counted, divisor, progress);
         self.control_density(progress)?;
@@ -79,40 +78,40 @@ impl Trainer {
             flags |= FLAG_DEPTH;
         }
         let degree = s.sh.degree_at(progress).min(self.plan.sh_degree);
-        f.counts = [self.gaussians as u32, degree.into(), flags, divisor];
+        (f.gaussians, f.sh_degree, f.flags, f.divisor) = (self.gaussians as u32, degree.into(), flags, divisor);
         let e = &resident.adjust.exposure;
-        let gain = |i: usize| e[i].exp() as f32;
-        f.exposure_gain = [gain(0), gain(1), gain(2), s.loss.depth_confidence];
-        f.exposure_offset = [e[3] as f32, e[4] as f32, e[5] as f32, s.loss.depth];
-        let mut background = [0.0f32; 3];
+        f.exposure_gain = std::array::from_fn(|i| e[i].exp() as f32);
+        f.exposure_offset = std::array::from_fn(|i| e[i + 3] as f32);
+        (f.min_confidence, f.depth_weight) = (s.loss.depth_confidence, s.loss.depth);
+        f.background = [0.0; 3];
         if s.regularise.background > 0.0 {
             let rng = self.sampler.rng();
-            background = std::array::from_fn(|_| rng.random_range(0.0..1.0) * s.regularise.background);
+            f.background = std::array::from_fn(|_| rng.random_range(0.0..1.0) * s.regularise.background);
         }
-        let drop = s.regularise.drop * progress;
-        f.background = [background[0], background[1], background[2], drop];
+        f.drop_share = s.regularise.drop * progress;
         let r = &s.rates;
         let mean = r.mean(progress, self.extent);
         // The device multiplies every step by the first bias: what decays for all decays there.
         let decay = r.decay(progress);
-        f.rates = [mean / decay, r.log_scale, r.rotation, r.opacity];
-        f.rates_more = [r.sh_dc, r.sh_rest, s.regularise.noise * mean, self.extent];
+        (f.mean_rate, f.log_scale_rate, f.rotation_rate) = (mean / decay, r.log_scale, r.rotation);
+        (f.opacity_rate, f.sh_dc_rate, f.sh_rest_rate) = (r.opacity, r.sh_dc, r.sh_rest);
+        (f.noise, f.max_noise) = (s.regularise.noise * mean, self.extent);
         let t = self.steps + 1;
-        f.adam = [s.adam.beta1, s.adam.beta2, s.adam.epsilon, self.plan.moment_scale()];
+        (f.beta1, f.beta2, f.epsilon) = (s.adam.beta1, s.adam.beta2, s.adam.epsilon);
+        f.moment_scale = self.plan.moment_scale();
         let bias = |beta: f32| (1.0 / (1.0 - f64::from(beta).powi(t as i32))) as f32;
-        f.bias = [decay * bias(s.adam.beta1), bias(s.adam.beta2), 0.0, 0.0];
-        let seed = (s.seed ^ (s.seed >> 32)) as u32;
-        f.step = [t, seed, 2 * LOOP_LANES as u32, 0];
-        f.loss = [s.loss.l1 / (3.0 * pixels), s.loss.ssim / (3.0 * pixels), 0.0, 0.0];
-        f.source = [resident.width, resident.height, resident.depth_at, 0];
+        (f.first_bias, f.second_bias) = (decay * bias(s.adam.beta1), bias(s.adam.beta2));
+        (f.step, f.seed) = (t, (s.seed ^ (s.seed >> 32)) as u32);
+        (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * pixels), s.loss.ssim / (3.0 * pixels));
+        (f.source_width, f.depth_offset) = (resident.width, resident.depth_at);
         divisor
     }
 
     /// First submission: picture, projection, sort, counts.
     pub(super) fn forward_count(&mut self, index: usize) -> Result<Counted, TrainError> {
-        let pixels = self.frame.size[0] as usize * self.frame.size[1] as usize;
+        let _phase = tracing::trace_span!("project, sort, count").entered();
         let commands = self.take_recording()?;
-        commands.run_view(Kernel::Target, index, pixels);
+        commands.run_view(Kernel::Target, index, self.frame.pixels());
         self.record_counting(&commands);
         commands.submit()?;
         self.cut_bands()
@@ -120,11 +119,12 @@ impl Trainer {
 
     /// Second submission (one per band where there are several): blend, loss, gradient, Adam.
     pub(super) fn forward_backward(&mut self) -> Result<(), TrainError> {
-        let depth = self.frame.counts[2] & FLAG_DEPTH != 0;
+        let _phase = tracing::trace_span!("blend, loss, gradient, Adam").entered();
+        let depth = self.frame.has(FLAG_DEPTH);
         let single = self.bands.len() == 1;
         let backward = if depth { Kernel::RasteriseBackwardDepth } else { Kernel::RasteriseBackward };
         let lanes = LOOP_LANES as usize;
-        let visible = self.arena.slice::<u32>(self.arena.section("status"))[0] as usize;
+        let visible = self.status().visible as usize;
         let mut r = self.take_recording()?;
         for (i, band) in self.bands.iter().enumerate() {
             if i > 0 {
@@ -173,13 +173,13 @@ impl Trainer {
         let starts = self.arena.slice::<u32>(self.arena.section("tile_starts"));
         let blended: u64 = starts[tiles + 1..2 * tiles + 1].iter().map(|n| u64::from(*n)).sum();
         let missing = self.missing_coefficients();
-        let c = &mut self.totals.counters;
+        let c = &mut self.counters;
         c.culled += (self.gaussians - counted.visible.min(self.gaussians)) as u64;
         c.instances += counted.instances;
         c.evaluations += blended * u64::from(TILE_WIDTH * TILE_HEIGHT);
         c.behind_opaque += counted.instances.saturating_sub(blended);
         c.banded_steps += u64::from(self.bands.len() > 1);
-        c.unsound_gradients += sums.unsound;
+        c.non_finite_gradients += sums.non_finite;
         c.sh_missing += missing;
 
         let s = &self.settings;
@@ -189,8 +189,7 @@ impl Trainer {
             view.adjust.move_pose(&mut view.view.pose, sums.pose, &s.rates, self.extent, &s.adam);
         }
         if s.refine_exposure {
-            let g = &sums.loss;
-            view.adjust.move_exposure([g[1], g[2], g[3], g[4], g[5], g[6]], &s.rates, &s.adam);
+            view.adjust.move_exposure(sums.exposure, &s.rates, &s.adam);
         }
         StepReport {
             step: self.steps,
@@ -212,13 +211,11 @@ impl Trainer {
 
     /// The loss and its terms from the partial sums and the depth's correlation.
     pub(super) fn weigh(&self, sums: &PartialSums) -> Weighed {
-        let values = 3.0 * f64::from(self.frame.size[0]) * f64::from(self.frame.size[1]);
-        let (l1, ssim) = (sums.loss[0] / values, sums.loss[7] / values);
+        let values = 3.0 * self.frame.pixels() as f64;
+        let (l1, ssim) = (sums.l1 / values, sums.ssim / values);
         let s = &self.settings.loss;
-        let depth = self.frame.counts[2] & FLAG_DEPTH != 0;
-        let status = self.arena.slice::<u32>(self.arena.section("status"));
-        let useful = depth && status[STATUS_CORRELATION + 1] == 1;
-        let correlation = useful.then(|| f32::from_bits(status[STATUS_CORRELATION]));
+        let useful = self.frame.has(FLAG_DEPTH) && self.status().correlates == 1;
+        let correlation = useful.then(|| self.status().correlation);
         let depth_loss = correlation.map_or(0.0, |c| f64::from(s.depth) * (1.0 - f64::from(c)));
         let loss = f64::from(s.l1) * l1 + f64::from(s.ssim) * (1.0 - ssim) + depth_loss;
         Weighed { loss: loss as f32, l1: l1 as f32, ssim: ssim as f32, correlation }
@@ -226,23 +223,24 @@ impl Trainer {
 
     /// The device's partial sums, added in order.
     pub(super) fn partial_sums(&self) -> PartialSums {
-        let partials = self.arena.slice::<[f32; 4]>(self.arena.section("partials"));
-        let lanes = LOOP_LANES as usize;
         let mut sums = PartialSums::default();
-        for p in partials[..2 * lanes].chunks_exact(2) {
+        let lanes = self.arena.slice::<PoseSums>(self.arena.section("lane_sums"));
+        for p in &lanes[..LOOP_LANES as usize] {
             for i in 0..3 {
-                sums.pose[i] += f64::from(p[0][i]);
-                sums.pose[i + 3] += f64::from(p[1][i]);
+                sums.pose[i] += f64::from(p.turn[i]);
+                sums.pose[i + 3] += f64::from(p.shift[i]);
             }
-            sums.unsound += p[0][3] as u64;
+            sums.non_finite += u64::from(p.non_finite);
         }
-        let (width, height) = (self.frame.size[0] as usize, self.frame.size[1] as usize);
-        let strips = height.div_ceil(STRIP) * width;
-        for p in partials[2 * lanes..2 * (lanes + strips)].chunks_exact(2) {
-            for i in 0..4 {
-                sums.loss[i] += f64::from(p[0][i]);
-                sums.loss[i + 4] += f64::from(p[1][i]);
+        let [width, height] = self.frame.size.map(|n| n as usize);
+        let strips = self.arena.slice::<LossSums>(self.arena.section("strip_sums"));
+        for p in &strips[..height.div_ceil(STRIP) * width] {
+            for i in 0..3 {
+                sums.exposure[i] += f64::from(p.gain[i]);
+                sums.exposure[i + 3] += f64::from(p.offset[i]);
             }
+            sums.l1 += f64::from(p.l1);
+            sums.ssim += f64::from(p.ssim);
         }
         sums
     }
@@ -262,8 +260,10 @@ pub(super) struct Weighed {
 pub(super) struct PartialSums {
     /// Turn and shift of the camera.
     pub pose: [f64; 6],
-    /// L1, gradient of log gain r g b, gradient of offset r g b, SSIM.
-    pub loss: [f64; 8],
+    /// Gradient of the logarithm of the gain r g b, and of the offset r g b.
+    pub exposure: [f64; 6],
+    pub l1: f64,
+    pub ssim: f64,
     /// Gaussians with a gradient that is not finite.
-    pub unsound: u64,
+    pub non_finite: u64,
 }

@@ -43,14 +43,38 @@ impl Trainer {
             bytes: config::plan::view_bytes(pixels as u64),
         };
         let words = self.arena.slice_mut::<u32>(section);
-        let (colours, depths) = words.split_at_mut(pixels);
+        for (word, p) in words.iter_mut().zip(image.pixels()) {
+            *word = u32::from_le_bytes([p[0], p[1], p[2], 0]);
+        }
+        self.pipelines.bind_view(index, &self.arena, section);
+        let mut view = picture.view;
+        view.intrinsics = view.intrinsics.resized(width, height);
+        let adjust = super::pose::Adjust::default();
+        self.views.push(Resident { view, width, height, depth_at: 0, last_loss: f32::INFINITY, adjust });
+        self.sampler.forget();
+        self.set_prior(index, prior)?;
+        Ok(index)
+    }
+
+    /// Replaces the depth prior of view `index`, of any size; its pixels stay.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] when there is no such view, or the prior's maps do not have the size it states.
+    pub fn set_prior(&mut self, index: usize, prior: Option<&DepthPrior>) -> Result<(), TrainError> {
+        let section = self.view_section(index)?;
+        let resident = &mut self.views[index];
+        if let Some(why) = prior.and_then(broken) {
+            return Err(TrainError::BadView { name: format!("view {index}"), why: why.to_owned() });
+        }
+        let (width, pixels) = (resident.width, resident.width as usize * resident.height as usize);
+        let (colours, depths) = self.arena.slice_mut::<u32>(section).split_at_mut(pixels);
         let range = prior.and_then(depth_range);
         depths.fill(0);
-        for (i, p) in image.pixels().enumerate() {
+        for (i, colour) in colours.iter_mut().enumerate() {
             let mut confidence = 0u8;
             if let (Some(prior), Some((low, high))) = (prior, range) {
                 let x = ((i as u32 % width) as f32 + 0.5) / width as f32 * prior.width as f32;
-                let y = ((i as u32 / width) as f32 + 0.5) / height as f32 * prior.height as f32;
+                let y = ((i as u32 / width) as f32 + 0.5) / resident.height as f32 * prior.height as f32;
                 let at = (y as usize).min(prior.height as usize - 1) * prior.width as usize
                     + (x as usize).min(prior.width as usize - 1);
                 if usable(prior, at) {
@@ -59,16 +83,46 @@ impl Trainer {
                     depths[i / 2] |= quantum << (16 * (i as u32 % 2));
                 }
             }
-            colours[i] = u32::from_le_bytes([p[0], p[1], p[2], confidence]);
+            *colour = (*colour & 0x00ff_ffff) | u32::from(confidence) << 24;
         }
-        self.pipelines.bind_view(index, &self.arena, section);
-        let mut view = picture.view;
-        view.intrinsics = view.intrinsics.resized(width, height);
-        let depth_at = if range.is_some() { pixels as u32 } else { 0 };
-        let adjust = super::pose::Adjust::default();
-        self.views.push(Resident { view, width, height, depth_at, last_loss: f32::INFINITY, adjust });
-        self.sampler.forget();
-        Ok(index)
+        resident.depth_at = if range.is_some() { pixels as u32 } else { 0 };
+        Ok(())
+    }
+
+    /// Another camera for the picture of view `index`, as if it had been added with it: what was learnt of its exposure and
+    /// loss is forgotten.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] when there is no such view, or the camera is not usable.
+    pub fn renew_view(&mut self, index: usize, view: View) -> Result<(), TrainError> {
+        self.view_section(index)?;
+        if let Some(why) = unusable(&view) {
+            return Err(TrainError::BadView { name: format!("view {index}"), why: why.to_owned() });
+        }
+        let resident = &mut self.views[index];
+        let intrinsics = view.intrinsics.resized(resident.width, resident.height);
+        resident.view = View { intrinsics, pose: view.pose };
+        (resident.last_loss, resident.adjust) = (f32::INFINITY, super::pose::Adjust::default());
+        Ok(())
+    }
+
+    /// The picture of view `index` as it is trained on; `None` when there is no such view.
+    pub fn view_image(&mut self, index: usize) -> Option<RgbImage> {
+        let section = self.view_section(index).ok()?;
+        let (width, height) = (self.views[index].width, self.views[index].height);
+        let words = self.arena.slice::<u32>(section);
+        let rgb = words.iter().take(width as usize * height as usize).flat_map(|w| w.to_le_bytes().into_iter().take(3));
+        RgbImage::from_raw(width, height, rgb.collect())
+    }
+
+    fn view_section(&self, index: usize) -> Result<Section, TrainError> {
+        let Some(resident) = self.views.get(index) else {
+            return Err(TrainError::BadView { name: format!("view {index}"), why: "does not exist".to_owned() });
+        };
+        let offset =
+            self.arena.section("views").offset + index as u64 * config::plan::view_bytes(self.plan.pixels as u64);
+        let pixels = u64::from(resident.width) * u64::from(resident.height);
+        Ok(Section { offset, bytes: config::plan::view_bytes(pixels) })
     }
 
     /// The largest size of the same shape that the plan holds.
@@ -92,18 +146,13 @@ impl Trainer {
         self.views.get(index).map(|v| v.view)
     }
 
-    /// Number of resident views.
-    pub fn view_count(&self) -> usize {
-        self.views.len()
-    }
-
     /// Replaces the camera pose of view `index` (a better estimate arrived); its picture stays.
     ///
     /// # Errors
     /// [`TrainError::BadView`] when there is no such view or the pose is not finite.
     pub fn set_pose(&mut self, index: usize, pose: Pose) -> Result<(), TrainError> {
         let bad = |why: &str| TrainError::BadView { name: format!("view {index}"), why: why.to_owned() };
-        if !pose_is_sound(&pose) {
+        if !is_usable(&pose) {
             return Err(bad("its pose is not finite"));
         }
         self.views.get_mut(index).ok_or_else(|| bad("does not exist"))?.view.pose = pose;
@@ -111,30 +160,31 @@ impl Trainer {
     }
 }
 
-pub(crate) fn pose_is_sound(pose: &Pose) -> bool {
+pub(crate) fn is_usable(pose: &Pose) -> bool {
     pose.center.is_finite() && pose.rotation.is_finite() && pose.rotation.length_squared() > 1e-12
 }
 
 fn check(picture: &PosedImage, prior: Option<&DepthPrior>) -> Result<(), TrainError> {
     let bad = |why: &str| Err(TrainError::BadView { name: picture.name.clone(), why: why.to_owned() });
-    let lens = picture.view.intrinsics;
     if picture.image.width() == 0 || picture.image.height() == 0 {
         return bad("has no pixels");
     }
-    let lens_is_sound = [lens.fx, lens.fy, lens.cx, lens.cy].iter().all(|v| v.is_finite());
-    if !lens_is_sound || lens.fx <= 0.0 || lens.fy <= 0.0 || lens.width == 0 || lens.height == 0 {
-        return bad("its focal length or principal point is not usable");
+    unusable(&picture.view).or(prior.and_then(broken)).map_or(Ok(()), bad)
+}
+
+fn unusable(view: &View) -> Option<&'static str> {
+    let lens = view.intrinsics;
+    let finite = [lens.fx, lens.fy, lens.cx, lens.cy].iter().all(|v| v.is_finite());
+    if !finite || lens.fx <= 0.0 || lens.fy <= 0.0 || lens.width == 0 || lens.height == 0 {
+        return Some("its focal length or principal point is not usable");
     }
-    if !pose_is_sound(&picture.view.pose) {
-        return bad("its pose is not finite");
-    }
-    if let Some(p) = prior {
-        let n = p.width as usize * p.height as usize;
-        if n == 0 || p.depth.len() != n || p.confidence.len() != n {
-            return bad("its depth prior's maps do not have the stated size");
-        }
-    }
-    Ok(())
+    (!is_usable(&view.pose)).then_some("its pose is not finite")
+}
+
+fn broken(prior: &DepthPrior) -> Option<&'static str> {
+    let n = prior.width as usize * prior.height as usize;
+    let whole = n > 0 && prior.depth.len() == n && prior.confidence.len() == n;
+    (!whole).then_some("its depth prior's maps do not have the stated size")
 }
 
 fn usable(prior: &DepthPrior, at: usize) -> bool {

@@ -1,5 +1,5 @@
-//! Adam (Kingma & Ba 2015) and what *deferred* means: a Gaussian that is not seen in a step has gradient zero there,
-//! its moments decay and its parameters still drift along the first moment. The shaders make up for k such steps at
+//! Adam (Kingma & Ba 2015) and lazy Adam updates of Gaussians outside the view: such a one has gradient zero,
+//! its moments decay and its parameters still drift along the first moment. The shaders take k such steps at
 //! once when the Gaussian is next needed; this twin takes them one by one and is the judge of the shortcut.
 
 use half::f16;
@@ -27,7 +27,7 @@ pub fn adam<R: Real>(parameter: &mut R, moments: &mut Moments<R>, g: R, rate: R,
     *parameter -= rate * first / (second.sqrt() + R::of(ADAM_EPSILON.into()));
 }
 
-/// What `k = rates.len()` unseen steps after step `t` amount to: the factor of m/√v, and what becomes of the moments.
+/// What `k = rates.len()` missed steps after step `t` amount to: the factor of m/√v, and what becomes of the moments.
 ///
 /// With g = 0, m and v only decay, so Δ = −(m/√v) Σⱼ rateⱼ (β₁/√β₂)ʲ √(1 − β₂^{t+j}) / (1 − β₁^{t+j}); ε = 1e-15 is left out.
 pub fn deferred(rates: &[f64], t: u32) -> (f64, f64, f64) {

@@ -9,7 +9,7 @@
 use super::camera::Camera;
 use super::gaussian::Gaussian;
 use super::real::{Mat3, Real, Vec3, apply, rotation_of, sigmoid};
-use super::sh;
+use super::shade::shade;
 use crate::constants::{ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, NEAR, SCALE_LIMIT, TRANSMITTANCE_MIN};
 
 /// Where the formulas are cut off. [`Limits::default`] is what the shaders use; gradient checks take
@@ -151,7 +151,7 @@ pub fn project<R: Real>(
     }
     let v: Vec3<R> = std::array::from_fn(|k| g.mean[k] - camera.center[k]);
     let norm = super::real::dot(v, v).sqrt();
-    let colour = sh::colour(degree, v.map(|k| k / norm), &g.sh);
+    let colour = shade(degree, v.map(|k| k / norm), &g.sh);
     let inverse_det = R::ONE / geo.det;
     let conic = [geo.cov[2] * inverse_det, -geo.cov[1] * inverse_det, geo.cov[0] * inverse_det];
     let mean2d: [R; 2] = std::array::from_fn(|k| camera.focal[k] * geo.p[k] / geo.p[2] + camera.principal[k]);

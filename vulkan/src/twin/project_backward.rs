@@ -11,7 +11,7 @@ use super::camera::Camera;
 use super::gaussian::Gaussian;
 use super::project::{Culled, Limits, Projected, geometry};
 use super::real::{Mat3, Real, Vec3, apply, apply_transposed, cross, dot, rotation_of_backward, sigmoid};
-use super::sh;
+use super::shade::shade_backward;
 
 /// dL/d of each field of [`Projected`].
 pub type ProjectedGradient<R> = Projected<R>;
@@ -86,7 +86,7 @@ pub fn project_backward<R: Real>(
     dp[2] += upstream.depth;
 
     let v: Vec3<R> = std::array::from_fn(|k| g.mean[k] - camera.center[k]);
-    let (sh, d_direction) = sh::colour_backward(degree, v, &g.sh, upstream.colour);
+    let (sh, d_direction) = shade_backward(degree, v, &g.sh, upstream.colour);
     let world = apply_transposed(w, dp);
     let mean = std::array::from_fn(|k| world[k] + d_direction[k]);
 

@@ -8,9 +8,9 @@
 //! Gaussian i is the pixel's total minus what has been passed: dL/dαᵢ = Tᵢ (cᵢ·g) − (rest behind)/(1 − αᵢ).
 
 use super::camera::Camera;
+use super::emit::{Instances, tile_grid};
 use super::project::{Limits, Projected};
 use super::real::Real;
-use super::tiles::{Instances, tile_grid};
 use crate::constants::{ALPHA_MAX, TILE_HEIGHT, TILE_WIDTH};
 
 /// What a pixel receives, or the loss' gradient to it.

@@ -3,13 +3,13 @@
 use config::training::LossSettings;
 
 use super::camera::Camera;
+use super::emit::{Instances, emit};
 use super::gaussian::Gaussian;
 use super::loss::{Exposure, Loss, Target, loss};
 use super::project::{Culled, Limits, Projected, project};
 use super::project_backward::project_backward;
 use super::rasterise::{Pixel, rasterise, rasterise_backward};
 use super::real::Real;
-use super::tiles::{Instances, emit_and_sort};
 
 /// What the forward half leaves behind.
 #[derive(Clone, Debug)]
@@ -35,7 +35,7 @@ pub fn forward<R: Real>(
     let results: Vec<_> =
         cloud.iter().enumerate().map(|(i, g)| project(g, camera, degree(i), opacity_scale(i), limits)).collect();
     let projected: Vec<_> = results.iter().map(|r| r.ok()).collect();
-    let instances = emit_and_sort(&projected, camera, limits);
+    let instances = emit(&projected, camera, limits);
     let picture = rasterise(&projected, &instances, camera, limits);
     Forward { projected, culled: results.into_iter().map(Result::err).collect(), instances, picture }
 }

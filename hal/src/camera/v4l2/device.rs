@@ -11,7 +11,9 @@ use moq_v4l::video::Capture;
 use moq_v4l::{Device, Format, FourCC};
 use rustix::io::Errno;
 
-use super::{Picture, Stamp, Stream, video, yuyv};
+use super::stream::{Stamp, Stream, video};
+use super::yuyv;
+use crate::camera::picture::Picture;
 use crate::error::{ErrorKind, HalError};
 
 /// Buffers the driver fills in turn.

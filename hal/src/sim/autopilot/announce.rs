@@ -3,8 +3,8 @@
 use super::Autopilot;
 use crate::error::HalError;
 use crate::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag};
-use crate::sim::dice::{About, strikes};
 use crate::sim::messages;
+use crate::sim::random::{About, strikes};
 use crate::traits::Link;
 
 /// PX4's custom mode: main mode AUTO (4), sub-mode MISSION (4).

@@ -62,7 +62,7 @@ pub fn octaves(x: f64, y: f64, footprint_m: f32, octaves: &[(f32, f32)], seed: u
         let fade = fade(wavelength, footprint_m);
         if fade > 0.0 {
             let s = 1.0 / f64::from(wavelength);
-            sum += amplitude * fade * noise(x * s, y * s, seed.wrapping_add(i as u32 * 0x68E3_1DA4));
+            sum += amplitude * fade * noise(x * s, y * s, seed.wrapping_add((i as u32).wrapping_mul(0x68E3_1DA4)));
         }
     }
     sum

@@ -172,25 +172,44 @@ fn nan_points_wrong_sizes_and_no_edges_are_survived() {
     assert!(none.sigma.is_empty() && none.maps.iter().all(Option::is_none));
 }
 
-/// The paper's way: Adam over log σ and log depth on the same objective from the same start, rate falling by a cosine as in
-/// DUSt3R. Returns σ.
-fn gradient_descent(views: &[View], edges: &[Edge], steps: usize, rate: f64) -> DVector<f64> {
-    let usable = vec![true; edges.len()];
-    let (terms, pixels) = gather(views, edges, &usable);
-    let (sigma, alive) = start::sigma(&terms, &pixels, &usable, edges.len());
-    let reference: Vec<f64> = pixels.iter().map(|p| start::depth(&terms, p, &sigma, &alive)).collect();
-    let mut parameters: Vec<f64> = sigma.iter().chain(&reference).map(|v| v.ln()).collect();
+/// What the closed steps minimise: Σ C ρ(‖r‖ / d), d being the start's depths, with ρ of which [`reweight`]'s weight is
+/// ρ′(x) / x: OUTLIER · atan(x / OUTLIER), a parabola below FLOOR.
+fn robust_cost(terms: &[Term], pixels: &[Pixel], reference: &[f64], parameters: &[f64], edges: usize) -> f64 {
+    let mut sum = 0.0;
+    for (p, pixel) in pixels.iter().enumerate() {
+        let depth = parameters[edges + p].exp();
+        for term in &terms[pixel.terms.clone()] {
+            let r = pixel.ray * depth - term.b - term.a * parameters[term.edge].exp();
+            let x = r.length() / reference[p];
+            let parabola = (x.min(FLOOR).powi(2) / FLOOR - FLOOR) / 2.0;
+            sum += term.confidence * (OUTLIER * (x.max(FLOOR) / OUTLIER).atan() + parabola);
+        }
+    }
+    sum
+}
+
+/// The paper's way: Adam over log σ and log depth from the given start on [`robust_cost`], the rate falling by a cosine as in
+/// DUSt3R.
+fn adam(
+    (terms, pixels, reference): (&[Term], &[Pixel], &[f64]),
+    mut parameters: Vec<f64>,
+    edges: usize,
+    steps: usize,
+    rate: f64,
+) -> Vec<f64> {
     let mut moments = vec![[0.0f64; 2]; parameters.len()];
     for t in 0..steps {
         let mut gradient = vec![0.0; parameters.len()];
         for (p, pixel) in pixels.iter().enumerate() {
-            let depth = parameters[edges.len() + p].exp();
+            let depth = parameters[edges + p].exp();
             for term in &terms[pixel.terms.clone()] {
                 let sigma = parameters[term.edge].exp();
                 let r = pixel.ray * depth - term.b - term.a * sigma;
-                let slope = r * (term.confidence / (r.length().max(1e-9) * reference[p]));
+                let relative = r.length() / reference[p];
+                let weight = 1.0 / (relative.max(FLOOR) * (1.0 + (relative / OUTLIER).powi(2)));
+                let slope = r * (term.confidence * weight / reference[p].powi(2));
                 gradient[term.edge] -= slope.dot(term.a) * sigma;
-                gradient[edges.len() + p] += slope.dot(pixel.ray) * depth;
+                gradient[edges + p] += slope.dot(pixel.ray) * depth;
             }
         }
         let now = rate * 0.5 * (1.0 + (std::f64::consts::PI * t as f64 / steps as f64).cos());
@@ -200,32 +219,50 @@ fn gradient_descent(views: &[View], edges: &[Edge], steps: usize, rate: f64) -> 
             *x -= now * unbiased[0] / (unbiased[1].sqrt() + 1e-12);
         }
     }
-    DVector::from_iterator(edges.len(), parameters[..edges.len()].iter().map(|v| v.exp()))
+    parameters
 }
 
-/// Why the steps are closed ones: with a fifth of outliers, what a few of them reach, 500 steps of gradient descent do
-/// not, at any of four rates.
+/// Why the steps are closed ones: on the same objective from the same start, with a fifth of outliers, a few dozen of them
+/// come as near to the least cost and to the truth as 500 steps of Adam at the best of four rates, and need no rate.
 #[test]
-fn closed_steps_come_closer_to_the_truth_than_five_hundred_gradient_steps() {
+fn a_few_closed_steps_do_what_five_hundred_of_adam_do_at_the_best_rate_on_the_same_objective() {
     let mut rng = Pcg64Mcg::seed_from_u64(9);
     let views: Vec<View> = (0..6).map(|i| view(12.0 * i as f64, (i % 2) as f64 * 5.0, 0.05 * i as f64)).collect();
     let pairs: Vec<(usize, usize)> = (0..6).flat_map(|i| (i + 1..(i + 3).min(6)).map(move |j| (i, j))).collect();
     let truth: Vec<f64> = pairs.iter().map(|_| rng.random_range(5.0..80.0)).collect();
     let edges: Vec<Edge> =
         pairs.iter().zip(&truth).map(|((i, j), s)| edge(&views, *i, *j, *s, 0.2, 0.01, &mut rng)).collect();
-    let off = |sigma: &DVector<f64>| sigma.iter().zip(&truth).map(|(s, t)| (s / t - 1.0).abs()).fold(0.0, f64::max);
-    let clock = std::time::Instant::now();
+    let n = edges.len();
     let closed = align(&views, &edges, 500);
-    let closed_ms = clock.elapsed().as_secs_f64() * 1e3;
-    let clock = std::time::Instant::now();
-    let descended = [0.1, 0.03, 0.01, 0.003].map(|rate| off(&gradient_descent(&views, &edges, 500, rate)));
-    let descent_ms = clock.elapsed().as_secs_f64() * 1e3 / 4.0;
-    let least = descended.iter().copied().fold(f64::INFINITY, f64::min);
+    let usable = vec![true; n];
+    let (terms, pixels) = gather(&views, &edges, &usable);
+    let (sigma, alive) = start::sigma(&terms, &pixels, &usable, n);
+    let reference: Vec<f64> = pixels.iter().map(|p| start::depth(&terms, p, &sigma, &alive)).collect();
+    let begin: Vec<f64> = sigma.iter().chain(&reference).map(|v| v.ln()).collect();
+    // The closed solution's depths, to compare costs: each pixel's best one at the final σ, by the same reweighting.
+    let found = DVector::from_iterator(n, closed.sigma.iter().map(|s| s.unwrap()));
+    let mut weights = vec![1.0; terms.len()];
+    for _ in 0..50 {
+        reweight(&terms, &pixels, &reference, &found, &alive, &mut weights);
+    }
+    let depths = pixels.iter().map(|p| best_depth(&terms, p, &weights, &found, &alive).unwrap());
+    let solution: Vec<f64> = found.iter().copied().chain(depths).map(f64::ln).collect();
+    let cost = |parameters: &[f64]| robust_cost(&terms, &pixels, &reference, parameters, n);
+    let off = |p: &[f64]| p.iter().zip(&truth).map(|(s, t)| (s.exp() / t - 1.0).abs()).fold(0.0, f64::max);
+    let descended = [0.1, 0.03, 0.01, 0.003].map(|rate| {
+        let p = adam((&terms, &pixels, &reference), begin.clone(), n, 500, rate);
+        (cost(&p), off(&p))
+    });
     println!(
-        "σ off by {:.5} after {} closed steps in {closed_ms:.1} ms; by {least:.5} at the best of four rates after 500 of \
-         gradient descent in {descent_ms:.1} ms",
-        error(&closed, &truth),
-        closed.steps
+        "start {:.2}; {} closed steps: cost {:.2}, σ off by {:.5}; 500 of Adam: {descended:.5?}",
+        cost(&begin),
+        closed.steps,
+        cost(&solution),
+        off(&solution)
     );
-    assert!(descended.iter().all(|d| error(&closed, &truth) < *d), "{descended:?} against {}", error(&closed, &truth));
+    let best = descended.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
+    assert!(closed.steps * 10 < 500, "{} steps", closed.steps);
+    assert!(cost(&solution) < 1.005 * best.0 && cost(&solution) < cost(&begin), "{best:?}");
+    assert!(off(&solution) < 1.2 * best.1, "{best:?}");
+    assert!(descended.iter().any(|d| d.0 > cost(&begin)), "a rate that makes it worse: {descended:?}");
 }

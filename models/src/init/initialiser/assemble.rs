@@ -7,10 +7,9 @@ use config::init::InitSettings;
 use rayon::prelude::*;
 
 use super::{Initialiser, VOXELS_PER_GAUSSIAN};
-use crate::camera::{DepthPrior, View};
+use crate::camera::{DepthPrior, Pinhole, View};
 use crate::init::consistency::{ConsistencyCount, resolve};
 use crate::init::fill::continued;
-use crate::init::frame::unproject;
 use crate::init::merge::{Sample, VoxelMerge};
 use crate::init::pairs::{SkippedPairs, partners};
 use crate::init::report::Initialisation;
@@ -37,7 +36,7 @@ impl Initialiser {
             let k = &frame.view.intrinsics;
             if let Some(depth) = self.typical_depth(i) {
                 spacing.push((depth as f32 * self.settings.stride as f32 / k.fx.max(k.fy), depth as f32));
-                center += unproject(&frame.view, k.cx, k.cy, depth as f32).as_dvec3() / self.frames.len() as f64;
+                center += Pinhole::from(&frame.view).unproject([k.cx, k.cy], depth) / self.frames.len() as f64;
             }
         }
         spacing.sort_by(|a, b| a.0.total_cmp(&b.0));

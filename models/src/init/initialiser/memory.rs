@@ -1,7 +1,7 @@
 //! Host memory of the initialisation, planned from the number of pictures and Gaussians before the first picture.
 
 use super::assemble::AHEAD;
-use super::{Initialiser, Network, VOXELS_PER_GAUSSIAN};
+use super::{Initialiser, Pairs, VOXELS_PER_GAUSSIAN};
 use crate::init::merge::VoxelMerge;
 use crate::init::unposed;
 
@@ -22,10 +22,20 @@ impl Initialiser {
     /// caller still holds of the pictures themselves is not in it.
     pub fn planned_bytes(&self, pictures: usize, max_gaussians: usize) -> u64 {
         let pixels = self.frames.first().map_or(640 * 480, |f| f.view.intrinsics.pixels()) as u64;
+        self.planned(pixels, pictures, max_gaussians)
+    }
+
+    /// The same before the first picture, for pictures of `size`.
+    pub fn planned_bytes_at(&self, size: (u32, u32), pictures: usize, max_gaussians: usize) -> u64 {
+        let (width, height) = self.network_size(size);
+        self.planned(u64::from(width) * u64::from(height), pictures, max_gaussians)
+    }
+
+    fn planned(&self, pixels: u64, pictures: usize, max_gaussians: usize) -> u64 {
         let samples = pixels / u64::from(self.settings.stride).pow(2);
-        let network = match &self.network {
-            Network::Posed(n) => n.planned_bytes(pixels),
-            Network::Unposed(n) => {
+        let network = match &self.pairs {
+            Pairs::Posed(n) => n.planned_bytes(pixels),
+            Pairs::Unposed(n) => {
                 let edges = pictures * (self.settings.window + self.settings.covisible);
                 n.planned_bytes(pixels) + unposed::planned_bytes(pictures as u64, edges as u64, samples)
             }

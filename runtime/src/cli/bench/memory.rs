@@ -53,7 +53,7 @@ pub struct Args {
 /// Runs `dgtr bench memory`.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
-    let temporary = tempfile::tempdir().map_err(CliError::failed)?;
+    let temporary = tempfile::tempdir()?;
     let out = args.out.clone().unwrap_or_else(|| temporary.path().to_path_buf());
     let dataset = match &args.dataset {
         Some(root) => root.clone(),

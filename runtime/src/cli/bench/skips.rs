@@ -63,7 +63,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             toml::from_str(&text).map_err(|e| CliError::input(format!("{}: {e}", path.display())))?
         }
     };
-    let temporary = tempfile::tempdir().map_err(CliError::failed)?;
+    let temporary = tempfile::tempdir()?;
     let out = args.out.clone().unwrap_or_else(|| temporary.path().to_path_buf());
     let dataset = match &args.dataset {
         Some(root) => root.clone(),

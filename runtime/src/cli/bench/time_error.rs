@@ -123,7 +123,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         page.tables.push(compared);
     }
     let path = args.out.join("report.html");
-    page.write(&path).map_err(CliError::failed)?;
+    page.write(&path)?;
     println!("{}", path.display());
     Ok(())
 }

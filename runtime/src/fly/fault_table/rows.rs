@@ -1,7 +1,13 @@
 //! The rows of the fault table: one fault each, what it must leave in the counters, and what the mission must end with.
 
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::time::Duration;
 
+use config::disk::bounded::Bounded;
+use config::disk::{Disk, Operations, Output, System};
 use config::link::Signing;
 use hal::counters::HalCounters;
 use hal::failsafe::Action;
@@ -168,6 +174,29 @@ pub(super) const ROWS: &[Row] = &[
         ..USUAL
     },
     Row {
+        fault: "every picture 40 s late",
+        settings: &[("SIM_PIC_LATE", 100.0), ("SIM_PIC_LATE_S", 40.0)],
+        noticed: |c, r| {
+            r.pictures.late == EXPOSURES && c.pictures_reconciled == EXPOSURES && c.posed_frames == EXPOSURES
+        },
+        rung: Action::Warn,
+        ..USUAL
+    },
+    Row {
+        fault: "somebody says disarmed, twice a second",
+        settings: &[("SIM_FORGE_DISARM", 1.0), ("SIM_FLT_START", 12.0)],
+        noticed: |c, r| r.completed && c.posed_frames == EXPOSURES,
+        ..USUAL
+    },
+    Row {
+        fault: "never disarmed, silent after the flight",
+        settings: &[],
+        also: |script| script.sim.autopilot.stays_armed = true,
+        noticed: |c, _| c.posed_frames == EXPOSURES && c.link_losses == 1,
+        rung: Action::Warn,
+        ..USUAL
+    },
+    Row {
         fault: "black pictures",
         settings: &[("SIM_PIC_BLACK", 40.0)],
         noticed: |c, r| r.pictures.spoiled > 0 && c.pictures_black == r.pictures.spoiled,
@@ -236,6 +265,32 @@ pub(super) const ROWS: &[Row] = &[
         ..USUAL
     },
     Row {
+        fault: "disk full after 40 kB",
+        also: |script| script.disk = |out| Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(40_000)))),
+        noticed: |c, _| c.posed_frames == EXPOSURES,
+        // Key frames that are not kept are trained on all the same; the last checkpoint waits for room.
+        end: End::Checkpoint(3, 10),
+        ..USUAL
+    },
+    Row {
+        fault: "disk read-only from the 13th file on",
+        also: |script| script.disk = |_| Disk::new(ReadOnlyAfter(AtomicU32::new(12))),
+        noticed: |c, _| c.posed_frames == EXPOSURES,
+        end: End::Checkpoint(3, 9),
+        ..USUAL
+    },
+    Row {
+        fault: "model and list of key frames damaged before the start",
+        also: |script| {
+            script.before = |out| {
+                std::fs::create_dir_all(out.join("keyframes")).expect("folder");
+                std::fs::write(out.join("model.dgtr"), b"dgtr\r\n\x1a\n, cut").expect("damaged");
+                std::fs::write(out.join("keyframes/transforms.json"), b"{ \"camera_model\":").expect("damaged");
+            };
+        },
+        ..USUAL
+    },
+    Row {
         fault: "Ctrl-C at 25 s, while it trains",
         also: |script| script.interrupt_at = Some(Duration::from_secs(25)),
         noticed: |c, r| !r.completed && c.posed_frames > 0 && c.posed_frames < EXPOSURES,
@@ -247,4 +302,46 @@ pub(super) const ROWS: &[Row] = &[
 fn signed(script: &mut Script) {
     script.sim.autopilot.signing_key = Some(KEY);
     script.vehicle.link.signing = Signing::Require;
+}
+
+/// A file system that becomes read-only, as ext4 does after an error, once so many files were made.
+#[derive(Debug)]
+struct ReadOnlyAfter(AtomicU32);
+
+impl ReadOnlyAfter {
+    fn checked<T>(&self, made: u32, act: impl FnOnce() -> io::Result<T>) -> io::Result<T> {
+        let left = self.0.load(Ordering::Relaxed);
+        self.0.store(left.saturating_sub(made), Ordering::Relaxed);
+        if left == 0 { Err(io::ErrorKind::ReadOnlyFilesystem.into()) } else { act() }
+    }
+}
+
+impl Operations for ReadOnlyAfter {
+    fn make_folder(&self, path: &Path) -> io::Result<()> {
+        self.checked(0, || System.make_folder(path))
+    }
+
+    fn create(&self, path: &Path) -> io::Result<Box<dyn Output>> {
+        self.checked(1, || System.create(path))
+    }
+
+    fn append(&self, path: &Path) -> io::Result<Box<dyn Output>> {
+        self.checked(0, || System.append(path))
+    }
+
+    fn link(&self, from: &Path, to: &Path) -> io::Result<()> {
+        self.checked(0, || System.link(from, to))
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        self.checked(0, || System.rename(from, to))
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        self.checked(0, || System.remove(path))
+    }
+
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        System.sync_folder(path)
+    }
 }

@@ -3,13 +3,12 @@
 use std::sync::atomic::AtomicBool;
 
 use super::*;
+use crate::keys::Identity;
+use crate::upload::admission::Admission;
 use crate::upload::receive::Receiver;
-
-fn noise(n: usize, seed: u8) -> Vec<u8> {
-    let mut bytes = vec![0; n];
-    blake3::Hasher::new_keyed(&[seed; 32]).finalize_xof().fill(&mut bytes);
-    bytes
-}
+use crate::upload::testing::noise;
+#[cfg(feature = "zenoh")]
+use crate::upload::testing::{certificates, free_port, knows_localhost};
 
 /// Writes a model as checkpoints are written: aside, then renamed.
 fn write_model(path: &Path, bytes: &[u8]) {
@@ -30,6 +29,16 @@ fn receive(r: &mut Receiver, limit: Duration, mut done: impl FnMut(&Receiver) ->
     false
 }
 
+/// A ground that takes any bytes for a model.
+fn anything(ids: &[&str]) -> Admission {
+    admission(ids, Identity::unsigned())
+}
+
+fn admission(ids: &[&str], identity: Identity) -> Admission {
+    let aircraft = ids.iter().map(|id| (*id).to_owned()).collect();
+    Admission { mission: "m".into(), aircraft, identity, check: Box::new(|_, _| Ok(())) }
+}
+
 const LIMIT: Duration = Duration::from_secs(60);
 
 #[test]
@@ -46,30 +55,24 @@ fn a_model_travels_through_a_folder_that_is_plugged_in_late() {
     };
     let path = dir.path().join("m.dgtr");
     write_model(&path, &noise(50_000, 1));
-    let o = Offerer::start(&settings, "m", "a1").expect("offerer");
+    let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(&path);
     assert!(!o.wait_delivered(Duration::from_millis(300), || true));
     assert!(o.status().failures > 0 && !o.status().last_error.is_empty());
     std::fs::create_dir(&stick).expect("plug in");
     assert!(o.wait_delivered(LIMIT, || true));
     o.shutdown();
-    let mut r = Receiver::open(&settings, "m", &["a1".into()], &dir.path().join("g")).expect("receiver");
+    let mut r = Receiver::open(&settings, anything(&["a1"]), &dir.path().join("g")).expect("receiver");
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
     assert_eq!(std::fs::read(&r.received()[0].path).expect("read"), noise(50_000, 1));
 }
 
 #[test]
 fn without_a_way_to_the_ground_nothing_is_waited_for() {
-    let o = Offerer::start(&UploadSettings::default(), "m", "a1").expect("offerer");
+    let o = Offerer::start(&UploadSettings::default(), Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(Path::new("/nonexistent"));
     assert!(!o.wait_delivered(LIMIT, || true));
     o.shutdown();
-}
-
-#[cfg(feature = "zenoh")]
-fn free_port() -> u16 {
-    let socket = std::net::TcpListener::bind("127.0.0.1:0").expect("bind");
-    socket.local_addr().expect("address").port()
 }
 
 #[cfg(feature = "zenoh")]
@@ -86,18 +89,18 @@ fn two_aircraft_deliver_over_loopback_tcp_whoever_starts_first() {
         poll_s: 0.2,
         ..Default::default()
     };
-    let ids = ["a1".to_owned(), "a2".to_owned()];
+    let ids = ["a1", "a2"];
     let paths = ["1.dgtr", "2.dgtr"].map(|n| dir.path().join(n));
     // The first aircraft is up before the ground, and replaces its model while it is on offer.
-    let a1 = Offerer::start(&settings, "m", "a1").expect("offerer");
+    let a1 = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
     write_model(&paths[0], &noise(300_000, 1));
     a1.offer(&paths[0]);
-    let mut r = Receiver::open(&settings, "m", &ids, &dir.path().join("g")).expect("receiver");
+    let mut r = Receiver::open(&settings, anything(&ids), &dir.path().join("g")).expect("receiver");
     assert!(receive(&mut r, LIMIT, |r| r.received().len() == 1));
     assert!(!r.received()[0].finished);
     write_model(&paths[0], &noise(3_000_000, 2));
     a1.offer_final(&paths[0]);
-    let a2 = Offerer::start(&settings, "m", "a2").expect("offerer");
+    let a2 = Offerer::start(&settings, Source::unsigned("m", "a2")).expect("offerer");
     write_model(&paths[1], &noise(1_000_000, 3));
     a2.offer_final(&paths[1]);
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?} {:?}", r.counters, a1.status());
@@ -125,15 +128,15 @@ fn a_ground_station_that_restarts_mid_transfer_resumes_over_the_network() {
     };
     let path = dir.path().join("m.dgtr");
     write_model(&path, &noise(8_000_000, 4));
-    let o = Offerer::start(&settings, "m", "a1").expect("offerer");
+    let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(&path);
-    let ids = ["a1".to_owned()];
-    let mut r = Receiver::open(&settings, "m", &ids, &dir.path().join("g")).expect("receiver");
+    let ids = ["a1"];
+    let mut r = Receiver::open(&settings, anything(&ids), &dir.path().join("g")).expect("receiver");
     assert!(receive(&mut r, LIMIT, |r| r.counters.chunks > 0));
     let first = r.counters.chunks;
     assert!(!r.all_finished());
     drop(r);
-    let mut r = Receiver::open(&settings, "m", &ids, &dir.path().join("g")).expect("receiver");
+    let mut r = Receiver::open(&settings, anything(&ids), &dir.path().join("g")).expect("receiver");
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
     assert_eq!(r.counters.chunks_reused, first);
     assert_eq!(r.counters.chunks + first, 489);
@@ -141,39 +144,11 @@ fn a_ground_station_that_restarts_mid_transfer_resumes_over_the_network() {
     assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(8_000_000, 4));
 }
 
-/// Writes a certificate authority and one certificate signed by it; returns the settings that use them.
-#[cfg(feature = "zenoh")]
-fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
-    use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
-    std::fs::create_dir_all(dir).expect("folder");
-    let ca_path = dir.join("ca.pem");
-    let ca_key_path = dir.join("ca.key");
-    let mut ca = CertificateParams::new(vec![]).expect("parameters");
-    ca.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-    let ca_key = match std::fs::read_to_string(&ca_key_path) {
-        Ok(pem) => KeyPair::from_pem(&pem).expect("key"),
-        Err(_) => {
-            let key = KeyPair::generate().expect("key");
-            std::fs::write(&ca_key_path, key.serialize_pem()).expect("write");
-            std::fs::write(&ca_path, ca.self_signed(&key).expect("sign").pem()).expect("write");
-            key
-        }
-    };
-    let key = KeyPair::generate().expect("key");
-    let own = CertificateParams::new(vec!["localhost".to_owned()]).expect("parameters");
-    let signed = own.signed_by(&key, &Issuer::from_params(&ca, &ca_key)).expect("sign");
-    let (certificate, key_path) = (dir.join(format!("{name}.pem")), dir.join(format!("{name}.key")));
-    std::fs::write(&certificate, signed.pem()).expect("write");
-    std::fs::write(&key_path, key.serialize_pem()).expect("write");
-    config::upload::TlsSettings { authority: ca_path, certificate, key: key_path }
-}
-
 #[cfg(feature = "zenoh")]
 #[test]
 fn over_tls_only_aircraft_of_the_same_authority_deliver() {
-    // The certificates are for the name; an empty container may not know it.
-    if std::net::ToSocketAddrs::to_socket_addrs(&("localhost", 0)).is_err() {
-        return println!("skipped: this machine does not know the name localhost (no /etc/hosts?)");
+    if !knows_localhost() {
+        return;
     }
     let dir = tempfile::tempdir().expect("temp dir");
     let endpoint = format!("tls/localhost:{}", free_port());
@@ -195,12 +170,13 @@ fn over_tls_only_aircraft_of_the_same_authority_deliver() {
     };
     let path = dir.path().join("m.dgtr");
     write_model(&path, &noise(500_000, 5));
-    let ids = ["friend".to_owned(), "stranger".to_owned()];
-    let mut r = Receiver::open(&ground, "m", &ids, &dir.path().join("g")).expect("receiver");
+    let ids = ["friend", "stranger"];
+    let mut r = Receiver::open(&ground, anything(&ids), &dir.path().join("g")).expect("receiver");
     let stranger = aircraft(certificates(&dir.path().join("theirs"), "stranger"));
-    let stranger = Offerer::start(&stranger, "m", "stranger").expect("offerer");
+    let stranger = Offerer::start(&stranger, Source::unsigned("m", "stranger")).expect("offerer");
     stranger.offer_final(&path);
-    let friend = Offerer::start(&aircraft(certificates(&ours, "friend")), "m", "friend").expect("offerer");
+    let friend = Offerer::start(&aircraft(certificates(&ours, "friend")), Source::unsigned("m", "friend"));
+    let friend = friend.expect("offerer");
     friend.offer_final(&path);
     assert!(receive(&mut r, LIMIT, |r| !r.received().is_empty()), "{:?}", friend.status());
     assert!(friend.wait_delivered(LIMIT, || true));

@@ -1,0 +1,104 @@
+//! The disk plan of an aircraft's output folder: what a whole flight may take, and the least with which one can begin.
+
+use serde::Serialize;
+
+/// Key frames without which nothing is built.
+const MIN_KEY_FRAMES: u64 = 3;
+/// Bytes of a key frame in the list: its pose twice, its deviations, its name.
+const LIST_ENTRY: u64 = 2 << 10;
+/// What a lossless picture takes beside its pixels when nothing can be compressed: a filter byte per row, headers.
+const PICTURE_OVERHEAD: u64 = 16 << 10;
+/// A model's header per view, and its fixed part.
+const MODEL_VIEW: u64 = 128;
+const MODEL_FIXED: u64 = 4 << 10;
+/// Two generations, and the one being written.
+const GENERATIONS: u64 = 3;
+
+/// What will be written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DiskRequest {
+    /// Width of a key frame, pixels.
+    pub width: u32,
+    /// Height of a key frame, pixels.
+    pub height: u32,
+    /// Most key frames.
+    pub key_frames: u32,
+    /// Most Gaussians.
+    pub gaussians: usize,
+    /// Highest SH degree, 0…3.
+    pub sh_degree: u8,
+}
+
+/// Bytes by what they are for; what a folder takes stays below.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct DiskPlan {
+    /// Name and bytes.
+    pub sections: Vec<(&'static str, u64)>,
+    /// All of it.
+    pub total_bytes: u64,
+    /// The first key frames, and the first checkpoint while the second is written.
+    pub min_bytes: u64,
+}
+
+/// Why a flight cannot begin.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "disk plan: {allowed_mib} MiB are too few for the first {MIN_KEY_FRAMES} key frames and two checkpoints; at least {needed_mib} \
+     MiB are needed (make room, raise memory.disk_mib, or use fewer Gaussians or smaller pictures)"
+)]
+pub struct DiskPlanError {
+    /// What there is.
+    pub allowed_mib: u64,
+    /// What the least takes.
+    pub needed_mib: u64,
+}
+
+impl DiskPlan {
+    /// The plan of a flight.
+    pub fn new(r: &DiskRequest) -> Self {
+        let frames = u64::from(r.key_frames);
+        let picture = 3 * u64::from(r.width) * u64::from(r.height) + PICTURE_OVERHEAD;
+        let floats = 11 + 3 * (u64::from(r.sh_degree) + 1).pow(2);
+        let model = |views: u64| 4 * floats * r.gaussians as u64 + MODEL_VIEW * views + MODEL_FIXED;
+        let sections = vec![
+            ("key frames", frames * picture),
+            ("their list", GENERATIONS * frames * LIST_ENTRY),
+            ("checkpoints", GENERATIONS * model(frames)),
+        ];
+        Self {
+            total_bytes: sections.iter().map(|s| s.1).sum(),
+            sections,
+            min_bytes: MIN_KEY_FRAMES * (picture + GENERATIONS * LIST_ENTRY) + 2 * model(MIN_KEY_FRAMES),
+        }
+    }
+
+    /// Whether a flight can begin with `bytes` to write to; false when it can, but not to its planned end.
+    ///
+    /// # Errors
+    /// [`DiskPlanError`] when there is too little for a first model.
+    pub fn fits(&self, bytes: u64) -> Result<bool, DiskPlanError> {
+        if bytes < self.min_bytes {
+            let (allowed_mib, needed_mib) = (bytes >> 20, self.min_bytes.div_ceil(1 << 20));
+            return Err(DiskPlanError { allowed_mib, needed_mib });
+        }
+        Ok(bytes >= self.total_bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flight_that_fits_begins_one_that_nearly_fits_is_told_and_one_without_room_is_refused() {
+        let request = DiskRequest { width: 640, height: 480, key_frames: 128, gaussians: 100_000, sh_degree: 3 };
+        let plan = DiskPlan::new(&request);
+        // 128 pictures of 921,600 bytes, three models of 23.6 MB.
+        assert!((180 << 20..190 << 20).contains(&plan.total_bytes), "{}", plan.total_bytes);
+        assert_eq!(plan.fits(plan.total_bytes), Ok(true));
+        assert_eq!(plan.fits(plan.total_bytes - 1), Ok(false));
+        assert_eq!(plan.fits(plan.min_bytes), Ok(false));
+        let said = plan.fits(plan.min_bytes - 1).map_err(|e| e.to_string()).unwrap_err();
+        assert!(said.contains("memory.disk_mib") && said.lines().count() == 1, "{said}");
+    }
+}

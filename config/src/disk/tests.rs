@@ -1,0 +1,118 @@
+#![allow(clippy::unwrap_used)]
+
+use std::sync::atomic::AtomicU64;
+
+use super::bounded::{Bounded, bytes_below};
+use super::*;
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+fn write(disk: &Disk, path: &Path, text: &str) -> Result<(), DiskError> {
+    disk.replace_keeping(path, |out| out.write_all(text.as_bytes()))
+}
+
+#[test]
+fn two_generations_are_kept_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("deep/model.dgtr");
+    for text in ["first", "second", "third"] {
+        write(&Disk::default(), &path, text).unwrap();
+    }
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "third");
+    assert_eq!(std::fs::read_to_string(previous(&path)).unwrap(), "second");
+    assert_eq!(names(&dir.path().join("deep")), ["model.dgtr", "model.previous.dgtr"]);
+}
+
+#[test]
+fn generations_that_a_cut_left_as_one_file_come_apart_and_leave_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("model.dgtr");
+    write(&Disk::default(), &path, "first").unwrap();
+    // As it is between keeping the earlier one and replacing it.
+    std::fs::hard_link(&path, previous(&path)).unwrap();
+    write(&Disk::default(), &path, "second").unwrap();
+    assert_eq!(std::fs::read_to_string(previous(&path)).unwrap(), "first");
+    assert_eq!(names(dir.path()), ["model.dgtr", "model.previous.dgtr"]);
+}
+
+#[test]
+fn a_failed_write_leaves_the_old_content_and_no_temporary_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("list.json");
+    let limit = Arc::new(AtomicU64::new(100));
+    let disk = Disk::new(Bounded::new(System, dir.path(), limit.clone()));
+    write(&disk, &path, "old").unwrap();
+    let e = write(&disk, &path, &"x".repeat(200)).unwrap_err();
+    assert!(is_full(&e.source) && e.action == "writing", "{e}");
+    assert_eq!((std::fs::read_to_string(&path).unwrap().as_str(), names(dir.path()).len()), ("old", 1));
+    limit.store(1000, Ordering::Relaxed);
+    write(&disk, &path, &"x".repeat(200)).unwrap();
+    assert_eq!(bytes_below(dir.path()), 203);
+}
+
+#[test]
+fn a_damaged_file_is_set_aside_by_name_and_none_is_overwritten() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("model.dgtr");
+    for n in 1..=3 {
+        std::fs::write(&path, format!("damaged {n}")).unwrap();
+        assert_eq!(Disk::default().set_aside(&path).unwrap(), dir.path().join(format!("model.damaged-{n}.dgtr")));
+    }
+    assert_eq!(names(dir.path()).len(), 3);
+}
+
+#[test]
+fn of_two_generations_the_newest_sound_one_is_read_and_a_damaged_one_never_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("model.dgtr");
+    let disk = Disk::default();
+    let read = |p: &Path| match std::fs::read_to_string(p).unwrap() {
+        text if text.starts_with("sound") => Ok(text),
+        _ => Err(format!("{} is damaged", p.display())),
+    };
+    assert!(disk.newest(&path, read).unwrap().found.is_none());
+    for text in ["sound 1", "sound 2", "cut"] {
+        write(&disk, &path, text).unwrap();
+    }
+    let first = disk.newest(&path, read).unwrap();
+    assert_eq!((first.found.as_deref(), first.damaged.len()), (Some("sound 2"), 1));
+    let said = first.damaged[0].to_string();
+    assert!(said.contains("model.dgtr is damaged; set aside as") && said.ends_with("model.damaged-1.dgtr"), "{said}");
+    let again = disk.newest(&path, read).unwrap();
+    assert_eq!((again.found.as_deref(), again.damaged.len()), (Some("sound 2"), 0));
+    // The next write leaves both generations sound again.
+    write(&disk, &path, "sound 3").unwrap();
+    std::fs::write(&path, "cut").unwrap();
+    std::fs::write(previous(&path), "cut").unwrap();
+    let neither = disk.newest(&path, read).unwrap();
+    assert!(neither.found.is_none() && neither.damaged.len() == 2);
+    assert_eq!(names(dir.path()).len(), 3);
+}
+
+#[test]
+fn lines_go_on_behind_the_last_whole_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("out/geotags.csv");
+    for (found, whole) in [("a\nb\ntorn", "a\nb\n"), ("a\nb\0\0\0\n", "a\n"), ("torn", ""), ("a\n", "a\n")] {
+        std::fs::create_dir_all(dir.path().join("out")).unwrap();
+        std::fs::write(&path, found).unwrap();
+        Disk::default().append_lines(&path).unwrap().write_all(b"next\n").unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), format!("{whole}next\n"));
+    }
+}
+
+#[test]
+fn what_a_kill_left_is_swept_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    for name in [".dgtr-77-3", ".dgtr-1-0", "model.dgtr", ".profile"] {
+        std::fs::write(dir.path().join(name), name).unwrap();
+    }
+    assert_eq!(Disk::default().sweep(dir.path()), 2);
+    assert_eq!(names(dir.path()), [".profile", "model.dgtr"]);
+    assert_eq!(Disk::default().sweep(&dir.path().join("none")), 0);
+}

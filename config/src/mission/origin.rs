@@ -1,0 +1,10 @@
+//! `origin`: where the local East-North-Up frame lies. The type is shared with the `no_std` core, hence described here.
+
+use crate::geodesy::Geodetic;
+use crate::settings::{Limits, described};
+
+described!(Geodetic {
+    ["Latitude, north positive."] lat_deg: f64, in Limits::within(-90.0, 90.0);
+    ["Longitude, east positive."] lon_deg: f64, in Limits::within(-180.0, 180.0);
+    ["Height on whatever vertical scale the autopilot reports; only differences matter."] alt_m: f64;
+});

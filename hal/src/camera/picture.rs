@@ -1,0 +1,79 @@
+//! A picture as a camera hands it out: a file, a JPEG in memory or pixels; decoded only after a look at its header.
+
+use std::io::{BufRead, BufReader, Cursor, Seek};
+use std::path::{Path, PathBuf};
+
+use config::mission::CameraSettings;
+use image::{ImageReader, RgbImage};
+
+use super::jpeg::marked_as_mjpeg;
+use super::regular;
+use super::undistort::undistort;
+use crate::error::HalError;
+
+/// Pixels or where they are.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Picture {
+    /// A complete file.
+    Path(PathBuf),
+    /// A whole JPEG in memory, decoded when it is needed.
+    Jpeg(Vec<u8>),
+    /// Decoded pixels.
+    Rgb(RgbImage),
+}
+
+impl Picture {
+    /// The undistorted pixels of a picture taken with `lens`.
+    ///
+    /// # Errors
+    /// As [`Picture::decode`].
+    pub fn load(&self, lens: &CameraSettings) -> Result<RgbImage, HalError> {
+        Ok(undistort(self.decode(lens)?, lens))
+    }
+
+    /// The pixels of a picture taken with `lens`, as they left the camera.
+    ///
+    /// # Errors
+    /// [`HalError::Picture`] when it cannot be decoded or is not of the lens's size (checked before anything is
+    /// allocated).
+    pub fn decode(&self, lens: &CameraSettings) -> Result<RgbImage, HalError> {
+        let image = match self {
+            Self::Path(path) => {
+                let wrong = |e: std::io::Error| HalError::Picture { path: path.clone(), why: e.to_string() };
+                decode(BufReader::new(regular::open(path).map_err(wrong)?), path, lens)?
+            }
+            Self::Jpeg(bytes) => decode(Cursor::new(marked_as_mjpeg(bytes)), &self.name(), lens)?,
+            Self::Rgb(image) => image.clone(),
+        };
+        if image.dimensions() != (lens.width, lens.height) {
+            return Err(wrong_size(&self.name(), image.dimensions(), lens));
+        }
+        Ok(image)
+    }
+
+    /// File name, or a word for pixels without one.
+    pub fn name(&self) -> PathBuf {
+        match self {
+            Self::Path(path) => path.clone(),
+            Self::Jpeg(_) | Self::Rgb(_) => "of the camera program".into(),
+        }
+    }
+}
+
+fn wrong_size(path: &Path, (w, h): (u32, u32), lens: &CameraSettings) -> HalError {
+    let why = format!("{w}×{h} pixels, the mission's camera has {}×{}", lens.width, lens.height);
+    HalError::Picture { path: path.into(), why }
+}
+
+/// Decodes after a look at the header: a picture of another size is refused before it is allocated.
+fn decode(mut from: impl BufRead + Seek, path: &Path, lens: &CameraSettings) -> Result<RgbImage, HalError> {
+    let wrong = |why: String| HalError::Picture { path: path.into(), why };
+    let header = ImageReader::new(&mut from).with_guessed_format().map_err(|e| wrong(e.to_string()))?;
+    let size = header.into_dimensions().map_err(|e| wrong(e.to_string()))?;
+    if size != (lens.width, lens.height) {
+        return Err(wrong_size(path, size, lens));
+    }
+    from.rewind().map_err(|e| wrong(e.to_string()))?;
+    let reader = ImageReader::new(from).with_guessed_format().map_err(|e| wrong(e.to_string()))?;
+    Ok(reader.decode().map_err(|e| wrong(e.to_string()))?.into_rgb8())
+}

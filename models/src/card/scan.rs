@@ -1,0 +1,80 @@
+//! Which files below a few folders may be pictures.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::error::CardError;
+
+/// Names looked at below the folders given; more is no card.
+const MAX_FILES: usize = 200_000;
+/// `DCIM/100MEDIA/…` is two deep; nobody's survey is deeper than this.
+const MAX_DEPTH: usize = 12;
+/// Folders of previews, masks, and what operating systems and other programs leave behind.
+const SKIPPED: [&str; 7] =
+    ["masks", "thm", "thumbnails", "@eadir", "__macosx", "$recycle.bin", "system volume information"];
+/// Files of positions that are found by their names.
+const GEOTAGS: [&str; 3] = ["geo.txt", "geotags.csv", "location.txt"];
+
+/// What was found.
+#[derive(Debug, Default)]
+pub(super) struct Scanned {
+    /// Files with the extension of a picture, by path.
+    pub files: Vec<PathBuf>,
+    /// Files of positions.
+    pub geotags: Vec<PathBuf>,
+    /// One line per folder that could not be read, or for a bound that was met.
+    pub notes: Vec<String>,
+}
+
+/// Looks through `folders`; a folder given by name must be readable, one below it is passed over with a line.
+pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
+    let mut found = Scanned::default();
+    for folder in folders {
+        if let Err(source) = walk(folder, 0, &mut found) {
+            return Err(CardError::Folder { path: folder.clone(), source });
+        }
+    }
+    found.files.sort();
+    found.files.dedup();
+    found.geotags.sort();
+    found.geotags.dedup();
+    Ok(found)
+}
+
+fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()> {
+    let mut folders = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let Ok(entry) = entry else { continue };
+        let name = entry.file_name().to_string_lossy().to_lowercase();
+        if name.starts_with('.') {
+            continue;
+        }
+        // Links to folders are not followed: they may lead back. A pipe or socket is no picture and is never opened.
+        let Ok(kind) = entry.file_type() else { continue };
+        let path = entry.path();
+        if kind.is_dir() {
+            if depth < MAX_DEPTH && !SKIPPED.contains(&name.as_str()) {
+                folders.push(path);
+            }
+        } else if kind.is_file() || (kind.is_symlink() && path.is_file()) {
+            if GEOTAGS.contains(&name.as_str()) {
+                found.geotags.push(path);
+            } else if ["jpg", "jpeg", "jpe", "png", "tif", "tiff"].iter().any(|e| name.ends_with(&format!(".{e}"))) {
+                if found.files.len() == MAX_FILES {
+                    found
+                        .notes
+                        .push(format!("{}: only the first {MAX_FILES} pictures are looked at", folder.display()));
+                    return Ok(());
+                }
+                found.files.push(path);
+            }
+        }
+    }
+    folders.sort();
+    for below in folders {
+        if let Err(e) = walk(&below, depth + 1, found) {
+            found.notes.push(format!("{}: cannot be read ({e}) and is passed over", below.display()));
+        }
+    }
+    Ok(())
+}

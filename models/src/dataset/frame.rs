@@ -1,0 +1,28 @@
+//! One picture of a data set.
+
+use std::path::PathBuf;
+
+use config::lens::Distortion;
+
+use crate::camera::{PosePrior, View};
+use crate::formats::telemetry::Telemetry;
+use crate::picture::Orientation;
+
+/// One picture of the set.
+#[derive(Clone, Debug)]
+pub struct DatasetFrame {
+    /// File name (with its folder only where names would repeat).
+    pub name: String,
+    /// Where the picture lies.
+    pub path: PathBuf,
+    /// Lens (undistorted, full size) and reconstructed pose.
+    pub view: View,
+    /// What is taken out of the picture on loading.
+    pub distortion: Distortion,
+    /// How the stored picture is turned on loading.
+    pub orientation: Orientation,
+    /// Pose from GPS and gimbal angles, where recorded.
+    pub prior: Option<PosePrior>,
+    /// The row of `gps.csv` that it comes from.
+    pub telemetry: Option<Telemetry>,
+}

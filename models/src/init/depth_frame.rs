@@ -1,0 +1,98 @@
+//! One key frame while it waits for, and after it got, its depth. Everything is kept at the network's size, u8 and
+//! strided, so that memory is known from the number of pictures alone.
+
+use image::RgbImage;
+
+use crate::camera::{Projector, Unprojector, View};
+
+/// Depth of one picture on a grid of every `stride`-th pixel.
+#[derive(Clone, Debug)]
+pub struct DepthGrid {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Pixels between samples.
+    pub stride: usize,
+    /// Along the optical axis, metres.
+    pub depth: Vec<f32>,
+    /// 0…1; 0 = no depth.
+    pub confidence: Vec<f32>,
+}
+
+impl DepthGrid {
+    /// Takes every `stride`-th pixel of full maps (centre of each block). Depths that are not positive and finite get
+    /// confidence 0; returns how many had claimed more.
+    pub fn sampled(width: usize, height: usize, stride: usize, depth: &[f32], confidence: &[f32]) -> (Self, usize) {
+        let (w, h) = ((width / stride).max(1), (height / stride).max(1));
+        let mut grid = Self {
+            width: w,
+            height: h,
+            stride,
+            depth: Vec::with_capacity(w * h),
+            confidence: Vec::with_capacity(w * h),
+        };
+        let mut non_finite = 0;
+        for j in 0..h {
+            for i in 0..w {
+                let at = (j * stride + stride / 2).min(height - 1) * width + (i * stride + stride / 2).min(width - 1);
+                let (d, c) = (depth[at], confidence[at]);
+                let usable = d.is_finite() && d > 0.0 && c.is_finite();
+                non_finite += usize::from(!usable && c != 0.0);
+                grid.depth.push(if usable { d } else { 0.0 });
+                grid.confidence.push(if usable { c.clamp(0.0, 1.0) } else { 0.0 });
+            }
+        }
+        (grid, non_finite)
+    }
+
+    /// Pixel position (of the network's picture) of a sample.
+    pub fn pixel(&self, i: usize, j: usize) -> (f32, f32) {
+        let half = (self.stride / 2) as f32 + 0.5;
+        ((i * self.stride) as f32 + half, (j * self.stride) as f32 + half)
+    }
+
+    /// The sample whose block holds a pixel position.
+    pub fn index_at(&self, x: f32, y: f32) -> Option<usize> {
+        if !(x >= 0.0 && y >= 0.0) {
+            return None;
+        }
+        let (i, j) = (x as usize / self.stride, y as usize / self.stride);
+        (i < self.width && j < self.height).then(|| j * self.width + i)
+    }
+}
+
+/// One key frame.
+#[derive(Debug)]
+pub struct DepthFrame {
+    /// Name of the picture.
+    pub name: String,
+    /// The picture at the network's size.
+    pub image: RgbImage,
+    /// Its camera, intrinsics at the network's size.
+    pub view: View,
+    /// Its depth, once known.
+    pub depth: Option<DepthGrid>,
+    /// The source views that the depth was made from, as they were then.
+    pub made_with: Vec<(usize, View)>,
+    /// The reference view that the depth was made from.
+    pub made_as: Option<View>,
+}
+
+/// Largest shift, in pixels, of the reference's corners and centre in the source between two pairs of poses.
+pub fn shift(reference: &View, source: &View, old_reference: &View, old_source: &View, depth: f32) -> f32 {
+    let (w, h) = (reference.intrinsics.width as f32, reference.intrinsics.height as f32);
+    let (new, old) = (Projector::new(source), Projector::new(old_source));
+    let (here, before) = (Unprojector::new(reference), Unprojector::new(old_reference));
+    [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h), (w / 2.0, h / 2.0)]
+        .into_iter()
+        .map(|(x, y)| {
+            let a = new.project(here.at(x, y, depth));
+            let b = old.project(before.at(x, y, depth));
+            match (a, b) {
+                (Some(a), Some(b)) => (a.0 - b.0).hypot(a.1 - b.1),
+                _ => f32::INFINITY,
+            }
+        })
+        .fold(0.0, f32::max)
+}

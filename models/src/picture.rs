@@ -1,0 +1,280 @@
+//! Pictures from files: decoded once, at the smallest size that serves, the right way up, with bounds on what a file may
+//! make us allocate.
+//!
+//! JPEG is scaled while it is decoded (each 8×8 block becomes 4×4, 2×2 or 1×1 pixels) by `jpeg-decoder`: a 12-megapixel
+//! picture at quarter size costs a few megabytes, no full-size picture ever exists, and nothing but Rust is needed to build
+//! it. (libjpeg-turbo is faster yet, but its crates want cmake and an assembler, which a board's two commands do not bring.)
+
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use config::lens::Distortion;
+use glam::DQuat;
+use image::{DynamicImage, ImageReader, Limits, RgbImage, imageops};
+use jpeg_decoder::{Decoder, PixelFormat};
+
+use crate::formats::reconstruction::{Focal, LensDescription};
+
+/// Largest picture edge taken; 16384² × 3 bytes is also what a decoder may allocate at most.
+const MAX_EDGE: u32 = 16_384;
+
+/// How a stored picture is turned to have the camera's top at its top (EXIF tag 274): mirrored first, then turned.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Orientation {
+    mirrored: bool,
+    /// Quarter turns clockwise.
+    turns: u8,
+}
+
+impl Orientation {
+    /// EXIF's number; what is no number of EXIF's leaves the picture as it is.
+    pub fn from_exif(tag: u32) -> Self {
+        let (mirrored, turns) = match tag {
+            2 => (true, 0),
+            3 => (false, 2),
+            4 => (true, 2),
+            5 => (true, 3),
+            6 => (false, 1),
+            7 => (true, 1),
+            8 => (false, 3),
+            _ => (false, 0),
+        };
+        Self { mirrored, turns }
+    }
+
+    /// True when width and height change places.
+    pub fn swaps(&self) -> bool {
+        self.turns % 2 == 1
+    }
+
+    /// What leads back from the turned picture to the stored one.
+    pub fn inverse(&self) -> Self {
+        // A mirrored picture turned one way is the mirror image of one turned the other.
+        Self { turns: if self.mirrored { self.turns } else { (4 - self.turns) % 4 }, ..*self }
+    }
+
+    /// The picture the right way up.
+    pub fn apply(&self, image: RgbImage) -> RgbImage {
+        let image = if self.mirrored { imageops::flip_horizontal(&image) } else { image };
+        match self.turns {
+            1 => imageops::rotate90(&image),
+            2 => imageops::rotate180(&image),
+            3 => imageops::rotate270(&image),
+            _ => image,
+        }
+    }
+
+    /// Rotation camera → world of the camera whose top is the turned picture's.
+    pub fn of_rotation(&self, rotation: DQuat) -> DQuat {
+        (rotation * DQuat::from_rotation_z(-f64::from(self.turns) * std::f64::consts::FRAC_PI_2)).normalize()
+    }
+
+    /// The lens as the turned picture shows it.
+    pub fn of_lens(&self, stored: &LensDescription) -> LensDescription {
+        let mut lens = *stored;
+        let d = &mut lens.distortion;
+        // Tangential and prism terms are vectors (p2, p1) and (sx1, sy1) in the picture.
+        let turn = |(x, y): (f64, f64)| (-y, x);
+        if self.mirrored {
+            (d.p2, d.sx1) = (-d.p2, -d.sx1);
+            if let (Some((cx, _)), Some((w, _))) = (&mut lens.principal, lens.size) {
+                *cx = f64::from(w) - *cx;
+            }
+        }
+        for _ in 0..self.turns {
+            let d: &mut Distortion = &mut lens.distortion;
+            (d.p2, d.p1) = turn((d.p2, d.p1));
+            (d.sx1, d.sy1) = turn((d.sx1, d.sy1));
+            if let Focal::Pixels(fx, fy) = lens.focal {
+                lens.focal = Focal::Pixels(fy, fx);
+            }
+            if let (Some((cx, cy)), Some((_, h))) = (lens.principal, lens.size) {
+                lens.principal = Some((f64::from(h) - cy, cx));
+            }
+            lens.size = lens.size.map(|(w, h)| (h, w));
+        }
+        lens
+    }
+}
+
+/// A picture is missing, unreadable or not what its description says.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {what}", path.display())]
+pub struct PictureError {
+    /// The picture.
+    pub path: PathBuf,
+    /// What is wrong.
+    pub what: String,
+}
+
+fn bad(path: &Path, what: impl Into<String>) -> PictureError {
+    PictureError { path: path.to_owned(), what: what.into() }
+}
+
+/// Width and height as stored, from the head of the file.
+///
+/// # Errors
+/// As [`decode`].
+pub fn dimensions(path: &Path) -> Result<(u32, u32), PictureError> {
+    open(path)?.into_dimensions().map_err(|e| bad(path, format!("cannot be decoded ({e})")))
+}
+
+fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PictureError> {
+    let failed = |e: std::io::Error| bad(path, format!("cannot be opened ({e}); is the picture folder complete?"));
+    ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(failed)
+}
+
+/// A JPEG, PNG or TIFF as 8-bit RGB, refused before decoding when it is too large.
+///
+/// # Errors
+/// The file cannot be opened, is damaged, or is no picture.
+pub fn decode(path: &Path) -> Result<RgbImage, PictureError> {
+    decode_at_least(path, (u32::MAX, u32::MAX))
+}
+
+/// As [`decode`], at full size or a half, a quarter or an eighth of it: the smallest that is at least `wanted` in width and
+/// height as stored, where the format allows it (JPEG).
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_at_least(path: &Path, wanted: (u32, u32)) -> Result<RgbImage, PictureError> {
+    if let Some(image) = scaled_jpeg(path, wanted)? {
+        return Ok(image);
+    }
+    let mut reader = open(path)?;
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_EDGE);
+    limits.max_image_height = Some(MAX_EDGE);
+    limits.max_alloc = Some(u64::from(MAX_EDGE) * u64::from(MAX_EDGE) * 3);
+    reader.limits(limits);
+    let image = reader.decode().map_err(|e| bad(path, format!("cannot be decoded ({e}); copy it again")))?;
+    if matches!(image, DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) | DynamicImage::ImageLuma16(_)) {
+        tracing::info!("{}: 16 bits a colour, of which 8 are used", path.display());
+    }
+    Ok(image.into_rgb8())
+}
+
+/// The picture reduced while it is decoded; `None` where it is no JPEG, or where less than half its size is not enough.
+fn scaled_jpeg(path: &Path, (width, height): (u32, u32)) -> Result<Option<RgbImage>, PictureError> {
+    let damaged = |e: jpeg_decoder::Error| bad(path, format!("cannot be decoded ({e}); copy it again"));
+    let io = |e: std::io::Error| bad(path, format!("cannot be opened ({e}); is the picture folder complete?"));
+    let mut file = File::open(path).map_err(io)?;
+    let mut magic = [0; 3];
+    if file.read_exact(&mut magic).is_err() || magic != [0xFF, 0xD8, 0xFF] || width.max(height) > MAX_EDGE {
+        return Ok(None);
+    }
+    file.seek(SeekFrom::Start(0)).map_err(io)?;
+    let mut decoder = Decoder::new(BufReader::with_capacity(1 << 16, file));
+    decoder.set_max_decoding_buffer_size(MAX_EDGE as usize * MAX_EDGE as usize * 3);
+    decoder.read_info().map_err(damaged)?;
+    let Some(info) = decoder.info() else { return Ok(None) };
+    if u32::from(info.width).max(u32::from(info.height)) > MAX_EDGE {
+        return Err(bad(
+            path,
+            format!("is {} x {}; at most {MAX_EDGE} pixels a side can be taken", info.width, info.height),
+        ));
+    }
+    // Half of an odd width is rounded up.
+    if width > u32::from(info.width).div_ceil(2) || height > u32::from(info.height).div_ceil(2) {
+        return Ok(None);
+    }
+    // The decoder's own choice is content with one edge; both are wanted.
+    let eighths = |n: u16, s: u32| (u32::from(n) * s).div_ceil(8);
+    let smallest =
+        [1, 2, 4].into_iter().find(|s| eighths(info.width, *s) >= width && eighths(info.height, *s) >= height);
+    let scale = smallest.unwrap_or(4);
+    let (w, h) =
+        decoder.scale(eighths(info.width, scale) as u16, eighths(info.height, scale) as u16).map_err(damaged)?;
+    let (w, h, pixels) = (u32::from(w), u32::from(h), decoder.decode().map_err(damaged)?);
+    let rgb = match info.pixel_format {
+        PixelFormat::RGB24 => pixels,
+        PixelFormat::L8 => pixels.iter().flat_map(|v| [*v; 3]).collect(),
+        PixelFormat::L16 => pixels.chunks_exact(2).flat_map(|v| [v[1]; 3]).collect(),
+        PixelFormat::CMYK32 => {
+            tracing::info!("{}: a picture for print (CMYK), converted", path.display());
+            // Adobe's are inverted, as everybody's are in practice; the decoder leaves them as stored.
+            let ink = |c: u8, k: u8| (u16::from(c) * u16::from(k) / 255) as u8;
+            pixels.chunks_exact(4).flat_map(|p| [ink(p[0], p[3]), ink(p[1], p[3]), ink(p[2], p[3])]).collect()
+        }
+    };
+    RgbImage::from_raw(w, h, rgb).map(Some).ok_or_else(|| bad(path, "is a damaged JPEG; copy it again"))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_orientation_puts_pixels_lens_and_axes_at_the_same_place() {
+        let mut image = RgbImage::new(8, 6);
+        image.put_pixel(1, 4, image::Rgb([255; 3]));
+        let stored = LensDescription {
+            size: Some((8, 6)),
+            focal: Focal::Pixels(10.0, 11.0),
+            principal: Some((3.5, 2.5)),
+            distortion: Distortion { k1: 0.1, p1: 0.02, p2: -0.03, sx1: 0.01, sy1: 0.02, ..Distortion::default() },
+        };
+        let pixel = [1.5, 4.5];
+        let ray = stored.lens((8, 6)).unproject(pixel).unwrap();
+        for tag in [1, 3, 6, 8] {
+            let orientation = Orientation::from_exif(tag);
+            let turned = orientation.apply(image.clone());
+            let at = turned.enumerate_pixels().find(|(_, _, p)| p.0[0] == 255).map(|(x, y, _)| (x, y)).unwrap();
+            let lens = orientation.of_lens(&stored);
+            assert_eq!(orientation.inverse().of_lens(&lens), stored, "{tag}");
+            assert_eq!(lens.size, Some(turned.dimensions()), "{tag}");
+            // The same ray of the world: the stored camera's axes and the turned one's.
+            let [x, y] =
+                lens.lens(turned.dimensions()).unproject([f64::from(at.0) + 0.5, f64::from(at.1) + 0.5]).unwrap();
+            let world = orientation.of_rotation(DQuat::IDENTITY) * glam::DVec3::new(x, y, 1.0);
+            assert!(world.distance(glam::DVec3::new(ray[0], ray[1], 1.0)) < 1e-9, "{tag}: {world} {ray:?}");
+        }
+        assert_eq!(Orientation::from_exif(99), Orientation::default());
+    }
+
+    fn photo(w: u32, h: u32) -> RgbImage {
+        RgbImage::from_fn(w, h, |x, y| image::Rgb([(x * 255 / w) as u8, (y * 255 / h) as u8, 90]))
+    }
+
+    #[test]
+    fn a_reduced_picture_is_the_smallest_that_is_large_enough_and_looks_the_same() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.jpg");
+        photo(400, 302).save(&path).unwrap();
+        for (wanted, size) in [
+            ((100, 75), (100, 76)),
+            ((101, 75), (200, 151)),
+            ((50, 30), (50, 38)),
+            ((201, 10), (400, 302)),
+            ((1, 1), (50, 38)),
+        ] {
+            let image = decode_at_least(&path, wanted).unwrap();
+            assert_eq!(image.dimensions(), size, "{wanted:?}");
+            let (w, h) = size;
+            for (x, y) in [(0, 0), (w / 2, h / 3), (w - 1, h - 1)] {
+                let (got, want) = (image.get_pixel(x, y), [(x * 255 / w) as u8, (y * 255 / h) as u8, 90]);
+                let close = got.0.iter().zip(want).all(|(g, w)| g.abs_diff(w) <= 6);
+                assert!(close, "{wanted:?} at {x}, {y}: {got:?} {want:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_picture_cut_off_is_an_error_at_every_size() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.jpg");
+        let noise = RgbImage::from_fn(160, 120, |x, y| {
+            let v = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).wrapping_mul(2_246_822_519) >> 24;
+            image::Rgb([v as u8, (v >> 1) as u8, (v >> 2) as u8])
+        });
+        noise.save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for keep in [whole.len() / 4, whole.len() / 2, whole.len() * 9 / 10] {
+            std::fs::write(&path, &whole[..keep]).unwrap();
+            let error = decode_at_least(&path, (40, 30)).unwrap_err().to_string();
+            assert!(error.contains("a.jpg") && !error.contains('\n'), "{error}");
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! The last half pixel. XFeat's key points are good to about a pixel and, on grass and in trees, a match along its
+//! epipolar line is often the neighbour's. The pictures themselves decide: a patch around the one key point, warped
+//! by the predicted geometry, is shifted until it fits the other picture, and dropped when it fits nowhere near.
+
+use super::grey::Grey;
+use super::overlap::{Ground, predict};
+use crate::camera::Pinhole;
+use glam::{DMat2, DVec2};
+
+/// Half the side of a patch, pixels: 11 × 11.
+const HALF: i32 = 5;
+const SAMPLES: usize = ((2 * HALF + 1) * (2 * HALF + 1)) as usize;
+/// Steps at most; most patches come to rest in three.
+const STEPS: usize = 6;
+/// A patch that wants to go further than this was a wrong match, pixels.
+const REACH: f64 = 3.0;
+/// Normalised correlation below which two patches do not show the same thing.
+const MIN_CORRELATION: f64 = 0.7;
+/// Contrast (standard deviation of 8-bit grey) below which there is nothing to fit.
+const MIN_CONTRAST: f64 = 2.0;
+
+/// Values on the grid of a patch around `center`, its axes mapped by `warp`.
+fn patch(grey: &Grey, center: DVec2, warp: DMat2) -> Option<[f64; SAMPLES]> {
+    let mut out = [0.0; SAMPLES];
+    for (k, value) in out.iter_mut().enumerate() {
+        let side = 2 * HALF + 1;
+        let offset = DVec2::new(f64::from(k as i32 % side - HALF), f64::from(k as i32 / side - HALF));
+        *value = grey.at(center + warp * offset)?;
+    }
+    Some(out)
+}
+
+/// One side of a match.
+pub(crate) struct Side<'a> {
+    pub grey: &'a Grey,
+    pub camera: &'a Pinhole,
+    /// Original pixels.
+    pub at: [f32; 2],
+}
+
+/// Where in `b` the surroundings of `a.at` really are, in original pixels; `None` when they are not within reach of
+/// `b.at`, or show nothing to hold on to.
+pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]> {
+    let place = |s: &Side| DVec2::new(s.at[0].into(), s.at[1].into());
+    // How a step in a's picture looks in b's: the plane's derivative, good enough for a patch of 11 pixels.
+    let step = |dx: f32, dy: f32| predict(a.camera, b.camera, ground, [a.at[0] + dx, a.at[1] + dy]);
+    let (right, left) = (step(2.0, 0.0)?, step(-2.0, 0.0)?);
+    let (down, up) = (step(0.0, 2.0)?, step(0.0, -2.0)?);
+    let warp = DMat2::from_cols((right - left) / 4.0, (down - up) / 4.0);
+    let warp = DMat2::from_diagonal(b.grey.scale) * warp * DMat2::from_diagonal(a.grey.scale.recip());
+    if !(0.25..4.0).contains(&warp.determinant()) {
+        return None;
+    }
+    let from = place(a) * a.grey.scale;
+    let (template, contrast) = normalised(patch(a.grey, from, DMat2::IDENTITY)?)?;
+    let sideways = |d: DVec2| patch(a.grey, from + d, DMat2::IDENTITY);
+    let (xp, xm) = (sideways(DVec2::X)?, sideways(-DVec2::X)?);
+    let (yp, ym) = (sideways(DVec2::Y)?, sideways(-DVec2::Y)?);
+    let slope: [DVec2; SAMPLES] = std::array::from_fn(|k| DVec2::new(xp[k] - xm[k], yp[k] - ym[k]) / (2.0 * contrast));
+    let mut h = DMat2::ZERO;
+    for g in &slope {
+        h += DMat2::from_cols(*g * g.x, *g * g.y);
+    }
+    let inverse = h.inverse();
+    if !inverse.is_finite() {
+        return None;
+    }
+    let start = place(b) * b.grey.scale;
+    let mut at = start;
+    let mut correlation = 0.0;
+    for _ in 0..STEPS {
+        let (seen, _) = normalised(patch(b.grey, at, warp)?)?;
+        correlation = seen.iter().zip(&template).map(|(s, t)| s * t).sum::<f64>() / SAMPLES as f64;
+        let mut g = DVec2::ZERO;
+        for k in 0..SAMPLES {
+            g += slope[k] * (seen[k] - template[k]);
+        }
+        let shift = warp * (inverse * g);
+        at -= shift;
+        if !(at - start).is_finite() || (at - start).length() > REACH {
+            return None;
+        }
+        if shift.length_squared() < 4e-4 {
+            break;
+        }
+    }
+    (correlation >= MIN_CORRELATION).then(|| (at / b.grey.scale).as_vec2().to_array())
+}
+
+/// Values less their mean over their standard deviation (given too): light and exposure drop out.
+fn normalised(mut values: [f64; SAMPLES]) -> Option<([f64; SAMPLES], f64)> {
+    let mean = values.iter().sum::<f64>() / SAMPLES as f64;
+    let variance = values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / SAMPLES as f64;
+    let contrast = variance.sqrt();
+    if contrast < MIN_CONTRAST {
+        return None;
+    }
+    values.iter_mut().for_each(|v| *v = (*v - mean) / contrast);
+    Some((values, contrast))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use super::*;
+    use crate::camera::{Intrinsics, Pose};
+    use glam::{DMat3, DQuat, DVec3};
+    use image::RgbImage;
+
+    const LENS: Intrinsics = Intrinsics { width: 128, height: 128, fx: 100.0, fy: 100.0, cx: 64.0, cy: 64.0 };
+
+    /// The ground's brightness at a place, seen from 50 m by a nadir camera with the given heading.
+    fn picture(camera: &Pinhole, gain: f64) -> RgbImage {
+        RgbImage::from_fn(128, 128, |x, y| {
+            let p = Ground(Some(0.0)).meet(camera, [x as f32 + 0.5, y as f32 + 0.5]);
+            let v = 120.0 + gain * ((p.x * 0.8).sin() * 40.0 + (p.y * 0.7 + p.x * 0.3).cos() * 40.0);
+            image::Rgb([v as u8; 3])
+        })
+    }
+
+    fn nadir(x: f64, heading: f64) -> Pinhole {
+        let down = DQuat::from_mat3(&DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z));
+        let pose = Pose { rotation: DQuat::from_rotation_z(heading) * down, center: DVec3::new(x, 0.0, 50.0) };
+        Pinhole::new(pose, &LENS, 1.0)
+    }
+
+    #[test]
+    fn a_key_point_off_by_two_pixels_is_pulled_to_its_place_through_rotation_and_exposure() {
+        for heading in [0.0, 0.7, 3.1] {
+            let (a, b) = (nadir(0.0, 0.0), nadir(6.0, heading));
+            let (ga, gb) = (Grey::new(&picture(&a, 1.0), 640), Grey::new(&picture(&b, 0.6), 640));
+            let at = [70.3f32, 60.8];
+            let truth = predict(&a, &b, Ground(Some(0.0)), at).unwrap().as_vec2();
+            let start = [truth.x + 1.5, truth.y - 1.2];
+            let side = |grey, camera, at| Side { grey, camera, at };
+            let found = align_patch(&side(&ga, &a, at), &side(&gb, &b, start), Ground(Some(0.0))).unwrap();
+            assert!((glam::Vec2::from(found) - truth).length() < 0.1, "{heading}: {found:?} {truth}");
+        }
+    }
+
+    #[test]
+    fn blank_patches_edges_and_other_places_are_refused() {
+        let (a, b) = (nadir(0.0, 0.0), nadir(6.0, 0.0));
+        let (ga, gb) = (Grey::new(&picture(&a, 1.0), 640), Grey::new(&picture(&b, 1.0), 640));
+        let blank = Grey::new(&RgbImage::new(128, 128), 640);
+        let side = |grey, camera, at| Side { grey, camera, at };
+        let ground = Ground(Some(0.0));
+        assert!(align_patch(&side(&blank, &a, [64.0; 2]), &side(&gb, &b, [64.0; 2]), ground).is_none());
+        assert!(align_patch(&side(&ga, &a, [1.0; 2]), &side(&gb, &b, [64.0; 2]), ground).is_none());
+        let truth = predict(&a, &b, ground, [70.0, 60.0]).unwrap().as_vec2();
+        assert!(align_patch(&side(&ga, &a, [70.0, 60.0]), &side(&gb, &b, [truth.x + 9.0, truth.y]), ground).is_none());
+    }
+}

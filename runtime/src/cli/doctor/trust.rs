@@ -1,0 +1,85 @@
+//! What protects the deliveries of a mission, and what does not.
+
+use config::link::Signing;
+use config::mission::Mission;
+use hal::link::LinkAddress;
+
+use super::Finding;
+use crate::keys::{GROUND, Identity, private_path};
+
+/// One line per kind of protection.
+pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
+    let upload = &mission.upload;
+    let exposed = upload.exposed().map(|e| e.1);
+    let signed = mission.check_trust();
+    let mut all = vec![(
+        "signatures",
+        match (&signed, exposed) {
+            (Err(e), _) => Finding::Missing(e.to_string()),
+            (Ok(true), _) => Finding::Ok("offers and receipts are signed by aircraft and ground".to_owned()),
+            (Ok(false), None) => {
+                Finding::Note("nothing is signed; no endpoint of [upload] reaches beyond this machine".to_owned())
+            }
+            (Ok(false), Some(endpoint)) => Finding::Note(format!(
+                "insecure = true: whoever reaches {endpoint} can replace any model; `dgtr keys` makes keys"
+            )),
+        },
+    )];
+    if matches!(signed, Ok(true)) {
+        let ids = mission.aircraft.iter().map(|a| a.id.as_str()).chain([GROUND]);
+        let here: Vec<&str> = ids.filter(|id| private_path(&upload.keys, id).exists()).collect();
+        if here.is_empty() {
+            let text = format!("none in {}; fly and serve need their own", upload.keys.display());
+            all.push(("private key", Finding::Note(text)));
+        }
+        all.extend(here.into_iter().map(|id| {
+            let finding = match Identity::of(mission, id) {
+                Ok(_) => Finding::Ok(format!("{id}'s, readable by its owner only")),
+                Err(e) => Finding::Missing(e.to_string()),
+            };
+            ("private key", finding)
+        }));
+    }
+    all.extend(exposed.map(|endpoint| {
+        let finding = match &upload.tls {
+            Some(_) => {
+                Finding::Ok(format!("{endpoint} by TLS; an aircraft's certificate speaks under its own id only"))
+            }
+            None => Finding::Note(format!("{endpoint} is not encrypted: models can be read on the way")),
+        };
+        ("encryption", finding)
+    }));
+    all.extend(
+        mission.aircraft.iter().map(|a| ("autopilot link", autopilot_link(&a.id, &a.link, &mission.link.signing))),
+    );
+    all
+}
+
+/// Whether somebody else could speak as the autopilot of aircraft `id`.
+fn autopilot_link(id: &str, link: &str, signing: &Signing) -> Finding {
+    match (link.parse::<LinkAddress>(), signing) {
+        (Err(e), _) => Finding::Missing(format!("{id}: {e}")),
+        (Ok(_), Signing::Require) => Finding::Ok(format!("{id}: only signed MAVLink is believed")),
+        (Ok(address), _) if !address.is_shared() => Finding::Ok(format!("{id}: {link} is a wire of its own")),
+        (Ok(_), Signing::Off | Signing::Accept) => Finding::Note(format!(
+            "{id}: whoever reaches {link} before the autopilot does can speak as it; set [link] signing = \"require\" and \
+             signing_key"
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn signing_is_advised_where_others_could_speak_as_the_autopilot() {
+        let finding = |link: &str, signing| autopilot_link("a1", link, &signing);
+        assert!(matches!(finding("serial:/dev/ttyAMA0:921600", Signing::Off), Finding::Ok(_)));
+        for signing in [Signing::Off, Signing::Accept] {
+            assert!(matches!(finding("udpin:0.0.0.0:14550", signing), Finding::Note(text) if text.contains("signing")));
+        }
+        assert!(matches!(finding("udpin:0.0.0.0:14550", Signing::Require), Finding::Ok(_)));
+        assert!(matches!(finding("carrier pigeon", Signing::Off), Finding::Missing(_)));
+    }
+}

@@ -1,0 +1,274 @@
+//! The reconstruction engine: posed pictures in, a trained model out, in the order capture → refine → initialise → train →
+//! checkpoint. A flight and `dgtr train` differ in their [`PictureSource`] and in [`EngineSettings`], not in the work.
+//!
+//! All memory is planned when it is opened. A picture comes by once: matching takes its features, the trainer its pixels,
+//! and what initialisation needs of it later is read from where the trainer keeps them.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use config::disk::Disk;
+use config::init::InitSettings;
+use config::mission::NetworkSettings;
+use config::refine::RefineSettings;
+use config::training::TrainSettings;
+use models::camera::{PoseSigma, PosedImage, View};
+use models::cloud::GaussianCloud;
+use models::formats::model::{self, ModelHeader};
+use models::init::Initialiser;
+use models::onnx::depth::DepthNetwork;
+use models::refine::{RefineReport, Refiner};
+use vulkan::trainer::Trainer;
+
+use crate::error::JobError;
+use crate::run_json::RunReport;
+
+mod carry;
+pub mod device;
+mod first_gaussians;
+pub mod host;
+mod reconstruct;
+pub mod source;
+
+use device::DeviceRequest;
+use first_gaussians::{FirstGaussians, at_random, feed_forward, sparse};
+pub use first_gaussians::{InitKind, Point};
+use host::{HostPlan, HostRequest};
+pub use reconstruct::Reconstruct;
+pub use source::PictureSource;
+
+/// What the engine needs to know before the first picture.
+#[derive(Clone, Debug)]
+pub struct EngineSettings {
+    /// Where checkpoints are written to and read from.
+    pub disk: Disk,
+    /// Device and budget.
+    pub device: DeviceRequest,
+    /// `memory.host_mib`: bound on the host's memory, MiB.
+    pub host_mib: Option<u32>,
+    /// Pixels of a picture as it leaves the camera.
+    pub camera_pixels: u64,
+    /// Pictures that the source decodes ahead.
+    pub ahead: usize,
+    /// Pictures are trained at this fraction of the size they come in; matching sees them whole.
+    pub scale: f64,
+    /// `[network]`: manifests of the user's own networks.
+    pub network: NetworkSettings,
+    /// `[training]`.
+    pub training: TrainSettings,
+    /// `[init]`.
+    pub init: InitSettings,
+    /// `[refine]`; `None` takes poses as they are.
+    pub refine: Option<RefineSettings>,
+    /// First Gaussians.
+    pub start: InitKind,
+    /// Refine, estimate depths and build while pictures still come, and keep what is trained over a rebuild; else everything
+    /// is done once, with all pictures there.
+    pub incremental: bool,
+}
+
+/// Where the model lies in an output folder.
+pub fn model_path(out: &Path) -> PathBuf {
+    out.join("model.dgtr")
+}
+
+/// One model in the making.
+pub struct Reconstruction {
+    settings: EngineSettings,
+    header: ModelHeader,
+    refiner: Option<Refiner>,
+    initialiser: Option<Initialiser>,
+    /// The user's own network for the depth loss.
+    depth: Option<DepthNetwork>,
+    trainer: Trainer,
+    cloud: GaussianCloud,
+    /// Key frames with lens and pose as they are known now, in the order of the trainer's views.
+    views: Vec<(String, View)>,
+    /// How many of them the initialiser has.
+    initialised: usize,
+    /// Views as they were at the last build.
+    built: Vec<View>,
+    /// Views of the model that is continued.
+    resumed: HashMap<String, View>,
+    /// Points of the scene known beforehand.
+    points: Vec<Point>,
+    /// The last refinement.
+    refined: Option<RefineReport>,
+    builds: u32,
+    /// Seconds of training over all continuations.
+    train_s: f64,
+    /// What was done and what it took.
+    pub report: RunReport,
+}
+
+impl Reconstruction {
+    /// Opens networks and device. What the user names is looked at before anything slow begins.
+    ///
+    /// # Errors
+    /// Anything missing that the job cannot do without: ONNX Runtime, a Vulkan device, memory.
+    pub fn open(settings: EngineSettings, header: ModelHeader, command: &str) -> Result<Self, JobError> {
+        let _span = tracing::info_span!("open").entered();
+        let (views, mut init) = (settings.device.views, settings.init.clone());
+        let depth = settings.network.depth.as_deref().filter(|_| settings.training.loss.depth > 0.0);
+        let depth = depth
+            .map(|path| DepthNetwork::open(path, settings.device.size, init.max_side, init.threads))
+            .transpose()?;
+        let refiner = settings.refine.as_ref().map(|refine| {
+            Refiner::open(&RefineSettings { max_keyframes: refine.max_keyframes.max(views), ..refine.clone() })
+        });
+        init.max_pictures = init.max_pictures.max(views);
+        let initialiser = match settings.start {
+            InitKind::FeedForward => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
+            InitKind::SparsePoints | InitKind::Random => None,
+        };
+        let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
+        let mut report = RunReport::new(command);
+        let host = HostPlan::new(&HostRequest {
+            plan: trainer.plan(),
+            shared: trainer.gpu().info().is_cpu,
+            initialiser: initialiser
+                .as_ref()
+                .map_or(0, |i| i.planned_bytes_at(settings.device.size, views, trainer.plan().gaussians)),
+            refine: settings.refine.as_ref(),
+            camera_pixels: settings.camera_pixels,
+            ahead: settings.ahead as u64,
+        });
+        host.fits(settings.host_mib)?;
+        report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
+        report.device = trainer.gpu().info().name.clone();
+        report.seed = header.seed;
+        (report.device_bytes_planned, report.device_bytes_peak) = (trainer.plan().total_bytes, trainer.device_bytes());
+        Ok(Self {
+            refiner: refiner.transpose()?,
+            initialiser,
+            depth,
+            cloud: GaussianCloud::with_capacity(settings.training.sh.degree, trainer.plan().gaussians),
+            trainer,
+            views: Vec::with_capacity(views),
+            initialised: 0,
+            built: Vec::with_capacity(views),
+            resumed: HashMap::new(),
+            points: Vec::new(),
+            refined: None,
+            builds: 0,
+            train_s: 0.0,
+            header,
+            settings,
+            report,
+        })
+    }
+
+    /// Takes up the model of an earlier run in `out`, when there is one of the same mission and aircraft that holds
+    /// Gaussians; its views.
+    ///
+    /// # Errors
+    /// A damaged model file that cannot be set aside.
+    pub fn resume(&mut self, out: &Path) -> Result<Option<&HashMap<String, View>>, JobError> {
+        let path = model_path(out);
+        let Some((header, cloud)) = model::read_checkpoint(&self.settings.disk, &path)? else { return Ok(None) };
+        let same = header.mission == self.header.mission && header.aircraft == self.header.aircraft;
+        if !same || cloud.is_empty() {
+            return Ok(None);
+        }
+        tracing::info!("continuing {} ({} Gaussians) after {} steps", path.display(), cloud.len(), header.steps);
+        // Models of earlier versions say it themselves.
+        let told = RunReport::read(out).ok().and_then(|run| run.more.get("train_seconds")?.as_f64());
+        self.train_s = told.unwrap_or(header.train_seconds);
+        self.header.steps = header.steps;
+        self.cloud = cloud;
+        self.resumed = header.views.into_iter().collect();
+        if !self.settings.incremental {
+            // Poses are those of the last checkpoint, and Gaussians are there: what is left to make are depth priors.
+            self.refiner = None;
+            if self.settings.training.loss.depth <= 0.0 || self.depth.is_some() {
+                self.initialiser = None;
+            }
+        }
+        Ok(Some(&self.resumed))
+    }
+
+    /// Points of the scene that came with the pictures.
+    pub fn hint_points(&mut self, points: Vec<Point>) {
+        self.points = points;
+    }
+
+    /// The trainer, for its counters and for rendering.
+    pub fn trainer(&mut self) -> &mut Trainer {
+        &mut self.trainer
+    }
+
+    /// What the model file says of itself, as of the last checkpoint.
+    pub fn header(&self) -> &ModelHeader {
+        &self.header
+    }
+
+    /// Seconds of training over all continuations.
+    pub fn train_seconds(&self) -> f64 {
+        self.train_s
+    }
+
+    /// Whether the model that is continued was trained on exactly these pictures.
+    fn is_continued(&self) -> bool {
+        self.builds == 0
+            && self.resumed.len() == self.views.len()
+            && self.views.iter().all(|(name, _)| self.resumed.contains_key(name))
+    }
+
+    /// The best poses and lenses of all key frames.
+    fn refine(&mut self) -> Result<(), JobError> {
+        let Some(refiner) = &mut self.refiner else { return Ok(()) };
+        let _span = tracing::info_span!("refine").entered();
+        let from = Instant::now();
+        let solved = refiner.solve()?;
+        for (name, view) in &mut self.views {
+            if let Some(pose) = refiner.pose(name) {
+                view.pose = pose;
+                if let Some(initialiser) = &mut self.initialiser {
+                    initialiser.update_pose(name, &pose);
+                }
+            }
+            if let Some(lens) = refiner.intrinsics(name) {
+                view.intrinsics = lens.resized(view.intrinsics.width, view.intrinsics.height);
+            }
+        }
+        self.refined = Some(solved);
+        self.report.stage("refine", from);
+        Ok(())
+    }
+
+    /// Gaussians and depth priors of all key frames; `None` when `go_on` said no.
+    fn initialise(&mut self, go_on: &dyn Fn() -> bool) -> Result<Option<FirstGaussians>, JobError> {
+        let _span = tracing::info_span!("initialise").entered();
+        let capacity = self.trainer.plan().gaussians;
+        if let Some(refiner) = &self.refiner {
+            self.points = refiner.sparse_points().iter().map(|p| (p.position, p.color)).collect();
+        }
+        let at_once = !self.settings.incremental;
+        if let Some(initialiser) = &mut self.initialiser {
+            if self.refiner.is_some() {
+                initialiser.hint_points(self.points.iter().map(|p| p.0.map(|v| v as f32)));
+            }
+            // Those that waited for their pose.
+            for i in self.initialised..self.views.len() {
+                if let (Some(image), Some(view)) = (self.trainer.view_image(i), self.trainer.view_pose(i)) {
+                    let (name, View { pose, .. }) = self.views[i].clone();
+                    let view = View { pose, ..view };
+                    let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
+                    initialiser.add(&PosedImage { name, time_ns: 0, image, view, sigma })?;
+                }
+            }
+            self.initialised = self.views.len();
+            return feed_forward(initialiser, self.views.len(), capacity, at_once, go_on);
+        }
+        let views: Vec<View> = self.views.iter().map(|v| v.1).collect();
+        Ok(Some(match self.settings.start {
+            _ if self.is_continued() => GaussianCloud::default().into(),
+            InitKind::Random => {
+                at_random(&views, &self.points, self.settings.init.depth_m, capacity, self.settings.training.seed)?
+                    .into()
+            }
+            InitKind::FeedForward | InitKind::SparsePoints => sparse(&self.points, capacity)?.into(),
+        }))
+    }
+}

@@ -1,0 +1,120 @@
+//! The first Gaussians: of the feed-forward network, of sparse points, or at random.
+
+use std::collections::HashMap;
+
+use models::camera::{DepthPrior, View};
+use models::cloud::GaussianCloud;
+use models::init::{InitReport, Initialiser, from_sfm, random};
+
+use crate::console::Progress;
+use crate::error::JobError;
+
+/// Points of a random start (3DGS: 100,000).
+const RANDOM_POINTS: usize = 100_000;
+/// Depths made between two looks at whether somebody asked to stop.
+const DEPTHS_BETWEEN_STOPS: usize = 16;
+
+/// Where the first Gaussians come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum InitKind {
+    /// The feed-forward network.
+    FeedForward,
+    /// Sparse points: the data set's, or those of the pose refinement.
+    SparsePoints,
+    /// Points at random in what the cameras see.
+    Random,
+}
+
+/// A triangulated point: ENU metres, 8-bit sRGB.
+pub type Point = ([f64; 3], [u8; 3]);
+
+/// What training starts from.
+pub(super) struct FirstGaussians {
+    pub cloud: GaussianCloud,
+    pub priors: HashMap<String, DepthPrior>,
+    /// Of the feed-forward network.
+    pub report: Option<InitReport>,
+}
+
+impl From<GaussianCloud> for FirstGaussians {
+    fn from(cloud: GaussianCloud) -> Self {
+        Self { cloud, priors: HashMap::new(), report: None }
+    }
+}
+
+/// All pictures of `initialiser` into at most `capacity` Gaussians; `None` when `go_on` said no. With `at_once` no picture
+/// is still to come, and every depth is made once, from its best partners, on all threads.
+pub(super) fn feed_forward(
+    initialiser: &mut Initialiser,
+    pictures: usize,
+    capacity: usize,
+    at_once: bool,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Option<FirstGaussians>, JobError> {
+    let mut progress = Progress::new("initialising", pictures as u64);
+    let (mut done, mut more) = (0, usize::from(at_once));
+    while more > 0 {
+        more = initialiser.advance(DEPTHS_BETWEEN_STOPS)?;
+        done += more;
+        progress.set(done as u64, || "depth".to_owned());
+        if more > 0 && !go_on() {
+            return Ok(None);
+        }
+    }
+    let made = initialiser.build(capacity)?;
+    let (gaussians, maps) = (made.cloud.len(), made.depth_priors.len());
+    progress.finish(&format!("{gaussians} Gaussians of {maps} depth maps by {}", made.report.network));
+    let priors = made.depth_priors.into_iter().collect();
+    Ok(Some(FirstGaussians { cloud: made.cloud, priors, report: Some(made.report) }))
+}
+
+/// The points themselves.
+pub(super) fn sparse(points: &[Point], capacity: usize) -> Result<GaussianCloud, JobError> {
+    if points.is_empty() {
+        let what = "no sparse points that two of the training pictures saw; use --init feed-forward or random";
+        return Err(JobError::Request(what.into()));
+    }
+    let (positions, colors): (Vec<[f32; 3]>, Vec<[u8; 3]>) =
+        points.iter().map(|(position, color)| (position.map(|v| v as f32), *color)).unzip();
+    Ok(from_sfm(&positions, &colors, capacity)?)
+}
+
+/// Anywhere in what `views` see between the depths `range`, or those of `points`.
+pub(super) fn at_random(
+    views: &[View],
+    points: &[Point],
+    range: Option<[f32; 2]>,
+    capacity: usize,
+    seed: u64,
+) -> Result<GaussianCloud, JobError> {
+    let range = match range {
+        Some(range) => range,
+        None => depth_range(views, points)?,
+    };
+    Ok(random(views, range, RANDOM_POINTS.min(capacity), seed)?)
+}
+
+/// Depths between which the scene lies: of the sparse points when there are any, else around the cameras' height
+/// above the ground plane.
+fn depth_range(views: &[View], points: &[Point]) -> Result<[f32; 2], JobError> {
+    let mut depths: Vec<f32> = Vec::new();
+    let step = points.len().div_ceil(512).max(1);
+    for view in views {
+        let forward = view.pose.forward();
+        let depth = |p: &Point| (glam::DVec3::from_array(p.0) - view.pose.center).dot(forward) as f32;
+        depths.extend(points.iter().step_by(step).map(depth));
+    }
+    depths.retain(|d| *d > 0.0 && d.is_finite());
+    if depths.is_empty() {
+        depths.extend(views.iter().flat_map(|v| [0.7, 1.3].map(|f| (f * v.pose.center.z) as f32)).filter(|d| *d > 0.0));
+    }
+    depths.sort_by(f32::total_cmp);
+    let at = |share: f64| depths.get(((depths.len().max(1) - 1) as f64 * share) as usize).copied();
+    match (at(0.02), at(0.98)) {
+        (Some(near), Some(far)) if far > near => Ok([near, far]),
+        _ => Err(JobError::Request(
+            "a random start needs to know how far the scene is; give depth_m = [near, far] in [init] of --settings"
+                .into(),
+        )),
+    }
+}

@@ -1,0 +1,145 @@
+//! Host memory of a job, planned like the device's: what it will hold at most, by a formula, before the first picture.
+//!
+//! ```text
+//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·N + A·3·P + 2·3·C (+ device)
+//! ```
+//!
+//! V views, N Gaussians, D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
+
+use config::plan::Plan;
+use config::refine::RefineSettings;
+
+use crate::error::JobError;
+
+/// Program, driver and Vulkan loader, resident (measured on x86-64 with lavapipe: 60 MiB, rounded up).
+const PROGRAM_BYTES: u64 = 96 << 20;
+/// The feature network, once upright and once on its side (measured: 26 MiB a session).
+const FEATURES_BYTES: u64 = 2 * (32 << 20);
+/// The trainer's own lists per Gaussian: density control and SH degrees.
+const LISTS_BYTES: u64 = 20;
+
+/// What a job will hold.
+#[derive(Clone, Copy, Debug)]
+pub struct HostRequest<'a> {
+    /// Plan of the device.
+    pub plan: &'a Plan,
+    /// The device's memory is the host's (a software renderer).
+    pub shared: bool,
+    /// The initialiser's own plan, bytes.
+    pub initialiser: u64,
+    /// `[refine]`, when poses are refined.
+    pub refine: Option<&'a RefineSettings>,
+    /// Pixels of a picture as it leaves the camera.
+    pub camera_pixels: u64,
+    /// Pictures decoded ahead of the engine, at training size.
+    pub ahead: u64,
+}
+
+/// Bytes by what holds them, in the order of the formula.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HostPlan {
+    /// Name and bytes.
+    pub sections: Vec<(&'static str, u64)>,
+}
+
+impl HostPlan {
+    /// The formula above.
+    pub fn new(r: &HostRequest<'_>) -> Self {
+        let (n, v, p) = (r.plan.gaussians as u64, r.plan.views as u64, r.plan.pixels as u64);
+        let coefficients = (u64::from(r.plan.sh_degree) + 1).pow(2);
+        let matching = r.refine.map_or(0, |s| {
+            let side = u64::from(s.feature_side);
+            // Per feature 100 bytes, per observation 250 (`RefineSettings`); luma at the network's size, 4:3.
+            let keyframes = v.max(s.max_keyframes.min(r.plan.views) as u64);
+            let per_keyframe = s.max_features as u64 * 100 + side * side * 3 / 4;
+            let observations = (s.max_observations as u64).min(keyframes * s.max_features as u64);
+            FEATURES_BYTES + keyframes * per_keyframe + observations * 250
+        });
+        let sections = vec![
+            ("program", PROGRAM_BYTES),
+            ("initialisation", r.initialiser),
+            ("matching", matching),
+            ("cloud and checkpoint", 2 * 4 * n * (11 + 3 * coefficients)),
+            ("density control", LISTS_BYTES * n),
+            ("pictures ahead", r.ahead * 3 * p),
+            ("picture at hand", 2 * 3 * r.camera_pixels),
+            ("device", if r.shared { r.plan.total_bytes } else { 0 }),
+        ];
+        Self { sections }
+    }
+
+    /// All of them.
+    pub fn total_bytes(&self) -> u64 {
+        self.sections.iter().map(|s| s.1).sum()
+    }
+
+    /// Whether it stays within `host_mib`, when there is a bound.
+    ///
+    /// # Errors
+    /// [`JobError::HostMemory`] with what would do and what takes most.
+    pub fn fits(&self, host_mib: Option<u32>) -> Result<(), JobError> {
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        let (needed_mib, largest) = (mib(self.total_bytes()), self.sections.iter().copied().max_by_key(|s| s.1));
+        match (host_mib, largest) {
+            (Some(host_mib), Some((section, bytes))) if needed_mib > host_mib.into() => {
+                Err(JobError::HostMemory { host_mib, needed_mib, section, section_mib: mib(bytes) })
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use config::plan::PlanRequest;
+
+    use super::*;
+
+    fn total(plan: &Plan, of: impl Fn(&mut HostRequest<'_>)) -> u64 {
+        let refine = RefineSettings::default();
+        let mut request = HostRequest {
+            plan,
+            shared: false,
+            initialiser: 100 << 20,
+            refine: Some(&refine),
+            camera_pixels: 640 * 480,
+            ahead: 4,
+        };
+        of(&mut request);
+        HostPlan::new(&request).total_bytes()
+    }
+
+    #[test]
+    fn every_term_of_the_host_plan_counts_and_a_software_device_lies_on_the_host() {
+        let plan = Plan::new(&PlanRequest::default()).unwrap();
+        let before = total(&plan, |_| {});
+        assert_eq!(total(&plan, |r| r.shared = true) - before, plan.total_bytes);
+        assert_eq!(total(&plan, |r| r.ahead += 1) - before, 3 * plan.pixels as u64);
+        assert_eq!(total(&plan, |r| r.camera_pixels += 1000) - before, 6000);
+        assert!(total(&plan, |r| r.refine = None) < before && total(&plan, |r| r.initialiser = 0) < before);
+        let larger = Plan::new(&PlanRequest { device_mib: 1024, ..PlanRequest::default() }).unwrap();
+        let more = (larger.gaussians - plan.gaussians) as u64;
+        assert_eq!(total(&larger, |_| {}) - before, more * (2 * 4 * (11 + 48) + 20));
+    }
+
+    #[test]
+    fn the_defaults_of_a_mission_fit_into_its_default_host_memory() {
+        let memory = config::mission::MemorySettings::default();
+        let request = PlanRequest { device_mib: memory.device_mib, views: 128, ..PlanRequest::default() };
+        let plan = Plan::new(&request).unwrap();
+        assert!(total(&plan, |r| r.initialiser = 700 << 20) <= u64::from(memory.host_mib) << 20);
+    }
+
+    #[test]
+    fn a_plan_beyond_host_mib_is_refused_with_what_would_do() {
+        let plan = HostPlan { sections: vec![("program", 96 << 20), ("initialisation", (300 << 20) + 1)] };
+        assert!(plan.fits(None).is_ok() && plan.fits(Some(397)).is_ok());
+        let refused = plan.fits(Some(396)).unwrap_err();
+        assert_eq!(config::error::Error::kind(&refused), config::error::ErrorKind::Input);
+        let line = refused.to_string();
+        assert!(
+            line.contains("host_mib = 396") && line.contains("397 MiB") && line.contains("initialisation"),
+            "{line}"
+        );
+    }
+}

@@ -1,0 +1,311 @@
+//! What a job asks of the engine, in the order in which it asks.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use image::imageops::{FilterType, resize};
+use models::camera::{Pose, PosedImage, View};
+use models::dataset::scaled;
+use models::formats::model;
+use vulkan::trainer::{RunBudget, StepReport, StopReason};
+
+use super::carry::carry_over;
+use super::first_gaussians::FirstGaussians;
+use super::{Reconstruction, model_path};
+use crate::error::JobError;
+
+/// Fewer key frames than this say too little about the ground.
+const FIRST_BUILD: usize = 3;
+/// A model is rebuilt when the key frames have grown by this share since the last build: often enough that new ground
+/// is trained on soon, seldom enough that building does not eat the time of training.
+const REBUILD_GROWTH: f64 = 0.34;
+/// Trained Gaussians are kept over a rebuild only when refinement moved no earlier key frame further than this,
+/// in pixels at the ground.
+const CARRY_LIMIT_PX: f64 = 1.5;
+
+/// What makes a model out of key frames: the seam at which a rehearsal stands in for networks, device and disk.
+pub trait Reconstruct {
+    /// Takes in a new key frame.
+    ///
+    /// # Errors
+    /// A network or the device fails. A picture that cannot be tied to the others keeps its pose and is logged.
+    fn add(&mut self, frame: PosedImage) -> Result<(), JobError>;
+    /// Number of key frames.
+    fn keyframes(&self) -> usize;
+    /// Pose of a key frame as it is known now.
+    fn pose(&self, name: &str) -> Option<Pose>;
+    /// Whether enough key frames came since the last build; with `last`, whether any did.
+    fn wants_build(&self, last: bool) -> bool;
+    /// Whether there is a model to train.
+    fn has_model(&self) -> bool;
+    /// (Re)builds the model from all key frames and starts its schedule anew; false when `go_on` said no before it was.
+    ///
+    /// # Errors
+    /// The network or the device fails; the pictures give no depth.
+    fn build(&mut self, go_on: &dyn Fn() -> bool) -> Result<bool, JobError>;
+    /// Whether the schedule of `budget` is over.
+    fn is_done(&self, budget: &RunBudget) -> bool;
+    /// Trains until the budget, the schedule, or `each` says stop.
+    ///
+    /// # Errors
+    /// The device fails; the last checkpoint stays valid.
+    fn train(
+        &mut self,
+        budget: &RunBudget,
+        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
+    ) -> Result<StopReason, JobError>;
+    /// Trains at half the size, or as scheduled again.
+    fn halve_resolution(&mut self, on: bool);
+    /// Gives up the least opaque third of the Gaussians: less memory moved, less to blend.
+    ///
+    /// # Errors
+    /// The device fails.
+    fn shrink(&mut self) -> Result<(), JobError>;
+    /// Gaussians of the model as it is now.
+    fn gaussians(&self) -> usize;
+    /// Writes the model as it is now; returns its path and its number of Gaussians.
+    ///
+    /// # Errors
+    /// The device cannot be read or the disk written; the file written before stays.
+    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), JobError>;
+}
+
+impl Reconstruct for Reconstruction {
+    fn add(&mut self, mut picture: PosedImage) -> Result<(), JobError> {
+        if !self.settings.incremental
+            && let Some(view) = self.resumed.get(&picture.name)
+        {
+            picture.view.pose = view.pose;
+        }
+        let from = Instant::now();
+        let mut tied = false;
+        if let Some(refiner) = &mut self.refiner {
+            match refiner.add(&picture) {
+                Ok(report) => {
+                    tied = true;
+                    tracing::debug!("{}: {} features, {} pairs", picture.name, report.features, report.pairs_verified);
+                }
+                Err(e) => {
+                    tracing::warn!("pose refinement: {e}");
+                    self.report.skip("pictures_not_refined", 1);
+                }
+            }
+            self.report.stage("refine", from);
+        }
+        let lens = scaled(&picture.view.intrinsics, self.settings.scale)?;
+        if (lens.width, lens.height) != picture.image.dimensions() {
+            picture.image = resize(&picture.image, lens.width, lens.height, FilterType::Lanczos3);
+        }
+        picture.view.intrinsics = lens;
+        let prior = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
+        self.trainer.add_view(&picture, prior.as_ref())?;
+        self.views.push((picture.name.clone(), picture.view));
+        if self.settings.incremental && tied {
+            self.refine()?;
+        }
+        // Without refinement, or while pictures come, the pose is as good as it will be for now.
+        if (self.settings.incremental || self.refiner.is_none())
+            && let Some(initialiser) = &mut self.initialiser
+            && let Some((_, view)) = self.views.last()
+        {
+            let from = Instant::now();
+            picture.view.pose = view.pose;
+            initialiser.add(&picture)?;
+            self.initialised = self.views.len();
+            if self.settings.incremental {
+                // The network runs on a picture once its neighbours are there; doing it now spreads the work over the flight.
+                initialiser.advance(1)?;
+            }
+            self.report.stage("init", from);
+        }
+        Ok(())
+    }
+
+    fn keyframes(&self) -> usize {
+        self.views.len()
+    }
+
+    fn pose(&self, name: &str) -> Option<Pose> {
+        self.views.iter().find(|v| v.0 == name).map(|v| v.1.pose)
+    }
+
+    fn wants_build(&self, last: bool) -> bool {
+        let (now, then) = (self.views.len(), self.built.len());
+        if now < FIRST_BUILD {
+            return false;
+        }
+        if last { now > then } else { then == 0 || now as f64 >= then as f64 * (1.0 + REBUILD_GROWTH) }
+    }
+
+    fn has_model(&self) -> bool {
+        !self.built.is_empty()
+    }
+
+    fn build(&mut self, go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
+        let clock = Instant::now();
+        self.refine()?;
+        let from = Instant::now();
+        let Some(fresh) = self.initialise(go_on)? else { return Ok(false) };
+        self.report.stage("init", from);
+        self.take_over(&fresh)?;
+        let loaded = self.trainer.load(&self.cloud)?;
+        self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
+        self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
+        let mut with_prior = 0;
+        for (i, (name, view)) in self.views.iter().enumerate() {
+            self.trainer.renew_view(i, *view)?;
+            if self.depth.is_none() {
+                self.trainer.set_prior(i, fresh.priors.get(name))?;
+            }
+            with_prior += u64::from(self.depth.is_some() || fresh.priors.contains_key(name));
+        }
+        self.built = self.views.iter().map(|v| v.1).collect();
+        let network = self.depth.as_ref().map(|network| network.name().to_owned());
+        let network = network.or(fresh.report.as_ref().map(|report| report.network.clone()));
+        if with_prior > 0 {
+            let prior = serde_json::json!({ "name": network, "views": with_prior });
+            self.report.more.insert("depth_prior".into(), prior);
+        }
+        if let Some(network) = &mut self.depth {
+            network.close();
+        }
+        if let Some(refined) = &self.refined {
+            self.report.more.insert("reprojection_rms_px".into(), refined.reprojection_rms_px.into());
+            self.report.more.insert("refine".into(), serde_json::to_value(refined)?);
+        }
+        if let Some(made) = &fresh.report {
+            self.report.skipped.insert("pairs".into(), made.skipped.total() as u64);
+            self.report.skipped.insert("depth_samples_inconsistent".into(), made.removed as u64);
+            self.report.more.insert("init".into(), serde_json::to_value(made)?);
+        }
+        if self.is_continued() && !self.settings.incremental {
+            let steps = u32::try_from(self.header.steps).unwrap_or(u32::MAX);
+            self.trainer.continue_from(steps, self.train_s);
+        }
+        self.builds += 1;
+        self.report.views = self.views.len() as u64;
+        self.report.more.insert("builds".into(), self.builds.into());
+        tracing::info!(
+            "built from {} key frames: {} Gaussians ({} of them from the pictures) in {:.1} s",
+            self.views.len(),
+            loaded.loaded,
+            fresh.cloud.len(),
+            clock.elapsed().as_secs_f64()
+        );
+        Ok(true)
+    }
+
+    fn is_done(&self, budget: &RunBudget) -> bool {
+        let by_steps = budget.steps.is_some_and(|s| self.trainer.steps() >= s);
+        let by_time = budget.seconds.is_some_and(|s| self.trainer.elapsed_s() >= s);
+        by_steps || by_time
+    }
+
+    fn train(
+        &mut self,
+        budget: &RunBudget,
+        each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
+    ) -> Result<StopReason, JobError> {
+        let _span = tracing::info_span!("train").entered();
+        let from = Instant::now();
+        let before = self.trainer.elapsed_s();
+        let summary = self.trainer.run(budget, each)?;
+        self.report.stage("train", from);
+        self.header.steps += u64::from(summary.steps);
+        self.train_s += self.trainer.elapsed_s() - before;
+        let c = summary.counters;
+        for (name, count) in [
+            ("culled", c.culled),
+            ("behind_opaque", c.behind_opaque),
+            ("gradients_not_finite", c.non_finite_gradients),
+            ("sh_coefficients", c.sh_missing),
+        ] {
+            // The counters run on since `load`.
+            self.report.skipped.insert(name.to_owned(), count);
+        }
+        let work = serde_json::json!({ "instances": c.instances, "evaluations": c.evaluations });
+        self.report.more.insert("work".into(), work);
+        if let Some(last) = summary.last.filter(|last| last.loss.is_finite()) {
+            self.report.more.insert("loss".into(), f64::from(last.loss).into());
+        }
+        for (name, ms) in self.trainer.stage_ms() {
+            self.report.stage_ms.insert(format!("device_{name}"), ms);
+        }
+        self.report.steps += u64::from(summary.steps);
+        self.report.gaussians = self.trainer.gaussians() as u64;
+        Ok(summary.reason)
+    }
+
+    fn halve_resolution(&mut self, on: bool) {
+        self.trainer.set_least_divisor(if on { 2 } else { 1 });
+    }
+
+    fn shrink(&mut self) -> Result<(), JobError> {
+        self.trainer.snapshot(&mut self.cloud)?;
+        let mut by_opacity = self.cloud.opacity_logits.clone();
+        by_opacity.sort_by(f32::total_cmp);
+        let Some(&least) = by_opacity.get(by_opacity.len() / 3) else { return Ok(()) };
+        let logits = self.cloud.opacity_logits.clone();
+        let removed = self.cloud.retain(|i| logits[i] >= least);
+        self.trainer.load(&self.cloud)?;
+        tracing::warn!("gave up {removed} Gaussians, {} remain", self.cloud.len());
+        Ok(())
+    }
+
+    fn gaussians(&self) -> usize {
+        self.trainer.gaussians()
+    }
+
+    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), JobError> {
+        let _span = tracing::info_span!("checkpoint").entered();
+        let from = Instant::now();
+        if self.has_model() {
+            self.trainer.snapshot(&mut self.cloud)?;
+        }
+        self.header.finished = finished;
+        let views = self.views.iter().enumerate().take(self.built.len());
+        self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), self.trainer.view_pose(i)?))).collect();
+        let path = model_path(out);
+        model::write_checkpoint(&self.settings.disk, &path, &self.header, &self.cloud)?;
+        self.report.stage("checkpoint", from);
+        Ok((path, self.cloud.len()))
+    }
+}
+
+impl Reconstruction {
+    /// The cloud to train: what is trained already, and fresh Gaussians where it is not.
+    fn take_over(&mut self, fresh: &FirstGaussians) -> Result<(), JobError> {
+        if self.builds > 0 {
+            self.trainer.snapshot(&mut self.cloud)?;
+        }
+        let made = fresh.report.as_ref().filter(|_| self.settings.incremental);
+        match made {
+            _ if self.is_continued() => {}
+            Some(made) => {
+                let moved_px = self.moved_px(0.5 * (made.depth_m[0] + made.depth_m[1]));
+                if moved_px > CARRY_LIMIT_PX {
+                    tracing::info!(
+                        "refinement moved earlier key frames by {moved_px:.1} px: starting from a fresh cloud"
+                    );
+                    self.cloud.clone_from(&fresh.cloud);
+                } else {
+                    carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().gaussians);
+                }
+            }
+            None => self.cloud.clone_from(&fresh.cloud),
+        }
+        Ok(())
+    }
+
+    /// How far refinement moved the key frames of the last build since then: the largest, in pixels at `depth_m`.
+    fn moved_px(&self, depth_m: f32) -> f64 {
+        let depth = f64::from(depth_m).max(1e-3);
+        let moved = |(then, (_, now)): (&View, &(String, View))| {
+            let shift = now.pose.center.distance(then.pose.center) / depth;
+            let angle = 2.0 * now.pose.rotation.dot(then.pose.rotation).abs().min(1.0).acos();
+            (shift + angle) * f64::from(then.intrinsics.fx)
+        };
+        self.built.iter().zip(&self.views).map(moved).fold(0.0, f64::max)
+    }
+}

@@ -1,0 +1,96 @@
+//! Where pictures come from: an aircraft in flight, a folder. The engine asks for the next one and never for an earlier one
+//! again: what it needs of a picture it keeps.
+
+use std::time::Duration;
+
+use config::mission::KeyframeSettings;
+use models::camera::PosedImage;
+use models::dataset::{Dataset, PoseSource};
+
+use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
+use crate::error::JobError;
+
+/// Gives posed pictures one by one, in the order of capture.
+pub trait PictureSource {
+    /// The next picture if there is one within `patience`: undistorted, with its pose as captured.
+    ///
+    /// # Errors
+    /// It cannot be read, or not be kept.
+    fn next(&mut self, patience: Duration) -> Result<Option<PosedImage>, JobError>;
+
+    /// Pictures that could be taken without waiting.
+    fn waiting(&self) -> usize;
+
+    /// Whether pictures may come that are not waiting yet.
+    fn is_open(&self) -> bool;
+}
+
+/// The pictures of a data set, each decoded once.
+pub struct Folder<'a> {
+    set: &'a Dataset,
+    /// Indices of those to come, the next one last.
+    frames: Vec<usize>,
+    scale: f64,
+    poses: PoseSource,
+    keyframes: KeyframeCounters,
+    decoded: u64,
+}
+
+impl<'a> Folder<'a> {
+    /// `frames` of `set` at `scale`, all of them or those that `rule` makes key frames.
+    ///
+    /// # Errors
+    /// A picture without the pose that was asked for.
+    pub fn new(
+        set: &'a Dataset,
+        mut frames: Vec<usize>,
+        scale: f64,
+        poses: PoseSource,
+        rule: Option<KeyframeSettings>,
+    ) -> Result<Self, JobError> {
+        let mut keyframes = KeyframeCounters::default();
+        if let Some(rule) = rule {
+            let mut selector = KeyframeSelector::new(rule);
+            let mut chosen = Vec::with_capacity(frames.len());
+            for i in frames {
+                if selector.consider(&set.pose(i, poses)?.0) == Decision::Key {
+                    chosen.push(i);
+                }
+            }
+            (frames, keyframes) = (chosen, selector.counters());
+        }
+        frames.reverse();
+        Ok(Self { set, frames, scale, poses, keyframes, decoded: 0 })
+    }
+
+    /// Indices of the pictures to come, in order.
+    pub fn frames(&self) -> Vec<usize> {
+        self.frames.iter().rev().copied().collect()
+    }
+
+    /// What the key-frame rule made of the pictures; zeros without one.
+    pub fn keyframes(&self) -> KeyframeCounters {
+        self.keyframes
+    }
+
+    /// Pictures decoded so far.
+    pub fn decoded(&self) -> u64 {
+        self.decoded
+    }
+}
+
+impl PictureSource for Folder<'_> {
+    fn next(&mut self, _patience: Duration) -> Result<Option<PosedImage>, JobError> {
+        let Some(i) = self.frames.pop() else { return Ok(None) };
+        self.decoded += 1;
+        Ok(Some(self.set.load_posed(i, self.scale, self.poses)?))
+    }
+
+    fn waiting(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn is_open(&self) -> bool {
+        false
+    }
+}

@@ -1,0 +1,164 @@
+//! Why a job (a flight, a training, an evaluation, a measurement) stopped.
+
+use std::path::PathBuf;
+
+use config::error::{Error, ErrorKind};
+use config::mission::MissionError;
+use config::plan::PlanError;
+use hal::error::HalError;
+use models::dataset::DatasetError;
+use models::formats::FormatError;
+use models::init::InitError;
+use models::onnx::OnnxError;
+use models::refine::RefineError;
+use vulkan::gpu::GpuError;
+use vulkan::trainer::TrainError;
+
+use crate::keyframe_store::StoreError;
+use crate::report::ReportError;
+use crate::upload::UploadError;
+
+/// Every variant's text is one line that says what, where and how to mend it.
+#[derive(Debug, thiserror::Error)]
+pub enum JobError {
+    /// The mission file.
+    #[error(transparent)]
+    Mission(#[from] MissionError),
+    /// The memory budget.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
+    /// The host's memory.
+    #[error(
+        "memory plan: host_mib = {host_mib} is too little, {needed_mib} MiB are needed, {section_mib} MiB of it for the \
+         {section}; raise memory.host_mib, or lower memory.device_mib, max_gaussians, image_scale or keyframes.max"
+    )]
+    HostMemory {
+        /// What was allowed.
+        host_mib: u32,
+        /// What would do.
+        needed_mib: u64,
+        /// The largest section of the plan.
+        section: &'static str,
+        /// Its MiB.
+        section_mib: u64,
+    },
+    /// Link or camera.
+    #[error(transparent)]
+    Hal(#[from] HalError),
+    /// Stored key frames.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A folder of pictures.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// Model files, run.json.
+    #[error(transparent)]
+    File(#[from] FormatError),
+    /// A user's network, or ONNX Runtime.
+    #[error(transparent)]
+    Network(#[from] OnnxError),
+    /// Pose refinement.
+    #[error(transparent)]
+    Refine(#[from] RefineError),
+    /// Initialisation.
+    #[error(transparent)]
+    Init(#[from] InitError),
+    /// Vulkan device or driver.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    /// Training and rendering.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+    /// Upload settings.
+    #[error(transparent)]
+    Upload(#[from] UploadError),
+    /// A page of figures.
+    #[error(transparent)]
+    Report(#[from] ReportError),
+    /// Figures that JSON cannot hold.
+    #[error("figures cannot be written as JSON: {0}")]
+    Json(#[from] serde_json::Error),
+    /// A file or folder that no format owns.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// Where.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A thread or a signal handler could not be started, or ended abnormally.
+    #[error("{0}")]
+    System(String),
+    /// What was asked for contradicts the pictures, the model or the settings.
+    #[error("{0}")]
+    Request(String),
+    /// The flight ended before there was anything to build from.
+    #[error("only {keyframes} key frames, nothing to build a model from: {cause}")]
+    TooFewKeyframes {
+        /// How many there were.
+        keyframes: usize,
+        /// The most likely cause by what was counted, and the remedy.
+        cause: String,
+    },
+    /// A rendering that does not have its camera's size.
+    #[error("{0}: the rendering has another size than its camera")]
+    RenderingSize(String),
+    /// A picture that cannot be encoded.
+    #[error("{}: cannot be encoded: {source}", path.display())]
+    Encode {
+        /// Where it should go.
+        path: PathBuf,
+        /// The encoder's reason.
+        source: image::ImageError,
+    },
+    /// A `dgtr` started as a process of its own.
+    #[error("{line}")]
+    Child {
+        /// By its exit code.
+        kind: ErrorKind,
+        /// Its last line.
+        line: String,
+    },
+}
+
+impl JobError {
+    /// For `map_err` on file operations.
+    pub fn io(path: &std::path::Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |source| Self::Io { path: path.to_owned(), source }
+    }
+}
+
+impl JobError {
+    /// Whether it is the disk's fault and room, or a medium that comes back, may mend it.
+    pub fn may_pass(&self) -> bool {
+        match self {
+            Self::Store(e) => e.may_pass(),
+            Self::File(e) => e.may_pass(),
+            _ => false,
+        }
+    }
+}
+
+impl Error for JobError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Mission(e) => e.kind(),
+            Self::Plan(e) => e.kind(),
+            Self::Hal(e) => e.kind(),
+            Self::Store(e) => e.kind(),
+            Self::Dataset(e) => e.kind(),
+            Self::File(e) => e.kind(),
+            Self::Network(e) => e.kind(),
+            Self::Refine(e) => e.kind(),
+            Self::Init(e) => e.kind(),
+            Self::Gpu(e) => e.kind(),
+            Self::Train(e) => e.kind(),
+            Self::Upload(e) => e.kind(),
+            Self::Report(e) => e.kind(),
+            Self::Io { source, .. } => Error::kind(source),
+            Self::HostMemory { .. } | Self::Request(_) | Self::TooFewKeyframes { .. } => ErrorKind::Input,
+            Self::Json(_) | Self::System(_) | Self::RenderingSize(_) | Self::Encode { .. } => ErrorKind::Failed,
+            Self::Child { kind, .. } => *kind,
+        }
+    }
+}

@@ -1,0 +1,168 @@
+//! A card's pictures find their poses: all of them, held-out ones too, so that the model can be scored in its own frame. What
+//! they settled on is kept as `transforms.json` beside the model, for the next start and for other programs.
+
+use std::collections::HashMap;
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use config::refine::RefineSettings;
+use models::camera::View;
+use models::card::name_list;
+use models::dataset::{CardNotes, Dataset, PoseSource};
+use models::formats::transforms;
+use models::refine::Refiner;
+
+use crate::console::Progress;
+use crate::error::JobError;
+
+/// Poses of a card, in the folder of the model.
+const FILE: &str = "transforms.json";
+/// Rotations that the pictures contradict by more than this many standard deviations, and this many degrees, are named.
+const CONTRADICTION: (f64, f64) = (5.0, 20.0);
+
+/// What settling a card is to be remembered for, in run.json.
+pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
+
+/// Says what was taken from the card and what not.
+fn announce(set: &Dataset, notes: &CardNotes) {
+    let mut sizes: Vec<(u32, u32)> =
+        set.frames.iter().map(|f| (f.view.intrinsics.width, f.view.intrinsics.height)).collect();
+    sizes.sort_unstable();
+    sizes.dedup();
+    let sizes: Vec<String> = sizes.iter().map(|(w, h)| format!("{w}x{h}")).collect();
+    tracing::info!(
+        "{}: {} pictures found, {} used ({})",
+        set.root.display(),
+        notes.found,
+        set.frames.len(),
+        sizes.join(", ")
+    );
+    notes.lines.iter().for_each(|line| tracing::warn!("{line}"));
+}
+
+/// Replaces the card's priors by poses that its pictures agree on; `None` when asked to stop.
+pub(super) fn settle(
+    set: &mut Dataset,
+    out: &Path,
+    fresh: bool,
+    refine: Option<&RefineSettings>,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Option<Remarks>, JobError> {
+    let mut remarks = Remarks::new();
+    let Some(notes) = set.card.clone() else { return Ok(Some(remarks)) };
+    announce(set, &notes);
+    let file = out.join(FILE);
+    if !fresh && let Some(settled) = known(set, &file)? {
+        set.settle(&settled);
+        return Ok(Some(remarks));
+    }
+    let settled = match refine {
+        None => set.frames.iter().map(|f| (f.name.clone(), f.view)).collect(),
+        Some(settings) => match refined(set, &notes, settings, go_on, &mut remarks)? {
+            Some(settled) => settled,
+            None => return Ok(None),
+        },
+    };
+    set.settle(&settled);
+    std::fs::create_dir_all(out).map_err(JobError::io(out))?;
+    transforms::write(&file, &set.reconstruction())?;
+    Ok(Some(remarks))
+}
+
+/// What an earlier start settled on, when it was about the same pictures.
+fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, View>>, JobError> {
+    if !file.is_file() {
+        return Ok(None);
+    }
+    let earlier = transforms::read(file)?;
+    let of_path: HashMap<_, _> = earlier.shots.iter().map(|s| (s.path.as_str(), s)).collect();
+    let now = set.reconstruction();
+    let mut settled = HashMap::with_capacity(set.frames.len());
+    for (frame, shot) in set.frames.iter().zip(&now.shots) {
+        // A picture that could not be decoded then is not asked again.
+        let (Some(before), Some(size)) = (of_path.get(shot.path.as_str()), shot.lens.size) else { continue };
+        let lens = frame.orientation.of_lens(&before.lens);
+        let turned = lens.size.unwrap_or(size);
+        let mut pose = before.pose;
+        pose.rotation = frame.orientation.of_rotation(pose.rotation);
+        settled.insert(frame.name.clone(), View { intrinsics: lens.intrinsics(turned), pose });
+    }
+    // Pictures that came since want poses, too.
+    Ok((settled.len() == earlier.shots.len()).then_some(settled))
+}
+
+fn refined(
+    set: &Dataset,
+    notes: &CardNotes,
+    settings: &RefineSettings,
+    go_on: &dyn Fn() -> bool,
+    remarks: &mut Remarks,
+) -> Result<Option<HashMap<String, View>>, JobError> {
+    let all: Vec<usize> = (0..set.frames.len()).collect();
+    let mut settings = settings.clone();
+    settings.max_keyframes = settings.max_keyframes.max(all.len());
+    settings.focal_sigma = settings.focal_sigma.max(notes.focal_sigma);
+    // The network sees no more of a picture than this; decoding more would be for nothing.
+    let longer = |i: &usize| set.frames[*i].view.intrinsics.width.max(set.frames[*i].view.intrinsics.height);
+    let largest = all.iter().map(longer).max().unwrap_or(1);
+    let scale = (f64::from(settings.feature_side) / f64::from(largest)).min(1.0);
+    let mut refiner = Refiner::open(&settings)?;
+    let mut progress = Progress::new("poses", all.len() as u64);
+    let (mut done, mut stopped) = (0, false);
+    let mut skipped = Vec::new();
+    set.load_ahead(&all, scale, PoseSource::Telemetry, settings.threads, |i, picture| {
+        let name = &set.frames[i].name;
+        let added = picture.map_err(|e| e.to_string()).and_then(|p| refiner.add(&p).map_err(|e| e.to_string()));
+        if let Err(e) = added {
+            tracing::warn!("{e}");
+            skipped.push(name.clone());
+        }
+        done += 1;
+        progress.set(done, || name.clone());
+        stopped = !go_on();
+        if stopped { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    if stopped {
+        return Ok(None);
+    }
+    remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
+    let solved = refiner.solve()?;
+    progress.finish(&format!(
+        "{} of {} pictures tied together, reprojection {:.2} px",
+        solved.frames_tied,
+        all.len(),
+        solved.reprojection_rms_px
+    ));
+    let mut settled = HashMap::with_capacity(all.len());
+    let (mut contradicted, mut untied) = (Vec::new(), Vec::new());
+    for frame in &set.frames {
+        let name = &frame.name;
+        let (Some(pose), Some(intrinsics)) = (refiner.pose(name), refiner.intrinsics(name)) else { continue };
+        if !refiner.is_tied(name) {
+            untied.push(name);
+        } else if let Some(prior) = frame.prior {
+            let away = prior.pose.rotation.angle_between(pose.rotation).to_degrees();
+            let sigma = f64::from(prior.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b))).to_degrees();
+            if away > CONTRADICTION.1.max(CONTRADICTION.0 * sigma) {
+                contradicted.push((name, away));
+            }
+        }
+        settled.insert(name.clone(), View { intrinsics, pose });
+    }
+    if !contradicted.is_empty() {
+        let mut angles: Vec<f64> = contradicted.iter().map(|c| c.1).collect();
+        angles.sort_by(f64::total_cmp);
+        let names: Vec<&String> = contradicted.iter().map(|c| c.0).collect();
+        tracing::warn!(
+            "{}: turned by about {:.0} degrees against what they say of themselves (the pictures are believed)",
+            name_list(&names),
+            angles[angles.len() / 2]
+        );
+        remarks.push(("pictures_turned", serde_json::json!(names)));
+    }
+    if !untied.is_empty() {
+        tracing::warn!("{}: see too little of what others see; their stated poses are kept", name_list(&untied));
+    }
+    remarks.push(("refine", serde_json::to_value(&solved)?));
+    Ok(Some(settled))
+}

@@ -1,0 +1,92 @@
+//! The gates between what arrives and what counts: signature and bounds of an offer, then, once its bytes are here, whether
+//! they parse and mean what they should. Whatever fails leaves the last good model in place and is counted with its reason.
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+
+use config::upload::UploadSettings;
+use serde::Serialize;
+
+use super::offer::{Offer, OfferError};
+use crate::keys::Identity;
+
+/// Distinct refusals that are remembered; beyond it they are only counted by kind.
+const MAX_REMEMBERED: usize = 256;
+
+/// Why a model that arrived whole does not count.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ModelRefusal {
+    /// Not a readable model, or one that breaks a bound.
+    #[error("{0}")]
+    Parse(String),
+    /// Readable, but not what this aircraft should have made.
+    #[error("{0}")]
+    Meaning(String),
+}
+
+/// Whether a model file may count as this aircraft's.
+pub type ModelCheck = dyn Fn(&str, &Path) -> Result<(), ModelRefusal> + Send + Sync;
+
+/// What the ground lets in.
+pub struct Admission {
+    /// Name of the mission.
+    pub mission: String,
+    /// Its aircraft.
+    pub aircraft: Vec<String>,
+    /// Whose signatures count, and our own.
+    pub identity: Identity,
+    /// The gates behind the transfer.
+    pub check: Box<ModelCheck>,
+}
+
+impl Admission {
+    /// The gates before the transfer.
+    ///
+    /// # Errors
+    /// What is wrong with the offer.
+    pub fn offer(&self, bytes: &[u8], settings: &UploadSettings) -> Result<Offer, OfferError> {
+        let offer = Offer::decode(bytes, settings)?;
+        offer.check(&self.mission, &self.aircraft, &self.identity)?;
+        Ok(offer)
+    }
+
+    /// The gates behind the transfer. A model that makes its reader panic costs only itself.
+    ///
+    /// # Errors
+    /// Why the model may not count.
+    pub fn model(&self, aircraft: &str, path: &Path) -> Result<(), ModelRefusal> {
+        let checked = catch_unwind(AssertUnwindSafe(|| (self.check)(aircraft, path)));
+        checked.unwrap_or_else(|_| Err(ModelRefusal::Parse("reading it failed".into())))
+    }
+}
+
+/// Refusals by their reason, in words, and how often each was met.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(transparent)]
+pub struct Refusals(BTreeMap<String, u64>);
+
+impl Refusals {
+    /// Counts one; the first of its reason is told.
+    pub fn count(&mut self, why: String) {
+        if self.0.len() < MAX_REMEMBERED && !self.0.contains_key(&why) {
+            tracing::warn!("serve: refused: {why}");
+        }
+        self.add(why, 1);
+    }
+
+    fn add(&mut self, why: String, times: u64) {
+        if self.0.len() < MAX_REMEMBERED || self.0.contains_key(&why) {
+            *self.0.entry(why).or_default() += times;
+        }
+    }
+
+    /// Each reason with its count.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, u64)> {
+        self.0.iter().map(|(why, n)| (why.as_str(), *n))
+    }
+
+    pub(super) fn absorb(&mut self, other: Self) {
+        other.0.into_iter().for_each(|(why, n)| self.add(why, n));
+    }
+}

@@ -1,0 +1,177 @@
+//! The ground's end: asks every aircraft, and takes no answer for true that the caller does not accept.
+
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::SyncSender;
+use std::time::Instant;
+
+use config::upload::UploadSettings;
+use zenoh::handlers::FifoChannel;
+use zenoh::qos::CongestionControl;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::{Session, Wait};
+
+use super::super::offer::{Offer, hex};
+use super::super::transport::{Inlet, Patience, TransportError};
+use super::{LOOK_UP, NOT_HELD, network, open};
+
+/// What zenoh lets pass on the ground: from each aircraft, known by its certificate's common name, what lies under its own
+/// key; to everybody, what the ground itself asks.
+fn access_control(mission: &str, aircraft: &[String]) -> serde_json::Value {
+    let everything = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"];
+    let rule = |id: &str, flow: &str, messages: &[&str], key: String| serde_json::json!({ "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": [key] });
+    let mut rules = vec![rule("ask", "egress", &everything, format!("dgtr/{mission}/**"))];
+    let (mut subjects, mut policies) = (Vec::new(), Vec::new());
+    for id in aircraft {
+        let own = format!("own {id}");
+        let speak = ["put", "reply", "declare_queryable"];
+        rules.push(rule(&own, "ingress", &speak, format!("dgtr/{mission}/{id}/**")));
+        subjects.push(serde_json::json!({ "id": id, "cert_common_names": [id] }));
+        policies.push(serde_json::json!({ "rules": ["ask", own], "subjects": [id] }));
+    }
+    serde_json::json!({
+        "enabled": true, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
+    })
+}
+
+/// The ground's end.
+pub struct NetworkInlet {
+    session: Session,
+    mission: String,
+    endpoints: String,
+    max_offer: u64,
+}
+
+impl NetworkInlet {
+    /// Listens on `settings.listen`; `wake` gets a token whenever an aircraft announces something.
+    ///
+    /// # Errors
+    /// An endpoint that cannot be listened on (in use, not ours), or unreadable certificates.
+    pub fn open(
+        settings: &UploadSettings,
+        mission: &str,
+        aircraft: &[String],
+        wake: SyncSender<()>,
+    ) -> Result<Self, TransportError> {
+        let session = open(settings, &settings.listen, &[], Some(access_control(mission, aircraft)))?;
+        session
+            .declare_subscriber(format!("dgtr/{mission}/*/offer"))
+            .callback(move |_| {
+                // Full means that the ground is about to look anyway.
+                let _ = wake.try_send(());
+            })
+            .background()
+            .wait()
+            .map_err(network)?;
+        let (mission, endpoints) = (mission.into(), settings.listen.join(", "));
+        Ok(Self { session, mission, endpoints, max_offer: Offer::max_encoded(settings) })
+    }
+
+    /// Shows every answer to one query until `take` is content; an answer above `limit` is shown as an empty one. Returns
+    /// whether it was, and whether somebody said that the thing is not held.
+    fn ask(
+        &self,
+        key: &str,
+        payload: Option<&[u8]>,
+        patience: Patience,
+        limit: u64,
+        take: &mut dyn FnMut(&[u8]) -> bool,
+    ) -> Result<(bool, bool), TransportError> {
+        let query = self
+            .session
+            .get(key)
+            // All, not the first: whoever answers first may lie.
+            .target(QueryTarget::All)
+            .timeout(patience.limit)
+            .congestion_control(CongestionControl::Block)
+            .consolidation(ConsolidationMode::None)
+            .with(FifoChannel::new(4));
+        let replies = match payload {
+            Some(payload) => query.payload(payload).wait(),
+            None => query.wait(),
+        };
+        let replies = replies.map_err(network)?;
+        let (until, mut not_held) = (Instant::now() + patience.limit, false);
+        while Instant::now() < until && !patience.stop.load(Ordering::Relaxed) {
+            let reply = match replies.recv_timeout(LOOK_UP) {
+                Ok(Some(reply)) => reply,
+                Ok(None) => continue,
+                Err(_) => break,
+            };
+            match reply.into_result() {
+                Ok(sample) if sample.payload().len() as u64 <= limit => {
+                    if take(&sample.payload().to_bytes()) {
+                        return Ok((true, not_held));
+                    }
+                }
+                Ok(sample) => {
+                    let bytes = sample.payload().len() as u64;
+                    tracing::debug!("serve: {}", TransportError::TooLong { what: key.into(), bytes, limit });
+                    if take(&[]) {
+                        return Ok((true, not_held));
+                    }
+                }
+                Err(e) => not_held |= e.payload().to_bytes() == NOT_HELD,
+            }
+        }
+        Ok((false, not_held))
+    }
+}
+
+impl Inlet for NetworkInlet {
+    fn name(&self) -> String {
+        format!("network {}", self.endpoints)
+    }
+
+    fn offers(&self, patience: Patience, see: &mut dyn FnMut(&[u8])) -> Result<(), TransportError> {
+        let mut see_all = |bytes: &[u8]| {
+            see(bytes);
+            false
+        };
+        self.ask(&format!("dgtr/{}/*/offer", self.mission), None, patience, self.max_offer, &mut see_all).map(|_| ())
+    }
+
+    fn chunk(
+        &self,
+        offer: &Offer,
+        index: usize,
+        patience: Patience,
+        accept: &mut dyn FnMut(&[u8]) -> bool,
+    ) -> Result<Vec<u8>, TransportError> {
+        let hash = offer.chunks[index];
+        let key = format!("dgtr/{}/{}/chunk/{}", self.mission, offer.aircraft, hex(&hash));
+        let (mut chunk, mut answers) = (None, 0);
+        let (_, not_held) = self.ask(&key, None, patience, offer.chunk_len(index), &mut |bytes| {
+            answers += 1;
+            let good = accept(bytes);
+            chunk = good.then(|| bytes.to_vec());
+            good
+        })?;
+        chunk.ok_or_else(|| match (answers, not_held) {
+            (0, true) => TransportError::NotHeld(hash),
+            (0, false) => network("no answer in time"),
+            _ => TransportError::Corrupt(hash),
+        })
+    }
+
+    fn deliver_receipt(
+        &self,
+        aircraft: &str,
+        receipt: &[u8],
+        patience: Patience,
+        accept: &mut dyn FnMut(&[u8]) -> bool,
+    ) -> Result<(), TransportError> {
+        let key = format!("dgtr/{}/{aircraft}/receipt", self.mission);
+        match self.ask(&key, Some(receipt), patience, 64, accept)?.0 {
+            true => Ok(()),
+            false => Err(network("the aircraft did not take the receipt")),
+        }
+    }
+}
+
+impl Drop for NetworkInlet {
+    fn drop(&mut self) {
+        if let Err(e) = self.session.close().wait() {
+            tracing::debug!("upload: closing the session: {e}");
+        }
+    }
+}

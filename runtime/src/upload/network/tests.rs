@@ -1,0 +1,136 @@
+//! Strangers on the network: whoever speaks in another's name, and whoever answers faster than the one who was asked.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use super::*;
+use crate::keys::Identity;
+use crate::keys::testing::identities;
+use crate::upload::admission::Admission;
+use crate::upload::offer::{OfferedModel, Order};
+use crate::upload::receipt::{Receipt, Verdict};
+use crate::upload::receive::Receiver;
+use crate::upload::testing::{certificates, free_port, knows_localhost, noise};
+use crate::upload::{Offerer, Source};
+
+const LIMIT: Duration = Duration::from_secs(60);
+
+fn settings(endpoint: &str) -> UploadSettings {
+    UploadSettings {
+        connect: vec![endpoint.to_owned()],
+        listen: vec![endpoint.to_owned()],
+        chunk_kib: 64,
+        retry_min_s: 0.1,
+        retry_max_s: 0.5,
+        poll_s: 0.2,
+        ..Default::default()
+    }
+}
+
+fn source(aircraft: &str, identity: &Identity) -> Source {
+    Source { identity: identity.clone(), ..Source::unsigned("m", aircraft) }
+}
+
+fn ground(settings: &UploadSettings, ids: &[&str], identity: &Identity, dir: &Path) -> Receiver {
+    let aircraft = ids.iter().map(|id| (*id).to_owned()).collect();
+    let check = Box::new(|_: &str, _: &Path| Ok(()));
+    let admission = Admission { mission: "m".into(), aircraft, identity: identity.clone(), check };
+    Receiver::open(settings, admission, dir).expect("receiver")
+}
+
+fn receive(r: &mut Receiver, limit: Duration, mut done: impl FnMut(&Receiver) -> bool) -> bool {
+    let until = Instant::now() + limit;
+    while Instant::now() < until {
+        r.round(&AtomicBool::new(false)).expect("round");
+        if done(r) {
+            return true;
+        }
+    }
+    false
+}
+
+/// Anybody could say "have" for the ground, and `fly` stopped waiting for its model to be safe.
+#[test]
+fn a_false_receipt_over_the_network_is_not_believed() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = settings(&format!("tcp/127.0.0.1:{}", free_port()));
+    let ids = identities(["a1", "a2"]);
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 1)).expect("write");
+    // Where the ground should be sits somebody else.
+    let stranger = open(&settings, &settings.listen, &[], None).expect("session");
+    let o = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
+    o.offer_final(&path);
+    let order = Order { flight: 1, counter: 1 };
+    let offer = OfferedModel::open(&path, &settings, &source("a1", &ids[0]), order, true).expect("offer").offer;
+    let receipt = Receipt::new(&offer, Verdict::Received);
+    let say = |bytes: Vec<u8>| {
+        let asked = stranger.get("dgtr/m/a1/receipt").payload(bytes).timeout(Duration::from_secs(2)).wait();
+        asked.expect("asked").into_iter().count()
+    };
+    let until = Instant::now() + LIMIT;
+    while stranger.get("dgtr/m/a1/offer").wait().expect("asked").into_iter().count() == 0 {
+        assert!(Instant::now() < until, "no connection");
+        std::thread::sleep(LOOK_UP);
+    }
+    for forger in [Identity::unsigned(), ids[0].clone(), ids[1].clone()] {
+        assert_eq!(say(receipt.seal(&forger)), 0, "signed for");
+    }
+    assert!(!o.wait_delivered(Duration::from_secs(1), || true));
+    // The ground's own is.
+    assert_eq!(say(receipt.seal(&ids[2])), 1);
+    assert!(o.wait_delivered(LIMIT, || true));
+}
+
+/// The first answer was taken for the answer, so that one liar could hide an aircraft for ever.
+#[test]
+fn a_liar_on_the_network_hides_nobody_and_gets_nothing_in() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = settings(&format!("tcp/127.0.0.1:{}", free_port()));
+    let ids = identities(["a1", "a2"]);
+    let mut r = ground(&settings, &["a1"], &ids[2], &dir.path().join("g"));
+    // One answers with garbage, one with an offer that a2 signed in the name of a1.
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, b"x").expect("write");
+    let order = Order { flight: u64::MAX, counter: u64::MAX };
+    let rogue = OfferedModel::open(&path, &settings, &source("a1", &ids[1]), order, true).expect("offer").offer;
+    let liars = [vec![7; 64], rogue.encode()].map(|answer| open_client(&settings, "dgtr/m/a1/**", answer));
+    std::fs::write(&path, noise(500_000, 2)).expect("write");
+    assert!(receive(&mut r, LIMIT, |r| r.counters.forged > 0 && r.counters.damaged > 0));
+    let a1 = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
+    a1.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished() && r.all_told()), "{:?} {:?}", r.counters, a1.status());
+    assert!(a1.wait_delivered(LIMIT, || true));
+    assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(500_000, 2));
+    assert_eq!((r.counters.chunks, r.counters.models), (8, 1));
+    drop(liars);
+}
+
+/// A certificate of one aircraft was good for the names of all.
+#[test]
+fn over_tls_an_aircrafts_certificate_speaks_under_its_own_name_only() {
+    if !knows_localhost() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("temp dir");
+    let endpoint = format!("tls/localhost:{}", free_port());
+    let with = |name: &str| {
+        let tls = Some(certificates(&dir.path().join("tls"), name));
+        UploadSettings { tls, ..settings(&endpoint) }
+    };
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 3)).expect("write");
+    // Without keys, so that nothing but the certificate protects the name.
+    let nobody = Identity::unsigned();
+    let mut r = ground(&with("ground"), &["a1", "a2"], &nobody, &dir.path().join("g"));
+    let a2 = with("a2");
+    let rogue = Offerer::start(&a2, source("a1", &nobody)).expect("offerer");
+    rogue.offer_final(&path);
+    let honest = Offerer::start(&a2, source("a2", &nobody)).expect("offerer");
+    honest.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| !r.received().is_empty() && r.all_told()), "{:?}", honest.status());
+    assert!(!receive(&mut r, Duration::from_secs(3), |r| r.received().len() > 1));
+    assert_eq!(r.received()[0].aircraft, "a2");
+    assert!(honest.wait_delivered(LIMIT, || true) && !rogue.status().delivered);
+}

@@ -1,0 +1,282 @@
+//! Five aircraft, one ground and a rogue over bad links, in the manner of Jepsen: every node is a process, which is killed
+//! and started again at random; links are slow, late, lossy, cut and reset. When the storm is over, every honest final
+//! model is at the ground, byte for byte, and nothing else is.
+//!
+//! `DGTR_STORM_S` sets the length of the storm (12 s without it), `DGTR_STORM_SEED` what happens in it.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use config::upload::UploadSettings;
+
+use super::admission::Admission;
+use super::folder::write_whole;
+use super::network::open_client;
+use super::receive::Receiver;
+use super::testing::{Dice, Proxy, Weather, certificates, free_port, knows_localhost, noise};
+use super::{Offerer, Source};
+use crate::keys::Identity;
+use crate::keys::testing::identities;
+
+const AIRCRAFT: [&str; 5] = ["a1", "a2", "a3", "a4", "a5"];
+/// One way, milliseconds.
+const DELAYS: [u64; 5] = [50, 100, 200, 400, 1000];
+/// After the storm everything must be in within so long.
+const CALM: Duration = Duration::from_secs(120);
+
+fn checkpoint_of(aircraft: usize) -> Vec<u8> {
+    noise(70_000, 100 + aircraft as u8)
+}
+
+fn final_of(aircraft: usize) -> Vec<u8> {
+    noise(250_000, 200 + aircraft as u8)
+}
+
+fn settings(dir: &Path, name: &str, port: u16) -> UploadSettings {
+    let file = |kind: &str| dir.join("tls").join(format!("{name}.{kind}"));
+    let (certificate, key) = (file("pem"), file("key"));
+    let tls = config::upload::TlsSettings { authority: dir.join("tls/ca.pem"), certificate, key };
+    UploadSettings {
+        connect: vec![format!("tls/localhost:{port}")],
+        tls: Some(tls),
+        chunk_kib: 32,
+        retry_min_s: 0.1,
+        retry_max_s: 1.0,
+        chunk_timeout_s: 5.0,
+        poll_s: 0.3,
+        checkpoint_s: 1.0,
+        ..Default::default()
+    }
+}
+
+/// One process of the storm.
+#[test]
+#[ignore = "a process that the storm starts"]
+fn node() {
+    let of = |name: &str| std::env::var(format!("DGTR_STORM_{name}")).ok();
+    let (Some(role), Some(dir), Some(port)) = (of("ROLE"), of("DIR"), of("PORT")) else { return };
+    let (dir, port) = (PathBuf::from(dir), port.parse().expect("a port"));
+    match AIRCRAFT.iter().position(|id| *id == role) {
+        Some(aircraft) => fly(&dir, aircraft, port),
+        None if role == "ground" => serve(&dir, port),
+        None => lie(&dir, port),
+    }
+}
+
+/// As `dgtr fly` does: a checkpoint, then the final model; started again, it goes on where it was.
+fn fly(dir: &Path, aircraft: usize, port: u16) {
+    let id = AIRCRAFT[aircraft];
+    let identity = identities(AIRCRAFT)[aircraft].clone();
+    let flight_number = Some(dir.join(format!("{id}.flight")));
+    let source = Source { identity, flight_number, ..Source::unsigned("m", id) };
+    let o = Offerer::start(&settings(dir, id, port), source).expect("offerer");
+    let (model, landed) = (dir.join(format!("{id}.dgtr")), dir.join(format!("{id}.landed")));
+    if !landed.exists() {
+        write_whole(&model, &checkpoint_of(aircraft)).expect("write");
+        o.offer(&model);
+        std::thread::sleep(Duration::from_secs(4));
+        write_whole(&landed, b"").expect("write");
+    }
+    write_whole(&model, &final_of(aircraft)).expect("write");
+    o.offer_final(&model);
+    while !o.wait_delivered(Duration::from_secs(3600), || true) {}
+    write_whole(&dir.join(format!("{id}.delivered")), b"").expect("write");
+    // Until it is killed, it answers.
+    std::thread::sleep(Duration::from_secs(3600));
+}
+
+/// As `dgtr serve` does, and writes down what it counted and which final models it completed.
+fn serve(dir: &Path, port: u16) {
+    let settings = UploadSettings { listen: vec![format!("tls/localhost:{port}")], ..settings(dir, "ground", port) };
+    let identity = identities(AIRCRAFT)[AIRCRAFT.len()].clone();
+    let aircraft: Vec<String> = AIRCRAFT.iter().map(|id| (*id).to_owned()).collect();
+    let admission = Admission { mission: "m".into(), aircraft, identity, check: Box::new(|_, _| Ok(())) };
+    let mut r = Receiver::open(&settings, admission, &dir.join("received")).expect("receiver");
+    let mut finals = finished(&r);
+    let counted = dir.join(format!("ground.{}.json", std::process::id()));
+    loop {
+        if !r.round(&AtomicBool::new(false)).expect("round") {
+            r.wait();
+        }
+        let now = finished(&r);
+        for id in now.iter().filter(|id| !finals.contains(id)) {
+            let log = dir.join(format!("{id}.final.{}", std::process::id()));
+            let n = std::fs::read(&log).map_or(0, |b| b.len());
+            write_whole(&log, &vec![b'.'; n + 1]).expect("write");
+        }
+        finals = now;
+        let done = r.all_finished() && r.all_told();
+        let said = serde_json::json!({ "done": done, "counters": r.counters, "refused": r.refusals });
+        write_whole(&counted, said.to_string().as_bytes()).expect("write");
+    }
+}
+
+fn finished(r: &Receiver) -> Vec<String> {
+    r.received().into_iter().filter(|m| m.finished).map(|m| m.aircraft).collect()
+}
+
+/// Holds a2's certificate, but not its key: offers rubbish as a2 and as a1, and answers every question about a2 with rubbish.
+fn lie(dir: &Path, port: u16) {
+    let settings = settings(dir, "a2", port);
+    let identity = Identity::stranger();
+    let model = dir.join("rogue.dgtr");
+    write_whole(&model, b"x").expect("write");
+    let offerers = ["a1", "a2"].map(|id| {
+        let flight_number = Some(dir.join(format!("rogue-{id}.flight")));
+        let source = Source { identity: identity.clone(), flight_number, ..Source::unsigned("m", id) };
+        let o = Offerer::start(&settings, source).expect("offerer");
+        o.offer_final(&model);
+        o
+    });
+    let _session = open_client(&settings, "dgtr/m/a2/**", vec![7; 1000]);
+    std::thread::sleep(Duration::from_secs(3600));
+    drop(offerers);
+}
+
+struct Node {
+    role: &'static str,
+    port: u16,
+    child: Option<Child>,
+}
+
+impl Node {
+    fn start(&mut self, dir: &Path) {
+        let mut command = Command::new(std::env::current_exe().expect("this program"));
+        command.args(["--exact", "upload::storm::node", "--ignored", "--nocapture"]);
+        command.env("DGTR_STORM_ROLE", self.role).env("DGTR_STORM_DIR", dir);
+        command.env("DGTR_STORM_PORT", self.port.to_string());
+        let path = dir.join(format!("{}.log", self.role));
+        let log = std::fs::File::options().create(true).append(true).open(path).expect("log");
+        let (out, err) = (Stdio::from(log.try_clone().expect("log")), Stdio::from(log));
+        self.child = Some(command.stdin(Stdio::null()).stdout(out).stderr(err).spawn().expect("process"));
+    }
+
+    /// SIGKILL.
+    fn kill(&mut self) {
+        if let Some(mut child) = self.child.take() {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        self.kill();
+    }
+}
+
+/// What all grounds counted, and whether one of them has everything.
+fn counted(dir: &Path) -> (BTreeMap<String, u64>, BTreeMap<String, u64>, bool) {
+    let (mut counters, mut refused, mut done) = (BTreeMap::new(), BTreeMap::new(), false);
+    for entry in std::fs::read_dir(dir).expect("folder").flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if !name.starts_with("ground.") || !name.ends_with(".json") {
+            continue;
+        }
+        let Ok(bytes) = std::fs::read(entry.path()) else { continue };
+        let said: serde_json::Value = serde_json::from_slice(&bytes).expect("written whole");
+        done |= said["done"] == true;
+        for (sum, part) in [(&mut counters, &said["counters"]), (&mut refused, &said["refused"])] {
+            for (what, n) in part.as_object().expect("an object") {
+                *sum.entry(what.clone()).or_default() += n.as_u64().unwrap_or(0);
+            }
+        }
+    }
+    (counters, refused, done)
+}
+
+#[test]
+fn after_the_storm_every_final_model_is_here_once_and_nothing_else() {
+    if !knows_localhost() {
+        return;
+    }
+    let number =
+        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(otherwise);
+    let (length, seed) = (number("DGTR_STORM_S", 12), number("DGTR_STORM_SEED", 1));
+    let dir = tempfile::tempdir().expect("temp dir");
+    for name in AIRCRAFT.into_iter().chain(["ground"]) {
+        certificates(&dir.path().join("tls"), name);
+    }
+    // The rogue counts from far above.
+    for id in ["a1", "a2"] {
+        std::fs::write(dir.path().join(format!("rogue-{id}.flight")), (u64::MAX - 9).to_string()).expect("write");
+    }
+    let port = free_port();
+    let link = |i: usize| {
+        let delay = Duration::from_millis(DELAYS[i]);
+        Proxy::to(port, Weather { rate: 400e3, delay, loss_pct: 20, seed: seed + i as u64 })
+    };
+    let proxies: Vec<Proxy> = (0..AIRCRAFT.len()).map(link).collect();
+    let aircraft = AIRCRAFT.iter().zip(&proxies).map(|(&role, p)| Node { role, port: p.port, child: None });
+    let others = ["ground", "rogue"].map(|role| Node { role, port, child: None });
+    let mut nodes: Vec<Node> = aircraft.chain(others).collect();
+    nodes.iter_mut().for_each(|n| n.start(dir.path()));
+
+    let mut dice = Dice(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+    let (mut kills, mut cuts, mut resets) = (0, 0, 0);
+    let storm = Instant::now() + Duration::from_secs(length);
+    let mut mend_at = vec![None::<Instant>; proxies.len()];
+    while Instant::now() < storm {
+        std::thread::sleep(Duration::from_millis(200 + dice.roll(800)));
+        for (proxy, at) in proxies.iter().zip(&mut mend_at) {
+            if at.is_some_and(|at| Instant::now() >= at) {
+                proxy.cut(false);
+                *at = None;
+            }
+        }
+        let (what, who) = (dice.roll(4), dice.roll(5) as usize);
+        match what {
+            0 => {
+                // Everybody, the rogue included.
+                let node = dice.roll(nodes.len() as u64) as usize;
+                nodes[node].kill();
+                nodes[node].start(dir.path());
+                kills += 1;
+            }
+            1 => {
+                proxies[who].cut(true);
+                mend_at[who] = Some(Instant::now() + Duration::from_millis(500 + dice.roll(4000)));
+                cuts += 1;
+            }
+            2 => {
+                proxies[who].reset();
+                resets += 1;
+            }
+            _ => {}
+        }
+    }
+    proxies.iter().for_each(|p| p.cut(false));
+    let until = Instant::now() + CALM;
+    let told = |id: &str| dir.path().join(format!("{id}.delivered")).exists();
+    while !(counted(dir.path()).2 && AIRCRAFT.iter().all(|id| told(id))) && Instant::now() < until {
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    nodes.iter_mut().for_each(Node::kill);
+    let (counters, refused, done) = counted(dir.path());
+    println!(
+        "{length} s of storm, seed {seed}: {kills} kills, {cuts} cuts, {resets} resets\n{counters:?}\n{refused:#?}"
+    );
+    assert!(done, "not everything arrived");
+    for (i, id) in AIRCRAFT.iter().enumerate() {
+        let folder = dir.path().join("received").join(id);
+        assert!(std::fs::read(folder.join("model.dgtr")).expect("a model") == final_of(i), "{id}");
+        assert_eq!(std::fs::read_dir(folder.join("chunk")).expect("folder").count(), 0, "{id}");
+        assert!(told(id), "{id} was not told");
+        let completed: u64 = std::fs::read_dir(dir.path())
+            .expect("folder")
+            .flatten()
+            .map(|e| {
+                let is_log = e.file_name().to_string_lossy().starts_with(&format!("{id}.final."));
+                if is_log { e.metadata().map_or(0, |m| m.len()) } else { 0 }
+            })
+            .sum();
+        assert!(completed <= 1, "{id}'s final model came {completed} times");
+    }
+    // The rogue was met as a2, by its missing key; as a1 its certificate did not even let it speak.
+    assert!(counters["forged"] > 0, "{counters:?}");
+    assert!(refused.keys().any(|why| why.contains("\"a2\"")) && !refused.keys().any(|why| why.contains("\"a1\"")));
+}

@@ -1,0 +1,122 @@
+//! Whether a device can be relied on, found out without training: one kernel against its twin, and a plan against what the
+//! device refuses.
+
+use super::{TrainError, Trainer};
+use crate::arena::Arena;
+use crate::gpu::{Gpu, GpuError};
+use crate::kernels::{Kernel, SCAN_LANES};
+use crate::layout::Push;
+use crate::pipelines::Pipelines;
+use crate::shape::KernelShape;
+use crate::synthetic::{cloud, plain, view};
+use crate::twin::camera::Camera;
+use crate::twin::gaussian::Gaussian;
+use crate::twin::project::{Culled, Limits, project};
+use config::plan::{Plan, PlanRequest};
+
+/// Gaussians that the kernel is tried on.
+const TRIED: usize = 200;
+
+/// Runs the projection on the device and compares it with its twin; returns on how many Gaussians.
+///
+/// # Errors
+/// [`GpuError::ComputesNothing`], [`GpuError::ComputesWrong`], or what the driver says, as [`TrainError::Gpu`].
+pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
+    let (v, c) = (view(64, 48), cloud(3, TRIED, 0));
+    let sort_lanes = gpu.info().sort_lanes();
+    let request = PlanRequest { width: 64, height: 48, views: 0, sh_degree: 0, sort_lanes, ..Default::default() };
+    let plan = Plan::with_capacities(&request, TRIED, TRIED);
+    let shape = KernelShape::standard(gpu.info());
+    let mut trainer = Trainer::with_kernels(gpu, &plan, &plain(), shape, &[Kernel::Project])?;
+    trainer.load(&c)?;
+    trainer.frame.plain();
+    (trainer.frame.gaussians, trainer.frame.step) = (TRIED as u32, 1);
+    trainer.frame.look(&v);
+    trainer.write_frame();
+    let recording = trainer.take_recording()?;
+    recording.run(Kernel::Project, TRIED, Push::default());
+    recording.submit()?;
+    let keys = &trainer.arena.slice::<u32>(trainer.arena.section("keys"))[..TRIED];
+    let projected = trainer.arena.slice::<[f32; 4]>(trainer.arena.section("projected"));
+    if keys.iter().all(|k| *k == 0) {
+        return Err(GpuError::ComputesNothing.into());
+    }
+    let camera = Camera::<f32>::of(&v);
+    let agrees = |i: usize| {
+        let twin = project(&Gaussian::of_row(&c, i), &camera, 0, 1.0, &Limits::default());
+        let twin = match twin {
+            Ok(twin) => twin,
+            // The two cull differently by a fraction of a pixel at the picture's edge.
+            Err(Culled::Outside) => return true,
+            Err(_) => return keys[i] == u32::MAX,
+        };
+        let inside = (0..2).all(|k| twin.mean2d[k] >= 0.0 && twin.mean2d[k] <= camera.size[k] as f32);
+        if keys[i] == u32::MAX && !inside {
+            return true;
+        }
+        let [x, y, z, _] = projected[3 * i];
+        let near = |a: f32, b: f32| (a - b).abs() <= 1e-3 * (1.0 + b.abs());
+        keys[i] == z.to_bits() && near(x, twin.mean2d[0]) && near(y, twin.mean2d[1]) && near(z, twin.depth)
+    };
+    let differ = (0..TRIED).filter(|i| !agrees(*i)).count();
+    match differ {
+        0 => Ok(TRIED),
+        _ => Err(GpuError::ComputesWrong { kernel: "project", differ, of: TRIED }.into()),
+    }
+}
+
+/// How a plan fits a device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlanFit {
+    /// As it is meant.
+    Whole,
+    /// The device shows a kernel fewer texels than the plan's sections have: kernels read storage buffers, which is slower.
+    StorageReads,
+}
+
+/// Whether the device takes the plan: sizes of workgroups, texels, what the driver adds to the buffer, a heap large enough.
+/// Nothing is compiled and no memory allocated.
+///
+/// # Errors
+/// The first thing the device refuses, and how to mend it.
+pub fn check_plan(gpu: &Gpu, plan: &Plan) -> Result<PlanFit, GpuError> {
+    let limits = &gpu.info().limits;
+    limits.check_workgroup(KernelShape::standard(gpu.info()).largest_workgroup().max(SCAN_LANES))?;
+    let storage = Pipelines::needs_storage_reads(limits, plan)?;
+    Arena::check(gpu, plan)?;
+    Ok(if storage { PlanFit::StorageReads } else { PlanFit::Whole })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{DeviceLimits, Forced};
+
+    #[test]
+    fn a_device_is_compared_with_its_twin_and_one_without_effect_is_named() {
+        let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+        let agreed = check_device(&gpu).unwrap();
+        println!("{agreed} of {TRIED} agree");
+        let Ok(gpu) = Gpu::open(None) else { return };
+        let gpu = gpu.forced(Forced { computes_nothing: true, ..Forced::default() });
+        assert_eq!(check_device(&gpu).err(), Some(TrainError::Gpu(GpuError::ComputesNothing)));
+    }
+
+    #[test]
+    fn what_a_device_refuses_of_a_plan_is_said_before_anything_is_compiled() {
+        let plan = Plan::new(&PlanRequest { views: 4, ..Default::default() }).unwrap();
+        let refusing = |limits: DeviceLimits, padding: u64| {
+            let gpu = Gpu::open(None).ok()?.limited(limits);
+            Some(check_plan(&gpu.forced(Forced { padding, ..Forced::default() }), &plan))
+        };
+        let limits = DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 };
+        let Some(whole) = refusing(limits, 256) else { return println!("skipped: no Vulkan device") };
+        assert_eq!(whole, Ok(PlanFit::Whole));
+        let few = DeviceLimits { texel_elements: 1 << 16, ..limits };
+        assert!(matches!(refusing(few, 0), Some(Err(GpuError::ViewTooLarge { .. }))));
+        assert_eq!(refusing(DeviceLimits { storage_buffers: 13, ..few }, 0), Some(Ok(PlanFit::StorageReads)));
+        assert!(matches!(refusing(limits, 1 << 20), Some(Err(GpuError::PlanMismatch { .. }))));
+        let narrow = DeviceLimits { workgroup_lanes: 128, ..limits };
+        assert!(matches!(refusing(narrow, 0), Some(Err(GpuError::WorkgroupTooLarge { .. }))));
+    }
+}

@@ -1,0 +1,129 @@
+//! A run of steps: how long it may take, what it says about itself, and when it ends early.
+
+use config::training::StopSettings;
+
+/// How long [`run`](super::Trainer::run) may take; whichever comes first. Neither given: the settings' schedule.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RunBudget {
+    /// Steps.
+    pub steps: Option<u32>,
+    /// Seconds of wall clock.
+    pub seconds: Option<f64>,
+}
+
+/// One step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepReport {
+    /// Number of this step, from 1.
+    pub step: u32,
+    /// The view it looked at.
+    pub view: usize,
+    /// The whole loss.
+    pub loss: f32,
+    /// Mean absolute difference.
+    pub l1: f32,
+    /// Mean SSIM, 0…1.
+    pub ssim: f32,
+    /// Pearson's correlation with the depth prior, when the view has one that says something.
+    pub depth_correlation: Option<f32>,
+    /// Gaussians on the device after the step.
+    pub gaussians: usize,
+    /// Gaussians in view.
+    pub visible: usize,
+    /// Gaussian–tile instances.
+    pub instances: u64,
+    /// Bands they were blended in (1 unless they exceed the plan).
+    pub bands: usize,
+    /// The picture was reduced by this factor.
+    pub divisor: u32,
+    /// Seconds of training so far.
+    pub elapsed_s: f64,
+    /// Share of the schedule that is over, 0…1.
+    pub progress: f32,
+    /// Every Gaussian is up to date: a snapshot taken now does not change the bits of what follows.
+    pub settled: bool,
+}
+
+/// Why a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StopReason {
+    /// The schedule is over.
+    Schedule,
+    /// The callback said so.
+    Caller,
+    /// The loss stopped falling.
+    Converged,
+}
+
+/// Counted work and skipped work since `load`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Gaussians that were projected and found out of view.
+    pub culled: u64,
+    /// Gaussian–tile instances.
+    pub instances: u64,
+    /// Gaussian–pixel evaluations of the forward blend (the backward repeats them).
+    pub evaluations: u64,
+    /// Instances not evaluated because their tile was already opaque.
+    pub behind_opaque: u64,
+    /// Steps that needed more than one band.
+    pub banded_steps: u64,
+    /// Gaussians whose gradient was not finite and was left out.
+    pub non_finite_gradients: u64,
+    /// Dead Gaussians moved onto live ones.
+    pub relocated: u64,
+    /// Gaussians added by splitting.
+    pub added: u64,
+    /// Gaussians removed.
+    pub pruned: u64,
+    /// Times a Gaussian's own SH degree was raised because the residual asked for it.
+    pub sh_raised: u64,
+    /// SH coefficients that were not there to be evaluated and stepped, summed over Gaussians and steps (as of the last
+    /// raise).
+    pub sh_missing: u64,
+}
+
+/// A run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrainSummary {
+    /// Steps taken.
+    pub steps: u32,
+    /// Seconds of wall clock.
+    pub seconds: f64,
+    /// Why it ended.
+    pub reason: StopReason,
+    /// Gaussians now.
+    pub gaussians: usize,
+    /// The last step.
+    pub last: Option<StepReport>,
+    /// Work done and skipped since `load`.
+    pub counters: Counters,
+}
+
+/// Early stop: epochs in a row without a useful fall of the mean loss.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Patience {
+    sum: f64,
+    count: u32,
+    best: Option<f64>,
+    idle: u32,
+}
+
+impl Patience {
+    pub fn is_over(&mut self, settings: &StopSettings, report: &StepReport, views: usize) -> bool {
+        if !settings.enabled {
+            return false;
+        }
+        self.sum += f64::from(report.loss);
+        self.count += 1;
+        if (self.count as usize) < views.max(1) {
+            return false;
+        }
+        let mean = self.sum / f64::from(self.count);
+        let improved = self.best.is_none_or(|b| mean < b * (1.0 - f64::from(settings.least_gain)));
+        self.idle = if improved { 0 } else { self.idle + 1 };
+        self.best = Some(self.best.map_or(mean, |b| b.min(mean)));
+        (self.sum, self.count) = (0.0, 0);
+        self.idle >= settings.patience.max(1)
+    }
+}
