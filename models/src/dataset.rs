@@ -196,6 +196,9 @@ impl Dataset {
     }
 
     /// The frames of a split, restricted to a region's when one is named; `all` is always a split.
+    ///
+    /// # Errors
+    /// A name that the data set does not have.
     pub fn select(&self, split: &str, region: Option<&str>) -> Result<Vec<usize>, DatasetError> {
         let unknown = |kind, name: &str, known: Vec<&str>| DatasetError::Unknown {
             root: self.root.clone(),
@@ -420,6 +423,9 @@ impl Dataset {
 }
 
 /// The lens of a picture scaled by `scale`, at least one pixel wide and high.
+///
+/// # Errors
+/// A scale that is not above 0 and at most 1.
 pub fn scaled(intrinsics: &Intrinsics, scale: f64) -> Result<Intrinsics, DatasetError> {
     if !(scale > 0.0 && scale <= 1.0) {
         return Err(DatasetError::Request(format!("the image scale is {scale}; it must be above 0 and at most 1")));

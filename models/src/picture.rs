@@ -155,6 +155,14 @@ pub fn decode_at_least(path: &Path, wanted: (u32, u32)) -> Result<RgbImage, Pict
     Ok(image.into_rgb8())
 }
 
+/// The picture at another size, each pixel the mean of those it covers; one of that size already is returned as it is.
+pub fn resized(image: RgbImage, (width, height): (u32, u32)) -> RgbImage {
+    match image.dimensions() == (width, height) {
+        true => image,
+        false => image::imageops::resize(&image, width, height, image::imageops::FilterType::Triangle),
+    }
+}
+
 /// The picture reduced while it is decoded; `None` where it is no JPEG, or where less than half its size is not enough.
 fn scaled_jpeg(path: &Path, (width, height): (u32, u32)) -> Result<Option<RgbImage>, PictureError> {
     let damaged = |e: jpeg_decoder::Error| bad(path, format!("cannot be decoded ({e}); copy it again"));

@@ -51,6 +51,8 @@ pub struct EngineSettings {
     pub camera_pixels: u64,
     /// Pictures that the source decodes ahead.
     pub ahead: usize,
+    /// Their camera's own pictures wait in memory with them.
+    pub ahead_in_memory: bool,
     /// Pictures are trained at this fraction of the size they come in; matching sees them whole.
     pub scale: f64,
     /// `[network]`: manifests of the user's own networks.
@@ -87,6 +89,8 @@ pub struct Reconstruction {
     views: Vec<(String, View)>,
     /// How many of them the initialiser has.
     initialised: usize,
+    /// Key frames were tied to others since the poses were last solved.
+    unsolved: bool,
     /// Views as they were at the last build.
     built: Vec<View>,
     /// Views of the model that is continued.
@@ -133,6 +137,7 @@ impl Reconstruction {
             refine: settings.refine.as_ref(),
             camera_pixels: settings.camera_pixels,
             ahead: settings.ahead as u64,
+            ahead_in_memory: settings.ahead_in_memory,
         });
         host.fits(settings.host_mib)?;
         report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
@@ -147,6 +152,7 @@ impl Reconstruction {
             trainer,
             views: Vec::with_capacity(views),
             initialised: 0,
+            unsolved: false,
             built: Vec::with_capacity(views),
             resumed: HashMap::new(),
             points: Vec::new(),
@@ -237,6 +243,21 @@ impl Reconstruction {
         Ok(())
     }
 
+    /// Gives the initialiser the first `until` views that waited for their pose, with the pixels that the trainer keeps.
+    fn initialise_waiting(&mut self, until: usize) -> Result<(), JobError> {
+        let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
+        for i in self.initialised..until {
+            if let (Some(image), Some(view)) = (self.trainer.view_image(i), self.trainer.view_pose(i)) {
+                let (name, View { pose, .. }) = self.views[i].clone();
+                let view = View { pose, ..view };
+                let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
+                initialiser.add(&PosedImage { name, time_ns: 0, image, view, sigma })?;
+            }
+        }
+        self.initialised = self.initialised.max(until);
+        Ok(())
+    }
+
     /// Gaussians and depth priors of all key frames; `None` when `go_on` said no.
     fn initialise(&mut self, go_on: &dyn Fn() -> bool) -> Result<Option<FirstGaussians>, JobError> {
         let _span = tracing::info_span!("initialise").entered();
@@ -245,20 +266,11 @@ impl Reconstruction {
             self.points = refiner.sparse_points().iter().map(|p| (p.position, p.color)).collect();
         }
         let at_once = !self.settings.incremental;
+        if let (Some(initialiser), Some(_)) = (&mut self.initialiser, &self.refiner) {
+            initialiser.hint_points(self.points.iter().map(|p| p.0.map(|v| v as f32)));
+        }
+        self.initialise_waiting(self.views.len())?;
         if let Some(initialiser) = &mut self.initialiser {
-            if self.refiner.is_some() {
-                initialiser.hint_points(self.points.iter().map(|p| p.0.map(|v| v as f32)));
-            }
-            // Those that waited for their pose.
-            for i in self.initialised..self.views.len() {
-                if let (Some(image), Some(view)) = (self.trainer.view_image(i), self.trainer.view_pose(i)) {
-                    let (name, View { pose, .. }) = self.views[i].clone();
-                    let view = View { pose, ..view };
-                    let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-                    initialiser.add(&PosedImage { name, time_ns: 0, image, view, sigma })?;
-                }
-            }
-            self.initialised = self.views.len();
             return feed_forward(initialiser, self.views.len(), capacity, at_once, go_on);
         }
         let views: Vec<View> = self.views.iter().map(|v| v.1).collect();

@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime};
 use config::disk::bounded::{Bounded, bytes_below};
 use config::disk::plan::{DiskPlan, DiskRequest};
 use config::disk::{Disk, System};
-use config::mission::{Aircraft, Mission};
+use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
 use hal::failsafe::Timing;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
@@ -108,13 +108,11 @@ pub fn fly(
 ) -> Result<FlyOutcome, JobError> {
     let intrinsics = training_lens(mission);
     let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
-    let disk = planned_disk(mission, &intrinsics, &options.out)?;
+    let disk = planned_disk(mission, &options.out)?;
     let mut reconstruction = open(mission, aircraft, &intrinsics, &disk)?;
-    let mut store = KeyframeStore::open(&disk, &options.out.join("keyframes"), &intrinsics, mission.origin)?;
+    let store =
+        KeyframeStore::open(&disk, &options.out.join("keyframes"), &mission.camera, &intrinsics, mission.origin)?;
     reconstruction.resume(&options.out)?;
-    while let Some(frame) = store.sound(reconstruction.keyframes()) {
-        reconstruction.add(frame)?;
-    }
     let offerer = Offerer::start(&mission.upload, source)?;
     let mut flight = Flight::start(FlightPlan {
         vehicle: VehicleSettings {
@@ -144,19 +142,19 @@ pub fn fly(
 }
 
 /// What a flight may take of the disk.
-fn disk_plan(mission: &Mission, intrinsics: &Intrinsics) -> DiskPlan {
+fn disk_plan(mission: &Mission) -> DiskPlan {
     let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
     // At least this much of the device's memory goes with every Gaussian: its floats, their two moments and gradient.
     let each = 16 * (11 + 3 * (u64::from(sh_degree) + 1).pow(2));
     let held = (u64::from(memory.device_mib) << 20) / each;
     let gaussians = memory.max_gaussians.map_or(held, u64::from).min(held) as usize;
-    let Intrinsics { width, height, .. } = *intrinsics;
+    let CameraSettings { width, height, .. } = mission.camera;
     DiskPlan::new(&DiskRequest { width, height, key_frames: mission.keyframes.max, gaussians, sh_degree })
 }
 
 /// The disk a flight writes to, bounded as the mission says; refused when not even a first model would fit.
-fn planned_disk(mission: &Mission, intrinsics: &Intrinsics, out: &Path) -> Result<Disk, JobError> {
-    let plan = disk_plan(mission, intrinsics);
+fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
+    let plan = disk_plan(mission);
     let here = bytes_below(out);
     let free = resources::free_disk_bytes(out).map_or(u64::MAX, |free| free.saturating_add(here));
     let limit = mission.memory.disk_mib.map_or(u64::MAX, |mib| u64::from(mib) << 20);
@@ -197,6 +195,8 @@ fn open(
         host_mib: Some(mission.memory.host_mib),
         camera_pixels: u64::from(mission.camera.width) * u64::from(mission.camera.height),
         ahead: DECODED_AHEAD + handover::AHEAD,
+        // Until they are kept on disk; those that are files already wait there.
+        ahead_in_memory: !matches!(aircraft.camera, CameraSource::Folder(_)),
         // The capture thread has scaled them already.
         scale: 1.0,
         network: mission.network.clone(),

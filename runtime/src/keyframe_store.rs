@@ -1,14 +1,18 @@
 //! Key frames on disk: what a restarted flight continues from, and a data set that `dgtr train` reads as it is.
 //!
-//! A folder of lossless pictures and one `transforms.json` (nerfstudio), with what only this project needs in a
+//! A folder of the camera's own files and one `transforms.json` (nerfstudio), with what only this project needs in a
 //! `dgtr` object per frame. Pictures are durable before the list that names them, and the list before stays as the older of two
 //! generations. What is damaged all the same is set aside and named; the rest is used.
 
 use std::path::{Path, PathBuf};
 
+use config::disk::plan::picture_bytes;
 use config::disk::{Damaged, Disk, previous};
 use config::error::{Error, ErrorKind};
 use config::geodesy::Geodetic;
+use config::mission::CameraSettings;
+use hal::camera::Picture;
+use hal::error::HalError;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use models::formats::{FormatError, read_bounded, transforms};
 use models::picture;
@@ -49,7 +53,10 @@ pub enum StoreError {
     /// A file could not be read or written.
     #[error(transparent)]
     File(#[from] FormatError),
-    /// A picture could not be encoded, or the stored ones are of another camera.
+    /// The camera's file of a key frame cannot be read.
+    #[error(transparent)]
+    Camera(HalError),
+    /// The stored ones are of another camera, or a picture is not what the list says.
     #[error("key frame {}: {what}", path.display())]
     Picture {
         /// The picture.
@@ -63,6 +70,7 @@ impl Error for StoreError {
     fn kind(&self) -> ErrorKind {
         match self {
             Self::File(e) => e.kind(),
+            Self::Camera(e) => e.kind(),
             Self::Picture { .. } => ErrorKind::Input,
         }
     }
@@ -82,6 +90,10 @@ struct List {
     fl_y: f32,
     cx: f32,
     cy: f32,
+    k1: f32,
+    k2: f32,
+    p1: f32,
+    p2: f32,
     w: u32,
     h: u32,
     enu_origin_wgs84: Origin,
@@ -129,10 +141,22 @@ impl Extra {
     }
 }
 
+/// A key frame on its way from the camera.
+#[derive(Clone, Debug)]
+pub struct KeyFrame {
+    /// Its pixels and pose, as they are trained on.
+    pub posed: PosedImage,
+    /// The picture as the camera gave it, to be kept.
+    pub file: Picture,
+}
+
 /// The key frames of one flight.
 pub struct KeyframeStore {
     disk: Disk,
     folder: PathBuf,
+    camera: CameraSettings,
+    /// The pictures as they are trained on.
+    lens: Intrinsics,
     list: List,
 }
 
@@ -142,17 +166,27 @@ impl KeyframeStore {
     ///
     /// # Errors
     /// A list of another camera; a damaged one that cannot be set aside.
-    pub fn open(disk: &Disk, folder: &Path, intrinsics: &Intrinsics, origin: Geodetic) -> Result<Self, StoreError> {
+    pub fn open(
+        disk: &Disk,
+        folder: &Path,
+        camera: &CameraSettings,
+        lens: &Intrinsics,
+        origin: Geodetic,
+    ) -> Result<Self, StoreError> {
         let path = folder.join(LIST);
-        let i = intrinsics;
+        let [k1, k2, p1, p2] = camera.distortion;
         let mut list = List {
-            camera_model: "PINHOLE".into(),
-            fl_x: i.fx,
-            fl_y: i.fy,
-            cx: i.cx,
-            cy: i.cy,
-            w: i.width,
-            h: i.height,
+            camera_model: if camera.distortion == [0.0; 4] { "PINHOLE" } else { "OPENCV" }.into(),
+            fl_x: camera.fx,
+            fl_y: camera.fy,
+            cx: camera.cx,
+            cy: camera.cy,
+            k1,
+            k2,
+            p1,
+            p2,
+            w: camera.width,
+            h: camera.height,
             enu_origin_wgs84: Origin { lat: origin.lat_deg, lon: origin.lon_deg, alt: origin.alt_m },
             frames: Vec::new(),
         };
@@ -171,7 +205,7 @@ impl KeyframeStore {
             }
             list.frames = old.frames;
         }
-        Ok(Self { disk: disk.clone(), folder: folder.into(), list })
+        Ok(Self { disk: disk.clone(), folder: folder.into(), camera: *camera, lens: *lens, list })
     }
 
     /// Number of stored key frames.
@@ -187,19 +221,15 @@ impl KeyframeStore {
     /// Stores one more key frame; a picture of the same name is replaced.
     ///
     /// # Errors
-    /// When the disk is full or not writable; what is stored stays as it was.
-    pub fn add(&mut self, frame: &PosedImage) -> Result<(), StoreError> {
-        let stem = Path::new(&frame.name).file_stem().and_then(|s| s.to_str()).unwrap_or("frame");
-        let file_path = format!("images/{stem}.png");
+    /// When the disk is full or not writable, or the camera's file is gone; what is stored stays as it was.
+    pub fn add(&mut self, frame: &KeyFrame) -> Result<(), StoreError> {
+        let file_path = format!("images/{}", frame.posed.name);
         let path = self.folder.join(&file_path);
-        let mut png = Vec::new();
-        frame
-            .image
-            .write_to(&mut std::io::Cursor::new(&mut png), image::ImageFormat::Png)
-            .map_err(|e| StoreError::Picture { path: path.clone(), what: e.to_string() })?;
-        self.disk.replace(&path, |out| out.write_all(&png)).map_err(|e| FormatError::disk(&path, e))?;
-        let transform_matrix = transforms::pose_to_opengl(&frame.view.pose);
-        let entry = Entry { file_path, transform_matrix, dgtr: Extra::new(frame) };
+        let limit = picture_bytes(self.camera.width, self.camera.height);
+        let bytes = frame.file.to_file(limit).map_err(StoreError::Camera)?;
+        self.disk.replace(&path, |out| out.write_all(&bytes)).map_err(|e| FormatError::disk(&path, e))?;
+        let transform_matrix = transforms::pose_to_opengl(&frame.posed.view.pose);
+        let entry = Entry { file_path, transform_matrix, dgtr: Extra::new(&frame.posed) };
         let at = self.list.frames.iter().position(|f| f.file_path == entry.file_path);
         let replaced = at.map(|at| self.list.frames.remove(at));
         self.list.frames.push(entry);
@@ -241,18 +271,12 @@ impl KeyframeStore {
     pub fn load(&self, i: usize) -> Result<PosedImage, StoreError> {
         let entry = &self.list.frames[i];
         let path = self.folder.join(&entry.file_path);
-        let wrong = |what: String| StoreError::Picture { path: path.clone(), what };
-        let image = picture::decode(&path).map_err(|e| wrong(e.to_string()))?;
-        if image.dimensions() != (self.list.w, self.list.h) {
-            return Err(wrong("has another size than the list says".into()));
-        }
-        let l = &self.list;
-        let intrinsics = Intrinsics { width: l.w, height: l.h, fx: l.fl_x, fy: l.fl_y, cx: l.cx, cy: l.cy };
+        let image = Picture::Path(path).load(&self.camera).map_err(StoreError::Camera)?;
         Ok(PosedImage {
             name: name(&entry.file_path),
             time_ns: entry.dgtr.time_ns,
-            image,
-            view: View { intrinsics, pose: entry.dgtr.pose },
+            image: picture::resized(image, (self.lens.width, self.lens.height)),
+            view: View { intrinsics: self.lens, pose: entry.dgtr.pose },
             sigma: entry.dgtr.sigma(),
         })
     }
@@ -317,7 +341,7 @@ impl KeyframeStore {
     ///
     /// # Errors
     /// As [`KeyframeStore::add`], with nothing left to give up.
-    pub fn add_with_relief(&mut self, frame: &PosedImage, model: &Path) -> Result<(), StoreError> {
+    pub fn add_with_relief(&mut self, frame: &KeyFrame, model: &Path) -> Result<(), StoreError> {
         let mut kept = self.add(frame);
         for relief in Relief::LADDER {
             if let Err(e) = &kept

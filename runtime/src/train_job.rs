@@ -155,6 +155,7 @@ impl TrainJob {
             host_mib: None,
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
             ahead: 0,
+            ahead_in_memory: false,
             scale,
             network: self.network.clone(),
             training: self.settings(),
@@ -274,7 +275,7 @@ impl TrainJob {
             let Some(picture) = source.next(Duration::ZERO)? else { break };
             engine.report.stage("decode", decoding);
             progress.set((total - source.waiting()) as u64, || picture.name.clone());
-            engine.add(picture)?;
+            engine.add(picture, source.waiting() > 0)?;
             if !go_on() {
                 return Ok(false);
             }

@@ -39,6 +39,8 @@ impl Drop for Arena {
 }
 
 impl Arena {
+    /// # Errors
+    /// The device has no such memory.
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<Self, GpuError> {
         let device = gpu.device();
         let bytes = plan.total_bytes;

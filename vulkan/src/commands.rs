@@ -47,6 +47,8 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 }
 
 impl Commands {
+    /// # Errors
+    /// The device refuses a command pool, fence or query pool.
     pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
         let device = gpu.device();
         let flags = vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER;
@@ -92,6 +94,9 @@ impl Commands {
     }
 
     /// Starts a recording; the one before was submitted or dropped.
+    ///
+    /// # Errors
+    /// The device fails.
     pub fn begin<'a>(&'a self, pipelines: &'a Pipelines) -> Result<Recording<'a>, GpuError> {
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
         let timed = self.gpu.timestamp_ns() > 0.0;
@@ -236,6 +241,9 @@ impl Recording<'_> {
     }
 
     /// Submits what was recorded and waits until the device is done and the host can see it.
+    ///
+    /// # Errors
+    /// The device fails or is lost.
     pub fn submit(self) -> Result<(), GpuError> {
         let c = self.commands;
         let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;

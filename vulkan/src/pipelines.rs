@@ -71,6 +71,9 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 impl Pipelines {
     /// Compiles `kernels`; the others must not be run. `own_degrees`: whether Gaussians have SH degrees of their own, or all
     /// the plan's.
+    ///
+    /// # Errors
+    /// The device refuses a kernel.
     pub fn new(
         gpu: &Gpu,
         plan: &Plan,

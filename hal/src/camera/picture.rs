@@ -1,6 +1,6 @@
 //! A picture as a camera hands it out: a file, a JPEG in memory or pixels; decoded only after a look at its header.
 
-use std::io::{BufRead, BufReader, Cursor, Seek};
+use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 
 use config::mission::CameraSettings;
@@ -49,6 +49,39 @@ impl Picture {
             return Err(wrong_size(&self.name(), image.dimensions(), lens));
         }
         Ok(image)
+    }
+
+    /// The camera's own file, as it is kept: bytes that [`Picture::decode`] reads again to the same pixels. Pixels that never
+    /// were a file become a PNG.
+    ///
+    /// # Errors
+    /// [`HalError::Picture`] when it is gone, unreadable or longer than `limit` bytes.
+    pub fn to_file(&self, limit: u64) -> Result<Vec<u8>, HalError> {
+        let wrong = |why: String| HalError::Picture { path: self.name(), why };
+        let mut bytes = Vec::new();
+        match self {
+            Self::Path(path) => {
+                let file = regular::open(path).map_err(|e| wrong(e.to_string()))?;
+                file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|e| wrong(e.to_string()))?;
+            }
+            Self::Jpeg(jpeg) => bytes = marked_as_mjpeg(jpeg),
+            Self::Rgb(image) => image
+                .write_to(&mut Cursor::new(&mut bytes), image::ImageFormat::Png)
+                .map_err(|e| wrong(e.to_string()))?,
+        }
+        match bytes.len() as u64 <= limit {
+            true => Ok(bytes),
+            false => Err(wrong(format!("more than {limit} bytes, what an uncompressed picture of the camera takes"))),
+        }
+    }
+
+    /// The file name that [`Picture::to_file`] is kept under: the camera's own, or the trigger's number.
+    pub fn file_name(&self, sequence: u32) -> String {
+        match (self, self.name().file_name().and_then(|n| n.to_str())) {
+            (Self::Path(path), Some(name)) if path.extension().is_some() => name.to_owned(),
+            (Self::Rgb(_), _) => format!("frame_{sequence:06}.png"),
+            _ => format!("frame_{sequence:06}.jpg"),
+        }
     }
 
     /// File name, or a word for pixels without one.

@@ -216,12 +216,18 @@ fn copy_name(name: &str) -> String {
 }
 
 /// Writes a file so that a reader of its folder sees it whole or not at all.
+///
+/// # Errors
+/// The folder cannot be written to.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SimError> {
     let written = Disk::default().replace(path, |out| out.write_all(bytes));
     written.map_err(|e| SimError::Folder { path: path.into(), source: e.into() })
 }
 
 /// A picture as a JPEG file of good quality.
+///
+/// # Errors
+/// The picture cannot be encoded.
 pub fn to_jpeg(picture: &RgbImage) -> Result<Vec<u8>, SimError> {
     let mut bytes = Vec::new();
     JpegEncoder::new_with_quality(&mut bytes, 93)

@@ -50,6 +50,9 @@ struct RawFile {
 }
 
 /// Reads `split.json`.
+///
+/// # Errors
+/// The file cannot be read or is no split.
 pub fn read(path: &Path) -> Result<SplitFile, FormatError> {
     let bytes = read_bounded(path, LIMIT)?;
     let raw: RawFile =

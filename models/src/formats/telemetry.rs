@@ -47,6 +47,9 @@ pub fn dji_rotation(yaw_deg: f64, pitch_deg: f64, roll_deg: f64) -> DQuat {
 ///
 /// With `origin` the pose comes from latitude, longitude and altitude; without it from the columns `gps_e_m`,
 /// `gps_n_m`, `gps_u_m`.
+///
+/// # Errors
+/// The file cannot be read, or a line of it is no telemetry.
 pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<HashMap<String, Telemetry>, FormatError> {
     let bytes = read_bounded(path, LIMIT)?;
     let text = std::str::from_utf8(&bytes).map_err(|_| FormatError::invalid(path, "not UTF-8 text"))?;

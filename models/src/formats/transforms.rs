@@ -199,6 +199,9 @@ pub(super) fn write_json(path: &Path, value: &Value) -> Result<(), FormatError> 
 }
 
 /// A 3×4 or 4×4 camera-to-world matrix with OpenGL axes → pose with OpenCV axes: y and z change sign.
+///
+/// # Errors
+/// A matrix that is no rotation with a translation.
 pub fn opengl_to_pose(rows: &[Vec<f64>]) -> Result<Pose, &'static str> {
     if rows.len() < 3 || rows.iter().take(3).any(|r| r.len() != 4) {
         return Err("transform_matrix must have 3 or 4 rows of 4 numbers");

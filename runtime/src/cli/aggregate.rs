@@ -72,6 +72,9 @@ pub struct Settings {
 
 impl Settings {
     /// Overrides what was given.
+    ///
+    /// # Errors
+    /// A value outside its range.
     pub fn apply(&self, to: &mut GroundSettings) -> Result<(), CliError> {
         to.device_mib = self.budget_mib.unwrap_or(to.device_mib);
         to.max_gaussians = self.max_gaussians.or(to.max_gaussians);
@@ -114,6 +117,9 @@ impl Settings {
 }
 
 /// Runs `dgtr aggregate`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut settings = GroundSettings::default();
     args.settings.apply(&mut settings)?;

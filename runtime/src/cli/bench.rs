@@ -46,6 +46,9 @@ impl Init {
 }
 
 /// Runs `dgtr bench`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     match args.command {
         Command::Stages(args) => stages::run(args),

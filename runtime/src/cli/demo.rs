@@ -27,6 +27,9 @@ pub struct Args {
 }
 
 /// Runs the command.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let Args { out, seconds, seed, process_mib: limit_mib, speed } = args;
     let interrupt = Interrupt::install()?;

@@ -42,6 +42,9 @@ enum Finding {
 }
 
 /// Runs `dgtr doctor`; fails with exit code 3 when something is missing.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut missing = 0;
     let mut tell = |what: &str, finding: Finding| {

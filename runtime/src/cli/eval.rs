@@ -61,6 +61,9 @@ struct Answer<'a> {
 }
 
 /// Runs `dgtr eval`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let set = Dataset::open(&args.dataset)?;
     let frames = set.select(&args.split, args.region.as_deref())?;

@@ -46,6 +46,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr export`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let (header, cloud) = model::read(&args.model)?;
     let out = args.out.unwrap_or_else(|| match args.format {

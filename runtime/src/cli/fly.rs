@@ -37,6 +37,9 @@ pub struct Args {
 }
 
 /// Runs the command.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let started = Instant::now();
     let mission = Mission::read(&args.mission)?;

@@ -18,6 +18,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr import`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let is_spz = args.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("spz"));
     let (cloud, origin, dropped) = if is_spz {

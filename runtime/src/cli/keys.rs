@@ -19,6 +19,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr keys`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mission = Mission::read(&args.mission)?;
     if let Some(id) = args.only.as_deref().filter(|id| *id != GROUND) {

@@ -61,6 +61,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr plan`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let (wanted, sh) = match &args.mission {
         Some(path) => of_mission(&Mission::read(path)?),

@@ -38,6 +38,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr render`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     if !(args.depth_unit > 0.0 && args.depth_unit.is_finite()) {
         return Err(CliError::input(format!("--depth-unit {} must be a positive number of metres", args.depth_unit)));

@@ -65,6 +65,9 @@ const DEFAULT_INTERVAL_S: f64 = 4.0;
 const TLOG_LENS: Lens = Lens { width: 640, height: 480, fx: 385.0, fy: 385.0, cx: 320.0, cy: 240.0 };
 
 /// Runs the command.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let link = match args.link.split_once(':') {
         Some(("udp", rest)) => format!("udpout:{rest}"),

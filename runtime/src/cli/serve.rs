@@ -35,6 +35,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr serve`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut mission = Mission::read(&args.mission)?;
     args.settings.apply(&mut mission.ground)?;

@@ -90,6 +90,9 @@ impl From<Triggers> for Announcing {
 }
 
 /// Runs the command.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mission = Mission::read(&args.mission)?;
     let aircraft = mission.aircraft(args.aircraft.as_deref())?;
@@ -150,6 +153,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
 }
 
 /// A flag that Ctrl-C sets.
+///
+/// # Errors
+/// The signal handler cannot be installed.
 pub fn stop_flag() -> Result<Arc<AtomicBool>, CliError> {
     let interrupt = Interrupt::install()?;
     let stop = Arc::new(AtomicBool::new(false));
@@ -164,6 +170,9 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>, CliError> {
 }
 
 /// The camera folder: the one asked for, else the mission's.
+///
+/// # Errors
+/// The aircraft has no camera folder.
 pub fn camera_dir(asked: Option<PathBuf>, camera: &CameraSource) -> Result<PathBuf, CliError> {
     let folder = match (asked, camera) {
         (Some(folder), _) => folder,

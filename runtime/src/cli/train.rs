@@ -137,6 +137,9 @@ pub(super) fn presets() -> impl TypedValueParser<Value = Preset> {
 }
 
 /// Runs `dgtr train`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     for (name, value) in [("--seconds", args.seconds), ("--checkpoint-seconds", Some(args.checkpoint_seconds))] {
         if value.is_some_and(|v| !(v > 0.0 && v.is_finite())) {

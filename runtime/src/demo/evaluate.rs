@@ -68,6 +68,9 @@ pub struct Figures {
 }
 
 /// Scores all models on all held-out views.
+///
+/// # Errors
+/// A model or picture cannot be read or rendered.
 pub fn all(out: &Path, options: &DemoOptions, interrupt: &Interrupt) -> Result<Vec<Figures>, DemoError> {
     let global = out.join("ground/out/global.dgtr");
     let mut figures = Vec::new();

@@ -27,6 +27,9 @@ pub struct Process {
 
 impl Process {
     /// Starts `dgtr ARGUMENTS`, its standard error into `out/NAME.log` and, line by line, to ours.
+    ///
+    /// # Errors
+    /// The program cannot be started or its log not be written.
     pub fn spawn(name: &str, arguments: &[&str], out: &Path, limit_mib: u64) -> Result<Self, DemoError> {
         let log = out.join(format!("{name}.log"));
         let failed = |e: std::io::Error| DemoError::Process {

@@ -75,6 +75,9 @@ impl fmt::Display for Summary {
 }
 
 /// Gathers the figures and writes `out/report.html`.
+///
+/// # Errors
+/// The folder cannot be written to.
 pub fn write(
     out: &Path,
     options: &DemoOptions,

@@ -1,7 +1,7 @@
 //! Host memory of a job, planned like the device's: what it will hold at most, by a formula, before the first picture.
 //!
 //! ```text
-//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·N + A·3·P + 2·3·C (+ device)
+//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·N + A·3·(P [+ C]) + 2·3·C (+ device)
 //! ```
 //!
 //! V views, N Gaussians, D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
@@ -33,6 +33,8 @@ pub struct HostRequest<'a> {
     pub camera_pixels: u64,
     /// Pictures decoded ahead of the engine, at training size.
     pub ahead: u64,
+    /// The camera's own pictures wait in memory beside them (those of a folder wait there).
+    pub ahead_in_memory: bool,
 }
 
 /// Bytes by what holds them, in the order of the formula.
@@ -61,7 +63,7 @@ impl HostPlan {
             ("matching", matching),
             ("cloud and checkpoint", 2 * 4 * n * (11 + 3 * coefficients)),
             ("density control", LISTS_BYTES * n),
-            ("pictures ahead", r.ahead * 3 * p),
+            ("pictures ahead", r.ahead * 3 * (p + if r.ahead_in_memory { r.camera_pixels } else { 0 })),
             ("picture at hand", 2 * 3 * r.camera_pixels),
             ("device", if r.shared { r.plan.total_bytes } else { 0 }),
         ];
@@ -104,6 +106,7 @@ mod tests {
             refine: Some(&refine),
             camera_pixels: 640 * 480,
             ahead: 4,
+            ahead_in_memory: false,
         };
         of(&mut request);
         HostPlan::new(&request).total_bytes()
@@ -115,6 +118,7 @@ mod tests {
         let before = total(&plan, |_| {});
         assert_eq!(total(&plan, |r| r.shared = true) - before, plan.total_bytes);
         assert_eq!(total(&plan, |r| r.ahead += 1) - before, 3 * plan.pixels as u64);
+        assert_eq!(total(&plan, |r| r.ahead_in_memory = true) - before, 4 * 3 * 640 * 480);
         assert_eq!(total(&plan, |r| r.camera_pixels += 1000) - before, 6000);
         assert!(total(&plan, |r| r.refine = None) < before && total(&plan, |r| r.initialiser = 0) < before);
         let larger = Plan::new(&PlanRequest { device_mib: 1024, ..PlanRequest::default() }).unwrap();

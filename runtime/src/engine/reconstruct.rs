@@ -26,11 +26,11 @@ const CARRY_LIMIT_PX: f64 = 1.5;
 
 /// What makes a model out of key frames: the seam at which a rehearsal stands in for networks, device and disk.
 pub trait Reconstruct {
-    /// Takes in a new key frame.
+    /// Takes in a new key frame. With `more` waiting behind it, poses are solved and depths estimated with the last of them.
     ///
     /// # Errors
     /// A network or the device fails. A picture that cannot be tied to the others keeps its pose and is logged.
-    fn add(&mut self, frame: PosedImage) -> Result<(), JobError>;
+    fn add(&mut self, frame: PosedImage, more: bool) -> Result<(), JobError>;
     /// Number of key frames.
     fn keyframes(&self) -> usize;
     /// Pose of a key frame as it is known now.
@@ -72,18 +72,17 @@ pub trait Reconstruct {
 }
 
 impl Reconstruct for Reconstruction {
-    fn add(&mut self, mut picture: PosedImage) -> Result<(), JobError> {
+    fn add(&mut self, mut picture: PosedImage, more: bool) -> Result<(), JobError> {
         if !self.settings.incremental
             && let Some(view) = self.resumed.get(&picture.name)
         {
             picture.view.pose = view.pose;
         }
         let from = Instant::now();
-        let mut tied = false;
         if let Some(refiner) = &mut self.refiner {
             match refiner.add(&picture) {
                 Ok(report) => {
-                    tied = true;
+                    self.unsolved = true;
                     tracing::debug!("{}: {} features, {} pairs", picture.name, report.features, report.pairs_verified);
                 }
                 Err(e) => {
@@ -101,15 +100,20 @@ impl Reconstruct for Reconstruction {
         let prior = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
         self.trainer.add_view(&picture, prior.as_ref())?;
         self.views.push((picture.name.clone(), picture.view));
-        if self.settings.incremental && tied {
+        if self.settings.incremental && more {
+            return Ok(());
+        }
+        if self.settings.incremental && std::mem::take(&mut self.unsolved) {
             self.refine()?;
         }
         // Without refinement, or while pictures come, the pose is as good as it will be for now.
         if (self.settings.incremental || self.refiner.is_none())
-            && let Some(initialiser) = &mut self.initialiser
-            && let Some((_, view)) = self.views.last()
+            && let Some((_, view)) = self.views.last().cloned()
+            && self.initialiser.is_some()
         {
             let from = Instant::now();
+            self.initialise_waiting(self.views.len() - 1)?;
+            let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
             picture.view.pose = view.pose;
             initialiser.add(&picture)?;
             self.initialised = self.views.len();
@@ -254,7 +258,7 @@ impl Reconstruct for Reconstruction {
     }
 
     fn gaussians(&self) -> usize {
-        self.trainer.gaussians()
+        if self.has_model() { self.trainer.gaussians() } else { self.cloud.len() }
     }
 
     fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), JobError> {

@@ -13,7 +13,7 @@ use models::camera::{Pose, PosedImage};
 
 use crate::engine::PictureSource;
 use crate::error::JobError;
-use crate::keyframe_store::{KeyframeStore, Relief};
+use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 
 /// Decoded key frames in the channel.
 pub(super) const AHEAD: usize = 2;
@@ -32,18 +32,20 @@ struct Shared {
 pub struct Handover {
     /// Where key frames are kept before they are used, and the checkpoint that shares the disk with them.
     store: Option<(KeyframeStore, PathBuf)>,
+    /// Key frames of earlier runs that were taken up again, while there are more.
+    taken_up: Option<usize>,
     /// Key frames that were used without being kept: the disk had no room.
     without_room: u64,
     /// Whether the last one was kept.
     room: bool,
-    frames: Receiver<PosedImage>,
+    frames: Receiver<KeyFrame>,
     words: SyncSender<(MavSeverity, String)>,
     shared: Arc<Shared>,
 }
 
 /// The capture's end.
 pub(super) struct CaptureEnd {
-    pub(super) frames: SyncSender<PosedImage>,
+    pub(super) frames: SyncSender<KeyFrame>,
     pub(super) words: Receiver<(MavSeverity, String)>,
     shared: Arc<Shared>,
 }
@@ -54,19 +56,37 @@ pub(super) fn handover() -> (Handover, CaptureEnd) {
     let (words, inbox) = sync_channel(WORDS);
     let shared = Arc::new(Shared::default());
     (
-        Handover { store: None, without_room: 0, room: true, frames, words, shared: shared.clone() },
+        Handover { store: None, taken_up: None, without_room: 0, room: true, frames, words, shared: shared.clone() },
         CaptureEnd { frames: to, words: inbox, shared },
     )
 }
 
 impl Handover {
-    /// Keeps every key frame in `store` from now on, beside the checkpoint `model`.
+    /// Keeps every key frame in `store` from now on, beside the checkpoint `model`. Those already there come first: the capture
+    /// listens meanwhile.
     pub fn keep_in(&mut self, store: KeyframeStore, model: PathBuf) {
+        self.taken_up = (!store.is_empty()).then_some(0);
         self.store = Some((store, model));
+    }
+
+    /// Key frames of earlier runs still to be taken up again.
+    pub fn earlier_left(&self) -> usize {
+        let all = self.store.as_ref().map_or(0, |(store, _)| store.len());
+        self.taken_up.map_or(0, |taken| all.saturating_sub(taken))
+    }
+
+    fn take_up(&mut self) -> Option<PosedImage> {
+        let (taken, (store, _)) = (self.taken_up?, self.store.as_mut()?);
+        let frame = store.sound(taken);
+        self.taken_up = (frame.is_some() && taken + 1 < store.len()).then_some(taken + 1);
+        frame
     }
 
     /// Makes room on the disk; false when there was nothing to give up.
     pub fn relieve(&mut self, relief: Relief) -> bool {
+        if relief == Relief::CoveredPictures && self.taken_up.is_some() {
+            return false;
+        }
         self.store.as_mut().is_some_and(|(store, model)| store.relieve(relief, model))
     }
 
@@ -77,15 +97,20 @@ impl Handover {
 
     /// Keeps a key frame. On a full disk what costs least is given up first; after that key frames are used and not kept,
     /// each of which tries again, as room may have been made.
-    fn keep(&mut self, frame: &PosedImage) -> Result<(), JobError> {
+    fn keep(&mut self, frame: &KeyFrame) -> Result<(), JobError> {
         let Some((store, model)) = &mut self.store else { return Ok(()) };
         let kept = store.add_with_relief(frame, model);
         let room = match kept {
             Ok(()) => true,
             Err(e) if e.may_pass() => {
-                tracing::debug!("{}: {e}", frame.name);
+                tracing::debug!("{}: {e}", frame.posed.name);
                 self.without_room += 1;
                 false
+            }
+            Err(StoreError::Camera(e)) => {
+                tracing::warn!("{e}; the key frame is used and not kept");
+                self.without_room += 1;
+                self.room
             }
             Err(e) => return Err(e.into()),
         };
@@ -131,14 +156,17 @@ impl Handover {
 
 impl PictureSource for Handover {
     fn next(&mut self, patience: Duration) -> Result<Option<PosedImage>, JobError> {
+        if let Some(frame) = self.take_up() {
+            return Ok(Some(frame));
+        }
         let Ok(frame) = self.frames.recv_timeout(patience) else { return Ok(None) };
         self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
         self.keep(&frame)?;
-        Ok(Some(frame))
+        Ok(Some(frame.posed))
     }
 
     fn waiting(&self) -> usize {
-        self.shared.waiting.load(Ordering::Acquire)
+        self.earlier_left() + self.shared.waiting.load(Ordering::Acquire)
     }
 
     fn is_open(&self) -> bool {

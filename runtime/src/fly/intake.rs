@@ -4,7 +4,6 @@
 //! wait as files and are decoded once more.
 
 use std::collections::{HashSet, VecDeque};
-use std::path::Path;
 use std::sync::mpsc::TrySendError;
 use std::time::Duration;
 
@@ -15,11 +14,13 @@ use hal::error::HalError;
 use hal::traits::{Camera, Clock, Link};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use models::picture;
 
 use super::geotags::Geotags;
 use super::handover::CaptureEnd;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::error::JobError;
+use crate::keyframe_store::KeyFrame;
 
 /// After the aircraft has landed, pictures that nobody announced may still be on their way from the camera for this long.
 const LATE_PICTURES_NS: u64 = 2_000_000_000;
@@ -89,7 +90,7 @@ pub struct FlightPlan {
 
 /// A key frame that the job has not taken yet.
 enum Waiting {
-    Decoded(PosedImage),
+    Decoded(KeyFrame),
     File(PosedPicture),
 }
 
@@ -297,7 +298,7 @@ where
     }
 
     /// A key frame that had to wait behind too many: its pixels were not kept.
-    fn load_again(&mut self, frame: &PosedPicture) -> Option<PosedImage> {
+    fn load_again(&mut self, frame: &PosedPicture) -> Option<KeyFrame> {
         self.counters.decoded += 1;
         match self.vehicle.load(frame) {
             Ok(image) => Some(self.posed(frame, image)),
@@ -310,37 +311,25 @@ where
         }
     }
 
-    fn posed(&mut self, frame: &PosedPicture, image: image::RgbImage) -> PosedImage {
+    fn posed(&mut self, frame: &PosedPicture, image: image::RgbImage) -> KeyFrame {
         let lens = self.plan.intrinsics;
-        let image = if image.dimensions() == (lens.width, lens.height) {
-            image
-        } else {
-            image::imageops::resize(&image, lens.width, lens.height, image::imageops::FilterType::Triangle)
-        };
-        PosedImage {
-            name: unused_name(&mut self.names, picture_name(&frame.picture.name(), frame.sequence)),
+        let posed = PosedImage {
+            name: unused_name(&mut self.names, frame.picture.file_name(frame.sequence)),
             time_ns: frame.time_ns,
-            image,
+            image: picture::resized(image, (lens.width, lens.height)),
             view: View { intrinsics: lens, pose: Pose { rotation: frame.pose.rotation, center: frame.pose.position } },
             sigma: PoseSigma { position_m: frame.pose.position_sigma_m, rotation_rad: frame.pose.rotation_sigma_rad },
-        }
+        };
+        KeyFrame { posed, file: frame.picture.clone() }
     }
 }
 
 /// `name`, or with a number behind it when it is taken: a camera that counts anew with every start takes other pictures under
 /// the same names.
 fn unused_name(taken: &mut HashSet<String>, name: String) -> String {
-    let stem = name.strip_suffix(".png").unwrap_or(&name);
-    let others = (2..).map(|k: u64| format!("{stem}-{k}.png"));
+    let (stem, extension) = name.rsplit_once('.').unwrap_or((&name, "png"));
+    let others = (2..).map(|k: u64| format!("{stem}-{k}.{extension}"));
     let unused = std::iter::once(name.clone()).chain(others).find(|name| !taken.contains(name)).unwrap_or(name);
     taken.insert(unused.clone());
     unused
-}
-
-/// The file's own name, or the trigger's number for pictures that never were a file; always `.png`, as it is stored.
-pub(super) fn picture_name(path: &Path, sequence: u32) -> String {
-    match path.file_stem().and_then(|s| s.to_str()) {
-        Some(stem) if path.extension().is_some() => format!("{stem}.png"),
-        _ => format!("frame_{sequence:06}.png"),
-    }
 }

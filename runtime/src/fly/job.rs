@@ -109,7 +109,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     fn reconstruct(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
-        if self.reconstruction.wants_build(false) {
+        if capture.earlier_left() == 0 && self.reconstruction.wants_build(false) {
             self.build(capture)?;
         }
         self.train(capture, interrupt)
@@ -132,7 +132,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let patience = if self.reconstruction.has_model() { Duration::ZERO } else { self.for_a_frame };
         let Some(frame) = capture.next(patience)? else { return Ok(false) };
         tracing::info!("key frame {}: {}", self.reconstruction.keyframes() + 1, frame.name);
-        self.reconstruction.add(frame)?;
+        self.reconstruction.add(frame, capture.waiting() > 0)?;
         Ok(true)
     }
 
@@ -220,6 +220,12 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             let finished = self.finish_schedule(capture, interrupt);
             self.survive(finished)?;
         }
+        let before = (model_path(&self.out), self.reconstruction.gaussians());
+        if !self.reconstruction.has_model() && interrupt.requested() && before.0.is_file() {
+            // Stopped before everything was taken up again: the checkpoint stays as it is.
+            let (reconstruction, offerer, (model, gaussians)) = (self.reconstruction, self.offerer, before);
+            return Ok(JobEnd { reconstruction, offerer, model, gaussians, finished: false });
+        }
         if !self.reconstruction.has_model() {
             let keyframes = self.reconstruction.keyframes();
             return Err(JobError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
@@ -230,7 +236,6 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             tracing::warn!("{cause}: the rest of the training is left; the same command continues it later");
         }
         let mut finished = !interrupt.requested() && !self.training_failed && !spared;
-        let before = (model_path(&self.out), self.reconstruction.gaussians());
         let (model, gaussians) = if self.training_failed {
             before
         } else {

@@ -7,13 +7,16 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use config::disk::Disk;
+use config::mission::CameraSettings;
 use glam::{DQuat, DVec3};
-use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use hal::camera::Picture;
+use models::camera::{Pose, PoseSigma, PosedImage, View};
 use vulkan::trainer::RunBudget;
 
 use super::fault_table::ORIGIN;
-use super::rehearsal::{Ledger, Promise};
+use super::rehearsal::{Ledger, Promise, intrinsics};
 use crate::engine::{Reconstruct, model_path};
+use crate::keyframe_store::KeyFrame;
 use crate::session::{Owner, Session};
 
 /// Tells the child where to fly.
@@ -23,21 +26,31 @@ const KILLS: &str = "DGTR_KILLS";
 const FRAMES: usize = 24;
 /// Steps after each key frame.
 const STEPS: u64 = 20;
-const LENS: Intrinsics = Intrinsics { width: 96, height: 72, fx: 80.0, fy: 80.0, cx: 48.0, cy: 36.0 };
+const LENS: CameraSettings = CameraSettings {
+    width: 96,
+    height: 72,
+    fx: 80.0,
+    fy: 80.0,
+    cx: 48.0,
+    cy: 36.0,
+    distortion: [0.0; 4],
+    exposure_delay_ms: 0.0,
+};
 
-fn frame(i: usize) -> PosedImage {
+fn frame(i: usize) -> KeyFrame {
     let mut pixels = vec![0; (3 * LENS.width * LENS.height) as usize];
     blake3::Hasher::new().update(&i.to_le_bytes()).finalize_xof().fill(&mut pixels);
-    PosedImage {
+    let posed = PosedImage {
         name: format!("{i:03}.png"),
         time_ns: i as u64,
         image: image::RgbImage::from_raw(LENS.width, LENS.height, pixels).expect("as many pixels"),
         view: View {
-            intrinsics: LENS,
+            intrinsics: intrinsics(&LENS),
             pose: Pose { rotation: DQuat::IDENTITY, center: DVec3::new(5.0 * i as f64, 0.0, 40.0) },
         },
         sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [0.1; 3] },
-    }
+    };
+    KeyFrame { file: Picture::Rgb(posed.image.clone()), posed }
 }
 
 /// Flies to the end in `out`, from wherever an earlier start came to.
@@ -51,7 +64,7 @@ fn fly(out: &Path, promised: impl FnMut(Promise) + Send + 'static) {
     for i in 0..FRAMES {
         if ledger.keyframes() <= i {
             store.add(&frame(i)).expect("stored");
-            ledger.add(frame(i)).expect("taken in");
+            ledger.add(frame(i).posed, false).expect("taken in");
         }
         let until = STEPS * (i as u64 + 1);
         if ledger.steps_total() >= until && i + 1 < FRAMES {

@@ -6,11 +6,12 @@ use std::sync::Arc;
 
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
+use config::mission::CameraSettings;
 use config::upload::UploadSettings;
+use hal::camera::Picture;
 use hal::failsafe::Timing;
 use hal::sim::world::{World, WorldSettings};
 use hal::time::ManualClock;
-use models::camera::{Intrinsics, PosedImage};
 use models::formats::model;
 use rayon::prelude::*;
 use vulkan::trainer::RunBudget;
@@ -21,10 +22,10 @@ use super::handover::handover;
 use super::health::Health;
 use super::intake::FlightCounters;
 use super::job::Job;
-use super::rehearsal::{Ledger, Promise, rehearse_on};
+use super::rehearsal::{Ledger, Promise, intrinsics, rehearse_on};
 use crate::engine::model_path;
 use crate::interrupt::Interrupt;
-use crate::keyframe_store::KeyframeStore;
+use crate::keyframe_store::{KeyFrame, KeyframeStore};
 use crate::power_cut::states::{State, each};
 use crate::power_cut::{Done, Recorder};
 use crate::session::{Owner, Session};
@@ -36,9 +37,9 @@ const AT_ONCE: usize = 256;
 struct Recording {
     folder: tempfile::TempDir,
     done: Vec<Done<Promise>>,
-    lens: Intrinsics,
+    lens: CameraSettings,
     /// The key frames of the undisturbed flight.
-    frames: Vec<PosedImage>,
+    frames: Vec<KeyFrame>,
 }
 
 fn record(careless: bool) -> Recording {
@@ -49,11 +50,12 @@ fn record(careless: bool) -> Recording {
     let (script, disk) = (usual(), Disk::new(recorder.clone()));
     let flown = rehearse_on(&disk, &script, world, folder.path(), Box::new(move |p| told.promise(p)));
     assert_eq!(flown.model.as_ref().map(|m| m.1), Ok(true));
-    let l = script.vehicle.lens;
-    let lens = Intrinsics { width: l.width, height: l.height, fx: l.fx, fy: l.fy, cx: l.cx, cy: l.cy };
-    let out = folder.path().join("out");
-    let mut store = KeyframeStore::open(&Disk::default(), &out.join("keyframes"), &lens, ORIGIN).expect("stored");
-    let frames: Vec<PosedImage> = (0..).map_while(|i| store.sound(i)).collect();
+    let lens = script.vehicle.lens;
+    let kept = folder.path().join("out/keyframes");
+    let mut store = KeyframeStore::open(&Disk::default(), &kept, &lens, &intrinsics(&lens), ORIGIN).expect("stored");
+    let file = |name: &str| Picture::Path(kept.join("images").join(name));
+    let frames: Vec<KeyFrame> =
+        (0..).map_while(|i| store.sound(i)).map(|posed| KeyFrame { file: file(&posed.name), posed }).collect();
     assert!(frames.len() >= 8);
     Recording { folder, done: recorder.take(), lens, frames }
 }
@@ -97,7 +99,10 @@ fn go_on(state: &State, promised: &[Promise], r: &Recording) -> Result<(), Strin
     let clock = ManualClock::default();
     let mut job = Job::new(ledger, offerer, out, budget, health, Timing::from(&limits), clock).without_waiting();
     let interrupt = Interrupt::default();
-    for frame in r.frames.iter().filter(|f| !here.contains(&f.name)) {
+    while capture.earlier_left() > 0 {
+        job.turn(&mut capture, &interrupt).map_err(|e| e.to_string())?;
+    }
+    for frame in r.frames.iter().filter(|f| !here.contains(&f.posed.name)) {
         end.count(true);
         end.frames.try_send(frame.clone()).map_err(|e| e.to_string())?;
         job.turn(&mut capture, &interrupt).map_err(|e| e.to_string())?;

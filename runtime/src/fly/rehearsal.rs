@@ -10,7 +10,7 @@ use std::time::Duration;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::geodesy::Geodetic;
-use config::mission::KeyframeSettings;
+use config::mission::{CameraSettings, KeyframeSettings};
 use config::upload::UploadSettings;
 use hal::camera::FolderCamera;
 use hal::failsafe::{Action, Cause, Timing};
@@ -68,11 +68,12 @@ impl Ledger {
     /// Takes up what an earlier run left in `out`, as `fly` does; and the store of its key frames.
     pub(super) fn open(
         disk: &Disk,
-        lens: &Intrinsics,
+        camera: &CameraSettings,
         origin: Geodetic,
         out: &Path,
     ) -> Result<(Self, KeyframeStore), JobError> {
-        let mut store = KeyframeStore::open(disk, &out.join("keyframes"), lens, origin)?;
+        let lens = intrinsics(camera);
+        let mut store = KeyframeStore::open(disk, &out.join("keyframes"), camera, &lens, origin)?;
         let views: Vec<_> = (0..).map_while(|i| store.sound(i)).map(|frame| (frame.name, frame.view)).collect();
         let before = model::read_checkpoint(disk, &model_path(out))?;
         let steps_total = before.map_or(0, |(header, _)| header.steps);
@@ -93,7 +94,10 @@ impl Ledger {
 }
 
 impl Reconstruct for Ledger {
-    fn add(&mut self, frame: PosedImage) -> Result<(), JobError> {
+    fn add(&mut self, frame: PosedImage, _more: bool) -> Result<(), JobError> {
+        if self.views.iter().any(|(name, _)| *name == frame.name) {
+            return Ok(());
+        }
         (self.promised)(Promise::KeyFrame(frame.name.clone()));
         self.views.push((frame.name, frame.view));
         Ok(())
@@ -214,6 +218,12 @@ pub(super) fn rehearse(script: &Script, world: Arc<World>, folder: &Path) -> Reh
     rehearse_on(&disk, script, world, folder, Box::new(|_| {}))
 }
 
+/// Pictures are trained on as large as they come.
+pub(super) fn intrinsics(camera: &CameraSettings) -> Intrinsics {
+    let c = camera;
+    Intrinsics { width: c.width, height: c.height, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy }
+}
+
 /// As [`rehearse`], with what is on disk told to `promised`.
 pub(super) fn rehearse_on(
     disk: &Disk,
@@ -232,14 +242,11 @@ pub(super) fn rehearse_on(
     let camera = FolderCamera::open(&pictures).expect("the folder").on_simulated_clock();
     let vehicle = Vehicle::new(wire, camera, clock.clone(), &script.vehicle).expect("a vehicle");
     let (mut capture, end) = handover();
-    let lens = script.vehicle.lens;
-    let intrinsics =
-        Intrinsics { width: lens.width, height: lens.height, fx: lens.fx, fy: lens.fy, cx: lens.cx, cy: lens.cy };
-    let (mut ledger, store) = Ledger::open(disk, &intrinsics, script.vehicle.origin, &out).expect("opens");
+    let (mut ledger, store) = Ledger::open(disk, &script.vehicle.lens, script.vehicle.origin, &out).expect("opens");
     ledger.promised = promised;
     let plan = FlightPlan {
         vehicle: script.vehicle.clone(),
-        intrinsics,
+        intrinsics: intrinsics(&script.vehicle.lens),
         keyframes: KeyframeSettings::default(),
         earlier: store.poses(),
         earlier_names: script.earlier_names.iter().cloned().collect(),

@@ -9,17 +9,34 @@ use glam::{DQuat, DVec3};
 
 use super::*;
 
-fn frame(name: &str, x: f64) -> PosedImage {
-    PosedImage {
+const CAMERA: CameraSettings = CameraSettings {
+    width: 4,
+    height: 3,
+    fx: 3.0,
+    fy: 3.0,
+    cx: 2.0,
+    cy: 1.5,
+    distortion: [0.0; 4],
+    exposure_delay_ms: 0.0,
+};
+const LENS: Intrinsics = Intrinsics { width: 4, height: 3, fx: 3.0, fy: 3.0, cx: 2.0, cy: 1.5 };
+
+fn open(disk: &Disk, folder: &Path) -> KeyframeStore {
+    KeyframeStore::open(disk, folder, &CAMERA, &LENS, ORIGIN).expect("opens")
+}
+
+fn frame(name: &str, x: f64) -> KeyFrame {
+    let posed = PosedImage {
         name: name.into(),
         time_ns: 7,
         image: image::RgbImage::from_fn(4, 3, |x, y| image::Rgb([x as u8, y as u8, 9])),
         view: View {
-            intrinsics: Intrinsics { width: 4, height: 3, fx: 3.0, fy: 3.0, cx: 2.0, cy: 1.5 },
+            intrinsics: LENS,
             pose: Pose { rotation: DQuat::from_rotation_x(3.0), center: DVec3::new(x, 2.0, 40.0) },
         },
         sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [f32::INFINITY; 3] },
-    }
+    };
+    KeyFrame { file: Picture::Rgb(posed.image.clone()), posed }
 }
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
@@ -27,20 +44,18 @@ const ORIGIN: Geodetic = Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
 #[test]
 fn a_restarted_flight_finds_its_key_frames_as_they_were() {
     let dir = tempfile::tempdir().expect("tempdir");
-    let intrinsics = frame("a.jpg", 0.0).view.intrinsics;
-    let mut store = KeyframeStore::open(&Disk::default(), dir.path(), &intrinsics, ORIGIN).expect("new");
-    store.add(&frame("a.jpg", 5.0)).expect("add");
-    let again =
-        KeyframeStore::open(&Disk::default(), dir.path(), &intrinsics, ORIGIN).expect("again").load(0).expect("load");
-    let (stored, first) = (again.view, frame("a.jpg", 5.0));
+    let mut store = open(&Disk::default(), dir.path());
+    store.add(&frame("a.png", 5.0)).expect("add");
+    let again = open(&Disk::default(), dir.path()).load(0).expect("load");
+    let (stored, first) = (again.view, frame("a.png", 5.0).posed);
     assert_eq!((stored, again.sigma, again.image), (first.view, first.sigma, first.image));
 }
 
 /// A store of `n` key frames along a line, 5 m apart.
 fn line(disk: &Disk, folder: &Path, n: u32) -> KeyframeStore {
-    let mut store = KeyframeStore::open(disk, folder, &frame("0.jpg", 0.0).view.intrinsics, ORIGIN).expect("new");
+    let mut store = open(disk, folder);
     for i in store.len() as u32..n {
-        store.add(&frame(&format!("{i}.jpg"), 5.0 * f64::from(i))).expect("add");
+        store.add(&frame(&format!("{i}.png"), 5.0 * f64::from(i))).expect("add");
     }
     store
 }
@@ -74,7 +89,7 @@ fn a_damaged_list_is_set_aside_and_the_one_before_is_used() {
     let mut store = line(&Disk::default(), dir.path(), 0);
     assert_eq!(names(&mut store), ["0.png", "1.png", "2.png"]);
     assert!(dir.path().join("transforms.damaged-1.json").is_file());
-    store.add(&frame("3.jpg", 15.0)).expect("goes on");
+    store.add(&frame("3.png", 15.0)).expect("goes on");
     std::fs::write(&list, b"").expect("emptied");
     std::fs::write(previous(&list), b"{").expect("cut");
     assert!(line(&Disk::default(), dir.path(), 0).is_empty(), "with neither it starts anew");
@@ -87,14 +102,14 @@ fn a_full_disk_refuses_one_key_frame_and_keeps_all_others() {
     let disk = Disk::new(Bounded::new(System, dir.path(), limit.clone()));
     let mut store = line(&disk, dir.path(), 20);
     limit.store(bytes_below(dir.path()) + 10, Ordering::Relaxed);
-    let e = store.add(&frame("20.jpg", 100.0)).expect_err("no room");
+    let e = store.add(&frame("20.png", 100.0)).expect_err("no room");
     assert!(e.may_pass() && e.to_string().contains("20.png"), "{e}");
     assert_eq!((store.len(), line(&Disk::default(), dir.path(), 0).len()), (20, 20));
     let mut relieve = |relief| store.relieve(relief, &dir.path().join("model.dgtr"));
     assert!(relieve(Relief::OldCheckpoints) && !relieve(Relief::OldCheckpoints));
     let gone = store.thin_out();
     assert!((6..=12).contains(&gone), "{gone} of 20 on an even line");
-    store.add(&frame("20.jpg", 100.0)).expect("room again");
+    store.add(&frame("20.png", 100.0)).expect("room again");
     let kept = names(&mut line(&Disk::default(), dir.path(), 0));
     assert_eq!(kept.len(), 21 - gone);
     // Never both of a pair.
@@ -105,12 +120,11 @@ fn a_full_disk_refuses_one_key_frame_and_keeps_all_others() {
 #[test]
 fn the_store_is_a_data_set() {
     let dir = tempfile::tempdir().expect("tempdir");
-    let intrinsics = frame("a.jpg", 0.0).view.intrinsics;
-    let mut store = KeyframeStore::open(&Disk::default(), dir.path(), &intrinsics, ORIGIN).expect("new");
+    let mut store = open(&Disk::default(), dir.path());
     for i in 0..9 {
-        store.add(&frame(&format!("{i}.jpg"), f64::from(i))).expect("add");
+        store.add(&frame(&format!("{i}.png"), f64::from(i))).expect("add");
     }
-    let again = KeyframeStore::open(&Disk::default(), dir.path(), &intrinsics, ORIGIN).expect("again");
+    let again = open(&Disk::default(), dir.path());
     assert_eq!(again.len(), 9);
     let loaded = again.load(3).expect("load");
     assert_eq!((loaded.name.as_str(), loaded.view.pose.center.x, loaded.time_ns), ("3.png", 3.0, 7));
@@ -118,4 +132,46 @@ fn the_store_is_a_data_set() {
     assert_eq!(set.frames.len(), 9);
     assert!((set.frames[3].view.pose.center - loaded.view.pose.center).length() < 1e-9);
     assert_eq!(set.origin, Some(ORIGIN));
+}
+
+#[test]
+fn the_cameras_own_file_is_kept_and_read_again_as_it_is_trained_on() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let photo = image::RgbImage::from_fn(64, 48, |x, y| image::Rgb([(4 * x) as u8, (5 * y) as u8, (x * y) as u8]));
+    let own = dir.path().join("DSC_7.JPG");
+    photo.save_with_format(&own, image::ImageFormat::Jpeg).expect("jpeg");
+    let camera = CameraSettings {
+        width: 64,
+        height: 48,
+        fx: 50.0,
+        fy: 50.0,
+        cx: 32.0,
+        cy: 24.0,
+        distortion: [-0.1, 0.01, 0.0, 0.0],
+        ..CAMERA
+    };
+    let lens = Intrinsics { width: 32, height: 24, fx: 25.0, fy: 25.0, cx: 16.0, cy: 12.0 };
+    let file = Picture::Path(own.clone());
+    let posed = PosedImage {
+        name: file.file_name(3),
+        image: picture::resized(file.load(&camera).expect("decodes"), (32, 24)),
+        view: View { intrinsics: lens, pose: frame("a.png", 0.0).posed.view.pose },
+        ..frame("a.png", 0.0).posed
+    };
+    let out = dir.path().join("keyframes");
+    let mut store = KeyframeStore::open(&Disk::default(), &out, &camera, &lens, ORIGIN).expect("opens");
+    store.add(&KeyFrame { posed: posed.clone(), file }).expect("kept");
+    let bytes = |path: &Path| std::fs::read(path).expect("a file");
+    assert_eq!(bytes(&out.join("images/DSC_7.JPG")), bytes(&own));
+    let again = store.load(0).expect("loads");
+    assert_eq!((again.name.as_str(), again.view, again.image), ("DSC_7.JPG", posed.view, posed.image));
+    // Other programs learn of the camera with its distortion.
+    let set = models::dataset::Dataset::open(&out).expect("a data set");
+    assert_eq!((set.frames[0].view.intrinsics.width, set.frames[0].view.intrinsics.fx), (64, 50.0));
+    // A file that vanished before it was kept costs only itself.
+    std::fs::remove_file(&own).expect("gone");
+    let gone =
+        KeyFrame { posed: PosedImage { name: "b.JPG".into(), ..frame("b.png", 9.0).posed }, file: Picture::Path(own) };
+    assert!(matches!(store.add(&gone), Err(StoreError::Camera(_))));
+    assert_eq!(store.len(), 1);
 }

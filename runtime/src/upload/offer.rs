@@ -132,6 +132,9 @@ impl Offer {
     }
 
     /// Wire bytes → an offer whose every field is within bounds. Whether it concerns us is [`Offer::check`]'s job.
+    ///
+    /// # Errors
+    /// The bytes are no offer of this version.
     pub fn decode(bytes: &[u8], settings: &UploadSettings) -> Result<Self, OfferError> {
         let damaged = |what: &str| Err(OfferError::Damaged(what.into()));
         if bytes.len() as u64 > Self::max_encoded(settings) {
@@ -263,6 +266,9 @@ impl OfferedModel {
     }
 
     /// Bytes of chunk `index`, out of the open file.
+    ///
+    /// # Errors
+    /// The model file cannot be read back.
     pub fn chunk(&self, index: usize) -> std::io::Result<Vec<u8>> {
         let mut bytes = vec![0; self.offer.chunk_len(index) as usize];
         self.file.read_exact_at(&mut bytes, index as u64 * u64::from(self.offer.chunk_bytes))?;

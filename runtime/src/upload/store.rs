@@ -197,6 +197,9 @@ impl Store {
     }
 
     /// Writes down which offer the complete model came from (the same bytes may be offered again as final).
+    ///
+    /// # Errors
+    /// The disk cannot be written to.
     pub fn note(&mut self, offer: &Offer) -> Result<(), StoreError> {
         self.write_note(NOTE, offer)?;
         // Left behind it vouches for the same model.

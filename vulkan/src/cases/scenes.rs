@@ -37,6 +37,9 @@ impl<R: Real> Answer<R> {
     }
 
     /// Every number of the picture and of every gradient.
+    ///
+    /// # Errors
+    /// Which number is not finite.
     pub fn check_finite(&self, case: &str) -> Result<(), Broken> {
         for p in &self.picture {
             promise!(p.rgb.iter().chain([&p.depth, &p.transmittance]).all(|v| v.is_finite()), "{case}: picture");
@@ -82,6 +85,9 @@ pub fn answer_in<R: Real>(
 }
 
 /// A trainer with `cloud` loaded and room for two views of `view`'s size.
+///
+/// # Errors
+/// The device refuses the plan or the scene.
 pub fn trainer(gpu: &Gpu, cloud: &GaussianCloud, view: &View, settings: &TrainSettings) -> Result<Trainer, Broken> {
     let mut trainer = empty_trainer(gpu, cloud.sh_degree, cloud.len().max(256), view, settings)?;
     trainer.load(cloud)?;
@@ -89,6 +95,9 @@ pub fn trainer(gpu: &Gpu, cloud: &GaussianCloud, view: &View, settings: &TrainSe
 }
 
 /// The same with nothing loaded yet.
+///
+/// # Errors
+/// The device refuses the plan.
 pub fn empty_trainer(
     gpu: &Gpu,
     sh_degree: u8,

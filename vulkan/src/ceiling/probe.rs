@@ -78,6 +78,9 @@ fn two_buffers(bytes: u64) -> Plan {
 
 impl Probe {
     /// `bytes` is a multiple of 64 KiB.
+    ///
+    /// # Errors
+    /// The device refuses buffers or pipeline.
     pub fn new(gpu: &Gpu, bytes: u64) -> Result<Self, GpuError> {
         let mut made = Self {
             pool: vk::CommandPool::null(),
@@ -167,6 +170,9 @@ impl Probe {
     }
 
     /// Runs `kind` `repeats` times, one after the other, and waits.
+    ///
+    /// # Errors
+    /// The device fails.
     pub fn run(&self, kind: Kind, repeats: u32) -> Result<(), GpuError> {
         let device = self.gpu.device();
         let begin = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);

@@ -51,6 +51,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr bench memory`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
     let temporary = tempfile::tempdir()?;

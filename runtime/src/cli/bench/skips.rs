@@ -55,6 +55,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr bench skips`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let base: toml::Table = match &args.settings {
         None => toml::Table::new(),

@@ -55,6 +55,9 @@ fn size(text: &str) -> Result<(u32, u32), String> {
 }
 
 /// Runs `dgtr bench stages`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
     let shape = kernels::shape_of(&gpu);

@@ -29,6 +29,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr bench stress`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = match args.twin_only {
         true => None,

@@ -50,6 +50,9 @@ pub struct Args {
 }
 
 /// Runs `dgtr bench time-error`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     if args.seconds.iter().chain(&args.sfm_seconds).any(|s| !(*s >= 0.0 && s.is_finite())) {
         return Err(CliError::input("--seconds and --sfm-seconds must be numbers of seconds"));
