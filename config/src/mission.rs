@@ -4,6 +4,8 @@
 //!
 //! Everything is checked once, on reading: what [`Mission::read`] returns needs no further validation.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::failsafe::FailsafeSettings;
@@ -167,11 +169,13 @@ impl Mission {
     /// One line that names the file, the field and the remedy.
     pub fn read(path: &Path) -> Result<Self, MissionError> {
         let at = |source| MissionError::Unreadable { path: path.into(), source };
-        let size = std::fs::metadata(path).map_err(at)?.len();
-        if size > MAX_FILE_BYTES {
-            return Err(MissionError::TooLarge { path: path.into(), bytes: size, limit: MAX_FILE_BYTES });
+        let mut text = String::new();
+        let file = File::open(path).map_err(at)?;
+        file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text).map_err(at)?;
+        if text.len() as u64 > MAX_FILE_BYTES {
+            let bytes = std::fs::metadata(path).map_or(0, |m| m.len()).max(MAX_FILE_BYTES + 1);
+            return Err(MissionError::TooLarge { path: path.into(), bytes, limit: MAX_FILE_BYTES });
         }
-        let text = std::fs::read_to_string(path).map_err(at)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         Self::parse(&text, folder).map_err(|e| e.in_file(path))
     }

@@ -102,7 +102,8 @@ impl SettingError {
 pub(crate) fn as_toml<T: Serialize + ?Sized>(value: &T) -> Option<String> {
     let mut text = String::new();
     value.serialize(toml::ser::ValueSerializer::new(&mut text)).ok()?;
-    Some(text)
+    // A text of several lines is written as one.
+    Some(text.replace('\n', "\\n"))
 }
 
 /// One setting, or one table of settings, as the reference prints it.
@@ -428,6 +429,12 @@ mod tests {
         // 0.1 in 32 bits is a little more than in 64.
         assert!(Value::check(&0.1_f32, &Limits::within(0.0, 0.1)).is_ok());
         assert_eq!(Limits::within(16.0, 8192.0).to_string(), "16 to 8192");
+    }
+
+    #[test]
+    fn a_text_of_several_lines_is_refused_in_one() {
+        let said = SettingError::new("id", "a\nb'c", "a name").to_string();
+        assert!(said.contains("a\\nb") && said.lines().count() == 1, "{said}");
     }
 
     #[test]

@@ -1,37 +1,95 @@
-//! Every reader of the HAL against broken input, as the readers of `models` are: 100,000 inputs each (`DGTR_FUZZ_INPUTS` says
-//! otherwise), mutated from whole ones. Whatever comes, nothing panics and memory stays bounded.
+//! Every reader of the HAL against broken input: the line to the autopilot, matching and reconciliation, logs, pictures, keys.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
+use std::io::Cursor;
 use std::path::Path;
 use std::time::Duration;
 
-use hal::camera::{JpegSplitter, exif_pose, is_complete};
+use config::link::{LinkSettings, Signing};
+use config::mission::CameraSettings;
+use hal::camera::{JpegSplitter, Picture, exif_pose, is_complete};
 use hal::link::TlogLink;
+use hal::mavlink::signing_store;
 use hal::traits::Link;
 
-#[path = "../../models/tests/readers/memory.rs"]
-mod memory;
-#[path = "../../models/tests/readers/mutation.rs"]
-mod mutation;
+#[path = "../../tests/readers/driver.rs"]
+mod driver;
 #[path = "../fuzz/src/targets.rs"]
 mod targets;
 
-use mutation::{Random, mutate};
-
-/// Inputs for each reader unless the environment says otherwise.
-fn inputs() -> usize {
-    std::env::var("DGTR_FUZZ_INPUTS").ok().and_then(|n| n.parse().ok()).unwrap_or(100_000)
-}
-
-/// A stretch of a recorded flight.
-fn stretch<'a>(flight: &'a [u8], most: usize, random: &mut Random) -> &'a [u8] {
-    let from = random.below(flight.len() - most);
-    &flight[from..from + most]
-}
+use driver::{Random, Read, Reader, line, memory_folder, survive};
 
 fn flight() -> Vec<u8> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/run8_trimmed.tlog");
     std::fs::read(path).expect("the recording in the repository")
+}
+
+/// Stretches of a recorded flight.
+fn stretches(length: usize) -> Vec<Vec<u8>> {
+    let (flight, mut random) = (flight(), Random::new(3));
+    let stretch = |_| {
+        let from = random.below(flight.len() - length);
+        flight[from..from + length].to_vec()
+    };
+    (0..256).map(stretch).collect()
+}
+
+#[test]
+fn mavlink() {
+    survive(&Reader {
+        name: "mavlink",
+        seeds: stretches(400),
+        text: false,
+        shell: None,
+        // Rings of a fixed size.
+        memory: (256 << 10, 0),
+        read: Read::Bytes(&|bytes| {
+            let frames = targets::parse(bytes).framer.counters().frames;
+            if frames > 0 { Ok(true) } else { Err("no frame".into()) }
+        }),
+    });
+}
+
+/// Events and leftovers are whatever the bytes say: what is checked is that all of them are accounted for.
+fn events(name: &'static str, memory: (usize, usize), read: &dyn Fn(&[u8])) {
+    survive(&Reader {
+        name,
+        seeds: stretches(400),
+        text: false,
+        shell: None,
+        memory,
+        read: Read::Bytes(&|bytes| {
+            read(bytes);
+            if bytes.len() >= 16 { Ok(true) } else { Err("no event".into()) }
+        }),
+    });
+}
+
+#[test]
+fn matcher() {
+    events("matcher", (64 << 10, 0), &targets::match_up);
+}
+
+#[test]
+fn reconciliation() {
+    // Quadratic in what is left, 32 bytes a pair; an input makes fifty of both at most.
+    events("reconciliation", ((64 << 10) + 64 * 50 * 50, 0), &targets::reconcile_all);
+}
+
+#[test]
+fn telemetry_logs() {
+    survive(&Reader {
+        name: "tlog",
+        seeds: stretches(600),
+        text: false,
+        shell: None,
+        memory: (128 << 10, 0),
+        read: Read::File("a.tlog", &|path| {
+            let (mut link, mut buffer) = (TlogLink::open(path).expect("opens"), [0; 512]);
+            while link.read(&mut buffer, Duration::ZERO).is_ok() {}
+            if link.records() > 0 { Ok(true) } else { Err("a.tlog: no record".into()) }
+        }),
+    });
 }
 
 /// A JPEG's head with a GPS position: EXIF in little-endian TIFF, one directory that points to the next.
@@ -60,52 +118,107 @@ fn tagged() -> Vec<u8> {
 }
 
 #[test]
-fn mavlink_matcher_and_reconciliation() {
-    let (flight, mut random, mut largest) = (flight(), Random::new(3), 0);
-    for _ in 0..inputs() {
-        let [seed, other] = [(); 2].map(|()| stretch(&flight, 400, &mut random));
-        let input = mutate(seed, other, false, &mut random);
-        targets::parse(&input);
-        targets::match_up(&input);
-        let ((), held) = memory::peak(|| targets::reconcile_all(&input));
-        largest = largest.max(held);
-        // Quadratic in what is left, 32 bytes a pair.
-        assert!(held < (64 << 10) + 64 * (input.len() / 16).pow(2), "{held} bytes for {}", input.len());
-    }
-    println!("{} inputs, {largest} bytes held at most by the reconciliation", inputs());
+fn poses_in_pictures() {
+    survive(&Reader {
+        name: "exif",
+        seeds: vec![tagged()],
+        text: false,
+        shell: None,
+        memory: (512 << 10, 64),
+        read: Read::File("a.jpg", &|path| {
+            let pose = exif_pose(path).ok_or("a.jpg: no pose")?;
+            Ok(pose.position.is_valid() && pose.mount.is_none_or(|m| m.is_finite()))
+        }),
+    });
 }
 
 #[test]
-fn logs_and_pictures() {
-    let folder = ["/dev/shm"].into_iter().find(|f| Path::new(f).is_dir()).map(tempfile::tempdir_in);
-    let folder = folder.unwrap_or_else(tempfile::tempdir).expect("a folder for the inputs");
-    let (log, picture) = (folder.path().join("a.tlog"), folder.path().join("a.jpg"));
-    let (flight, tagged, mut random) = (flight(), tagged(), Random::new(4));
-    std::fs::write(&picture, &tagged).expect("written");
-    assert!(exif_pose(&picture).is_some(), "what is mutated is whole to begin with");
-    let (mut records, mut poses, mut whole, mut buffer, mut largest) = (0u64, 0u64, 0u64, [0; 512], 0);
-    for _ in 0..inputs() {
-        let [seed, other] = [(); 2].map(|()| stretch(&flight, 600, &mut random));
-        std::fs::write(&log, mutate(seed, other, false, &mut random)).expect("written");
-        let ((), held) = memory::peak(|| {
-            let mut link = TlogLink::open(&log).expect("opens");
-            while link.read(&mut buffer, Duration::ZERO).is_ok() {}
-            records += link.records();
-        });
-        assert!(held < 128 << 10, "{held} bytes for a log");
-
-        let input = mutate(&tagged, &tagged, false, &mut random);
-        std::fs::write(&picture, &input).expect("written");
-        let ((), held) = memory::peak(|| {
-            poses += u64::from(exif_pose(&picture).is_some());
-            whole += u64::from(is_complete(&picture).is_ok_and(|complete| complete));
+fn ends_of_pictures_and_streams_of_them() {
+    survive(&Reader {
+        name: "jpeg-ends",
+        seeds: vec![tagged()],
+        text: false,
+        shell: None,
+        memory: (512 << 10, 64),
+        read: Read::File("a.jpg", &|path| {
             let mut splitter = JpegSplitter::default();
-            splitter.push(&input);
+            splitter.push(&std::fs::read(path).expect("there"));
             while splitter.next_jpeg().is_some() {}
-        });
-        assert!(held < (512 << 10) + 64 * input.len(), "{held} bytes for a picture of {}", input.len());
-        largest = largest.max(held);
-    }
-    println!("{} inputs: {records} records, {poses} poses, {whole} whole pictures, {largest} bytes at most", inputs());
-    assert!(records > 0 && poses > 0 && whole > 0, "mutations reach the decoders");
+            match is_complete(path) {
+                Ok(true) => Ok(true),
+                Ok(false) => Err("a.jpg: not whole".into()),
+                Err(e) => Err(format!("a.jpg: {e}")),
+            }
+        }),
+    });
+}
+
+#[test]
+fn pixels_of_pictures() {
+    let lens = CameraSettings {
+        width: 16,
+        height: 12,
+        fx: 10.0,
+        fy: 10.0,
+        cx: 8.0,
+        cy: 6.0,
+        distortion: [0.01, 0.0, 0.0, 0.0],
+        exposure_delay_ms: 0.0,
+    };
+    let picture = image::RgbImage::from_fn(16, 12, |x, y| image::Rgb([(x * 16) as u8, (y * 20) as u8, 90]));
+    let encoded = |format| {
+        let mut bytes = Cursor::new(Vec::new());
+        picture.write_to(&mut bytes, format).expect("encoded");
+        bytes.into_inner()
+    };
+    survive(&Reader {
+        name: "camera-pixels",
+        seeds: vec![encoded(image::ImageFormat::Jpeg)],
+        text: false,
+        shell: None,
+        memory: (2 << 20, 256),
+        // From a folder and from a stream.
+        read: Read::File("a.jpg", &|path| {
+            let bytes = Picture::Jpeg(std::fs::read(path).expect("there")).decode(&lens);
+            let file = line(Picture::Path(path.into()).decode(&lens), |image| image.dimensions() == (16, 12));
+            let same = file.is_ok() == bytes.is_ok_and(|image| image.dimensions() == (16, 12));
+            file.map(|usable| usable && same)
+        }),
+    });
+}
+
+#[test]
+fn signing_keys_and_their_time_stamps() {
+    let folder = memory_folder();
+    let key = folder.path().join("key");
+    let settings =
+        |path: &Path| LinkSettings { signing: Signing::Require, signing_key: Some(path.into()), ..Default::default() };
+    survive(&Reader {
+        name: "signing-key",
+        seeds: vec![vec![7; 32], "0123456789abcdef".repeat(4).into_bytes()],
+        text: false,
+        shell: None,
+        memory: (256 << 10, 16),
+        read: Read::File("link.key", &|path| line(signing_store::open(&settings(path)), |(_, store)| store.is_some())),
+    });
+    std::fs::write(&key, [7; 32]).expect("written");
+    let settings = settings(&key);
+    survive(&Reader {
+        name: "signing-time",
+        seeds: ["200000000000000\n", "200000000000001"].map(|s| s.as_bytes().to_vec()).into(),
+        text: true,
+        shell: None,
+        memory: (256 << 10, 16),
+        read: Read::Bytes(&|bytes| {
+            let path = folder.path().join("key.timestamp");
+            std::fs::write(&path, bytes).expect("written");
+            let (signer, _) = signing_store::open(&settings).map_err(|e| e.to_string())?;
+            // What could not be read is set aside by name, and nothing stands in the way of the next.
+            let aside = folder.path().join("key.damaged-1.timestamp");
+            match std::fs::remove_file(&aside) {
+                Ok(()) => Err(format!("set aside as {}", aside.display())),
+                Err(_) => Ok(signer.timestamp() >> 48 == 0),
+            }
+        }),
+    });
 }

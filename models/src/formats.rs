@@ -130,6 +130,11 @@ pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     Ok(bytes)
 }
 
+/// What another library says, on one line: decoders' and ONNX Runtime's messages span several.
+pub(crate) fn one_line(error: impl std::fmt::Display) -> String {
+    error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 /// Writes a file whole or not at all, see [`Disk::replace`].
 ///
 /// # Errors

@@ -81,8 +81,3 @@ impl Error for OnnxError {
         }
     }
 }
-
-/// ONNX Runtime's messages span lines; ours do not.
-fn one_line(error: impl std::fmt::Display) -> String {
-    error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
-}

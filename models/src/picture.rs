@@ -14,6 +14,7 @@ use glam::DQuat;
 use image::{DynamicImage, ImageReader, Limits, RgbImage, imageops};
 use jpeg_decoder::{Decoder, PixelFormat};
 
+use crate::formats::one_line;
 use crate::formats::reconstruction::{Focal, LensDescription};
 
 /// Largest picture edge taken; 16384² × 3 bytes is also what a decoder may allocate at most.
@@ -117,7 +118,7 @@ fn bad(path: &Path, what: impl Into<String>) -> PictureError {
 /// # Errors
 /// As [`decode`].
 pub fn dimensions(path: &Path) -> Result<(u32, u32), PictureError> {
-    open(path)?.into_dimensions().map_err(|e| bad(path, format!("cannot be decoded ({e})")))
+    open(path)?.into_dimensions().map_err(|e| bad(path, format!("cannot be decoded ({})", one_line(e))))
 }
 
 fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PictureError> {
@@ -148,7 +149,8 @@ pub fn decode_at_least(path: &Path, wanted: (u32, u32)) -> Result<RgbImage, Pict
     limits.max_image_height = Some(MAX_EDGE);
     limits.max_alloc = Some(u64::from(MAX_EDGE) * u64::from(MAX_EDGE) * 3);
     reader.limits(limits);
-    let image = reader.decode().map_err(|e| bad(path, format!("cannot be decoded ({e}); copy it again")))?;
+    let image =
+        reader.decode().map_err(|e| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e))))?;
     if matches!(image, DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) | DynamicImage::ImageLuma16(_)) {
         tracing::info!("{}: 16 bits a colour, of which 8 are used", path.display());
     }
@@ -165,7 +167,7 @@ pub fn resized(image: RgbImage, (width, height): (u32, u32)) -> RgbImage {
 
 /// The picture reduced while it is decoded; `None` where it is no JPEG, or where less than half its size is not enough.
 fn scaled_jpeg(path: &Path, (width, height): (u32, u32)) -> Result<Option<RgbImage>, PictureError> {
-    let damaged = |e: jpeg_decoder::Error| bad(path, format!("cannot be decoded ({e}); copy it again"));
+    let damaged = |e: jpeg_decoder::Error| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e)));
     let io = |e: std::io::Error| bad(path, format!("cannot be opened ({e}); is the picture folder complete?"));
     let mut file = File::open(path).map_err(io)?;
     let mut magic = [0; 3];
@@ -284,5 +286,9 @@ mod tests {
             let error = decode_at_least(&path, (40, 30)).unwrap_err().to_string();
             assert!(error.contains("a.jpg") && !error.contains('\n'), "{error}");
         }
+        // At full size another decoder reads it, whose words end with a line break.
+        std::fs::write(&path, &whole[..whole.len() / 20]).unwrap();
+        let error = decode(&path).unwrap_err().to_string();
+        assert!(error.contains("a.jpg") && !error.contains('\n'), "{error}");
     }
 }

@@ -209,6 +209,9 @@ fn opendronemaps_reconstruction_is_a_data_set_with_points_and_an_origin() {
     assert_eq!((frame.distortion.k3, frame.distortion.p1), (-0.004, 0.0003));
     let points = set.sparse_points().unwrap();
     assert_eq!((points.len(), points[0].position, points[0].color), (1, [1.0, 2.0, 0.5], [1, 2, 255]));
+    std::fs::write(folder.join("reconstruction.json"), text.replace("[3.141592653589793,", "[1e308,")).unwrap();
+    let said = Dataset::open(dir.path()).unwrap_err().to_string();
+    assert!(said.contains("DJI_0018.JPG") && said.contains("pose is not a number"), "{said}");
     std::fs::write(folder.join("reconstruction.json"), text.replace("\"brown\"", "\"spherical\"")).unwrap();
     assert!(Dataset::open(dir.path()).unwrap_err().to_string().contains("spherical"));
 }

@@ -10,7 +10,7 @@ use vulkan::calibration::calibrate;
 use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::shape::KernelShape;
 
-mod cache;
+pub mod cache;
 
 /// No further shape is tried after this when nobody asked for it.
 const PATIENCE: Duration = Duration::from_millis(1500);

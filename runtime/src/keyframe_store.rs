@@ -100,6 +100,19 @@ struct List {
     frames: Vec<Entry>,
 }
 
+impl List {
+    /// The lens of every picture.
+    fn intrinsics(&self) -> Intrinsics {
+        Intrinsics { width: self.w, height: self.h, fx: self.fl_x, fy: self.fl_y, cx: self.cx, cy: self.cy }
+    }
+
+    /// Whether a picture can lie where it says, and be trained from: what it names may be removed later, and is ours only there.
+    fn is_usable(&self, frame: &Entry) -> bool {
+        let named = frame.file_path.strip_prefix("images/").is_some_and(|n| !n.is_empty() && !n.contains(['/', '\0']));
+        named && View { intrinsics: self.intrinsics(), pose: frame.dgtr.pose }.is_usable()
+    }
+}
+
 #[derive(Serialize, Deserialize)]
 struct Origin {
     lat: f64,
@@ -377,8 +390,12 @@ impl KeyframeStore {
 
 fn read_list(path: &Path) -> Result<List, FormatError> {
     let bytes = read_bounded(path, LIST_LIMIT)?;
-    serde_json::from_slice(&bytes)
-        .map_err(|e| FormatError::Invalid { path: path.into(), what: format!("not a list of key frames: {e}") })
+    let invalid = |what: String| FormatError::Invalid { path: path.into(), what };
+    let list: List = serde_json::from_slice(&bytes).map_err(|e| invalid(format!("not a list of key frames: {e}")))?;
+    match list.frames.iter().find(|f| !list.is_usable(f)) {
+        Some(f) => Err(invalid(format!("key frame {:?} has no place in the folder, or no pose", f.file_path))),
+        None => Ok(list),
+    }
 }
 
 /// Key frames are known by the name of their file.

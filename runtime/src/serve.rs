@@ -16,7 +16,7 @@ use crate::upload::UploadError;
 use crate::upload::admission::{Admission, ModelRefusal, Refusals};
 use crate::upload::receive::{ReceiveCounters, Received, Receiver};
 
-mod admit;
+pub mod admit;
 
 /// After the last model is here, the aircraft have so long to take their receipts.
 const RECEIPTS: Duration = Duration::from_secs(10);

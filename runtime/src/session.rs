@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use config::disk::{Disk, DiskError};
 use config::error::{Error, ErrorKind};
+use models::formats::{FormatError, read_bounded};
 use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};
 
@@ -16,6 +17,8 @@ use crate::run_json::RunReport;
 
 /// Says whose folder it is.
 const FILE: &str = "session.json";
+/// Bound on it; it has a few hundred bytes.
+const LIMIT: u64 = 1 << 16;
 /// Earlier sessions in one folder that are kept apart.
 const MAX_EARLIER: u32 = 9999;
 
@@ -90,8 +93,9 @@ impl Session {
         }
         disk.sweep(out);
         let path = out.join(FILE);
-        let before = models::formats::read_bounded(&path, 1 << 16).ok();
-        let before: Option<Owner> = before.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        let newest = disk.newest(&path, read_owner).map_err(failed("setting session.json aside"))?;
+        newest.damaged.iter().for_each(|d| tracing::warn!("{d}; what is here is taken for this session's"));
+        let before = newest.found;
         let over = owner.command == "serve" && RunReport::read(out).is_ok_and(|r| r.outcome == "done");
         let mut put_aside = None;
         if before.as_ref().is_some_and(|before| before != owner || over) {
@@ -107,6 +111,12 @@ impl Session {
         }
         Ok(Self { _lock: lock, put_aside })
     }
+}
+
+fn read_owner(path: &Path) -> Result<Owner, FormatError> {
+    let bytes = read_bounded(path, LIMIT)?;
+    serde_json::from_slice(&bytes)
+        .map_err(|e| FormatError::Invalid { path: path.into(), what: format!("does not say whose folder it is: {e}") })
 }
 
 /// Moves everything in `out` into a folder below it, what says whose it is last: a move that was cut short goes on into the
@@ -183,6 +193,19 @@ mod tests {
             assert_eq!(begin(), over);
         }
         assert!(!begin() && out.join("earlier-1/run.json").is_file());
+    }
+
+    #[test]
+    fn a_damaged_session_file_is_set_aside_by_name_and_the_job_goes_on() {
+        let dir = tempfile::tempdir().expect("folder");
+        let (disk, out) = (Disk::default(), dir.path());
+        drop(Session::begin(&disk, out, &owner("fly", "park")).expect("begins"));
+        std::fs::write(out.join("model.dgtr"), "a day's work").expect("written");
+        std::fs::write(out.join(FILE), "{\"command\":").expect("cut");
+        let session = Session::begin(&disk, out, &owner("fly", "park")).expect("begins");
+        assert!(session.put_aside.is_none() && out.join("model.dgtr").is_file());
+        assert_eq!(std::fs::read_to_string(out.join("session.damaged-1.json")).expect("kept"), "{\"command\":");
+        assert_eq!(read_owner(&out.join(FILE)).expect("written anew"), owner("fly", "park"));
     }
 
     #[test]

@@ -11,7 +11,7 @@ use config::mission::Mission;
 use crate::keys::{Identity, KeyError};
 
 pub mod admission;
-mod flight_number;
+pub mod flight_number;
 pub mod folder;
 mod medium;
 #[cfg(feature = "zenoh")]

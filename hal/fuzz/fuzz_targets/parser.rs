@@ -4,4 +4,4 @@
 #[path = "../src/targets.rs"]
 mod targets;
 
-libfuzzer_sys::fuzz_target!(|data: &[u8]| targets::parse(data));
+libfuzzer_sys::fuzz_target!(|data: &[u8]| drop(targets::parse(data)));

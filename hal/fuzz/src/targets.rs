@@ -60,7 +60,7 @@ impl CaptureLoop {
 }
 
 /// Target `parser`: the first byte of each piece says how long it is and how much later it comes.
-pub fn parse(mut data: &[u8]) {
+pub fn parse(mut data: &[u8]) -> CaptureLoop {
     let mut capture = CaptureLoop::new();
     let mut now_ns = 1_000_000_000u64;
     while let Some((&head, rest)) = data.split_first() {
@@ -69,6 +69,7 @@ pub fn parse(mut data: &[u8]) {
         capture.handle(piece, now_ns, || PictureClues { arrived_ns: now_ns, ..PictureClues::default() });
         data = later;
     }
+    capture
 }
 
 /// Target `matcher`: twelve bytes an event. Every exposure and every picture must come out exactly once.

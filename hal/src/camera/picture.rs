@@ -100,7 +100,11 @@ fn wrong_size(path: &Path, (w, h): (u32, u32), lens: &CameraSettings) -> HalErro
 
 /// Decodes after a look at the header: a picture of another size is refused before it is allocated.
 fn decode(mut from: impl BufRead + Seek, path: &Path, lens: &CameraSettings) -> Result<RgbImage, HalError> {
-    let wrong = |why: String| HalError::Picture { path: path.into(), why };
+    // The decoders' messages may span lines.
+    let wrong = |why: String| {
+        let why = why.split_whitespace().collect::<Vec<_>>().join(" ");
+        HalError::Picture { path: path.into(), why }
+    };
     let header = ImageReader::new(&mut from).with_guessed_format().map_err(|e| wrong(e.to_string()))?;
     let size = header.into_dimensions().map_err(|e| wrong(e.to_string()))?;
     if size != (lens.width, lens.height) {

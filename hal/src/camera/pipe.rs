@@ -152,6 +152,8 @@ impl Camera for PipeCamera {
 mod tests {
     use std::time::Duration;
 
+    use config::mission::CameraSettings;
+
     use super::*;
 
     /// Everything a program writes, and its last words.
@@ -179,6 +181,27 @@ mod tests {
         let jpeg = Picture::Jpeg(std::fs::read(&path).expect("read"));
         assert!(pictures == [(Some(1), jpeg.clone()), (Some(2), jpeg)], "{} pictures", pictures.len());
         assert!(end.contains("started again"), "{end}");
+    }
+
+    #[test]
+    fn a_picture_cut_in_its_head_is_refused_in_one_line() {
+        let lens = CameraSettings {
+            width: 16,
+            height: 8,
+            fx: 10.0,
+            fy: 10.0,
+            cx: 8.0,
+            cy: 4.0,
+            distortion: [0.0; 4],
+            exposure_delay_ms: 0.0,
+        };
+        let mut jpeg = std::io::Cursor::new(Vec::new());
+        RgbImage::new(16, 8).write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("encoded");
+        let jpeg = jpeg.into_inner();
+        for n in 2..jpeg.len() {
+            let refused = Picture::Jpeg(jpeg[..n].to_vec()).decode(&lens).err().map(|e| e.to_string());
+            assert!(refused.as_ref().is_none_or(|line| !line.contains('\n')), "{n} bytes: {refused:?}");
+        }
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! The signing key from its file, and the time stamp kept beside it: signing time stamps must never go back, also over a
 //! restart on a computer without a battery-backed clock.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -13,6 +15,9 @@ use crate::error::HalError;
 /// The stored time stamp is this far ahead of the one in use, so that it is written once a minute and still never
 /// reused after a crash. 10 µs ticks.
 const RESERVE: u64 = 60 * 100_000;
+
+/// 64 hexadecimal digits with blanks around them.
+const MOST_BYTES: u64 = 256;
 
 /// Keeps the time stamp.
 pub struct SigningStore {
@@ -46,9 +51,16 @@ pub fn open(settings: &LinkSettings) -> Result<(Signer, Option<SigningStore>), H
     Ok((signer, Some(store)))
 }
 
+/// As much of a file as a key or a time stamp can have, and one byte more.
+fn read(path: &Path) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
 fn read_key(path: &Path) -> Result<[u8; 32], HalError> {
     let wrong = |why: String| HalError::Signing { path: path.into(), why };
-    let bytes = std::fs::read(path).map_err(|e| wrong(e.to_string()))?;
+    let bytes = read(path).map_err(|e| wrong(e.to_string()))?;
     if let Ok(key) = <[u8; 32]>::try_from(bytes.as_slice()) {
         return Ok(key);
     }
@@ -64,14 +76,15 @@ impl SigningStore {
     /// The newest time stamp that can be read. Damage never keeps an aircraft on the ground: with what is lost the reserve of
     /// two writes is skipped, so that no time stamp is used again.
     fn read(&self) -> Result<u64, HalError> {
-        let read = |path: &Path| {
-            let text = std::fs::read_to_string(path).map_err(|e| e.to_string())?;
+        let stamp = |path: &Path| {
+            let bytes = read(path).map_err(|e| e.to_string())?;
+            let text = std::str::from_utf8(&bytes).unwrap_or_default();
             // 48 bits on the wire.
             let stamp = text.trim().parse().ok().filter(|stamp: &u64| stamp >> 48 == 0);
             stamp.ok_or_else(|| format!("{}: not a time stamp", path.display()))
         };
         let wrong = |e: std::io::Error| HalError::Signing { path: self.path.clone(), why: e.to_string() };
-        let newest = Disk::default().newest(&self.path, read).map_err(wrong)?;
+        let newest = Disk::default().newest(&self.path, stamp).map_err(wrong)?;
         newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));
         let skipped = if newest.damaged.is_empty() { 0 } else { 2 * RESERVE };
         Ok(newest.found.unwrap_or(0).saturating_add(skipped))

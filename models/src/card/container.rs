@@ -8,6 +8,8 @@ use std::path::Path;
 use exif::{Context, Exif, In, Reader, Tag, Value};
 use image::ImageReader;
 
+use crate::formats::one_line;
+
 /// Bytes read of segments before the pixels; makers put a few hundred KiB of previews there.
 const MAX_HEAD: u64 = 32 << 20;
 /// A JPEG that ends properly has its end marker in the last bytes; some cameras pad or append a little.
@@ -126,7 +128,7 @@ fn parse(tiff: Vec<u8>) -> Option<Exif> {
 }
 
 fn other(path: &Path, file: File) -> Result<Head, String> {
-    let bad = |e: &dyn std::fmt::Display| format!("cannot be read as a picture ({e})");
+    let bad = |e: &dyn std::fmt::Display| format!("cannot be read as a picture ({})", one_line(e));
     let size = ImageReader::open(path)
         .and_then(ImageReader::with_guessed_format)
         .map_err(|e| bad(&e))?

@@ -21,6 +21,9 @@ const MAX_EXPOSURES: usize = 200_000;
 /// itself 1.5 m).
 const SIGMA_M: [f64; 2] = [1.5, 2.0];
 
+/// A hundred years after the autopilot's start: no log is longer, and what is further off is damaged.
+const MAX_TIME_US: f64 = 100.0 * 366.0 * 86_400.0 * 1e6;
+
 struct Format {
     length: usize,
     name: String,
@@ -153,7 +156,8 @@ fn exposure(format: &Format, message: &[u8]) -> Option<Exposure> {
         rotation: nadir_rotation(yaw, pitch, roll),
         source: AttitudeSource::Airframe,
     });
-    Some(Exposure { time_s: of(&["TimeUS"])? * 1e-6, fix: Fix { position, sigma_m: SIGMA_M }, attitude })
+    let time_s = of(&["TimeUS"]).filter(|us| (0.0..MAX_TIME_US).contains(us))? * 1e-6;
+    Some(Exposure { time_s, fix: Fix { position, sigma_m: SIGMA_M }, attitude })
 }
 
 #[cfg(test)]
@@ -205,6 +209,21 @@ mod tests {
         assert!((e.fix.position.lat_deg - 46.842_600_2).abs() < 1e-9);
         let expected = nadir_rotation(90.0, -5.0, 10.0);
         assert!(e.attitude.unwrap().rotation.angle_between(expected) < 1e-6);
+    }
+
+    #[test]
+    fn an_exposure_before_all_time_is_damaged_and_left_out() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("1.BIN");
+        let mut log = fmt(201, 23, "CAM", "dLLe", "TimeUS,Lat,Lng,Alt");
+        for time in [2e6, -1e308, 1e308, 3e6] {
+            log.extend([0xA3, 0x95, 201]);
+            log.extend(f64::to_le_bytes(time));
+            log.extend([468_426_000, -919_945_000, 19_830].iter().flat_map(|v: &i32| v.to_le_bytes()));
+        }
+        std::fs::write(&path, log).unwrap();
+        let times: Vec<f64> = read(&path).unwrap().iter().map(|e| e.time_s).collect();
+        assert_eq!(times, [2.0, 3.0]);
     }
 
     #[test]

@@ -47,10 +47,7 @@ impl Model {
     /// # Errors
     /// The file cannot be read, is damaged, or holds a camera model that is not supported.
     pub fn cameras(&self) -> Result<HashMap<u32, LensDescription>, FormatError> {
-        match self.extension {
-            "bin" => binary::cameras(&self.file("cameras")),
-            _ => text::cameras(&self.file("cameras")),
-        }
+        read_cameras(&self.file("cameras"))
     }
 
     /// Registered images in file order.
@@ -58,10 +55,7 @@ impl Model {
     /// # Errors
     /// The file cannot be read or is damaged.
     pub fn images(&self) -> Result<Vec<ColmapImage>, FormatError> {
-        match self.extension {
-            "bin" => binary::images(&self.file("images")),
-            _ => text::images(&self.file("images")),
-        }
+        read_images(&self.file("images"))
     }
 
     /// Gives every point at a finite position to `take`, in file order; returns how many were not at one. None when the
@@ -71,11 +65,7 @@ impl Model {
     /// The file cannot be read or is damaged.
     pub fn points(&self, take: &mut dyn FnMut(ColmapPoint)) -> Result<u64, FormatError> {
         let path = self.file("points3D");
-        match self.extension {
-            _ if !path.is_file() => Ok(0),
-            "bin" => read_points(&path, take),
-            _ => finite(take, |finite| text::points(&path, finite)),
-        }
+        if path.is_file() { read_points(&path, take) } else { Ok(0) }
     }
 
     /// Poses and lenses, sorted by name: COLMAP writes images in order of registration, names follow the capture.
@@ -103,28 +93,32 @@ impl Model {
     }
 }
 
-/// Lenses of a binary `cameras.bin`.
+/// Lenses of `cameras.bin` or `cameras.txt`.
 ///
 /// # Errors
 /// See [`Model::cameras`].
 pub fn read_cameras(path: &Path) -> Result<HashMap<u32, LensDescription>, FormatError> {
-    binary::cameras(path)
+    if is_text(path) { text::cameras(path) } else { binary::cameras(path) }
 }
 
-/// Images of a binary `images.bin`.
+/// Images of `images.bin` or `images.txt`.
 ///
 /// # Errors
 /// See [`Model::images`].
 pub fn read_images(path: &Path) -> Result<Vec<ColmapImage>, FormatError> {
-    binary::images(path)
+    if is_text(path) { text::images(path) } else { binary::images(path) }
 }
 
-/// Points of a binary `points3D.bin`, one by one; returns how many were left out.
+/// Points of `points3D.bin` or `points3D.txt`, one by one; returns how many were left out.
 ///
 /// # Errors
 /// See [`Model::points`].
 pub fn read_points(path: &Path, take: &mut dyn FnMut(ColmapPoint)) -> Result<u64, FormatError> {
-    finite(take, |finite| binary::points(path, finite))
+    finite(take, |finite| if is_text(path) { text::points(path, finite) } else { binary::points(path, finite) })
+}
+
+fn is_text(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "txt")
 }
 
 /// Passes on points at finite positions, their images sorted and each once; counts the others.

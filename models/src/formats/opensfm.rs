@@ -166,11 +166,13 @@ pub fn read(path: &Path) -> Result<Reconstruction, FormatError> {
             part.cameras.get(&shot.camera).ok_or_else(|| bad(format!("camera {:?} is not there", shot.camera)))?;
         let lens = camera.describe().map_err(|e| bad(format!("camera {:?}: {e}", shot.camera)))?;
         let (r, t) = (DVec3::from_array(shot.rotation), DVec3::from_array(shot.translation));
-        if !(r.is_finite() && t.is_finite()) {
+        let rotation = DQuat::from_scaled_axis(r).conjugate();
+        let pose = Pose { rotation, center: -(rotation * t) };
+        // Of numbers, too: the length of a rotation by 1e308 is none.
+        if !(pose.rotation.is_finite() && pose.center.is_finite()) {
             return Err(bad("its pose is not a number".to_owned()));
         }
-        let rotation = DQuat::from_scaled_axis(r).conjugate();
-        shots.push(Shot { path: name, lens, pose: Pose { rotation, center: -(rotation * t) } });
+        shots.push(Shot { path: name, lens, pose });
     }
     Ok(Reconstruction { shots, origin })
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::OnnxError;
-use crate::formats::{FormatError, read_bounded};
+use crate::formats::{FormatError, one_line, read_bounded};
 
 /// Networks larger than this are refused before they are read: nothing a companion computer can run is larger.
 const MAX_NETWORK_BYTES: u64 = 4 << 30;
@@ -224,7 +224,7 @@ impl Manifest {
     /// Not TOML, unknown fields, or contradictions.
     pub fn parse(text: &str, origin: &str) -> Result<Self, OnnxError> {
         let fail = |field, reason: String| OnnxError::Manifest { manifest: origin.to_owned(), field, reason };
-        let m: Self = toml::from_str(text).map_err(|e| fail("syntax", super::one_line(e)))?;
+        let m: Self = toml::from_str(text).map_err(|e| fail("syntax", one_line(e)))?;
         if m.contract == Contract::Pair {
             let Some(pair) = &m.pair else { return Err(fail("pair", "contract `pair` needs a [pair] table".into())) };
             let wanted = if pair.poses == Poses::None { 2..=2 } else { 2..=8 };

@@ -12,7 +12,8 @@ use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
 use ort::value::{TensorElementType, TensorRef, ValueType};
 
-use super::{OnnxError, one_line};
+use super::OnnxError;
+use crate::formats::one_line;
 
 /// Name, element type and shape of an input or output as the file declares it; −1 where the file leaves it open.
 #[derive(Clone, Debug, PartialEq)]

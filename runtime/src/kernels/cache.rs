@@ -76,7 +76,7 @@ pub(super) fn path() -> Option<PathBuf> {
 ///
 /// # Errors
 /// A file that is there and cannot be used.
-pub(super) fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatError> {
+pub fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatError> {
     let kept = load(path)?;
     // An entry equals the one that would be written for its own shape, or it is another driver's or other kernels'.
     let found = kept.device.iter().rev().find(|e| **e == Entry::of(info, e.shape()));
@@ -93,7 +93,7 @@ pub(super) fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, F
 ///
 /// # Errors
 /// A file or folder that cannot be written.
-pub(super) fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), FormatError> {
+pub fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
     let entry = Entry::of(info, shape);
     kept.device.retain(|e| !e.is_device(&entry));

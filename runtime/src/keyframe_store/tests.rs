@@ -95,6 +95,27 @@ fn a_damaged_list_is_set_aside_and_the_one_before_is_used() {
     assert!(line(&Disk::default(), dir.path(), 0).is_empty(), "with neither it starts anew");
 }
 
+/// Pictures that are given up are removed: a damaged list must not say where.
+#[test]
+fn a_list_that_leads_out_of_its_folder_or_nowhere_in_the_world_counts_as_damaged() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    line(&Disk::default(), dir.path(), 2);
+    let list = dir.path().join("transforms.json");
+    let whole = std::fs::read_to_string(&list).expect("list");
+    let damaged = [
+        whole.replace("images/1.png", "../../precious.png"),
+        whole.replace("images/1.png", "/precious.png"),
+        whole.replace("\"rotation\": [", "\"rotation\": [\n 1e9, 0, 0, 0], \"turned\": ["),
+    ];
+    for (n, damaged) in damaged.iter().enumerate() {
+        assert_ne!(*damaged, whole, "{n}");
+        std::fs::write(&list, damaged).expect("damaged");
+        let left = names(&mut line(&Disk::default(), dir.path(), 0));
+        assert_eq!(left, ["0.png"], "{n}: the list before");
+        std::fs::copy(previous(&list), &list).expect("again");
+    }
+}
+
 #[test]
 fn a_full_disk_refuses_one_key_frame_and_keeps_all_others() {
     let dir = tempfile::tempdir().expect("tempdir");

@@ -17,7 +17,7 @@ use crate::upload::admission::ModelRefusal;
 ///
 /// # Errors
 /// Not a model, or not one of this aircraft and mission.
-pub(super) fn admit(mission: &Mission, aircraft: &str, path: &Path) -> Result<LocalModel, ModelRefusal> {
+pub fn admit(mission: &Mission, aircraft: &str, path: &Path) -> Result<LocalModel, ModelRefusal> {
     // Without the path: it lies under a temporary name, and the same reason should read the same.
     let parse = |e: AggregateError| ModelRefusal::Parse(e.to_string().replace(&format!("{}: ", path.display()), ""));
     let mut model = LocalModel::read(path).map_err(parse)?;

@@ -82,6 +82,10 @@ impl Outlet for FolderOutlet {
         let parent = self.root.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         std::fs::metadata(parent).map_err(TransportError::io(parent))?;
         self.medium.check().map_err(TransportError::io(&self.root))?;
+        if self.current.is_none() {
+            // The first of this start: what a kill left half written. Chunks are looked through below.
+            Disk::default().sweep(&self.dir);
+        }
         let chunks = self.dir.join("chunk");
         std::fs::create_dir_all(&chunks).map_err(TransportError::io(&chunks))?;
         for (index, hash) in model.offer.chunks.iter().enumerate() {

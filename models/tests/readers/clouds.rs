@@ -1,0 +1,121 @@
+//! Gaussian models: `.dgtr`, PLY, SPZ.
+
+use std::fmt::Display;
+use std::io::Read as _;
+use std::path::Path;
+
+use flate2::read::GzDecoder;
+use glam::{DQuat, DVec3};
+use models::camera::{Intrinsics, Pose, View};
+use models::cloud::GaussianCloud;
+use models::formats::{model, ply, spz};
+
+use crate::driver::{Random, Read, Reader, Shell, line, survive};
+
+fn cloud(degree: u8, n: usize) -> GaussianCloud {
+    let mut random = Random::new(u64::from(degree));
+    let mut cloud = GaussianCloud::with_capacity(degree, n);
+    for _ in 0..n {
+        let mut number = || random.below(2000) as f32 / 500.0 - 2.0;
+        let (mean, scale) = ([(); 3].map(|()| 20.0 * number()), [(); 3].map(|()| number()));
+        let (rotation, logit) = ([1.0, number(), number(), number()], number());
+        let sh: Vec<f32> = (0..cloud.sh_stride()).map(|_| number()).collect();
+        cloud.push(mean, scale, rotation, logit, &sh);
+    }
+    cloud
+}
+
+fn all_valid(cloud: &GaussianCloud) -> bool {
+    (0..cloud.len()).all(|i| cloud.is_valid(i))
+}
+
+/// What a writer wrote.
+fn written<E: Display>(write: impl FnOnce(&Path) -> Result<(), E>) -> Vec<u8> {
+    let folder = tempfile::tempdir().expect("tempdir");
+    let path = folder.path().join("seed");
+    write(&path).map_err(|e| e.to_string()).expect("a seed");
+    std::fs::read(&path).expect("read")
+}
+
+fn headers() -> [model::ModelHeader; 2] {
+    let intrinsics = Intrinsics { width: 64, height: 48, fx: 40.0, fy: 41.0, cx: 32.0, cy: 24.5 };
+    let view = View { intrinsics, pose: Pose { rotation: DQuat::IDENTITY, center: DVec3::new(1.0, -2.5, 60.0) } };
+    let views = (0..3).map(|i| (format!("v{i}.jpg"), view)).collect();
+    let region = vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]];
+    [
+        model::ModelHeader { mission: "park".into(), aircraft: "a1".into(), region, views, ..Default::default() },
+        model::ModelHeader::default(),
+    ]
+}
+
+#[test]
+fn dgtr_models() {
+    let [full, empty] = headers();
+    let seeds = vec![
+        written(|path| model::write(path, &full, &cloud(1, 4))),
+        written(|path| model::write(path, &empty, &cloud(0, 2))),
+    ];
+    let shell = Shell {
+        open: |file| file[..file.len() - 32].to_vec(),
+        close: |mut content| {
+            content.extend_from_slice(blake3::hash(&content).as_bytes());
+            content
+        },
+    };
+    survive(&Reader {
+        name: "dgtr",
+        seeds,
+        text: false,
+        shell: Some(shell),
+        memory: (512 << 10, 16),
+        read: Read::File("m.dgtr", &|path| {
+            line(model::read(path), |(header, cloud)| {
+                all_valid(&cloud) && header.views.iter().all(|(_, view)| view.is_usable())
+            })
+        }),
+    });
+}
+
+#[test]
+fn ply_models() {
+    survive(&Reader {
+        name: "ply",
+        seeds: [(0, 5), (2, 2)].map(|(degree, n)| written(|path| ply::write(path, &cloud(degree, n), None))).into(),
+        text: true,
+        shell: None,
+        memory: (256 << 10, 64),
+        read: Read::File("m.ply", &|path| line(ply::read(path), |model| all_valid(&model.cloud))),
+    });
+}
+
+#[test]
+fn spz_models() {
+    let shell = Shell {
+        open: |file| {
+            let mut content = Vec::new();
+            GzDecoder::new(file).read_to_end(&mut content).expect("a seed unpacks");
+            content
+        },
+        // Stored, not packed: packing is no part of what is tested, and takes most of the time.
+        close: |content| {
+            let (parts, last) = content.split_at(content.len() - content.len().min(0xFFFF));
+            assert!(parts.is_empty(), "a short file");
+            let length = last.len() as u16;
+            let mut crc = flate2::Crc::new();
+            crc.update(last);
+            let mut out = vec![0x1F, 0x8B, 8, 0, 0, 0, 0, 0, 0, 255, 1];
+            out.extend([length.to_le_bytes(), (!length).to_le_bytes()].concat());
+            out.extend(last);
+            out.extend([crc.sum().to_le_bytes(), crc.amount().to_le_bytes()].concat());
+            out
+        },
+    };
+    survive(&Reader {
+        name: "spz",
+        seeds: [(0, 9), (3, 3)].map(|(degree, n)| written(|path| spz::write(path, &cloud(degree, n)))).into(),
+        text: false,
+        shell: Some(shell),
+        memory: (512 << 10, 400),
+        read: Read::File("m.spz", &|path| line(spz::read(path), |model| all_valid(&model.cloud))),
+    });
+}
