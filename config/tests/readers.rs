@@ -130,7 +130,7 @@ fn files_of_settings() {
         seeds: [some, network].map(|s| s.as_bytes().to_vec()).into(),
         text: true,
         shell: None,
-        memory: (64 << 10, 256),
+        memory: (128 << 10, 256),
         read: Read::Bytes(&|bytes| {
             let text = std::str::from_utf8(bytes).map_err(|e| e.to_string())?;
             let tables: Tables = config::settings::parse(text).map_err(|e| e.to_string())?;

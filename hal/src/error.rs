@@ -40,7 +40,8 @@ mod with_std {
     pub enum HalError {
         /// A link address that does not follow the syntax.
         #[error(
-            "link address '{text}': {why}; use serial:PATH:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcpin:HOST:PORT, tcpout:HOST:PORT, file:LOG.tlog or pty:"
+            "link address '{}': {why}; use serial:PATH:BAUD, udpin:HOST:PORT, udpout:HOST:PORT, tcpin:HOST:PORT, tcpout:HOST:PORT, file:LOG.tlog or pty:",
+            text.escape_debug()
         )]
         Address {
             /// As given.

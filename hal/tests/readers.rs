@@ -92,6 +92,48 @@ fn telemetry_logs() {
     });
 }
 
+/// A log that is played back: everything it says of the flight is needed at once.
+#[cfg(feature = "lab")]
+#[test]
+fn recordings() {
+    use hal::replay::Recording;
+    let folder = memory_folder();
+    let path = folder.path().join("whole.tlog");
+    let mut seeds = stretches(6000);
+    seeds.retain(|bytes| {
+        std::fs::write(&path, bytes).expect("written");
+        Recording::read(&path).is_ok()
+    });
+    seeds.truncate(32);
+    survive(&Reader {
+        name: "recording",
+        seeds,
+        text: false,
+        shell: None,
+        memory: (256 << 10, 32),
+        read: Read::File("a.tlog", &|path| {
+            line(Recording::read(path), |r| r.home.is_valid() && r.length_s().is_finite() && r.boot_s(1.0).is_finite())
+        }),
+    });
+}
+
+#[test]
+fn addresses_of_links() {
+    let seeds =
+        ["serial:/dev/ttyAMA0:921600", "udpin:0.0.0.0:14550", "tcpout:ground.local:5760", "file:a.tlog", "pty:port"];
+    survive(&Reader {
+        name: "link-address",
+        seeds: seeds.map(|s| s.as_bytes().to_vec()).into(),
+        text: true,
+        shell: None,
+        memory: (16 << 10, 16),
+        read: Read::Bytes(&|bytes| {
+            let text = std::str::from_utf8(bytes).map_err(|e| e.to_string())?;
+            line(text.parse::<hal::link::LinkAddress>(), |_| true)
+        }),
+    });
+}
+
 /// A JPEG's head with a GPS position: EXIF in little-endian TIFF, one directory that points to the next.
 fn tagged() -> Vec<u8> {
     let entry = |tag: u16, kind: u16, count: u32, value: u32| {

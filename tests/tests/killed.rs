@@ -21,7 +21,7 @@ use support::{Running, change_mission, small_mission, wait_until};
 
 const PATIENCE: Duration = Duration::from_secs(300);
 /// Kills of one flight or one session of the ground; then it is left alone to its end.
-const KILLS_EACH: u32 = 8;
+const KILLS_EACH: u32 = 16;
 
 fn kills() -> u32 {
     std::env::var("DGTR_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(3)
@@ -147,7 +147,7 @@ fn a_flight_that_is_killed_again_and_again_loses_nothing_promised_and_ends_with_
             ],
         );
         // Long enough for all kills, and on the ground for as long as it takes: the last start must see the landing.
-        let speed = if wanted > KILLS_EACH { "0.7" } else { "2" };
+        let speed = if wanted > KILLS_EACH { "2" } else { "4" };
         let sim = ["sim", "--mission", "mission.toml", "--link", "pty:port", "--speed", speed, "--linger", "600"];
         let sim = [&sim[..], &["--forward-overlap", "0.9"]].concat();
         let _sim = Running::start(at, &sim, &at.join("sim.log"));
@@ -157,7 +157,7 @@ fn a_flight_that_is_killed_again_and_again_loses_nothing_promised_and_ends_with_
         let (mut known, mut had_model, mut ended) = (Vec::new(), false, false);
         for n in 0..KILLS_EACH.min(wanted - killed) {
             let mut job = Victim::start(at, &fly, &format!("fly-{n}.log"));
-            ended = !job.killed(moments.between(200, 7000));
+            ended = !job.killed(moments.between(200, 5000));
             if ended {
                 break;
             }

@@ -3,11 +3,13 @@
 
 use std::fmt::Write;
 
+use config::disk::Disk;
 use config::keys::PublicKey;
 
 use super::*;
 use crate::aggregate::testing::{carpet, model};
 use crate::keys;
+use crate::session::{Owner, Session};
 use crate::upload::testing::{Proxy, Weather, certificates, free_port, knows_localhost, noise};
 use crate::upload::{Offerer, Source};
 
@@ -197,6 +199,64 @@ fn ground_restarted() -> Outcome {
     Outcome { happened: format!("stopped after {here} chunks and started again"), reception }
 }
 
+/// Half of what was fetched is on the medium: chunks cut, full of zeros or empty, a file under its temporary name.
+fn power_cut() -> Outcome {
+    let field = Field::new(false);
+    let _aircraft = ["west", "east"].map(|id| field.fly(id));
+    field.receive(|p| p.bytes < 100_000);
+    let received = field.dir.path().join("out/received");
+    let mut torn = 0;
+    for id in ["west", "east"] {
+        std::fs::create_dir_all(received.join(id)).expect("folder");
+        std::fs::write(received.join(id).join(".dgtr-1-0"), [0; 4096]).expect("write");
+        let chunks = std::fs::read_dir(received.join(id).join("chunk")).into_iter().flatten().flatten();
+        for (n, chunk) in chunks.enumerate() {
+            let bytes = std::fs::read(chunk.path()).expect("read");
+            let left = [bytes[..bytes.len() / 2].to_vec(), vec![0; bytes.len()], Vec::new()];
+            std::fs::write(chunk.path(), &left[n % left.len()]).expect("write");
+            torn += 1;
+        }
+    }
+    let reception = field.receive(|_| true);
+    assert!(!received.join("west/.dgtr-1-0").exists() && !received.join("east/.dgtr-1-0").exists());
+    Outcome { happened: format!("{torn} chunks torn, two temporary files left"), reception }
+}
+
+fn two_processes() -> Outcome {
+    let field = Field::new(false);
+    let (disk, out) = (Disk::default(), field.dir.path().join("out"));
+    let (command, mission, aircraft) = ("serve".into(), "park".into(), String::new());
+    let owner = Owner { command, mission, aircraft, origin: [28.0, -82.0, 0.0], picture: [0; 2] };
+    let _first = Session::begin(&disk, &out, &owner).expect("free");
+    let _aircraft = ["west", "east"].map(|id| field.fly(id));
+    let mut refused = String::new();
+    let reception = field.receive(|_| {
+        refused = Session::begin(&disk, &out, &owner).expect_err("taken").to_string();
+        true
+    });
+    let refused = refused.rsplit_once(": ").map_or("", |r| r.1);
+    Outcome { happened: format!("a second one in the same folder was told: {refused}"), reception }
+}
+
+/// An aircraft that knows neither the time nor which flight this is: its next model must not be taken for an old one.
+fn clock_gone_back() -> Outcome {
+    let field = Field::new(false);
+    let number = field.dir.path().join("keys/west.flight");
+    std::fs::write(&number, "40").expect("write");
+    let (west, east) = (field.fly("west"), field.fly("east"));
+    field.receive(|_| true);
+    west.shutdown();
+    std::fs::remove_file(&number).expect("there");
+    let west = field.offerer("west");
+    let last = field.model_after("west", 9);
+    west.offer_final(&last);
+    let reception = field.receive(|_| !west.status().delivered);
+    let here = field.dir.path().join("out/received/west/model.dgtr");
+    assert!(std::fs::read(here).expect("read") == std::fs::read(last).expect("read"), "the newer model is here");
+    assert!(east.status().delivered);
+    Outcome { happened: "west offered flight 41, forgot its number and offered flight 1".into(), reception }
+}
+
 /// Rightly signed by the aircraft, whose disk spoiled it before.
 fn damaged_checkpoint() -> Outcome {
     let field = Field::new(false);
@@ -223,12 +283,15 @@ fn damaged_checkpoint() -> Outcome {
 /// Its name, how it is flown, and what the ground must have counted.
 type Row = (&'static str, fn() -> Outcome, fn(&ReceiveCounters) -> bool);
 
-const ROWS: [Row; 6] = [
+const ROWS: [Row; 9] = [
     ("none", none, |c| c.forged + c.stale + c.corrupt + c.damaged + c.models_damaged + c.models_refused == 0),
     ("rogue peer", rogue_peer, |c| c.forged > 0),
     ("stolen certificate", stolen_certificate, |c| c.models == 2 && c.forged == 0),
     ("slow link", slow_link, |c| c.models >= 3),
     ("ground restarted", ground_restarted, |c| c.corrupt == 0),
+    ("power cut", power_cut, |c| c.models == 2),
+    ("two processes", two_processes, |c| c.models == 2 && c.corrupt == 0),
+    ("clock gone back", clock_gone_back, |c| c.stale > 0 && c.models == 1),
     ("damaged checkpoint received", damaged_checkpoint, |c| c.models_damaged == 1),
 ];
 

@@ -13,8 +13,10 @@ use hal::counters::HalCounters;
 use hal::failsafe::Action;
 use hal::sim::SessionReport;
 use hal::sim::autopilot::Announcing;
+use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 
 use super::super::rehearsal::Script;
+use crate::keyframe_store::KeyframeStore;
 
 pub(super) const KEY: [u8; 32] = [7; 32];
 /// Exposures of the flight: two lines of five.
@@ -291,6 +293,13 @@ pub(super) const ROWS: &[Row] = &[
         ..USUAL
     },
     Row {
+        fault: "power cut in an earlier start, while its third key frame was stored",
+        also: |script| script.before = power_cut,
+        // Two of the earlier start, and all of this one.
+        end: End::Model(12, 12),
+        ..USUAL
+    },
+    Row {
         fault: "Ctrl-C at 25 s, while it trains",
         also: |script| script.interrupt_at = Some(Duration::from_secs(25)),
         noticed: |c, r| !r.completed && c.posed_frames > 0 && c.posed_frames < EXPOSURES,
@@ -298,6 +307,29 @@ pub(super) const ROWS: &[Row] = &[
         ..USUAL
     },
 ];
+
+/// The picture is there, its list is torn, the one before it is whole; two files have only their temporary names.
+fn power_cut(out: &Path) {
+    let lens = Intrinsics { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+    let folder = out.join("keyframes");
+    let mut store = KeyframeStore::open(&Disk::default(), &folder, &lens, super::ORIGIN).expect("opened");
+    for i in 0..3 {
+        let center = glam::DVec3::new(500.0 + 10.0 * f64::from(i), 0.0, 40.0);
+        let frame = PosedImage {
+            name: format!("earlier_{i}.jpg"),
+            time_ns: 1,
+            image: image::RgbImage::from_pixel(lens.width, lens.height, image::Rgb([90; 3])),
+            view: View { intrinsics: lens, pose: Pose { rotation: glam::DQuat::IDENTITY, center } },
+            sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [0.1; 3] },
+        };
+        store.add(&frame).expect("stored");
+    }
+    let list = folder.join("transforms.json");
+    let bytes = std::fs::read(&list).expect("there");
+    std::fs::write(&list, [&bytes[..bytes.len() / 2], &vec![0; bytes.len() / 2]].concat()).expect("torn");
+    std::fs::write(out.join(".dgtr-1-0"), b"half a mod").expect("left");
+    std::fs::write(folder.join("images/.dgtr-1-1"), b"half a pic").expect("left");
+}
 
 fn signed(script: &mut Script) {
     script.sim.autopilot.signing_key = Some(KEY);
