@@ -5,9 +5,11 @@ use std::path::Path;
 
 use config::disk::Disk;
 use config::geodesy::Geodetic;
+use config::mission::CameraSettings;
+use hal::camera::Picture;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use runtime::kernels::cache;
-use runtime::keyframe_store::KeyframeStore;
+use runtime::keyframe_store::{KeyFrame, KeyframeStore};
 use runtime::keys;
 use runtime::run_json::RunReport;
 use runtime::session::{Owner, Session};
@@ -19,6 +21,16 @@ use crate::driver::{Read, Reader, Verdict, line, memory_folder, survive};
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
 const LENS: Intrinsics = Intrinsics { width: 8, height: 6, fx: 8.0, fy: 8.0, cx: 4.0, cy: 3.0 };
+const CAMERA: CameraSettings = CameraSettings {
+    width: 8,
+    height: 6,
+    fx: 8.0,
+    fy: 8.0,
+    cx: 4.0,
+    cy: 3.0,
+    distortion: [0.0; 4],
+    exposure_delay_ms: 0.0,
+};
 
 /// The refusal of a file that was set aside, with the name it got; the next input finds the place empty.
 fn set_aside(folder: &Path, name: &str) -> Verdict {
@@ -78,22 +90,23 @@ fn reports() {
     });
 }
 
-fn key_frame(i: u32) -> PosedImage {
+fn key_frame(i: u32) -> KeyFrame {
     let pose = Pose { rotation: glam::DQuat::IDENTITY, center: glam::DVec3::new(f64::from(i), 0.0, 40.0) };
-    PosedImage {
+    let posed = PosedImage {
         name: format!("{i:03}.png"),
         time_ns: u64::from(i),
         image: image::RgbImage::from_pixel(LENS.width, LENS.height, image::Rgb([i as u8; 3])),
         view: View { intrinsics: LENS, pose },
         sigma: PoseSigma { position_m: [1.0, 1.0, f32::INFINITY], rotation_rad: [0.1; 3] },
-    }
+    };
+    KeyFrame { file: Picture::Rgb(posed.image.clone()), posed }
 }
 
 #[test]
 fn lists_of_key_frames() {
     let list = |frames: u32| {
         let folder = tempfile::tempdir().expect("a folder");
-        let mut store = KeyframeStore::open(&Disk::default(), folder.path(), &LENS, ORIGIN).expect("opened");
+        let mut store = KeyframeStore::open(&Disk::default(), folder.path(), &CAMERA, &LENS, ORIGIN).expect("opened");
         (0..frames).for_each(|i| store.add(&key_frame(i)).expect("stored"));
         std::fs::read(folder.path().join("transforms.json")).expect("a list")
     };
@@ -106,7 +119,7 @@ fn lists_of_key_frames() {
         memory: (64 << 10, 256),
         read: Read::File("transforms.json", &|path| {
             let folder = path.parent().expect("a folder");
-            let store = KeyframeStore::open(&disk, folder, &LENS, ORIGIN).map_err(|e| e.to_string())?;
+            let store = KeyframeStore::open(&disk, folder, &CAMERA, &LENS, ORIGIN).map_err(|e| e.to_string())?;
             set_aside(folder, "transforms.damaged-1.json")?;
             // A picture lies in its folder, and its pose can be trained from.
             let usable = |pose: &Pose| View { intrinsics: LENS, pose: *pose }.is_usable();

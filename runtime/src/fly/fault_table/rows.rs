@@ -9,14 +9,15 @@ use std::time::Duration;
 use config::disk::bounded::Bounded;
 use config::disk::{Disk, Operations, Output, System};
 use config::link::Signing;
+use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::failsafe::Action;
 use hal::sim::SessionReport;
 use hal::sim::autopilot::Announcing;
-use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use models::camera::{Pose, PoseSigma, PosedImage, View};
 
-use super::super::rehearsal::Script;
-use crate::keyframe_store::KeyframeStore;
+use super::super::rehearsal::{Script, intrinsics};
+use crate::keyframe_store::{KeyFrame, KeyframeStore};
 
 pub(super) const KEY: [u8; 32] = [7; 32];
 /// Exposures of the flight: two lines of five.
@@ -310,19 +311,20 @@ pub(super) const ROWS: &[Row] = &[
 
 /// The picture is there, its list is torn, the one before it is whole; two files have only their temporary names.
 fn power_cut(out: &Path) {
-    let lens = Intrinsics { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
-    let folder = out.join("keyframes");
-    let mut store = KeyframeStore::open(&Disk::default(), &folder, &lens, super::ORIGIN).expect("opened");
+    let camera = super::usual().vehicle.lens;
+    let (lens, folder) = (intrinsics(&camera), out.join("keyframes"));
+    let mut store = KeyframeStore::open(&Disk::default(), &folder, &camera, &lens, super::ORIGIN).expect("opened");
     for i in 0..3 {
         let center = glam::DVec3::new(500.0 + 10.0 * f64::from(i), 0.0, 40.0);
-        let frame = PosedImage {
-            name: format!("earlier_{i}.jpg"),
+        let posed = PosedImage {
+            name: format!("earlier_{i}.png"),
             time_ns: 1,
             image: image::RgbImage::from_pixel(lens.width, lens.height, image::Rgb([90; 3])),
             view: View { intrinsics: lens, pose: Pose { rotation: glam::DQuat::IDENTITY, center } },
             sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [0.1; 3] },
         };
-        store.add(&frame).expect("stored");
+        let file = Picture::Rgb(posed.image.clone());
+        store.add(&KeyFrame { posed, file }).expect("stored");
     }
     let list = folder.join("transforms.json");
     let bytes = std::fs::read(&list).expect("there");
