@@ -6,6 +6,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
+use config::lens::Distortion;
 use config::geodesy::Geodetic;
 use image::imageops;
 
@@ -97,8 +98,19 @@ pub struct CardNotes {
     pub lines: Vec<String>,
     /// Relative standard deviation of the focal lengths that the pictures state (the largest of the cameras').
     pub focal_sigma: f64,
+    /// True when no picture states a distortion, so that it is for the pictures to tell.
+    pub distortion_unknown: bool,
     /// Files that were found.
     pub found: usize,
+}
+
+/// What the pictures of a card say of one of them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settled {
+    /// Lens, at whatever size the picture was asked, and pose.
+    pub view: View,
+    /// What is taken out of the picture on loading.
+    pub distortion: Distortion,
 }
 
 impl Dataset {
@@ -136,7 +148,8 @@ impl Dataset {
     pub fn open_card(folders: &[PathBuf], options: &CardOptions) -> Result<Self, DatasetError> {
         let card = Card::open(folders, options)?;
         let focal_sigma = card.pictures.iter().map(|p| p.focal_sigma).fold(0.0, f64::max);
-        let notes = CardNotes { lines: card.notes, focal_sigma, found: card.found };
+        let distortion_unknown = card.pictures.iter().all(|p| p.lens.distortion.is_none());
+        let notes = CardNotes { lines: card.notes, focal_sigma, distortion_unknown, found: card.found };
         let frames = card.pictures.into_iter().map(|p| {
             let size = p.lens.size.unwrap_or((1, 1));
             let view = View { intrinsics: p.lens.intrinsics(size), pose: p.prior.pose };
@@ -156,13 +169,14 @@ impl Dataset {
         Self { root, frames, split: Split::default(), origin: Some(card.origin), card: Some(notes) }.with_split()
     }
 
-    /// Takes poses that the pictures have settled on, and what they say of the focal length, in place of a card's priors;
-    /// pictures that are not among them (they could not be decoded) are left out of the set.
-    pub fn settle(&mut self, settled: &HashMap<String, View>) {
+    /// Takes poses and lenses that the pictures have settled on in place of a card's priors; pictures that are not among them
+    /// (they could not be decoded) are left out of the set.
+    pub fn settle(&mut self, settled: &HashMap<String, Settled>) {
         let mut number = vec![None; self.frames.len()];
         let mut frames = Vec::with_capacity(settled.len());
         for (i, mut frame) in std::mem::take(&mut self.frames).into_iter().enumerate() {
-            let Some(view) = settled.get(&frame.name) else { continue };
+            let Some(Settled { view, distortion }) = settled.get(&frame.name) else { continue };
+            frame.distortion = *distortion;
             // The pictures may have been smaller when they were asked.
             let full = &frame.view.intrinsics;
             frame.view = View { intrinsics: view.intrinsics.resized(full.width, full.height), pose: view.pose };

@@ -18,7 +18,9 @@ mod motion;
 mod overlap;
 mod photometric;
 mod problem;
+mod radial;
 mod reduced;
+mod relink;
 mod report;
 mod resect;
 mod schur;
@@ -34,13 +36,14 @@ pub use report::{AddReport, RefineReport, RefinedPoint, SharedEstimate};
 use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
 use crate::onnx::OnnxError;
 use crate::onnx::features::{FeatureNetwork, Features};
+use config::lens::Distortion;
 use config::error::ErrorKind;
 use config::refine::RefineSettings;
 use config::settings::SettingError;
 use glam::DVec3;
 use grey::Grey;
 use image::RgbImage;
-use keyframe::{DESCRIPTOR, KeyFrame, quantise, spread};
+use keyframe::{DESCRIPTOR, KeyFrame};
 use linking::Pair;
 use problem::Shared;
 use std::collections::HashMap;
@@ -159,13 +162,15 @@ impl Refiner {
             return Err(invalid(&image.name, "picture and intrinsics differ in size"));
         }
         let camera = Pinhole::new(self.expect(&image.view.pose), &lens, self.shared.log_focal.exp());
-        let candidates = self.candidates(&camera, &lens);
+        let candidates = self.candidates(&camera, &lens, self.frames.len());
         let turns = candidates.first().map_or(0, |a| {
             let frame = &self.frames[*a as usize];
             upright::turns_like(&self.camera_of(frame), frame.turns, &camera, &lens, self.ground_at(*a as usize))
         });
         let mut report = AddReport::default();
-        let features = self.extract(&image.image, turns, &mut report)?;
+        let size = image.image.dimensions();
+        let features = self.extract(&image.image, size, turns, &mut report)?;
+        let as_told = features.clone();
         self.insert(&image.name, image.time_ns, &image.view, &image.sigma);
         self.set_features(features, turns, Some(&image.image), &mut report);
         self.link(&candidates, &mut report);
@@ -176,11 +181,15 @@ impl Refiner {
                 break;
             }
             let turns = (turns + more) % 4;
-            let features = self.extract(&image.image, turns, &mut report)?;
+            let features = self.extract(&image.image, size, turns, &mut report)?;
             self.set_features(features, turns, Some(&image.image), &mut report);
             let clock = Instant::now();
             self.link_wide(&candidates[..candidates.len().min(2)], &mut report);
             report.match_seconds += clock.elapsed().as_secs_f64();
+        }
+        if report.extractions > 1 && report.pairs_verified == 0 {
+            // No direction links it: the next frames should find it in the likeliest.
+            self.set_features(as_told, turns, Some(&image.image), &mut report);
         }
         self.finish(report)
     }
@@ -202,7 +211,7 @@ impl Refiner {
             return Err(invalid(name, "features do not hold 64 values per key point"));
         }
         let camera = Pinhole::new(self.expect(&view.pose), &view.intrinsics, self.shared.log_focal.exp());
-        let candidates = self.candidates(&camera, &view.intrinsics);
+        let candidates = self.candidates(&camera, &view.intrinsics, self.frames.len());
         let mut report = AddReport::default();
         self.insert(name, time_ns, view, sigma);
         self.set_features(features, 0, None, &mut report);
@@ -235,6 +244,12 @@ impl Refiner {
         Some(Intrinsics { fx: k.fx * scale, fy: k.fy * scale, ..k })
     }
 
+    /// What the pictures say that the given lens lacks, in its normalised coordinates: none where it is calibrated, or where they
+    /// cannot tell.
+    pub fn distortion(&self) -> Distortion {
+        self.shared.radial.distortion()
+    }
+
     /// Depths between which 98 % of the key frame's points lie, widened by 15 %, metres along the optical axis;
     /// `None` with too few points.
     pub fn depth_range(&self, name: &str) -> Option<(f32, f32)> {
@@ -258,7 +273,7 @@ impl Refiner {
         let frames: usize = self
             .frames
             .iter()
-            .map(|f| f.descriptors.len() + f.keypoints.len() * 12 + f.grey.as_ref().map_or(0, Grey::bytes))
+            .map(|f| f.descriptors.len() + f.keypoints.len() * 20 + f.grey.as_ref().map_or(0, Grey::bytes))
             .sum();
         frames
             + self.union.bytes()
@@ -309,14 +324,21 @@ impl Refiner {
         Ok(())
     }
 
-    fn extract(&mut self, image: &RgbImage, turns: u8, report: &mut AddReport) -> Result<Features, RefineError> {
+    /// Key points in pixels of a picture of `size`, of which `image` may be a smaller copy.
+    fn extract(
+        &mut self,
+        image: &RgbImage,
+        size: (u32, u32),
+        turns: u8,
+        report: &mut AddReport,
+    ) -> Result<Features, RefineError> {
         let clock = Instant::now();
         let [level, sideways] = self.networks.as_mut().ok_or(RefineError::NoNetwork)?;
         let network = if turns.is_multiple_of(2) { level } else { sideways };
         let seen = upright::prepare(image, self.settings.feature_side, turns);
         let mut features = network.extract(&seen, 2 * self.settings.max_features)?;
         for p in &mut features.keypoints {
-            *p = upright::restore(*p, seen.width(), seen.height(), turns, image.dimensions());
+            *p = upright::restore(*p, seen.width(), seen.height(), turns, size);
         }
         report.extractions += 1;
         report.extract_seconds += clock.elapsed().as_secs_f64();
@@ -345,6 +367,7 @@ impl Refiner {
             pairs: 0,
             depths: None,
             keypoints: Vec::new(),
+            seen: Vec::new(),
             colors: Vec::new(),
             settled: Vec::new(),
             grey: None,
@@ -356,16 +379,13 @@ impl Refiner {
     /// Gives the newest frame its features (again, when a turn of the picture did not match).
     fn set_features(&mut self, features: Features, turns: u8, image: Option<&RgbImage>, report: &mut AddReport) {
         let newest = self.frames.len().saturating_sub(1) as u32;
+        let (focal, radial) = (self.shared.log_focal.exp(), self.shared.radial);
         let Some(frame) = self.frames.last_mut() else { return };
-        let features = spread(features, self.settings.max_features);
-        let count = features.keypoints.len();
-        let first = frame.first_node;
+        frame.describe(features, turns, self.settings.max_features, (focal, &radial));
+        let (first, count) = (frame.first_node, frame.seen.len());
         report.features = count;
-        frame.turns = turns;
-        frame.descriptors = quantise(&features.descriptors);
-        frame.keypoints = features.keypoints;
         frame.colors = frame
-            .keypoints
+            .seen
             .iter()
             .map(|p| match image {
                 Some(image) => {
@@ -374,7 +394,6 @@ impl Refiner {
                 None => [128; 3],
             })
             .collect();
-        frame.settled = vec![false; count];
         frame.grey = image.map(|image| Grey::new(image, self.settings.feature_side));
         self.union.shrink(first);
         self.union.grow(newest, count);
@@ -382,7 +401,8 @@ impl Refiner {
 
     fn link(&mut self, candidates: &[u32], report: &mut AddReport) {
         let clock = Instant::now();
-        self.link_guided(candidates, report);
+        let newest = self.frames.len() - 1;
+        self.link_guided(newest, candidates, report);
         if report.pairs_verified == 0 && self.frames.len() > 1 {
             // No overlap predicted may be a wrong prediction: the frames just before are worth a look.
             let newest = self.frames.len() as u32 - 1;

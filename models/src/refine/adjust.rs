@@ -1,6 +1,6 @@
 //! Levenberg–Marquardt on the reduced equations, and the question which shared parameters the pictures can tell.
 
-use super::problem::{Loss, Problem, SHARED};
+use super::problem::{Loss, Problem, RADIAL, SHARED};
 use super::reduced::Step;
 use super::schur::{FrameVec, Reduced, SharedVec, point_steps};
 use super::so3;
@@ -37,7 +37,7 @@ pub(crate) fn adjust(problem: &mut Problem, limits: Limits) -> Outcome {
         equations.fill(problem, limits.loss, lambda);
         let before = (problem.poses.clone(), problem.points.clone(), problem.shared);
         let improved = equations.solve(&equations.downhill()).is_some_and(|step| {
-            let points = point_steps(problem, limits.loss, lambda, &step.frames, step.shared[super::problem::FOCAL]);
+            let points = point_steps(problem, limits.loss, lambda, &step.frames, &step.shared);
             apply(problem, &step, &points);
             let after = problem.cost(limits.loss);
             let fell = after.is_finite() && after < cost;
@@ -73,13 +73,15 @@ fn apply(problem: &mut Problem, step: &Step, points: &[DVec3]) {
     problem.shared.mount = (problem.shared.mount * so3::exp(DVec3::new(s[0], s[1], s[2]))).normalize();
     problem.shared.delay += s[3];
     problem.shared.log_focal += s[4];
+    problem.shared.radial.k1 += s[5];
+    problem.shared.radial.k2 += s[6];
 }
 
 /// Standard deviation of every shared parameter if it were free, given all the rest unknown too; infinite where
 /// the equations cannot be solved.
 pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
     let free = problem.free;
-    problem.free = std::array::from_fn(|k| problem.shared_weight[k].is_finite());
+    problem.free = std::array::from_fn(|k| problem.shared_weight[k].is_finite() && (k < RADIAL || problem.shared_weight[k] > 0.0));
     let mut equations = Reduced::new(problem);
     equations.fill(problem, loss, 0.0);
     problem.free = free;

@@ -27,6 +27,14 @@ impl Grey {
         self.data.len()
     }
 
+    /// The picture in grey: what the network makes of colours is nearly the same.
+    pub fn picture(&self) -> RgbImage {
+        RgbImage::from_fn(self.width as u32, self.height as u32, |x, y| {
+            let value = self.data[y as usize * self.width as usize + x as usize];
+            image::Rgb([value; 3])
+        })
+    }
+
     /// Bilinear value at a place in its own pixels; `None` outside.
     pub fn at(&self, p: DVec2) -> Option<f64> {
         let q = p - 0.5;

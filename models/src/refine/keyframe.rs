@@ -1,7 +1,8 @@
 //! One key frame as the refiner keeps it: key points and quantised descriptors, never the picture itself.
 
 use super::grey::Grey;
-use crate::camera::{Intrinsics, Pose, PoseSigma};
+use super::radial::Radial;
+use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma};
 pub(crate) use crate::onnx::features::DESCRIPTOR;
 use crate::onnx::features::Features;
 use std::collections::HashMap;
@@ -32,8 +33,10 @@ pub(crate) struct KeyFrame {
     pub pairs: u32,
     /// Depth below which 1 % and above which 1 % of the frame's points lie, metres.
     pub depths: Option<(f32, f32)>,
-    /// Pixels of the original picture.
+    /// Pixels of the picture as a pinhole would have taken it.
     pub keypoints: Vec<[f32; 2]>,
+    /// Pixels of the picture as it is: what the lens is estimated from.
+    pub seen: Vec<[f32; 2]>,
     pub colors: Vec<[u8; 3]>,
     /// Key points whose place photometric alignment has settled.
     pub settled: Vec<bool>,
@@ -49,6 +52,23 @@ pub(crate) struct KeyFrame {
 impl KeyFrame {
     pub fn descriptor(&self, i: usize) -> &[i8] {
         &self.descriptors[i * DESCRIPTOR..(i + 1) * DESCRIPTOR]
+    }
+
+    /// Takes the best `max` of features found with the picture turned by `turns`; colours are the caller's.
+    pub fn describe(&mut self, features: Features, turns: u8, max: usize, lens: (f64, &Radial)) {
+        let features = spread(features, max);
+        self.turns = turns;
+        self.descriptors = quantise(&features.descriptors);
+        self.settled = vec![false; features.keypoints.len()];
+        self.seen = features.keypoints;
+        self.straighten(lens.0, lens.1);
+    }
+
+    /// Key points as the pinhole sees them, of those in the picture and what is known of the lens.
+    pub fn straighten(&mut self, focal_scale: f64, radial: &Radial) {
+        let camera = Pinhole::new(self.pose, &self.intrinsics, focal_scale);
+        self.keypoints.clear();
+        self.keypoints.extend(self.seen.iter().map(|p| radial.undistorted(&camera, *p)));
     }
 }
 

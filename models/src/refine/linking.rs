@@ -52,11 +52,12 @@ impl Refiner {
         Ground(self.grounds[frame].or(self.ground))
     }
 
-    /// Earlier frames that should see the same ground as the camera, best overlap first.
-    pub(super) fn candidates(&self, camera: &Pinhole, lens: &crate::camera::Intrinsics) -> Vec<u32> {
+    /// Frames before number `before` that should see the same ground as the camera, best overlap first.
+    pub(super) fn candidates(&self, camera: &Pinhole, lens: &crate::camera::Intrinsics, before: usize) -> Vec<u32> {
         let mut found: Vec<(f64, u32)> = self
             .frames
             .iter()
+            .take(before)
             .enumerate()
             .map(|(i, f)| (overlap((&self.camera_of(f), &f.intrinsics), (camera, lens), self.ground_at(i)), i as u32))
             .filter(|(share, _)| *share >= self.settings.min_overlap)
@@ -66,9 +67,8 @@ impl Refiner {
         found.into_iter().map(|(_, i)| i).collect()
     }
 
-    /// Links the newest frame to `candidates` by guided search; stops at the wanted number of pairs.
-    pub(super) fn link_guided(&mut self, candidates: &[u32], report: &mut AddReport) {
-        let b = self.frames.len() - 1;
+    /// Links frame `b` to `candidates` by guided search; stops at the wanted number of pairs.
+    pub(super) fn link_guided(&mut self, b: usize, candidates: &[u32], report: &mut AddReport) {
         for a in candidates.iter().take(2 * self.settings.max_pairs) {
             if report.pairs_verified >= self.settings.max_pairs {
                 break;
@@ -178,21 +178,23 @@ impl Refiner {
             .with_min_len(32)
             .map(|i| {
                 let m = matches[*i as usize];
-                let from = Side { grey: ga, camera: &ca, at: fa.keypoints[m.a as usize] };
-                align_patch(&from, &Side { grey: gb, camera: cb, at: fb.keypoints[m.b as usize] }, ground)
+                let from = Side { grey: ga, camera: &ca, at: fa.seen[m.a as usize] };
+                align_patch(&from, &Side { grey: gb, camera: cb, at: fb.seen[m.b as usize] }, ground)
             })
             .collect();
         let inliers = std::mem::take(&mut found.inliers);
+        let (lens, radial) = (self.camera_of(fb), self.shared.radial);
         let frame = &mut self.frames[b];
         for (i, place) in inliers.into_iter().zip(places) {
             let Some(place) = place else { continue };
             let k = matches[i as usize].b as usize;
-            let apart = (place[0] - frame.keypoints[k][0]).hypot(place[1] - frame.keypoints[k][1]);
+            let apart = (place[0] - frame.seen[k][0]).hypot(place[1] - frame.seen[k][1]);
             if frame.settled[k] && apart > SETTLED_PX {
                 continue;
             }
             if !frame.settled[k] {
-                frame.keypoints[k] = place;
+                frame.seen[k] = place;
+                frame.keypoints[k] = radial.undistorted(&lens, place);
                 frame.settled[k] = true;
             }
             found.inliers.push(i);
@@ -219,7 +221,12 @@ impl Refiner {
         let (own, pair) = (frame.rotation_sigma.powi(-2), PAIR_SIGMA.powi(-2));
         let contradicted = frame.pairs == 0 && away.length() > CONTRADICTION;
         report.contradicted |= contradicted;
-        let gain = if contradicted { 1.0 } else { pair / (pair + own) };
+        let gain = match contradicted {
+            true => 1.0,
+            // The adjustment knows better than any single pair.
+            false if frame.adjusted => 0.0,
+            false => pair / (pair + own),
+        };
         frame.pose.rotation = (frame.pose.rotation * so3::exp(away * gain)).normalize();
         frame.pairs += 1;
         frame.rotation_sigma = frame.rotation_sigma.min(LINKED_SIGMA);

@@ -1,14 +1,19 @@
 //! The bundle adjustment's unknowns and residuals: key-frame poses, points, and the few parameters all frames
 //! share; reprojection errors against telemetry priors, each with a robust loss.
 
+use super::radial::Radial;
 use super::so3;
 use crate::camera::{Intrinsics, Pinhole, Pose};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-/// Shared parameters: mount misalignment (3), delay of positions, log focal scale.
-pub(crate) const SHARED: usize = 5;
-/// Index of the focal length among them.
+/// Shared parameters: mount misalignment (3), delay of positions, and the lens.
+pub(crate) const SHARED: usize = FOCAL + LENS;
+/// Index of the first parameter of the lens among them.
 pub(crate) const FOCAL: usize = 4;
+/// Index of the first radial term among them.
+pub(crate) const RADIAL: usize = 5;
+/// Parameters of the lens: log focal scale and the two radial terms.
+pub(crate) const LENS: usize = 3;
 
 /// What all key frames have in common and telemetry does not know.
 #[derive(Clone, Copy, Debug)]
@@ -19,11 +24,13 @@ pub(crate) struct Shared {
     pub delay: f64,
     /// Natural logarithm of true over given focal length.
     pub log_focal: f64,
+    /// What the given lens lacks.
+    pub radial: Radial,
 }
 
 impl Default for Shared {
     fn default() -> Self {
-        Self { mount: DQuat::IDENTITY, delay: 0.0, log_focal: 0.0 }
+        Self { mount: DQuat::IDENTITY, delay: 0.0, log_focal: 0.0, radial: Radial::default() }
     }
 }
 
@@ -41,6 +48,7 @@ pub(crate) struct PosePrior {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Observation {
     pub camera: u32,
+    /// As found in the picture, radial distortion not taken out.
     pub pixel: [f32; 2],
 }
 
@@ -103,7 +111,9 @@ impl Problem {
 
     /// Residual in pixels, when the point is in front.
     pub fn residual(&self, camera: &Pinhole, point: DVec3, o: &Observation) -> Option<DVec2> {
-        Some(camera.project(point)? - DVec2::new(o.pixel[0].into(), o.pixel[1].into()))
+        let p = camera.local(point);
+        let pixel = (p.z > 1e-6).then(|| self.shared.radial.pixel(camera, p))?;
+        Some(pixel - DVec2::new(o.pixel[0].into(), o.pixel[1].into()))
     }
 
     /// Total robust cost.
@@ -126,7 +136,8 @@ impl Problem {
     /// Whitened residuals of the shared parameters against their own priors.
     pub fn shared_residuals(&self) -> [f64; SHARED] {
         let m = so3::log(self.shared.mount);
-        let v = [m.x, m.y, m.z, self.shared.delay, self.shared.log_focal];
+        let radial = self.shared.radial;
+        let v = [m.x, m.y, m.z, self.shared.delay, self.shared.log_focal, radial.k1, radial.k2];
         std::array::from_fn(|k| v[k] * self.shared_weight[k])
     }
 
@@ -147,12 +158,12 @@ impl Problem {
         let (cost_v, weight_v) = PRIOR_LOSS.at(rp.z * rp.z);
         let rotation = |k: usize| {
             let (row, mount) = (row(&jr, k) * wr[k], row(&jl, k) * -wr[k]);
-            (re[k], [row.x, row.y, row.z, 0.0, 0.0, 0.0], [mount.x, mount.y, mount.z, 0.0, 0.0], weight_r)
+            (re[k], [row.x, row.y, row.z, 0.0, 0.0, 0.0], [mount.x, mount.y, mount.z, 0.0, 0.0, 0.0, 0.0], weight_r)
         };
         let position = |k: usize, weight: f64| {
             let mut by_pose = [0.0; 6];
             by_pose[3 + k] = wp[k];
-            (rp[k], by_pose, [0.0, 0.0, 0.0, -prior.velocity[k] * wp[k], 0.0], weight)
+            (rp[k], by_pose, [0.0, 0.0, 0.0, -prior.velocity[k] * wp[k], 0.0, 0.0, 0.0], weight)
         };
         PriorRows {
             rows: [

@@ -126,6 +126,12 @@ pub struct SharedEstimate {
     pub focal_sigma: f64,
     /// Whether it was estimated.
     pub focal_estimated: bool,
+    /// First and second radial term that the given lens lacks (OpenCV's k1, k2).
+    pub radial: [f64; 2],
+    /// Standard deviation the pictures would leave.
+    pub radial_sigma: [f64; 2],
+    /// Which were estimated.
+    pub radial_estimated: [bool; 2],
 }
 
 /// A triangulated point.

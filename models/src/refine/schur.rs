@@ -1,9 +1,8 @@
 //! Normal equations with the points eliminated: the 3×3 block of every point is inverted on the spot, so that
 //! only frames and shared parameters remain. Blocks exist only for pairs of frames that see a common point.
 
-use super::problem::{FOCAL, Loss, Problem, SHARED};
+use super::problem::{FOCAL, LENS, Loss, Problem, SHARED};
 use super::so3::skew;
-use super::triangulate::pixel_by_local;
 use crate::camera::Pinhole;
 use glam::DVec3;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
@@ -153,15 +152,15 @@ impl Reduced {
         let eq = PointEquation::new(problem, cameras, point, loss, lambda, rows);
         let Some(inverse) = eq.inverse else { return };
         let n = cameras.len();
-        let to_focal = inverse * eq.by_focal;
+        let to_lens = inverse * eq.by_lens;
         for (k, row) in rows.iter().enumerate() {
             let i = row.camera as usize;
             undamped[i] += row.jc.transpose() * row.jc * row.weight;
             let t = row.cross * inverse;
             self.gradient[i] += row.jc.transpose() * row.r * row.weight - t * eq.gradient;
-            let focal = row.jc.transpose() * row.jf * row.weight - row.cross * to_focal;
-            let mut column = self.border[i].column_mut(FOCAL);
-            column += focal;
+            let lens = row.jc.transpose() * row.jl * row.weight - row.cross * to_lens;
+            let mut columns = self.border[i].fixed_columns_mut::<LENS>(FOCAL);
+            columns += lens;
             for other in &rows[..=k] {
                 let (i, j) = (row.camera.min(other.camera) as usize, row.camera.max(other.camera) as usize);
                 let product = t * other.cross.transpose();
@@ -172,11 +171,15 @@ impl Reduced {
                     *block -= product.transpose();
                 }
             }
-            self.shared[(FOCAL, FOCAL)] += row.jf.dot(&row.jf) * row.weight;
-            self.shared_gradient[FOCAL] += row.jf.dot(&row.r) * row.weight;
+            let mut corner = self.shared.fixed_view_mut::<LENS, LENS>(FOCAL, FOCAL);
+            corner += row.jl.transpose() * row.jl * row.weight;
+            let mut gradient = self.shared_gradient.fixed_rows_mut::<LENS>(FOCAL);
+            gradient += row.jl.transpose() * row.r * row.weight;
         }
-        self.shared[(FOCAL, FOCAL)] -= eq.by_focal.dot(&to_focal);
-        self.shared_gradient[FOCAL] -= to_focal.dot(&eq.gradient);
+        let mut corner = self.shared.fixed_view_mut::<LENS, LENS>(FOCAL, FOCAL);
+        corner -= eq.by_lens.transpose() * to_lens;
+        let mut gradient = self.shared_gradient.fixed_rows_mut::<LENS>(FOCAL);
+        gradient -= to_lens.transpose() * eq.gradient;
     }
 }
 
@@ -186,7 +189,8 @@ pub(crate) struct Row {
     weight: f64,
     r: SVector<f64, 2>,
     jc: SMatrix<f64, 2, 6>,
-    jf: SVector<f64, 2>,
+    /// By the lens.
+    jl: SMatrix<f64, 2, LENS>,
     /// weight · Jcᵀ · Jx
     cross: SMatrix<f64, 6, 3>,
 }
@@ -196,7 +200,7 @@ struct PointEquation {
     /// `None` when no observation constrains the point.
     inverse: Option<Matrix3<f64>>,
     gradient: Vector3<f64>,
-    by_focal: Vector3<f64>,
+    by_lens: SMatrix<f64, 3, LENS>,
 }
 
 impl PointEquation {
@@ -205,14 +209,15 @@ impl PointEquation {
         let world = problem.points[point];
         let per_px = 1.0 / problem.pixel_sigma;
         let mut v = Matrix3::zeros();
-        let (mut gradient, mut by_focal) = (Vector3::zeros(), Vector3::zeros());
+        let (mut gradient, mut by_lens) = (Vector3::zeros(), SMatrix::<f64, 3, LENS>::zeros());
+        let radial = problem.shared.radial;
         for o in problem.sightings(point) {
             let camera = &cameras[o.camera as usize];
             let p = camera.local(world);
             let Some(r) = problem.residual(camera, world, o) else { continue };
             let r = r * per_px;
             let weight = loss.at(r.length_squared()).1;
-            let (du, dv) = pixel_by_local(camera, p);
+            let (du, dv) = radial.by_local(camera, p);
             let (du, dv) = (du * per_px, dv * per_px);
             // p turns by p × δ when the camera turns by δ about its own axes, and moves against its centre.
             let turn = skew(p).transpose();
@@ -222,23 +227,30 @@ impl PointEquation {
                 tu.x, tu.y, tu.z, -xu.x, -xu.y, -xu.z, tv.x, tv.y, tv.z, -xv.x, -xv.y, -xv.z,
             ]);
             let jx = SMatrix::<f64, 2, 3>::from_row_slice(&[xu.x, xu.y, xu.z, xv.x, xv.y, xv.z]);
-            let from_centre = (camera.pixel(p) - camera.c) * per_px;
-            let jf = SVector::<f64, 2>::new(from_centre.x, from_centre.y);
+            let by = radial.by_lens(camera, p).map(|d| d * per_px);
+            let jl = SMatrix::<f64, 2, LENS>::from_fn(|row, k| by[k][row]);
             let r = SVector::<f64, 2>::new(r.x, r.y);
             v += jx.transpose() * jx * weight;
             gradient += jx.transpose() * r * weight;
-            by_focal += jx.transpose() * jf * weight;
-            rows.push(Row { camera: o.camera, weight, r, jc, jf, cross: jc.transpose() * jx * weight });
+            by_lens += jx.transpose() * jl * weight;
+            rows.push(Row { camera: o.camera, weight, r, jc, jl, cross: jc.transpose() * jx * weight });
         }
         for k in 0..3 {
             v[(k, k)] += lambda * v[(k, k)] + 1e-12;
         }
-        Self { inverse: v.cholesky().map(|c| c.inverse()), gradient, by_focal }
+        Self { inverse: v.cholesky().map(|c| c.inverse()), gradient, by_lens }
     }
 }
 
-/// Steps of the points that belong to the given steps of frames and focal length.
-pub(crate) fn point_steps(problem: &Problem, loss: Loss, lambda: f64, frames: &[FrameVec], focal: f64) -> Vec<DVec3> {
+/// Steps of the points that belong to the given steps of frames and of what all share.
+pub(crate) fn point_steps(
+    problem: &Problem,
+    loss: Loss,
+    lambda: f64,
+    frames: &[FrameVec],
+    shared: &SharedVec,
+) -> Vec<DVec3> {
+    let lens: SVector<f64, LENS> = shared.fixed_rows::<LENS>(FOCAL).into_owned();
     let cameras: Vec<Pinhole> = (0..problem.poses.len()).map(|i| problem.camera(i)).collect();
     (0..problem.points.len())
         .into_par_iter()
@@ -246,7 +258,7 @@ pub(crate) fn point_steps(problem: &Problem, loss: Loss, lambda: f64, frames: &[
         .map_init(Vec::new, |rows, i| {
             let eq = PointEquation::new(problem, &cameras, i, loss, lambda, rows);
             let Some(inverse) = eq.inverse else { return DVec3::ZERO };
-            let mut g = eq.gradient + eq.by_focal * focal;
+            let mut g = eq.gradient + eq.by_lens * lens;
             for row in rows.iter() {
                 g += row.cross.transpose() * frames[row.camera as usize];
             }

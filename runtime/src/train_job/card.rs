@@ -8,7 +8,7 @@ use std::path::Path;
 use config::refine::RefineSettings;
 use models::camera::View;
 use models::card::name_list;
-use models::dataset::{CardNotes, Dataset, PoseSource};
+use models::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled};
 use models::formats::transforms;
 use models::refine::Refiner;
 
@@ -19,6 +19,12 @@ use crate::error::JobError;
 const FILE: &str = "transforms.json";
 /// Rotations that the pictures contradict by more than this many standard deviations, and this many degrees, are named.
 const CONTRADICTION: (f64, f64) = (5.0, 20.0);
+
+/// Radial distortion (k1, k2) of a lens that nothing is known of: the survey cameras of the reference data have up to 0.015.
+const UNKNOWN_RADIAL: f64 = 0.05;
+/// A card's pictures are matched at this many times the size, and with as many more key points, than in flight, where the
+/// time is short: brighton_beach's card lies 0.63 m from its reference at 640 pixels and 0.21 m at 1,280.
+const DETAIL: u32 = 2;
 
 /// What settling a card is to be remembered for, in run.json.
 pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
@@ -57,7 +63,10 @@ pub(super) fn settle(
         return Ok(Some(remarks));
     }
     let settled = match refine {
-        None => set.frames.iter().map(|f| (f.name.clone(), f.view)).collect(),
+        None => {
+            let stated = |f: &DatasetFrame| Settled { view: f.view, distortion: f.distortion };
+            set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
+        }
         Some(settings) => match refined(set, &notes, settings, go_on, &mut remarks)? {
             Some(settled) => settled,
             None => return Ok(None),
@@ -70,7 +79,7 @@ pub(super) fn settle(
 }
 
 /// What an earlier start settled on, when it was about the same pictures.
-fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, View>>, JobError> {
+fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, Settled>>, JobError> {
     if !file.is_file() {
         return Ok(None);
     }
@@ -85,7 +94,8 @@ fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, View>>, Jo
         let turned = lens.size.unwrap_or(size);
         let mut pose = before.pose;
         pose.rotation = frame.orientation.of_rotation(pose.rotation);
-        settled.insert(frame.name.clone(), View { intrinsics: lens.intrinsics(turned), pose });
+        let view = View { intrinsics: lens.intrinsics(turned), pose };
+        settled.insert(frame.name.clone(), Settled { view, distortion: lens.distortion });
     }
     // Pictures that came since want poses, too.
     Ok((settled.len() == earlier.shots.len()).then_some(settled))
@@ -97,11 +107,16 @@ fn refined(
     settings: &RefineSettings,
     go_on: &dyn Fn() -> bool,
     remarks: &mut Remarks,
-) -> Result<Option<HashMap<String, View>>, JobError> {
+) -> Result<Option<HashMap<String, Settled>>, JobError> {
     let all: Vec<usize> = (0..set.frames.len()).collect();
     let mut settings = settings.clone();
     settings.max_keyframes = settings.max_keyframes.max(all.len());
     settings.focal_sigma = settings.focal_sigma.max(notes.focal_sigma);
+    if notes.distortion_unknown {
+        settings.radial_sigma = settings.radial_sigma.max(UNKNOWN_RADIAL);
+    }
+    settings.feature_side *= DETAIL;
+    settings.max_features *= DETAIL as usize;
     // The network sees no more of a picture than this; decoding more would be for nothing.
     let longer = |i: &usize| set.frames[*i].view.intrinsics.width.max(set.frames[*i].view.intrinsics.height);
     let largest = all.iter().map(longer).max().unwrap_or(1);
@@ -126,6 +141,8 @@ fn refined(
         return Ok(None);
     }
     remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
+    refiner.solve()?;
+    refiner.relink()?;
     let solved = refiner.solve()?;
     progress.finish(&format!(
         "{} of {} pictures tied together, reprojection {:.2} px",
@@ -147,7 +164,9 @@ fn refined(
                 contradicted.push((name, away));
             }
         }
-        settled.insert(name.clone(), View { intrinsics, pose });
+        // Only a picture without a distortion of its own may have been given one.
+        let distortion = if frame.distortion.is_none() { refiner.distortion() } else { frame.distortion };
+        settled.insert(name.clone(), Settled { view: View { intrinsics, pose }, distortion });
     }
     if !contradicted.is_empty() {
         let mut angles: Vec<f64> = contradicted.iter().map(|c| c.1).collect();

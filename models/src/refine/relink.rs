@@ -1,0 +1,97 @@
+//! A second look at every pair, once all pictures are there and have poses. The first look takes pictures as they come, with
+//! telemetry as the guide: one whose heading is wrong is linked to its neighbour alone, if at all, and its features are those of
+//! a picture that lies on its side. On brighton_beach's card, where six of 18 are turned around, that left a line of forest hanging
+//! by a few matches, one picture of it 25 m off.
+
+use super::keyframe::KeyFrame;
+use super::linking::LINKED_SIGMA;
+use super::tracks::Union;
+use super::{AddReport, RefineError, RefineReport, Refiner, upright};
+
+/// Positions that the adjustment moved further than this from telemetry's are searched for as if they were not known,
+/// standard deviations.
+const DOUBT: f64 = 3.0;
+
+impl Refiner {
+    /// Links all key frames anew from the poses of the last [`Refiner::solve`], every picture upright by those poses. For use
+    /// between two solves, when no more pictures come; takes as long as matching did, and features are extracted again where
+    /// a picture was turned.
+    ///
+    /// # Errors
+    /// The network failed.
+    pub fn relink(&mut self) -> Result<AddReport, RefineError> {
+        let mut report = AddReport::default();
+        if self.solves == 0 {
+            return Ok(report);
+        }
+        self.extract_upright(&mut report)?;
+        self.union = Union::with_capacity(self.settings.max_keyframes * self.settings.max_features);
+        self.pairs.clear();
+        for (i, frame) in self.frames.iter_mut().enumerate() {
+            frame.first_node = self.union.grow(i as u32, frame.seen.len());
+            frame.pairs = 0;
+            frame.settled.fill(false);
+            doubt(frame);
+        }
+        // The pairs of the first look are gone, and so is their part in the counts.
+        let RefineReport { extract_seconds, match_seconds, frames_invalid, frames_over_cap, .. } = self.totals;
+        self.totals =
+            RefineReport { extract_seconds, match_seconds, frames_invalid, frames_over_cap, ..Default::default() };
+        let clock = std::time::Instant::now();
+        for b in 1..self.frames.len() {
+            let verified = report.pairs_verified;
+            let candidates = self.candidates(&self.camera_of(&self.frames[b]), &self.frames[b].intrinsics, b);
+            report.pairs_verified = 0;
+            self.link_guided(b, &candidates, &mut report);
+            report.pairs_verified += verified;
+        }
+        report.match_seconds = clock.elapsed().as_secs_f64();
+        self.totals.absorb(&report);
+        Ok(report)
+    }
+
+    /// Extracts features anew where a picture was not turned as the others are.
+    fn extract_upright(&mut self, report: &mut AddReport) -> Result<(), RefineError> {
+        if self.networks.is_none() {
+            return Ok(());
+        }
+        let Some(first) = self.frames.iter().position(|f| f.tied) else { return Ok(()) };
+        let reference = (self.camera_of(&self.frames[first]), self.frames[first].turns);
+        for i in 0..self.frames.len() {
+            let frame = &self.frames[i];
+            let camera = self.camera_of(frame);
+            let turns =
+                upright::turns_like(&reference.0, reference.1, &camera, &frame.intrinsics, self.ground_at(first));
+            let Some(grey) = frame.grey.as_ref().filter(|_| turns != frame.turns) else { continue };
+            let (image, size) = (grey.picture(), (frame.intrinsics.width, frame.intrinsics.height));
+            let features = self.extract(&image, size, turns, report)?;
+            let (focal, radial, max) =
+                (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
+            let frame = &mut self.frames[i];
+            let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
+            frame.describe(features, turns, max, (focal, &radial));
+            // Colours are no longer there; that of the nearest key point is.
+            let nearest = |p: &[f32; 2]| {
+                let apart = |q: &[f32; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
+                let place = (0..before.len()).min_by(|a, b| apart(&before[*a]).total_cmp(&apart(&before[*b])));
+                place.map_or([128; 3], |k| colors[k])
+            };
+            frame.colors = frame.seen.iter().map(nearest).collect();
+        }
+        Ok(())
+    }
+}
+
+/// How far off the frame may be: where pictures and telemetry disagree, either may be wrong.
+fn doubt(frame: &mut KeyFrame) {
+    let away = (frame.pose.center - frame.prior.center).abs();
+    let sigma = frame.sigma.position_m.map(f64::from);
+    let disagree = (0..3).any(|k| away[k] > DOUBT * sigma[k]);
+    frame.rotation_sigma = LINKED_SIGMA;
+    if !frame.tied || disagree {
+        let widest = sigma.iter().fold(0.0f64, |a, b| a.max(*b));
+        frame.position_sigma = widest.max(away.length() / 2.0).min(30.0);
+        frame.pose.center = frame.prior.center;
+        frame.adjusted = false;
+    }
+}
