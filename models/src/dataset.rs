@@ -6,8 +6,8 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
-use config::lens::Distortion;
 use config::geodesy::Geodetic;
+use config::lens::Distortion;
 use image::imageops;
 
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};

@@ -1,6 +1,5 @@
 //! From a card's own words to poses: what a real camera's card says, settled by its pictures, against a reference
-//! reconstruction of the same flight. How far the poses lie from it is printed and not asserted: 4.66 m rms after a similarity, where
-//! 0.25 m is the aim. Needs the reference data (`DGTR_DATA`); says so and passes without.
+//! reconstruction of the same flight. Needs the reference data (`DGTR_DATA`); says so and passes without.
 
 #![allow(clippy::unwrap_used)] // a test may
 
@@ -11,8 +10,9 @@ use std::path::PathBuf;
 use config::refine::RefineSettings;
 use glam::DQuat;
 use models::camera::Pose;
+use models::card::CardOptions;
 use models::dataset::{Dataset, PoseSource};
-use models::refine::Refiner;
+use models::refine::{RefineReport, Refiner};
 use pose_errors::pose_errors;
 
 #[path = "support/pose_errors.rs"]
@@ -27,68 +27,99 @@ fn data(name: &str) -> Option<PathBuf> {
     folder.is_dir().then_some(folder)
 }
 
-#[test]
-fn the_six_turned_pictures_of_a_real_card_are_found_and_every_picture_is_tied_in() {
-    let (Some(card), Some(reference)) = (data("brighton_beach_card"), data("brighton_beach")) else { return };
-    let (set, truth) = (Dataset::open(&card).unwrap(), Dataset::open(&reference).unwrap());
-    let notes = set.card.clone().unwrap();
-    let settings = RefineSettings { solve_seconds: 120.0, focal_sigma: notes.focal_sigma, radial_sigma: 0.05, ..Default::default() };
-    let var = |n: &str, d: f64| std::env::var(n).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
+/// As `dgtr train` settles a card, with time enough on a busy machine.
+fn settle(set: &Dataset, side: u32) -> Option<(Refiner, RefineReport)> {
+    let notes = set.card.as_ref().unwrap();
+    assert!(notes.distortion_unknown);
     let settings = RefineSettings {
-        feature_side: var("SIDE", 1280.0) as u32,
-        max_features: var("FEATURES", 2000.0) as usize,
-        max_pairs: var("PAIRS", 6.0) as usize,
-        min_cosine: var("COSINE", 0.6) as f32,
-        focal_sigma: var("FSIGMA", settings.focal_sigma),
-        radial_sigma: var("RSIGMA", 0.05),
-        observable_ratio: var("RATIO", 0.5),
-        pixel_sigma: var("PXSIGMA", 0.4),
-        ..settings
+        solve_seconds: 120.0,
+        focal_sigma: notes.focal_sigma,
+        radial_sigma: 0.05,
+        feature_side: side,
+        max_features: 2000,
+        ..Default::default()
     };
     let mut refiner = match Refiner::open(&settings) {
         Ok(r) => r,
-        Err(e) => return println!("skipped: {e}"),
+        Err(e) => {
+            println!("skipped: {e}");
+            return None;
+        }
     };
     let all: Vec<usize> = (0..set.frames.len()).collect();
-    set.load_ahead(&all, var("SIDE", 1280.0) / 4000.0, PoseSource::Telemetry, 2, |_, picture| {
+    let scale = f64::from(side) / f64::from(set.frames[0].view.intrinsics.width);
+    set.load_ahead(&all, scale, PoseSource::Telemetry, 2, |_, picture| {
         refiner.add(&picture.unwrap()).unwrap();
         ControlFlow::Continue(())
     });
-    let first = refiner.solve().unwrap();
-    println!("first {:?} {} pairs {:.1} s", first.shared, first.pairs_verified, first.match_seconds);
-    for _ in 0..var("RELINKS", 1.0) as usize {
-        println!("{:?}", refiner.relink().unwrap());
-        let r = refiner.solve().unwrap();
-        println!("{:?}", r.shared);
-    }
+    refiner.solve().unwrap();
+    refiner.relink().unwrap();
     let report = refiner.solve().unwrap();
+    Some((refiner, report))
+}
+
+/// In widths of the picture.
+fn focal(refiner: &Refiner, set: &Dataset) -> f64 {
+    let k = refiner.intrinsics(&set.frames[0].name).unwrap();
+    f64::from(k.fx) / f64::from(k.width)
+}
+
+#[test]
+fn a_real_card_is_settled_to_a_decimetre_and_its_six_turned_pictures_are_found() {
+    let (Some(card), Some(reference)) = (data("brighton_beach_card"), data("brighton_beach")) else { return };
+    let (set, truth) = (Dataset::open(&card).unwrap(), Dataset::open(&reference).unwrap());
+    let Some((refiner, report)) = settle(&set, 1280) else { return };
     let (mut turned, mut found, mut wanted) = (Vec::new(), Vec::new(), Vec::new());
     for frame in &set.frames {
         let pose = refiner.pose(&frame.name).unwrap();
-        if frame.prior.unwrap().pose.rotation.angle_between(pose.rotation).to_degrees() > 90.0 {
+        let is_turned = frame.prior.unwrap().pose.rotation.angle_between(pose.rotation).to_degrees() > 90.0;
+        if is_turned {
             turned.push(frame.name.as_str());
         }
         let stem = frame.name.trim_end_matches(".JPG");
         let same = truth.frames.iter().find(|f| f.name.starts_with(stem)).unwrap();
         // In the reference the six were turned back.
-        let back =
-            if turned.last() == Some(&frame.name.as_str()) { DQuat::from_rotation_z(PI) } else { DQuat::IDENTITY };
+        let back = if is_turned { DQuat::from_rotation_z(PI) } else { DQuat::IDENTITY };
         found.push(Pose { rotation: pose.rotation * back, ..pose });
         wanted.push(same.view.pose);
     }
-    for ((f, w), frame) in found.iter().zip(&wanted).zip(&set.frames) {
-        println!("{} {:?} {:?} {:?} {:?}", frame.name, f.center, f.rotation, w.center, w.rotation);
-    }
-    for (f, w) in found.iter().zip(&wanted) {
-        println!("{:.2} {:.2}", f.center, w.center);
-    }
     let errors = pose_errors(&found, &wanted);
-    let focal = refiner.intrinsics(&set.frames[0].name).unwrap().fx / var("SIDE", 1280.0) as f32;
-    println!("{turned:?}\n{errors:?}, focal length {focal:.4} of the width (reference 0.6004)\n{report:#?}");
+    println!("{turned:?}\n{errors:?}, focal length {:.4} of the width\n{report:#?}", focal(&refiner, &set));
     assert_eq!(
         turned,
         ["DJI_0024.JPG", "DJI_0025.JPG", "DJI_0026.JPG", "DJI_0027.JPG", "DJI_0028.JPG", "DJI_0029.JPG"]
     );
     assert_eq!(report.frames_tied, 18);
-    assert!(report.reprojection_median_px < 0.3 && (focal / 0.6004 - 1.0).abs() < 0.05, "{focal}");
+    assert!(report.reprojection_median_px < 0.3);
+    assert!(errors.aligned_position < 0.15 && errors.aligned_angle < 0.3, "{errors:?}");
+    // A flat block seen straight down cannot tell its focal length (it drifts by 10 % and more); its radial terms it can:
+    // k2 of the same camera model, calibrated on an oblique block, is 0.0153.
+    assert!(!report.shared.focal_estimated && report.shared.focal_scale == 1.0);
+    assert!(report.shared.radial_estimated[1] && (report.shared.radial[1] - 0.0153).abs() < 0.005);
+}
+
+#[test]
+fn the_focal_length_of_an_oblique_block_comes_out_of_its_pictures() {
+    let Some(reference) = data("sheffield_cross") else { return };
+    let truth = Dataset::open(&reference).unwrap();
+    let card = tempfile::tempdir().unwrap();
+    for i in truth.select("train", None).unwrap() {
+        let frame = &truth.frames[i];
+        std::fs::copy(&frame.path, card.path().join(&frame.name)).unwrap();
+    }
+    let set = Dataset::open_card(&[card.path().to_owned()], &CardOptions::default()).unwrap();
+    let start = set.frames[0].view.intrinsics;
+    let Some((refiner, report)) = settle(&set, 640) else { return };
+    let poses = set.frames.iter().map(|frame| {
+        let same = truth.frames.iter().find(|f| f.name == frame.name).unwrap();
+        (refiner.pose(&frame.name).unwrap(), same.view.pose)
+    });
+    let (found, wanted): (Vec<Pose>, Vec<Pose>) = poses.unzip();
+    let errors = pose_errors(&found, &wanted);
+    let true_focal = f64::from(truth.frames[0].view.intrinsics.fx) / 640.0;
+    let (before, after) = (f64::from(start.fx) / 640.0 / true_focal, focal(&refiner, &set) / true_focal);
+    println!("{errors:?}, focal length {before:.4} and {after:.4} of the reference's\n{report:#?}");
+    assert_eq!(report.frames_tied, set.frames.len());
+    assert!(report.shared.focal_estimated && (after - 1.0).abs() < 0.01, "{after}");
+    assert!(errors.aligned_position < 0.15 && errors.aligned_angle < 0.15, "{errors:?}");
 }

@@ -81,7 +81,8 @@ fn apply(problem: &mut Problem, step: &Step, points: &[DVec3]) {
 /// the equations cannot be solved.
 pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
     let free = problem.free;
-    problem.free = std::array::from_fn(|k| problem.shared_weight[k].is_finite() && (k < RADIAL || problem.shared_weight[k] > 0.0));
+    problem.free =
+        std::array::from_fn(|k| problem.shared_weight[k].is_finite() && (k < RADIAL || problem.shared_weight[k] > 0.0));
     let mut equations = Reduced::new(problem);
     equations.fill(problem, loss, 0.0);
     problem.free = free;
@@ -90,4 +91,100 @@ pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
         unit.shared[k] = 1.0;
         equations.solve(&unit).map_or(f64::INFINITY, |x| x.shared[k].max(0.0).sqrt())
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Intrinsics, Pose};
+    use crate::refine::problem::{Observation, PosePrior, Shared};
+    use crate::refine::radial::Radial;
+    use glam::{DQuat, DVec2};
+
+    const LENS: Intrinsics = Intrinsics { width: 640, height: 480, fx: 400.0, fy: 395.0, cx: 318.0, cy: 243.0 };
+    const LOSS: Loss = Loss::Cauchy(2.0);
+
+    /// Three cameras that look down on twelve points, everything a little off and nothing at its optimum.
+    fn scene() -> Problem {
+        let wobble = |i: usize, k: usize| ((i * 7 + k * 3) % 11) as f64 / 11.0 - 0.5;
+        let three = |i: usize, scale: f64| DVec3::new(wobble(i, 0), wobble(i, 1), wobble(i, 2)) * scale;
+        let pose = |i: usize| Pose {
+            rotation: DQuat::from_rotation_x(std::f64::consts::PI) * so3::exp(three(i, 0.2)),
+            center: DVec3::new(10.0 * i as f64, 0.0, 40.0) + three(i + 3, 1.0),
+        };
+        let priors = (0..3).map(|i| PosePrior {
+            pose: Pose {
+                rotation: pose(i).rotation * so3::exp(three(i + 5, 0.05)),
+                center: pose(i).center + three(i + 1, 1.0),
+            },
+            velocity: DVec3::new(5.0, 0.5, 0.0),
+            position_weight: DVec3::new(1.0, 1.0, 2.0),
+            rotation_weight: DVec3::splat(12.0),
+        });
+        let mut problem = Problem {
+            intrinsics: vec![LENS; 3],
+            poses: (0..3).map(pose).collect(),
+            priors: priors.collect(),
+            points: (0..12)
+                .map(|i| DVec3::new((i % 4) as f64 * 8.0 - 3.0, (i / 4) as f64 * 8.0 - 8.0, wobble(i, 4)))
+                .collect(),
+            starts: (0..=12).map(|i| 3 * i).collect(),
+            observations: Vec::new(),
+            shared: Shared {
+                mount: so3::exp(DVec3::new(0.01, -0.02, 0.015)),
+                delay: 0.1,
+                log_focal: 0.03,
+                radial: Radial { k1: -0.04, k2: 0.02 },
+            },
+            shared_weight: [20.0, 20.0, 20.0, 1.0, 10.0, 20.0, 20.0],
+            free: [true; SHARED],
+            pixel_sigma: 0.4,
+        };
+        for point in 0..12 {
+            for camera in 0..3 {
+                let at = problem.camera(camera);
+                let seen = problem.shared.radial.pixel(&at, at.local(problem.points[point]));
+                let seen = seen + DVec2::new(wobble(point, camera), wobble(camera, point)) * 2.0;
+                problem.observations.push(Observation { camera: camera as u32, pixel: seen.as_vec2().to_array() });
+            }
+        }
+        problem
+    }
+
+    #[test]
+    fn the_gradient_by_every_pose_and_shared_parameter_is_that_of_finite_differences() {
+        let mut problem = scene();
+        let mut equations = Reduced::new(&problem);
+        // Damped so heavily points stand still, and the reduced gradient is the plain one.
+        equations.fill(&problem, LOSS, 1e18);
+        let still = [DVec3::ZERO; 12];
+        let none = Step { frames: vec![FrameVec::zeros(); 3], shared: SharedVec::zeros() };
+        let mut slope = |step: &dyn Fn(&mut Step, f64)| {
+            let h = 1e-6;
+            let before = (problem.poses.clone(), problem.shared);
+            let [fore, back] = [h, -h].map(|h| {
+                let mut moved = none.clone();
+                step(&mut moved, h);
+                apply(&mut problem, &moved, &still);
+                let cost = problem.cost(LOSS);
+                (problem.poses, problem.shared) = before.clone();
+                cost
+            });
+            // The normal equations hold half of the cost's gradient.
+            (fore - back) / (4.0 * h)
+        };
+        let close = |found: f64, wanted: f64, what: String| {
+            assert!((found - wanted).abs() < 2e-4 * (1.0 + wanted.abs()), "{what}: {found} {wanted}");
+        };
+        for i in 0..3 {
+            for k in 0..6 {
+                let wanted = slope(&|s, h| s.frames[i][k] = h);
+                close(equations.gradient[i][k], wanted, format!("frame {i}, {k}"));
+            }
+        }
+        for k in 0..SHARED {
+            let wanted = slope(&|s, h| s.shared[k] = h);
+            close(equations.shared_gradient[k], wanted, format!("shared {k}"));
+        }
+    }
 }

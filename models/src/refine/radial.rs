@@ -53,9 +53,7 @@ impl Radial {
         let (d, slope) = (self.stretch(r2), self.k1 + 2.0 * self.k2 * r2);
         // d(x·D)/dx and so on, D the stretch.
         let (xx, xy, yy) = (d + 2.0 * x * x * slope, 2.0 * x * y * slope, d + 2.0 * y * y * slope);
-        let row = |f: f64, by_x: f64, by_y: f64| {
-            DVec3::new(by_x, by_y, -(by_x * x + by_y * y)) * (f * z)
-        };
+        let row = |f: f64, by_x: f64, by_y: f64| DVec3::new(by_x, by_y, -(by_x * x + by_y * y)) * (f * z);
         (row(camera.f.x, xx, xy), row(camera.f.y, xy, yy))
     }
 

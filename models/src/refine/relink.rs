@@ -65,8 +65,7 @@ impl Refiner {
             let Some(grey) = frame.grey.as_ref().filter(|_| turns != frame.turns) else { continue };
             let (image, size) = (grey.picture(), (frame.intrinsics.width, frame.intrinsics.height));
             let features = self.extract(&image, size, turns, report)?;
-            let (focal, radial, max) =
-                (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
+            let (focal, radial, max) = (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
             let frame = &mut self.frames[i];
             let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
             frame.describe(features, turns, max, (focal, &radial));
