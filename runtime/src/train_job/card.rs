@@ -23,8 +23,10 @@ const CONTRADICTION: (f64, f64) = (5.0, 20.0);
 /// Radial distortion (k1, k2) of a lens that nothing is known of: the survey cameras of the reference data have up to 0.015.
 const UNKNOWN_RADIAL: f64 = 0.05;
 /// A card's pictures are matched at this many times the size, and with as many more key points, than in flight, where the
-/// time is short: brighton_beach's card lies 0.63 m from its reference at 640 pixels and 0.21 m at 1,280.
+/// time is short: brighton_beach's card lies 0.80 m from its reference at 640 pixels and 0.07 m at 1,280.
 const DETAIL: u32 = 2;
+/// What `[refine]` allows of either.
+const MOST_DETAIL: u32 = 8192;
 
 /// What settling a card is to be remembered for, in run.json.
 pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
@@ -115,8 +117,8 @@ fn refined(
     if notes.distortion_unknown {
         settings.radial_sigma = settings.radial_sigma.max(UNKNOWN_RADIAL);
     }
-    settings.feature_side *= DETAIL;
-    settings.max_features *= DETAIL as usize;
+    settings.feature_side = (settings.feature_side * DETAIL).min(MOST_DETAIL);
+    settings.max_features = (settings.max_features * DETAIL as usize).min(MOST_DETAIL as usize);
     // The network sees no more of a picture than this; decoding more would be for nothing.
     let longer = |i: &usize| set.frames[*i].view.intrinsics.width.max(set.frames[*i].view.intrinsics.height);
     let largest = all.iter().map(longer).max().unwrap_or(1);
