@@ -42,6 +42,9 @@ impl Spirv {
 
 pub(crate) struct KernelInfo {
     pub name: &'static str,
+    /// Name of its source and of its SPIR-V, without more lanes.
+    #[cfg_attr(not(test), expect(dead_code, reason = "for the list of what the boards' drivers compile"))]
+    pub file: &'static str,
     pub spirv: Spirv,
     /// The variant with more lanes per tile or share.
     pub more_lanes: Option<Spirv>,
@@ -87,6 +90,7 @@ macro_rules! kernels {
 
         pub(crate) const KERNELS: &[KernelInfo] = &[$(KernelInfo {
             name: stringify!($id),
+            file: $file,
             spirv: spirv!($file "" [$($texels)*]),
             more_lanes: spirv!(more_lanes $group $file [$($texels)*]),
             bindings: &[$($binding),*],

@@ -1,5 +1,8 @@
 //! One pipeline and one descriptor set per kernel, all made at start-up over one shared layout.
 
+#[cfg(test)]
+mod listed;
+
 use crate::arena::{Arena, Section};
 use crate::gpu::{DeviceLimits, Gpu, GpuError};
 use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots};
@@ -62,6 +65,26 @@ struct Specialisation {
 /// What a kernel sees of the arena under a section's name.
 fn bound(arena: &Arena, plan: &Plan, name: &str) -> Section {
     part_of_slots(name, arena.section("slots"), plan.pixels).unwrap_or_else(|| arena.section(name))
+}
+
+/// Whether kernels of this kind have more than one lane per tile or share.
+fn takes_more_lanes(group: Group, shape: KernelShape) -> bool {
+    match group {
+        Group::Sort | Group::Walk => shape.share_lanes > 1,
+        _ => shape.tile_lanes > 1,
+    }
+}
+
+/// Lanes of a workgroup of this kind.
+fn local_size(group: Group, shape: KernelShape) -> u32 {
+    let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, .. } = shape;
+    match group {
+        Group::Wide => wide,
+        Group::Sort if share_lanes > 1 => SCAN_LANES,
+        Group::Sort | Group::Walk => narrow,
+        Group::Tiles => tiles * tile_lanes,
+        Group::Scan => SCAN_LANES,
+    }
 }
 
 fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
@@ -240,7 +263,7 @@ impl Pipelines {
     unsafe fn pipeline(&self, index: usize, plan: &Plan, own_degrees: bool) -> Result<vk::Pipeline, GpuError> {
         let kernel = &KERNELS[index];
         let constants = Specialisation {
-            local_size: self.local_size(kernel.group),
+            local_size: local_size(kernel.group, self.shape),
             sh_columns: sh_columns(plan.sh_degree) as u32,
             sh_degree: plan.sh_degree.into(),
             sort_lanes: plan.sort_lanes,
@@ -255,10 +278,7 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
-        let more_lanes = kernel.more_lanes.filter(|_| match kernel.group {
-            Group::Sort | Group::Walk => self.shape.share_lanes > 1,
-            _ => self.shape.tile_lanes > 1,
-        });
+        let more_lanes = kernel.more_lanes.filter(|_| takes_more_lanes(kernel.group, self.shape));
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
         unsafe {
             self.gpu.compute_pipeline(
@@ -270,23 +290,12 @@ impl Pipelines {
         }
     }
 
-    fn local_size(&self, group: Group) -> u32 {
-        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, .. } = self.shape;
-        match group {
-            Group::Wide => wide,
-            Group::Sort if share_lanes > 1 => SCAN_LANES,
-            Group::Sort | Group::Walk => narrow,
-            Group::Tiles => tiles * tile_lanes,
-            Group::Scan => SCAN_LANES,
-        }
-    }
-
     /// Workgroups that give `kernel` at least `count` lanes, tiles or shares, whichever it is dispatched over.
     pub fn groups(&self, kernel: Kernel, count: usize) -> u32 {
         let each = match KERNELS[kernel as usize].group {
             Group::Tiles => self.shape.tiles,
             Group::Sort | Group::Walk if self.shape.share_lanes > 1 => 1,
-            group => self.local_size(group),
+            group => local_size(group, self.shape),
         };
         (count as u32).div_ceil(each).max(1)
     }

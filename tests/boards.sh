@@ -1,0 +1,91 @@
+#!/bin/bash
+# The boards' own Vulkan drivers compile every kernel, without a board: Mesa's V3DV, PanVK and Turnip as arm64 programs under
+# qemu, over Mesa's drm-shim, a fake kernel device. It tells whether a kernel compiles, how large it becomes and what it spills;
+# submitted work does nothing. Prints the table kernel x board and compares it with tests/data/boards.md: ends with 1 and the
+# kernels' names when one spills more or no longer compiles; DGTR_BLESS=1 writes the table instead.
+#   tests/boards.sh [--spirv FOLDER] [BOARD...]     boards: pi5 pi4 g610 adreno660 adreno730, default all
+# Packages (150 MB, Debian sid: the newer the Mesa, the more GPUs its shim knows) go to ${XDG_CACHE_HOME:-~/.cache}/dgtr/boards;
+# nothing is installed. Half an hour on two cores. What it needs and does not find it names, and skips.
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+spirv=$here/../vulkan/shaders/spirv
+if [ "${1:-}" = --spirv ]; then spirv=$2; shift 2; fi
+boards=("$@")
+[ $# -gt 0 ] || boards=(pi5 pi4 g610 adreno660 adreno730)
+kit=${XDG_CACHE_HOME:-$HOME/.cache}/dgtr/boards
+skip() { echo "boards.sh: skipped: $*"; exit 0; }
+
+for tool in apt-get dpkg-deb python3; do command -v $tool >/dev/null || skip "no $tool here"; done
+command -v aarch64-linux-gnu-gcc >/dev/null || skip "no arm64 compiler; apt-get install gcc-aarch64-linux-gnu libc6-dev-arm64-cross"
+
+# fetch NAME ARCH SUITE MODE PACKAGE…: packages by an apt of its own, which knows nothing as installed; unpacked into $kit/NAME.
+fetch() {
+    local name=$1 arch=$2 suite=$3 mode=$4 at=$kit/apt/$1 mirror keyring
+    shift 4
+    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/$') || return 1
+    keyring=$(dpkg -L debian-archive-keyring | grep -m1 'debian-archive-keyring\.gpg$') || return 1
+    mkdir -p "$at"/etc/{apt.conf.d,preferences.d,sources.list.d} "$at"/{lists,cache/archives}/partial "$kit/$name"
+    : > "$at/status"
+    echo "deb [arch=$arch signed-by=$keyring] $mirror $suite main" > "$at/etc/sources.list"
+    cat > "$at/apt.conf" <<END
+APT::Architecture "$arch";
+APT::Architectures { "$arch"; };
+APT::Install-Recommends "false";
+APT::Sandbox::User "root";
+Acquire::Languages "none";
+Acquire::Check-Valid-Until "false";  // a mirror frozen at some date is as good
+Dir::Etc "$at/etc";
+Dir::Etc::sourcelist "$at/etc/sources.list";
+Dir::Etc::parts "$at/etc/apt.conf.d";
+Dir::State::lists "$at/lists";
+Dir::State::status "$at/status";
+Dir::Cache "$at/cache";
+END
+    export APT_CONFIG=$at/apt.conf
+    apt-get update -qq || return 1
+    if [ "$mode" = alone ]; then
+        (cd "$at/cache/archives" && apt-get download -qq "$@") || return 1
+    else
+        apt-get install -qq -y --download-only "$@" || return 1
+    fi
+    unset APT_CONFIG
+    for deb in "$at"/cache/archives/*.deb; do dpkg-deb -x "$deb" "$kit/$name" || return 1; done
+    rm -rf "$at/cache"
+}
+
+if [ ! -e "$kit/complete" ]; then
+    mkdir -p "$kit"
+    {
+        fetch root arm64 sid whole libc6 libgcc-s1 libstdc++6 libvulkan1 mesa-vulkan-drivers mesa-drm-shim &&
+        fetch headers arm64 sid alone libvulkan-dev &&
+        fetch qemu "$(dpkg --print-architecture)" trixie alone qemu-user
+    } > "$kit/fetch.log" 2>&1 || skip "the packages could not be had: $(tail -1 "$kit/fetch.log")"
+    [ -e "$kit/root/lib" ] || ln -s usr/lib "$kit/root/lib"  # base-files would; the loader is /lib/ld-linux-aarch64.so.1
+    touch "$kit/complete"
+fi
+aarch64-linux-gnu-gcc -O1 -Wall -Werror -I"$kit/headers/usr/include" -o "$kit/pipelines" "$here/boards/pipelines.c" -ldl
+version=$(zcat "$kit"/root/usr/share/doc/mesa-vulkan-drivers/changelog.Debian*.gz | sed -n '1s/.*(\(.*\)).*/\1/p')
+
+# compile BOARD: one line per kernel to BOARD.tsv.
+compile() {
+    local driver shim model lib=/usr/lib/aarch64-linux-gnu
+    case $1 in
+        pi5) driver=broadcom shim=v3d model=V3D_GPU_ID=71 ;;
+        pi4) driver=broadcom shim=v3d model=V3D_GPU_ID=42 ;;
+        g610) driver=panfrost shim=panfrost model=PAN_GPU_ID=a867 ;;
+        adreno*) driver=freedreno shim=freedreno model=FD_GPU_ID=${1#adreno} ;;
+        *) echo "boards.sh: unknown board $1" >&2; return 2 ;;
+    esac
+    # The shim lives in the guest: LD_PRELOAD must not reach qemu itself, hence -E.
+    env "$model" MESA_SHADER_CACHE_DISABLE=true nice "$kit/qemu/usr/bin/qemu-aarch64" -L "$kit/root" \
+        -E LD_LIBRARY_PATH=$lib -E "LD_PRELOAD=$lib/lib${shim}_noop_drm_shim.so" \
+        -E VK_DRIVER_FILES=/usr/share/vulkan/icd.d/${driver}_icd.json \
+        "$kit/pipelines" "$spirv" < "$here/boards/kernels.txt" > "$kit/$1.tsv" 2> "$kit/$1.log" ||
+        { echo "boards.sh: $1: $(tail -1 "$kit/$1.log")" >&2; return 1; }
+}
+export -f compile
+export kit spirv here
+printf '%s\n' "${boards[@]}" | xargs -P "$(nproc)" -I{} bash -c 'compile {}'
+files=()
+for board in "${boards[@]}"; do files+=("$board=$kit/$board.tsv"); done
+python3 "$here/boards/table.py" "$here/data/boards.md" "${version:-unknown}" "${files[@]}"

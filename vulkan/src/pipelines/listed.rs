@@ -1,0 +1,53 @@
+//! The kernels and the shapes in which `tests/boards.sh` has the boards' drivers compile them: `tests/boards/kernels.txt`,
+//! made from the list of kernels. `DGTR_BLESS=1` remakes it.
+
+use super::*;
+use config::plan::SORT_LANES_GPU;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// A line per kernel and shape: a name for the table, the SPIR-V, the specialisation constants in order.
+fn lines() -> BTreeSet<String> {
+    // What a GPU gets where nothing was measured, and what calibration may choose instead (`KernelShape`).
+    let one = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
+    let more = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 4, ..one };
+    let mut lines = BTreeSet::new();
+    for kernel in KERNELS {
+        for shape in [one, more, KernelShape { fetched: 4, ..more }] {
+            if shape != one && kernel.more_lanes.is_none() || shape.fetched > 1 && kernel.group != Group::Tiles {
+                continue;
+            }
+            let suffix = match (takes_more_lanes(kernel.group, shape), kernel.group) {
+                (false, _) => "",
+                (true, Group::Tiles) => "_rows",
+                (true, _) => "_group",
+            };
+            let (lanes, staged) = (local_size(kernel.group, shape), u32::from(shape.fetched > 1));
+            let halves = kernel.bindings.contains(&"sh_first_moment");
+            for half in 0..=u32::from(halves) {
+                let name = format!("{}{suffix}", kernel.file);
+                let chosen = [("", 1), ("+half", half), ("+staged", staged)];
+                let label: String = chosen.iter().filter(|c| c.1 == 1).map(|c| c.0).collect();
+                let constants = format!("{lanes} {} 3 {SORT_LANES_GPU} {LOOP_LANES} 0 {half} {staged}", sh_columns(3));
+                lines.insert(format!("{name}:{lanes}{label} {name}.spv {constants}"));
+                if kernel.spirv.storage.is_some() && shape == one && half == 0 {
+                    lines.insert(format!("{name}:{lanes}+storage {name}.storage.spv {constants}"));
+                }
+            }
+        }
+    }
+    lines
+}
+
+#[test]
+fn the_boards_compile_every_kernel_in_every_kind_of_shape() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/boards/kernels.txt");
+    let text: String = lines().into_iter().map(|line| line + "\n").collect();
+    if std::env::var_os("DGTR_BLESS").is_some() {
+        std::fs::write(&path, &text).unwrap();
+    }
+    let stored = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(stored == text, "tests/boards/kernels.txt is older than src/kernels.rs: DGTR_BLESS=1 remakes it");
+    // The kernels whose sums over a tile are taken by its lanes are what the drivers have most trouble with.
+    assert!(text.lines().count() > 40 && text.contains("rasterise_backward_rows:32+staged "), "{text}");
+}
