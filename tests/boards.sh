@@ -81,7 +81,7 @@ compile() {
         -E LD_LIBRARY_PATH=$lib -E "LD_PRELOAD=$lib/lib${shim}_noop_drm_shim.so" \
         -E VK_DRIVER_FILES=/usr/share/vulkan/icd.d/${driver}_icd.json \
         "$kit/pipelines" "$spirv" < "$here/boards/kernels.txt" > "$kit/$1.tsv" 2> "$kit/$1.log" ||
-        { echo "boards.sh: $1: $(tail -1 "$kit/$1.log")" >&2; return 1; }
+        { echo "boards.sh: $1: ended at '$(tail -1 "$kit/$1.tsv")': $(tail -1 "$kit/$1.log")" >&2; return 1; }
 }
 export -f compile
 export kit spirv here
