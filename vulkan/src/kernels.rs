@@ -43,7 +43,7 @@ impl Spirv {
 pub(crate) struct KernelInfo {
     pub name: &'static str,
     /// Name of its source and of its SPIR-V, without more lanes.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the list of what the boards' drivers compile"))]
+    #[cfg_attr(not(test), allow(dead_code, reason = "for the list of what the boards' drivers compile"))]
     pub file: &'static str,
     pub spirv: Spirv,
     /// The variant with more lanes per tile or share.
