@@ -30,6 +30,10 @@ table! {
         /// A flight whose end nobody has seen goes on for this long without a sign of life from autopilot and camera.
         pub silence_limit_s: f32 = 1800.0, in Limits::above(0.0).up_to(86_400.0),
             from "what a multirotor stays in the air";
+        /// A flight that an earlier start began is over when the aircraft has stood disarmed for this long: a program started
+        /// after the landing never sees it fly.
+        pub standing_limit_s: f32 = 600.0, in Limits::above(0.0).up_to(86_400.0),
+            from "longer than a change of batteries";
         /// Message signing.
         pub signing: Signing = Signing::Off;
         /// File with the 32-byte key, raw or as 64 hexadecimal digits. The last time stamp is kept beside it.

@@ -110,6 +110,12 @@ impl Autopilot {
         }
     }
 
+    /// A flight that an earlier start began is over when the aircraft has stood disarmed for `standing_ns`.
+    pub fn continued(mut self, standing_ns: u64) -> Self {
+        self.landing = Landing::continued(standing_ns);
+        self
+    }
+
     /// Who is listened to; `system` is 0 until one was heard when it is to be learnt.
     pub fn ids(&self) -> Ids {
         self.ids

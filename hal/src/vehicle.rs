@@ -115,7 +115,10 @@ where
             clock,
             recorded_ns: None,
             peers: Peers::new(ids.system),
-            autopilot: Autopilot::new(ids),
+            autopilot: match settings.pictures_since {
+                Some(_) => Autopilot::new(ids).continued(ns(settings.link.standing_limit_s)),
+                None => Autopilot::new(ids),
+            },
             matcher: Matcher::new(matching),
             exposures: Exposures::default(),
             pending: VecDeque::with_capacity(PENDING),

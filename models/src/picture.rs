@@ -5,6 +5,8 @@
 //! picture at quarter size costs a few megabytes, no full-size picture ever exists, and nothing but Rust is needed to build
 //! it. (libjpeg-turbo is faster yet, but its crates want cmake and an assembler, which a board's two commands do not bring.)
 
+pub(crate) mod tiff;
+
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -123,6 +125,9 @@ pub fn dimensions(path: &Path) -> Result<(u32, u32), PictureError> {
 
 fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PictureError> {
     let failed = |e: std::io::Error| bad(path, format!("cannot be opened ({e}); is the picture folder complete?"));
+    if !tiff::fits_its_tags(path).map_err(failed)? {
+        return Err(bad(path, "is a damaged TIFF (a tag is larger than the file); copy it again"));
+    }
     ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(failed)
 }
 

@@ -33,9 +33,16 @@ pub struct Landing {
     landed_state: Option<(u64, bool)>,
     /// When something last spoke against standing on the ground.
     moving_ns: Option<u64>,
+    /// An earlier start saw it fly: without a flight of this start it is down after standing for so long.
+    standing_ns: Option<u64>,
 }
 
 impl Landing {
+    /// Of a flight that an earlier start began; it is over when the aircraft has stood disarmed for `standing_ns`.
+    pub(super) fn continued(standing_ns: u64) -> Self {
+        Self { standing_ns: Some(standing_ns), ..Self::default() }
+    }
+
     /// A heartbeat of the autopilot.
     pub(super) fn on_heartbeat(&mut self, armed: bool, now_ns: u64) {
         self.heartbeat_ns = now_ns;
@@ -89,9 +96,9 @@ impl Landing {
         self.armed
     }
 
-    /// It flew, and everything that is known at `now_ns` says that it is down again.
+    /// It flew, in this start or an earlier one, and everything that is known at `now_ns` says that it is down again.
     pub fn is_down(&self, now_ns: u64) -> bool {
-        let Some(since_ns) = self.disarmed_since_ns.filter(|_| self.flown) else { return false };
+        let Some(since_ns) = self.disarmed_since_ns else { return false };
         // What spoke against it last counts, whichever came later.
         let quiet_ns = now_ns.saturating_sub(since_ns.max(self.moving_ns.unwrap_or(0)));
         let fresh = |at: u64| now_ns.saturating_sub(at) < FRESH_NS;
@@ -106,7 +113,12 @@ impl Landing {
             (Some(_), None) => false,
         };
         let agreed = fresh(self.heartbeat_ns) && (on_ground == Some(true) || near_ground);
-        quiet_ns >= if agreed { HOLD_NS } else { LONG_HOLD_NS }
+        match (self.flown, self.standing_ns) {
+            (true, _) => quiet_ns >= if agreed { HOLD_NS } else { LONG_HOLD_NS },
+            // Nobody flies with the motors off; but a second flight of the same mission may still begin.
+            (false, Some(standing_ns)) => quiet_ns >= standing_ns,
+            (false, None) => false,
+        }
     }
 }
 
@@ -190,5 +202,23 @@ mod tests {
     #[test]
     fn an_autopilot_that_only_sends_heartbeats_lands_by_them() {
         assert_eq!(first_down(100, |s| (5..52).contains(&s), |_| None, |_| None), Some(55));
+    }
+
+    #[test]
+    fn a_program_started_after_the_landing_sees_it_only_when_an_earlier_one_saw_the_flight() {
+        let first_down = |mut landing: Landing, armed: fn(u64) -> bool, moved: fn(u64) -> f64| {
+            (0..2000).find(|&s| {
+                landing.on_heartbeat(armed(s), S + s * S);
+                landing.on_motion(moved(s), 0.2, S + s * S);
+                landing.is_down(S + s * S)
+            })
+        };
+        let continued = || Landing::continued(600 * S);
+        assert_eq!(first_down(continued(), |_| false, |_| 0.0), Some(600));
+        assert_eq!(first_down(Landing::default(), |_| false, |_| 0.0), None);
+        // A second flight begins after a change of batteries, and ends as any.
+        let armed = |s| (300..900).contains(&s);
+        let height = |s| if (310..890).contains(&s) { 40.0 } else { 0.0 };
+        assert_eq!(first_down(continued(), armed, height), Some(903));
     }
 }

@@ -9,6 +9,7 @@ use exif::{Context, Exif, In, Reader, Tag, Value};
 use image::ImageReader;
 
 use crate::formats::one_line;
+use crate::picture::tiff;
 
 /// Bytes read of segments before the pixels; makers put a few hundred KiB of previews there.
 const MAX_HEAD: u64 = 32 << 20;
@@ -129,6 +130,9 @@ fn parse(tiff: Vec<u8>) -> Option<Exif> {
 
 fn other(path: &Path, file: File) -> Result<Head, String> {
     let bad = |e: &dyn std::fmt::Display| format!("cannot be read as a picture ({})", one_line(e));
+    if !tiff::fits_its_tags(path).map_err(|e| bad(&e))? {
+        return Err("is a damaged TIFF (a tag is larger than the file)".into());
+    }
     let size = ImageReader::open(path)
         .and_then(ImageReader::with_guessed_format)
         .map_err(|e| bad(&e))?

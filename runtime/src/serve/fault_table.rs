@@ -201,7 +201,9 @@ fn ground_restarted() -> Outcome {
 
 /// Half of what was fetched is on the medium: chunks cut, full of zeros or empty, a file under its temporary name.
 fn power_cut() -> Outcome {
-    let field = Field::new(false);
+    let mut field = Field::new(false);
+    // Slow enough that the power goes in the midst of both models.
+    field.mission.upload.max_kib_s = Some(300);
     let _aircraft = ["west", "east"].map(|id| field.fly(id));
     field.receive(|p| p.bytes < 100_000);
     let received = field.dir.path().join("out/received");

@@ -38,5 +38,7 @@ pub(super) fn pose(q: [f64; 4], t: DVec3) -> Option<Pose> {
         return None;
     }
     let rotation = q.normalize().conjugate();
-    Some(Pose { rotation, center: -(rotation * t) })
+    // A sum of three products of the largest numbers is none.
+    let center = -(rotation * t);
+    center.is_finite().then_some(Pose { rotation, center })
 }

@@ -268,8 +268,8 @@ pub(super) const ROWS: &[Row] = &[
         ..USUAL
     },
     Row {
-        fault: "disk full after 16 kB",
-        also: |script| script.disk = |out| Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(16_000)))),
+        fault: "disk full after 9 kB",
+        also: |script| script.disk = |out| Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(9_000)))),
         noticed: |c, _| c.posed_frames == EXPOSURES,
         // Key frames that are not kept are trained on all the same; the last checkpoint waits for room.
         end: End::Checkpoint(3, 10),
