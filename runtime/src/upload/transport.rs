@@ -67,6 +67,9 @@ pub trait Outlet: Send {
 
     /// Makes a model available in place of the one before. Chunks of the one before stay available for a ground
     /// station that is just fetching them.
+    ///
+    /// # Errors
+    /// The medium or the network refuses it; it is tried again.
     fn offer(&mut self, model: &Arc<OfferedModel>) -> Result<(), TransportError>;
 
     /// What has become of the model on offer.
@@ -89,9 +92,15 @@ pub trait Inlet: Send + Sync {
     fn name(&self) -> String;
 
     /// Shows every encoded offer that can be seen now, unchecked.
+    ///
+    /// # Errors
+    /// The medium or the network fails.
     fn offers(&self, patience: Patience, see: &mut dyn FnMut(&[u8])) -> Result<(), TransportError>;
 
     /// The first answer that `accept` takes for chunk `index`; none is longer than the offer says.
+    ///
+    /// # Errors
+    /// Nobody holds it, nobody answers in time, or no answer is accepted.
     fn chunk(
         &self,
         offer: &Offer,
@@ -101,6 +110,9 @@ pub trait Inlet: Send + Sync {
     ) -> Result<Vec<u8>, TransportError>;
 
     /// Gives the aircraft a receipt; `accept` says whether an answer proves that it was taken.
+    ///
+    /// # Errors
+    /// Nobody takes it in time.
     fn deliver_receipt(
         &self,
         aircraft: &str,
