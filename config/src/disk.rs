@@ -6,106 +6,21 @@
 
 use std::fmt;
 use std::fs::File;
-use std::io::{self, BufWriter, ErrorKind, Write};
+use std::io::{self, BufRead, BufReader, BufWriter, ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 pub mod bounded;
+mod operations;
 pub mod plan;
+
+pub use operations::{Operations, Output, System};
 
 /// What every temporary file's name begins with.
 const TEMPORARY: &str = ".dgtr-";
 /// Damaged files of one name that are kept apart; the last one is replaced by further ones.
 const MAX_DAMAGED: u32 = 99;
-
-/// What a file system is asked to do. Reading is done directly: it changes nothing.
-pub trait Operations: fmt::Debug + Send + Sync {
-    /// Makes one folder, whose parent is there.
-    ///
-    /// # Errors
-    /// The system's.
-    fn make_folder(&self, path: &Path) -> io::Result<()>;
-    /// Opens a new, empty file for writing; one of that name loses its content.
-    ///
-    /// # Errors
-    /// The system's.
-    fn create(&self, path: &Path) -> io::Result<Box<dyn Output>>;
-    /// Opens a file for writing behind its end, made if absent.
-    ///
-    /// # Errors
-    /// The system's.
-    fn append(&self, path: &Path) -> io::Result<Box<dyn Output>>;
-    /// Gives a file a second name.
-    ///
-    /// # Errors
-    /// The system's; FAT has no links.
-    fn link(&self, from: &Path, to: &Path) -> io::Result<()>;
-    /// Moves a file or folder within the file system, in place of a file of the new name.
-    ///
-    /// # Errors
-    /// The system's.
-    fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
-    /// Removes a file.
-    ///
-    /// # Errors
-    /// The system's.
-    fn remove(&self, path: &Path) -> io::Result<()>;
-    /// Makes the names in a folder durable.
-    ///
-    /// # Errors
-    /// The system's.
-    fn sync_folder(&self, path: &Path) -> io::Result<()>;
-}
-
-/// A file being written.
-pub trait Output: Write + fmt::Debug + Send {
-    /// Makes the content durable.
-    ///
-    /// # Errors
-    /// The system's: the disk may report only here that it is full or broken.
-    fn sync(&mut self) -> io::Result<()>;
-}
-
-impl Output for File {
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_all()
-    }
-}
-
-/// The machine's own file system.
-#[derive(Clone, Copy, Debug)]
-pub struct System;
-
-impl Operations for System {
-    fn make_folder(&self, path: &Path) -> io::Result<()> {
-        std::fs::create_dir(path)
-    }
-
-    fn create(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        Ok(Box::new(File::create(path)?))
-    }
-
-    fn append(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        Ok(Box::new(File::options().append(true).create(true).open(path)?))
-    }
-
-    fn link(&self, from: &Path, to: &Path) -> io::Result<()> {
-        std::fs::hard_link(from, to)
-    }
-
-    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
-        std::fs::rename(from, to)
-    }
-
-    fn remove(&self, path: &Path) -> io::Result<()> {
-        std::fs::remove_file(path)
-    }
-
-    fn sync_folder(&self, path: &Path) -> io::Result<()> {
-        File::open(path)?.sync_all()
-    }
-}
 
 /// What failed, and the system's word on it.
 #[derive(Debug, thiserror::Error)]
@@ -259,14 +174,12 @@ impl Disk {
     /// # Errors
     /// The system's.
     pub fn append_lines(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        match std::fs::read(path) {
-            Ok(bytes) => {
-                let whole = bytes.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
-                // A hole that the file system left where lines should be ends the file as well.
-                let whole = bytes[..whole].iter().position(|&b| b == 0).unwrap_or(whole);
-                let whole = bytes[..whole].iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
-                if whole < bytes.len() {
-                    self.replace(path, |out| out.write_all(&bytes[..whole]))?;
+        match File::open(path) {
+            Ok(mut file) => {
+                let whole = whole_lines(&file)?;
+                if whole < file.metadata()?.len() {
+                    file.rewind()?;
+                    self.replace(path, |mut out| io::copy(&mut file.take(whole), &mut out).map(|_| ()))?;
                 }
             }
             Err(e) if e.kind() == ErrorKind::NotFound => self.make_folders(folder_of(path))?,
@@ -337,10 +250,26 @@ impl Disk {
     /// Removes the temporary files that a power cut or a kill left directly in `folder`, which nobody else may be writing
     /// to; returns how many. A folder that is not there holds none.
     pub fn sweep(&self, folder: &Path) -> usize {
+        self.sweep_those(folder, |_| true)
+    }
+
+    /// As [`Disk::sweep`], where other processes write, too: only what those left that are no more.
+    pub fn sweep_abandoned(&self, folder: &Path) -> usize {
+        let processes = Path::new("/proc");
+        let is_over = |maker: &str| maker.parse::<u32>().is_ok() && !processes.join(maker).exists();
+        self.sweep_those(folder, |maker| processes.join("self").exists() && is_over(maker))
+    }
+
+    /// Removes the temporary files whose maker's process number `fits`.
+    fn sweep_those(&self, folder: &Path, fits: impl Fn(&str) -> bool) -> usize {
         let Ok(entries) = std::fs::read_dir(folder) else { return 0 };
-        let temporary = |name: &std::ffi::OsStr| name.as_encoded_bytes().starts_with(TEMPORARY.as_bytes());
-        let left = entries.flatten().filter(|e| temporary(&e.file_name()) && e.file_type().is_ok_and(|t| t.is_file()));
-        left.filter(|e| self.0.remove(&e.path()).is_ok()).count()
+        let wanted = |entry: &std::fs::DirEntry| {
+            let name = entry.file_name();
+            let named = name.to_str().and_then(|n| n.strip_prefix(TEMPORARY));
+            named.is_some_and(|n| fits(n.split('-').next().unwrap_or(n)))
+                && entry.file_type().is_ok_and(|t| t.is_file())
+        };
+        entries.flatten().filter(wanted).filter(|e| self.0.remove(&e.path()).is_ok()).count()
     }
 }
 
@@ -384,6 +313,25 @@ fn temporary_beside(path: &Path) -> PathBuf {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let n = NEXT.fetch_add(1, Ordering::Relaxed);
     folder_of(path).join(format!("{TEMPORARY}{}-{n}", std::process::id()))
+}
+
+/// Bytes of the whole lines a file begins with. A hole that the file system left where lines should be ends them as well.
+fn whole_lines(file: &File) -> io::Result<u64> {
+    let (mut reader, mut at, mut whole) = (BufReader::new(file), 0, 0);
+    loop {
+        let bytes = reader.fill_buf()?;
+        let hole = bytes.iter().position(|&b| b == 0);
+        let sound = &bytes[..hole.unwrap_or(bytes.len())];
+        if let Some(end) = sound.iter().rposition(|&b| b == b'\n') {
+            whole = at + end as u64 + 1;
+        }
+        if hole.is_some() || bytes.is_empty() {
+            return Ok(whole);
+        }
+        let read = bytes.len();
+        at += read as u64;
+        reader.consume(read);
+    }
 }
 
 /// The folder a file lies in.

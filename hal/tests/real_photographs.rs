@@ -17,6 +17,11 @@ use hal::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot};
 use hal::replay::{Playlist, PlaylistItem, ReplaySettings, play};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
+
 const LENS: CameraSettings = CameraSettings {
     width: 640,
     height: 480,
@@ -30,13 +35,7 @@ const LENS: CameraSettings = CameraSettings {
 
 /// The data set's folder, if the shared data is there.
 fn sheffield() -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA").map_or_else(|| PathBuf::from("../../shared"), PathBuf::from);
-    let folder = root.join("data/sheffield_cross");
-    if folder.join("gps.csv").exists() {
-        return Some(folder);
-    }
-    println!("skipped: {} is not there (set DGTR_DATA)", folder.display());
-    None
+    shared("data/sheffield_cross")
 }
 
 /// Seconds of the day of an EXIF time.

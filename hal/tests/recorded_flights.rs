@@ -21,20 +21,13 @@ use hal::time::MonotonicClock;
 use hal::traits::{Camera, Link, PictureClues};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
+
 /// SITL's home.
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84265, lon_deg: -91.99390, alt_m: 158.6 };
-
-/// The file, if the shared data is there.
-fn shared(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA").map_or_else(|| PathBuf::from("../../shared"), PathBuf::from);
-    let path = root.join("data").join(name);
-    if path.exists() {
-        Some(path)
-    } else {
-        println!("skipped: {} is not there (set DGTR_DATA)", path.display());
-        None
-    }
-}
 
 fn trimmed() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/run8_trimmed.tlog")
@@ -185,7 +178,7 @@ fn forty_exposures_of_a_survey_become_forty_frames_within_reach_of_the_truth() {
     let (position, attitude) = survey_errors(&trimmed(), in_time);
     assert!(position[0] <= 0.15 && attitude[0] <= 1.0, "{position:?} m {attitude:?}°");
     for name in ["sitl/run8/survey.tlog", "sitl/runcam/survey.tlog"] {
-        if let Some(path) = shared(name) {
+        if let Some(path) = shared(&format!("data/{name}")) {
             let (position, attitude) = survey_errors(&path, in_time);
             assert!(position[0] <= 0.15 && attitude[0] <= 1.0, "{name}: {position:?} m {attitude:?}°");
         }
@@ -251,7 +244,7 @@ fn a_truncated_log_is_reported_and_what_came_before_is_used() {
 
 #[test]
 fn an_old_log_with_damaged_frames_is_read_to_its_end() {
-    let Some(path) = shared("logs/dronekit_flight.tlog") else { return };
+    let Some(path) = shared("data/logs/dronekit_flight.tlog") else { return };
     let settings = VehicleSettings { system_id: 0, ..settings(&path) };
     let (_, _, counters) = play(&settings, Vec::new());
     // An independent reader (pymavlink) finds the same 75,477 good frames and 1,314 damaged ones.

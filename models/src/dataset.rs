@@ -3,7 +3,7 @@
 //! of themselves. Opening reads the small files only; pictures are decoded
 //! one at a time, so that a thousand of them need no more memory than one.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use config::geodesy::Geodetic;
@@ -13,45 +13,25 @@ use image::imageops;
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use crate::card::{Card, CardOptions};
 use crate::formats::reconstruction::{LensDescription, Reconstruction, Shot};
-use crate::formats::{FormatError, colmap, opensfm, split, telemetry};
+use crate::formats::telemetry;
 use crate::picture::{PictureError, decode_at_least};
 use crate::undistort::undistort;
 
 mod ahead;
 mod error;
 mod frame;
+mod points;
+mod selection;
 mod sources;
 
 pub use error::DatasetError;
 pub use frame::DatasetFrame;
-use sources::{file_name, frames, reconstruction};
+pub use points::SparsePoint;
+pub use selection::{Region, Split};
+use sources::{frames, reconstruction};
 
-/// Without a `split.json` every eighth picture is held out, as 3DGS and its successors do.
-const TEST_EVERY: usize = 8;
-/// Sparse points held at most (some 100 bytes each); initialisation needs far fewer.
-const MAX_POINTS: usize = 2_000_000;
 /// What a pose from bundle adjustment is worth: never exact, but far better than any GPS.
 const RECONSTRUCTED_SIGMA: PoseSigma = PoseSigma { position_m: [0.02; 3], rotation_rad: [5e-4; 3] };
-
-/// An area flown by one aircraft.
-#[derive(Clone, Debug)]
-pub struct Region {
-    /// Its name (`--region`).
-    pub name: String,
-    /// Corners counter-clockwise, ENU metres.
-    pub polygon: Vec<[f64; 2]>,
-    /// Frame numbers by list name.
-    pub lists: BTreeMap<String, Vec<usize>>,
-}
-
-/// Which frames are for what, as indices into [`Dataset::frames`].
-#[derive(Clone, Debug, Default)]
-pub struct Split {
-    /// `train`, `test`, …
-    pub lists: BTreeMap<String, Vec<usize>>,
-    /// May be empty.
-    pub regions: Vec<Region>,
-}
 
 /// Where a frame's pose is taken from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,19 +40,6 @@ pub enum PoseSource {
     Dataset,
     /// Raw GPS and gimbal angles.
     Telemetry,
-}
-
-/// A triangulated point.
-#[derive(Clone, Debug)]
-pub struct SparsePoint {
-    /// ENU metres.
-    pub position: [f64; 3],
-    /// 8-bit sRGB.
-    pub color: [u8; 3],
-    /// Mean reprojection error, pixels at full size.
-    pub error_px: f64,
-    /// Frames that saw it, sorted; empty when the file has no tracks.
-    pub frames: Vec<u32>,
 }
 
 /// An opened data set.
@@ -203,51 +170,6 @@ impl Dataset {
         Reconstruction { shots: shots.collect(), origin: self.origin }
     }
 
-    fn with_split(mut self) -> Result<Self, DatasetError> {
-        let file = self.root.join("split.json");
-        self.split = if file.is_file() { self.resolve(&file)? } else { self.every_eighth() };
-        Ok(self)
-    }
-
-    /// The frames of a split, restricted to a region's when one is named; `all` is always a split.
-    ///
-    /// # Errors
-    /// A name that the data set does not have.
-    pub fn select(&self, split: &str, region: Option<&str>) -> Result<Vec<usize>, DatasetError> {
-        let unknown = |kind, name: &str, known: Vec<&str>| DatasetError::Unknown {
-            root: self.root.clone(),
-            kind,
-            name: name.to_owned(),
-            known: if known.is_empty() { "none".to_owned() } else { known.join(", ") },
-        };
-        let all: Vec<usize> = (0..self.frames.len()).collect();
-        let whole = match self.split.lists.get(split) {
-            Some(list) => list,
-            None if split == "all" => &all,
-            None => {
-                return Err(unknown(
-                    "split",
-                    split,
-                    self.split.lists.keys().map(String::as_str).chain(["all"]).collect(),
-                ));
-            }
-        };
-        let Some(name) = region else { return Ok(whole.clone()) };
-        let regions = &self.split.regions;
-        let Some(region) = regions.iter().find(|r| r.name == name) else {
-            return Err(unknown("region", name, regions.iter().map(|r| r.name.as_str()).collect()));
-        };
-        Ok(match region.lists.get(split) {
-            Some(list) => list.clone(),
-            None => whole.iter().copied().filter(|i| region.lists.values().any(|l| l.contains(i))).collect(),
-        })
-    }
-
-    /// The region of this name.
-    pub fn region(&self, name: &str) -> Option<&Region> {
-        self.split.regions.iter().find(|r| r.name == name)
-    }
-
     fn frame(&self, i: usize) -> Result<&DatasetFrame, DatasetError> {
         self.frames.get(i).ok_or_else(|| {
             DatasetError::Request(format!(
@@ -322,117 +244,6 @@ impl Dataset {
         }
         let time_ns = frame.prior.map_or(0, |p| p.time_ns);
         Ok(PosedImage { name: frame.name.clone(), time_ns, image, view: View { intrinsics, pose }, sigma })
-    }
-
-    /// The coloured sparse points of the reconstruction; none where it has no file of them.
-    ///
-    /// # Errors
-    /// A file of the reconstruction is damaged.
-    pub fn sparse_points(&self) -> Result<Vec<SparsePoint>, DatasetError> {
-        self.points_where(&|_| true)
-    }
-
-    /// The points that at least two of `frames` saw: what a strict held-out test may start from. Points without
-    /// tracks (some writers leave them out) are kept.
-    ///
-    /// # Errors
-    /// As [`Dataset::sparse_points`].
-    pub fn sparse_points_of(&self, frames: &[usize]) -> Result<Vec<SparsePoint>, DatasetError> {
-        let chosen: std::collections::HashSet<u32> = frames.iter().map(|&i| i as u32).collect();
-        self.points_where(&|p| p.frames.is_empty() || p.frames.iter().filter(|f| chosen.contains(f)).count() >= 2)
-    }
-
-    /// Whatever the size of the file, at most [`MAX_POINTS`] points are held: every second is let go each time the room is
-    /// full, so that what remains is an even sample.
-    fn points_where(&self, wanted: &dyn Fn(&SparsePoint) -> bool) -> Result<Vec<SparsePoint>, DatasetError> {
-        let (mut points, mut seen, mut every) = (Vec::new(), 0u64, 1u64);
-        let mut take = |point: SparsePoint| {
-            if !wanted(&point) {
-                return;
-            }
-            if seen.is_multiple_of(every) {
-                if points.len() == MAX_POINTS {
-                    let mut number = 0;
-                    points.retain(|_| {
-                        number += 1;
-                        number % 2 == 1
-                    });
-                    every *= 2;
-                }
-                if seen.is_multiple_of(every) {
-                    points.push(point);
-                }
-            }
-            seen += 1;
-        };
-        if let Some(model) = colmap::Model::find(&self.root) {
-            let by_name: HashMap<&str, u32> =
-                self.frames.iter().enumerate().map(|(i, f)| (f.name.as_str(), i as u32)).collect();
-            let number = |name: &str| by_name.get(name).or_else(|| by_name.get(file_name(name))).copied();
-            let by_id: HashMap<u32, u32> =
-                model.images()?.iter().filter_map(|m| Some((m.id, number(&m.name)?))).collect();
-            let dropped = model.points(&mut |p| {
-                let mut frames: Vec<u32> = p.images.iter().filter_map(|id| by_id.get(id).copied()).collect();
-                frames.sort_unstable();
-                let position = p.position.to_array();
-                take(SparsePoint { position, color: p.color, error_px: p.error, frames });
-            })?;
-            if dropped > 0 {
-                let file = model.file("points3D");
-                tracing::warn!("{}: {dropped} points are not at a finite position and were left out", file.display());
-            }
-        } else if let Some(file) = opensfm::find(&self.root) {
-            opensfm::points(&file, &mut |position, color| {
-                take(SparsePoint { position, color, error_px: 0.0, frames: Vec::new() });
-            })?;
-        }
-        if every > 1 {
-            tracing::warn!("{}: of {seen} sparse points every {every}th is kept", self.root.display());
-        }
-        Ok(points)
-    }
-
-    fn every_eighth(&self) -> Split {
-        let mut by_name: Vec<usize> = (0..self.frames.len()).collect();
-        by_name.sort_by(|&a, &b| self.frames[a].name.cmp(&self.frames[b].name));
-        let mut test: Vec<usize> = by_name.iter().copied().step_by(TEST_EVERY).collect();
-        test.sort_unstable();
-        let train = (0..self.frames.len()).filter(|i| test.binary_search(i).is_err()).collect();
-        Split { lists: BTreeMap::from([("test".to_owned(), test), ("train".to_owned(), train)]), regions: Vec::new() }
-    }
-
-    fn resolve(&self, path: &Path) -> Result<Split, DatasetError> {
-        let file = split::read(path)?;
-        let by_name: HashMap<&str, usize> = self.frames.iter().enumerate().map(|(i, f)| (f.name.as_str(), i)).collect();
-        let lists = |lists: BTreeMap<String, Vec<String>>| -> Result<BTreeMap<String, Vec<usize>>, DatasetError> {
-            lists
-                .into_iter()
-                .map(|(list, names)| {
-                    let numbers = names.iter().map(|n| {
-                        by_name.get(n.as_str()).or_else(|| by_name.get(file_name(n))).copied().ok_or_else(|| {
-                            FormatError::invalid(
-                                path,
-                                format!("list {list:?} names {n:?}, which is not a picture of this data set"),
-                            )
-                            .into()
-                        })
-                    });
-                    let numbers = numbers.collect::<Result<Vec<_>, DatasetError>>()?;
-                    Ok((list, numbers))
-                })
-                .collect()
-        };
-        let mut regions = Vec::with_capacity(file.regions.len());
-        for r in file.regions {
-            let mut lists = lists(r.lists)?;
-            // A region calls its `train_dense` list `images`.
-            if let Some(images) = lists.get("images").cloned() {
-                lists.entry("train_dense".to_owned()).or_insert(images);
-            }
-            let polygon = vec![[r.min[0], r.min[1]], [r.max[0], r.min[1]], [r.max[0], r.max[1]], [r.min[0], r.max[1]]];
-            regions.push(Region { name: r.name, polygon, lists });
-        }
-        Ok(Split { lists: lists(file.lists)?, regions })
     }
 }
 

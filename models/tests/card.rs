@@ -1,7 +1,7 @@
 //! Promises of a card: what pictures say of themselves becomes priors, and what is wrong with them becomes one line.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use config::geodesy::{EnuFrame, Geodetic};
 use glam::DVec3;
@@ -10,6 +10,11 @@ use models::card::write::{DJI, PIX4D, Tags};
 use models::card::{AttitudeSource, Card, CardError, CardOptions, CardPicture, Exposure, Fix};
 use models::dataset::{Dataset, PoseSource};
 use models::formats::reconstruction::Focal;
+
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
 
 const HOME: Geodetic = Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 158.5 };
 const START_NS: u64 = 1_466_699_519_000_000_000;
@@ -327,20 +332,9 @@ fn tiff_and_png_are_read_like_jpeg() {
     }
 }
 
-fn reference(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    let path = root.join("data").join(name);
-    if path.is_dir() {
-        return Some(path);
-    }
-    println!("skipped: {} is not there (set DGTR_DATA to the folder that holds data/)", path.display());
-    None
-}
-
 #[test]
 fn a_real_card_has_its_eighteen_pictures_forty_metres_above_the_take_off() {
-    let Some(root) = reference("brighton_beach_card") else { return };
+    let Some(root) = shared("data/brighton_beach_card") else { return };
     let card = open(&root);
     assert_eq!((card.pictures.len(), card.notes.len()), (18, 0), "{:?}", card.notes);
     for p in &card.pictures {
@@ -355,7 +349,7 @@ fn a_real_card_has_its_eighteen_pictures_forty_metres_above_the_take_off() {
 
 #[test]
 fn phantoms_maker_notes_have_the_gimbals_angles() {
-    let Some(root) = reference("sheffield_cross") else { return };
+    let Some(root) = shared("data/sheffield_cross") else { return };
     let card = open(&root.join("images"));
     assert_eq!(card.pictures.len(), 86);
     let tilted = card.pictures.iter().filter(|p| (-0.98..-0.95).contains(&p.prior.pose.forward().z)).count();

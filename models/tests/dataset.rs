@@ -1,13 +1,18 @@
 //! Promises of the data set loader, on small sets written here and, where they are, on the reference sets.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use models::camera::Pose;
 use models::dataset::{Dataset, DatasetError, PoseSource};
 use models::formats::transforms::{opengl_to_pose, pose_to_opengl};
+
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
 
 fn picture(path: &Path, w: u32, h: u32) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -201,21 +206,10 @@ fn errors_name_the_file_and_what_is_wrong() {
     assert!(Dataset::open(dir.path()).unwrap_err().to_string().contains("frames"));
 }
 
-fn reference(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    let path = root.join("data").join(name);
-    if path.is_dir() {
-        return Some(path);
-    }
-    println!("skipped: {} is not there (set DGTR_DATA to the folder that holds data/)", path.display());
-    None
-}
-
 #[test]
 fn reference_transforms_and_colmap_agree() {
     for name in ["sheffield_cross", "fox", "brighton_beach"] {
-        let Some(root) = reference(name) else { return };
+        let Some(root) = shared(&format!("data/{name}")) else { return };
         let set = Dataset::open(&root).unwrap();
         let images = models::formats::colmap::read_images(&root.join("sparse/0/images.bin")).unwrap();
         assert_eq!(images.len(), set.frames.len());
@@ -229,7 +223,7 @@ fn reference_transforms_and_colmap_agree() {
 
 #[test]
 fn reference_points_project_onto_their_own_colour() {
-    let Some(root) = reference("sheffield_cross") else { return };
+    let Some(root) = shared("data/sheffield_cross") else { return };
     let set = Dataset::open(&root).unwrap();
     let points = set.sparse_points().unwrap();
     assert_eq!(points.len(), 15_000);
@@ -251,7 +245,7 @@ fn reference_points_project_onto_their_own_colour() {
 #[test]
 fn reference_telemetry_is_near_the_reconstruction() {
     for (name, bound_m, bound_deg) in [("sheffield_cross", 2.0, 6.0), ("brighton_beach", 2.0, 7.0)] {
-        let Some(root) = reference(name) else { return };
+        let Some(root) = shared(&format!("data/{name}")) else { return };
         let set = Dataset::open(&root).unwrap();
         let mut worst = (0.0f64, 0.0f64);
         for frame in &set.frames {

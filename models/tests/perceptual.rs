@@ -7,6 +7,11 @@ use models::onnx::depth::DepthNetwork;
 use models::onnx::metric::PerceptualMetric;
 use models::onnx::session::find_library;
 
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
+
 fn no_runtime() -> bool {
     let missing = find_library().is_err();
     if missing {
@@ -83,12 +88,7 @@ fn inverse_depth_turns_its_sign_and_a_network_of_any_size_keeps_the_pictures_sha
 
 #[test]
 fn st_lpips_grows_with_damage_and_forgives_a_shift_of_one_pixel() {
-    let data = std::env::var("DGTR_DATA").map_or_else(|_| PathBuf::from("../../shared"), PathBuf::from);
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(data).join("models/stlpips_alex.onnx");
-    if no_runtime() || !file.is_file() {
-        println!("skipped: no {}", file.display());
-        return;
-    }
+    let Some(file) = shared("models/stlpips_alex.onnx").filter(|_| !no_runtime()) else { return };
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("st-lpips.toml");
     let text = format!(

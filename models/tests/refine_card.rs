@@ -5,7 +5,6 @@
 
 use std::f64::consts::PI;
 use std::ops::ControlFlow;
-use std::path::PathBuf;
 
 use config::refine::RefineSettings;
 use glam::DQuat;
@@ -18,14 +17,10 @@ use pose_errors::pose_errors;
 #[path = "support/pose_errors.rs"]
 mod pose_errors;
 
-fn data(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA").map_or_else(|| "../../shared".into(), PathBuf::from);
-    let folder = root.join("data").join(name);
-    if !folder.is_dir() {
-        println!("skipped: {} is not there (set DGTR_DATA)", folder.display());
-    }
-    folder.is_dir().then_some(folder)
-}
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
 
 /// As `dgtr train` settles a card, with time enough on a busy machine.
 fn settle(set: &Dataset, side: u32) -> Option<(Refiner, RefineReport)> {
@@ -66,7 +61,9 @@ fn focal(refiner: &Refiner, set: &Dataset) -> f64 {
 
 #[test]
 fn a_real_card_is_settled_to_a_decimetre_and_its_six_turned_pictures_are_found() {
-    let (Some(card), Some(reference)) = (data("brighton_beach_card"), data("brighton_beach")) else { return };
+    let (Some(card), Some(reference)) = (shared("data/brighton_beach_card"), shared("data/brighton_beach")) else {
+        return;
+    };
     let (set, truth) = (Dataset::open(&card).unwrap(), Dataset::open(&reference).unwrap());
     let Some((refiner, report)) = settle(&set, 1280) else { return };
     let (mut turned, mut found, mut wanted) = (Vec::new(), Vec::new(), Vec::new());
@@ -100,7 +97,7 @@ fn a_real_card_is_settled_to_a_decimetre_and_its_six_turned_pictures_are_found()
 
 #[test]
 fn the_focal_length_of_an_oblique_block_is_estimated_and_halves_the_error_of_its_exif() {
-    let Some(reference) = data("sheffield_cross") else { return };
+    let Some(reference) = shared("data/sheffield_cross") else { return };
     let truth = Dataset::open(&reference).unwrap();
     let card = tempfile::tempdir().unwrap();
     for i in truth.select("train", None).unwrap() {

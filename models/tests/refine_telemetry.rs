@@ -8,23 +8,18 @@ use models::camera::Pose;
 use models::dataset::{Dataset, PoseSource};
 use models::refine::{RefineReport, Refiner};
 use pose_errors::{PoseErrors, pose_errors};
-use std::path::PathBuf;
 use std::time::Instant;
 
 #[path = "support/pose_errors.rs"]
 mod pose_errors;
 
-fn data(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA").map(PathBuf::from).unwrap_or_else(|| "../../shared".into());
-    let folder = root.join("data").join(name);
-    if !folder.is_dir() {
-        println!("skipped: {} is not there (set DGTR_DATA)", folder.display());
-    }
-    folder.is_dir().then_some(folder)
-}
+#[path = "../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
 
 fn refine(name: &str, split: &str, settings: &RefineSettings) -> Option<(PoseErrors, PoseErrors, RefineReport)> {
-    let dataset = Dataset::open(&data(name)?).unwrap();
+    let dataset = Dataset::open(&shared(&format!("data/{name}"))?).unwrap();
     let mut refiner = match Refiner::open(settings) {
         Ok(r) => r,
         Err(e) => {

@@ -13,15 +13,14 @@ use config::geodesy::Geodetic;
 use config::mission::CameraSettings;
 use hal::camera::Picture;
 use hal::error::HalError;
-use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
-use models::formats::{FormatError, read_bounded, transforms};
+use models::camera::{Intrinsics, Pose, PosedImage, View};
+use models::formats::{FormatError, transforms};
 use models::picture;
-use serde::{Deserialize, Serialize};
 
-/// The list's name, as nerfstudio reads it.
-const LIST: &str = "transforms.json";
-/// 4,096 key frames (the most a mission allows) at 2 KiB each.
-const LIST_LIMIT: u64 = 8 << 20;
+mod list;
+
+use list::{Entry, Extra, List, name, read_list};
+
 /// Fewer key frames than this are never thinned out: too little to build from.
 const MIN_KEPT: usize = 8;
 
@@ -83,77 +82,6 @@ impl StoreError {
     }
 }
 
-#[derive(Serialize, Deserialize)]
-struct List {
-    camera_model: String,
-    fl_x: f32,
-    fl_y: f32,
-    cx: f32,
-    cy: f32,
-    k1: f32,
-    k2: f32,
-    p1: f32,
-    p2: f32,
-    w: u32,
-    h: u32,
-    enu_origin_wgs84: Origin,
-    frames: Vec<Entry>,
-}
-
-impl List {
-    /// The lens of every picture.
-    fn intrinsics(&self) -> Intrinsics {
-        Intrinsics { width: self.w, height: self.h, fx: self.fl_x, fy: self.fl_y, cx: self.cx, cy: self.cy }
-    }
-
-    /// Whether a picture can lie where it says, and be trained from: what it names may be removed later, and is ours only there.
-    fn is_usable(&self, frame: &Entry) -> bool {
-        let named = frame.file_path.strip_prefix("images/").is_some_and(|n| !n.is_empty() && !n.contains(['/', '\0']));
-        named && View { intrinsics: self.intrinsics(), pose: frame.dgtr.pose }.is_usable()
-    }
-}
-
-#[derive(Serialize, Deserialize)]
-struct Origin {
-    lat: f64,
-    lon: f64,
-    alt: f64,
-}
-
-#[derive(Serialize, Deserialize)]
-struct Entry {
-    file_path: String,
-    transform_matrix: [[f64; 4]; 4],
-    dgtr: Extra,
-}
-
-/// What nerfstudio's format has no field for.
-#[derive(Clone, Copy, Serialize, Deserialize)]
-struct Extra {
-    time_ns: u64,
-    pose: Pose,
-    /// Null where nothing is known: JSON has no infinity.
-    position_sigma_m: [Option<f32>; 3],
-    rotation_sigma_rad: [Option<f32>; 3],
-}
-
-impl Extra {
-    fn new(frame: &PosedImage) -> Self {
-        let known = |sigma: [f32; 3]| sigma.map(|s| s.is_finite().then_some(s));
-        Self {
-            time_ns: frame.time_ns,
-            pose: frame.view.pose,
-            position_sigma_m: known(frame.sigma.position_m),
-            rotation_sigma_rad: known(frame.sigma.rotation_rad),
-        }
-    }
-
-    fn sigma(&self) -> PoseSigma {
-        let or_infinite = |sigma: [Option<f32>; 3]| sigma.map(|s| s.unwrap_or(f32::INFINITY));
-        PoseSigma { position_m: or_infinite(self.position_sigma_m), rotation_rad: or_infinite(self.rotation_sigma_rad) }
-    }
-}
-
 /// A key frame on its way from the camera.
 #[derive(Clone, Debug)]
 pub struct KeyFrame {
@@ -186,23 +114,8 @@ impl KeyframeStore {
         lens: &Intrinsics,
         origin: Geodetic,
     ) -> Result<Self, StoreError> {
-        let path = folder.join(LIST);
-        let [k1, k2, p1, p2] = camera.distortion;
-        let mut list = List {
-            camera_model: if camera.distortion == [0.0; 4] { "PINHOLE" } else { "OPENCV" }.into(),
-            fl_x: camera.fx,
-            fl_y: camera.fy,
-            cx: camera.cx,
-            cy: camera.cy,
-            k1,
-            k2,
-            p1,
-            p2,
-            w: camera.width,
-            h: camera.height,
-            enu_origin_wgs84: Origin { lat: origin.lat_deg, lon: origin.lon_deg, alt: origin.alt_m },
-            frames: Vec::new(),
-        };
+        let path = folder.join(list::FILE);
+        let mut list = List::new(camera, origin);
         disk.sweep(folder);
         disk.sweep(&folder.join("images"));
         let aside = |e| FormatError::Io { path: path.clone(), action: "setting aside", source: e };
@@ -373,7 +286,7 @@ impl KeyframeStore {
         match relief {
             Relief::OldCheckpoints => {
                 // Both, whatever becomes of the first; they are kept again from the next writes on.
-                let older = [previous(&self.folder.join(LIST)), previous(model)];
+                let older = [previous(&self.folder.join(list::FILE)), previous(model)];
                 older.map(|path| path.is_file() && self.disk.remove(&path).is_ok()).contains(&true)
             }
             Relief::CoveredPictures => self.thin_out() > 0,
@@ -381,26 +294,11 @@ impl KeyframeStore {
     }
 
     fn save(&self) -> Result<(), StoreError> {
-        let path = self.folder.join(LIST);
+        let path = self.folder.join(list::FILE);
         let json = serde_json::to_vec_pretty(&self.list)
             .map_err(|e| StoreError::Picture { path: path.clone(), what: e.to_string() })?;
         Ok(self.disk.replace_keeping(&path, |out| out.write_all(&json)).map_err(|e| FormatError::disk(&path, e))?)
     }
-}
-
-fn read_list(path: &Path) -> Result<List, FormatError> {
-    let bytes = read_bounded(path, LIST_LIMIT)?;
-    let invalid = |what: String| FormatError::Invalid { path: path.into(), what };
-    let list: List = serde_json::from_slice(&bytes).map_err(|e| invalid(format!("not a list of key frames: {e}")))?;
-    match list.frames.iter().find(|f| !list.is_usable(f)) {
-        Some(f) => Err(invalid(format!("key frame {:?} has no place in the folder, or no pose", f.file_path))),
-        None => Ok(list),
-    }
-}
-
-/// Key frames are known by the name of their file.
-fn name(file_path: &str) -> String {
-    file_path.rsplit('/').next().unwrap_or(file_path).to_owned()
 }
 
 #[cfg(test)]

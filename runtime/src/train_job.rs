@@ -2,21 +2,22 @@
 //! cut or a crash costs at most the time since the last checkpoint.
 
 use std::collections::HashSet;
-use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use config::disk::Disk;
+use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
 use config::mission::{KeyframeSettings, NetworkSettings};
 use config::plan::Plan;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use hal::time::MonotonicClock;
 use models::card::CardOptions;
 use models::dataset::{Dataset, PoseSource, scaled};
 use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
-use vulkan::trainer::{RunBudget, StopReason};
+use vulkan::trainer::RunBudget;
 
 use crate::console::Progress;
 use crate::engine::device::DeviceRequest;
@@ -24,12 +25,16 @@ use crate::engine::source::Folder;
 use crate::engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
 use crate::error::JobError;
 use crate::evaluate;
+use crate::failsafe::Failsafe;
+use crate::health::Health;
 use crate::interrupt::Interrupt;
 use crate::run_json::RunReport;
 use crate::transfer::PoseTransfer;
+use slices::{REST, Slices};
 
 mod card;
 pub mod log;
+mod slices;
 
 /// Everything a training needs to know; see `dgtr train --help`.
 #[derive(Clone, Debug)]
@@ -46,6 +51,8 @@ pub struct TrainJob {
     pub region: Option<String>,
     /// The rule by which a flight chooses key frames; `None` takes every picture.
     pub keyframes: Option<KeyframeSettings>,
+    /// The thresholds by which a flight spares its computer; `None` trains whatever the computer says.
+    pub failsafe: Option<FailsafeSettings>,
     /// First Gaussians.
     pub init: InitKind,
     /// Poses.
@@ -283,37 +290,26 @@ impl TrainJob {
         Ok(true)
     }
 
-    /// Trains in slices between checkpoints; false when asked to stop before the goal.
+    /// Trains to the goal; false when asked to stop before it.
     fn optimise(&self, engine: &mut Reconstruction, stop: &Interrupt) -> Result<bool, JobError> {
         self.save(engine, false)?;
-        let steps_before = engine.header().steps;
         let settings = self.settings();
-        let budget = RunBudget {
-            steps: self.steps.or(if self.seconds.is_none() { Some(settings.steps) } else { None }),
-            seconds: settings.seconds,
+        let failsafe = self.failsafe.as_ref().map(|limits| {
+            // Nothing bounds the host's memory here.
+            Failsafe::new(Health::new(*limits, u32::MAX, &self.out), limits)
+        });
+        let slices = Slices {
+            budget: RunBudget {
+                steps: self.steps.or(if self.seconds.is_none() { Some(settings.steps) } else { None }),
+                seconds: settings.seconds,
+            },
+            checkpoint_every: Duration::from_secs_f64(self.checkpoint_seconds),
+            steps_before: engine.header().steps,
+            failsafe,
+            clock: MonotonicClock::default(),
+            rest: REST,
         };
-        let mut progress = Progress::new("training", u64::from(budget.steps.unwrap_or(100)));
-        let every = Duration::from_secs_f64(self.checkpoint_seconds);
-        loop {
-            let (last, mut words) = (Instant::now(), String::new());
-            let reason = engine.train(&budget, &mut |step| {
-                let at = budget.steps.map_or((step.progress * 100.0) as u64, |_| steps_before + u64::from(step.step));
-                progress.set(at, || format!("loss {:.4}, {} Gaussians", step.loss, step.gaussians));
-                words = format!("loss {:.4}", step.loss);
-                // Only where saving leaves no trace: the same seed gives the same bytes however slow the machine is.
-                if stop.requested() || (step.settled && last.elapsed() >= every) {
-                    ControlFlow::Break(())
-                } else {
-                    ControlFlow::Continue(())
-                }
-            })?;
-            let over = reason != StopReason::Caller;
-            self.save(engine, over)?;
-            if over || stop.requested() {
-                progress.finish(&format!("{} steps, {words}, {} Gaussians", engine.header().steps, engine.gaussians()));
-                return Ok(over);
-            }
-        }
+        slices.run(engine, stop, &mut |engine, over| self.save(engine, over))
     }
 
     /// The model, and beside it what a continuation needs to know and the model does not say: the same seed gives the same

@@ -9,6 +9,11 @@ use serde_json::Value;
 use support::plane::plane_dataset;
 use support::{refused, run};
 
+#[path = "../shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
+
 fn network(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/networks").join(name)
 }
@@ -105,14 +110,8 @@ fn networks_that_do_not_fit_are_refused_in_one_line_before_anything_begins() {
 }
 
 /// Five pictures of a real survey and a held-out one, as a data set of its own; `None` without the shared data.
-fn six_photographs(at: &Path) -> Option<PathBuf> {
-    let root = std::env::var_os("DGTR_DATA").map(PathBuf::from).unwrap_or_else(|| "../../shared".into());
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join(root);
-    let from = root.join("data/sheffield_cross");
-    if !from.is_dir() {
-        println!("skipped: {} is not there; DGTR_DATA names the folder that holds data/ and models/", from.display());
-        return None;
-    }
+fn six_photographs(at: &Path) -> Option<()> {
+    let from = shared("data/sheffield_cross")?;
     let (train, test) = (["0054", "0058", "0064", "0068", "0072"], ["0062"]);
     let name = |n: &&str| format!("DJI_{n}.jpg");
     let mut world = read_json(&from.join("transforms.json"));
@@ -128,7 +127,7 @@ fn six_photographs(at: &Path) -> Option<PathBuf> {
     std::fs::write(at.join("photos/transforms.json"), world.to_string()).expect("write");
     let split = serde_json::json!({ "train": train.iter().map(name).collect::<Vec<_>>(), "test": test.iter().map(name).collect::<Vec<_>>() });
     std::fs::write(at.join("photos/split.json"), split.to_string()).expect("write");
-    Some(root)
+    Some(())
 }
 
 /// IterMVS (MIT) is no part of this project: it stands for any network a user brings.
@@ -136,11 +135,8 @@ fn six_photographs(at: &Path) -> Option<PathBuf> {
 fn a_trained_network_of_the_users_is_one_line_and_initialises_real_photographs() {
     let dir = tempfile::tempdir().expect("tempdir");
     let at = dir.path();
-    let Some(root) = six_photographs(at) else { return };
-    let file = root.join("models/itermvs_blendedmvs_v3_352x640.onnx");
-    if !file.is_file() {
-        return println!("skipped: {} is not there", file.display());
-    }
+    let Some(()) = six_photographs(at) else { return };
+    let Some(file) = shared("models/itermvs_blendedmvs_v3_352x640.onnx") else { return };
     let manifest = format!(
         "name = 'itermvs'\ncontract = 'pair'\nfile = {file:?}\nlicence = 'MIT'\n[input]\nwidth = 640\nheight = 352\n\
          range = [-1.0, 1.0]\n[pair]\nposes = 'given'\nviews = 3\n"

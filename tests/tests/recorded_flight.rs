@@ -14,18 +14,17 @@ use glam::DQuat;
 use models::dataset::Dataset;
 use support::{Running, run, wait_until};
 
+#[path = "../shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
+
 const PATIENCE: Duration = Duration::from_secs(180);
 
 /// The whole survey of 40 exposures if it is there, else the piece in the repository.
 fn recording() -> PathBuf {
-    let shared = std::env::var_os("DGTR_DATA").map_or_else(|| PathBuf::from("../../shared"), PathBuf::from);
-    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let whole = here.join(&shared).join("data/sitl/run8/survey.tlog");
-    if whole.exists() {
-        return whole;
-    }
-    println!("the whole survey is not there ({}; set DGTR_DATA): flying the piece", whole.display());
-    here.join("data/run8_trimmed.tlog")
+    let piece = || Path::new(env!("CARGO_MANIFEST_DIR")).join("data/run8_trimmed.tlog");
+    shared("data/sitl/run8/survey.tlog").unwrap_or_else(piece)
 }
 
 fn mission(folder: &Path) {

@@ -2,12 +2,15 @@
 //! refined pose is then the truth. Needs the reference data (`DGTR_DATA`); says so and passes without.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
-use std::path::PathBuf;
-
 use models::camera::View;
 use models::dataset::{Dataset, PoseSource};
 use models::refine::Refiner;
 use runtime::transfer::PoseTransfer;
+
+#[path = "../shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
 
 /// Mean distance of a few ground points' projections, pixels.
 fn apart_px(a: &View, b: &View, depth: f64) -> f64 {
@@ -32,10 +35,9 @@ const Y: [f64; 3] = [0.0, 1.0, 0.0];
 
 #[test]
 fn a_held_out_pose_lands_within_a_pixel_of_where_refinement_would_have_put_it() {
-    let root = std::env::var_os("DGTR_DATA").map(PathBuf::from).unwrap_or_else(|| "../../shared".into());
-    let folder = root.join("data/sheffield_cross");
-    if !folder.is_dir() || models::onnx::session::find_library().is_err() {
-        println!("skipped: {} or ONNX Runtime is not there", folder.display());
+    let Some(folder) = shared("data/sheffield_cross") else { return };
+    if models::onnx::session::find_library().is_err() {
+        println!("skipped: ONNX Runtime is not there");
         return;
     }
     let set = Dataset::open(&folder).expect("data set");

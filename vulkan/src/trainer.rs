@@ -214,9 +214,15 @@ impl Trainer {
         self.before = (steps, seconds);
     }
 
+    /// Steps and seconds spent on the schedule, earlier processes' included.
+    pub fn spent(&self) -> (u32, f64) {
+        (self.before.0.saturating_add(self.steps), self.before.1 + self.elapsed_s)
+    }
+
     /// How much of the schedule is over, 0…1.
     pub fn progress(&self) -> f32 {
-        self.settings.progress(self.before.0.saturating_add(self.steps), self.before.1 + self.elapsed_s)
+        let (steps, seconds) = self.spent();
+        self.settings.progress(steps, seconds)
     }
 
     /// Seconds of training since the last [`Trainer::load`].

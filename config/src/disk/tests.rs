@@ -116,3 +116,14 @@ fn what_a_kill_left_is_swept_and_nothing_else() {
     assert_eq!(names(dir.path()), [".profile", "model.dgtr"]);
     assert_eq!(Disk::default().sweep(&dir.path().join("none")), 0);
 }
+
+#[test]
+fn beside_other_processes_only_what_ended_ones_left_is_swept() {
+    let dir = tempfile::tempdir().unwrap();
+    let (running, ended) = (format!(".dgtr-{}-3", std::process::id()), ".dgtr-4294967295-0");
+    for name in [&running, ended, ".dgtr-x", "a1.flight"] {
+        std::fs::write(dir.path().join(name), name).unwrap();
+    }
+    assert_eq!(Disk::default().sweep_abandoned(dir.path()), 1);
+    assert_eq!(names(dir.path()), [running.as_str(), ".dgtr-x", "a1.flight"]);
+}

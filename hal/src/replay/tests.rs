@@ -12,6 +12,11 @@ use crate::sim::companion::accompany;
 use crate::sim::reference::Lens;
 use crate::sim::world::WorldSettings;
 
+#[path = "../../../tests/shared_data.rs"]
+mod shared_data;
+
+use shared_data::shared;
+
 const HOME: Geodetic = Geodetic { lat_deg: 28.04, lon_deg: -82.7, alt_m: -69.7 };
 
 /// A zig-zag of tilted photographs, 6 s apart, with files in `folder`.
@@ -104,15 +109,7 @@ fn a_missing_photograph_is_named() {
 
 /// The recorded SITL flights, where they are on this machine.
 fn recorded(name: &str) -> Option<PathBuf> {
-    let data = std::env::var_os("DGTR_DATA")
-        .map(PathBuf::from)
-        .unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"));
-    let path = data.join("data/sitl").join(name).join("survey.tlog");
-    if !path.exists() {
-        println!("skipped: {} is not there (set DGTR_DATA)", path.display());
-        return None;
-    }
-    Some(path)
+    shared(&format!("data/sitl/{name}/survey.tlog"))
 }
 
 #[test]

@@ -1,27 +1,26 @@
 //! Exposures on their way to posed pictures: their poses are looked up as soon as the track reaches past them and kept for the
 //! whole flight, their pictures when they come. What found no partner in flight is compared once more at its end.
 
-use std::collections::VecDeque;
 use std::path::PathBuf;
 
 use super::{CameraPose, Event, PosedPicture, Unmatched, UnmatchedReason, Vehicle};
 use crate::camera::{Picture, exif_pose};
-use crate::error::Error;
-use crate::error::{ErrorKind, HalError};
-use crate::matcher::reconcile::reconcile;
+use crate::error::{Error, ErrorKind, HalError};
 use crate::matcher::{Outcome, Reason};
-use crate::pose::{BodyPose, PoseError};
+use crate::pose::PoseError;
 use crate::traits::{Camera, Clock, Link, PictureClues, PoseSource};
 use crate::trigger::{Trigger, TriggerKind};
 
-/// Exposures of one flight that are kept with their pose, and pictures put aside: an hour at one a second.
-const EXPOSURES: usize = 4096;
-const PUT_ASIDE: usize = 4096;
+mod ledger;
+
+pub(super) use ledger::Exposures;
+use ledger::{EXPOSURES, Exposure, PUT_ASIDE, Partner, PutAside};
+
 /// Poses are found within seconds: only so many of the newest exposures can still be without.
 const UNPOSED: usize = 128;
 /// A pose that is still in the future of the track after this is taken from what there is, ns.
 const POSE_PATIENCE_NS: u64 = 1_000_000_000;
-/// Uncertainty of a free-running picture's time, s.
+/// Uncertainty of a free-running picture's time, ns.
 const FREE_RUNNING_SIGMA_NS: u64 = 50_000_000;
 /// In flight what was put aside is compared this often, and believed only when it is all but certain.
 const RECONCILE_EVERY_NS: u64 = 10_000_000_000;
@@ -29,111 +28,11 @@ const CERTAIN: f32 = 0.999;
 /// Late pictures and their like are handed out while at most so many events wait.
 const EVENTS_WAITING: usize = 64;
 
-/// What an exposure waits for.
-#[derive(Clone, Copy, PartialEq)]
-enum Partner {
-    /// Its picture.
-    Awaited,
-    /// Nothing: pictures of this camera are posed by their own time.
-    Unneeded,
-    /// Nothing: this was its picture.
-    Found(PictureClues),
-}
-
-#[derive(Clone, Copy)]
-struct Exposure {
-    trigger: Trigger,
-    /// Middle of the exposure, boot clock.
-    mid_boot_ns: u64,
-    heard_ns: u64,
-    pose: Option<Result<BodyPose, PoseError>>,
-    partner: Partner,
-}
-
-/// A picture that found no exposure yet.
-struct PutAside {
-    clues: PictureClues,
-    picture: Picture,
-    reason: Reason,
-}
-
 /// A picture whose exposure is known and whose pose may not be yet.
 pub(super) struct PendingPicture {
     trigger: Trigger,
     picture: Picture,
     confidence: f32,
-}
-
-/// The exposures of the flight, and the pictures that found none.
-pub(super) struct Exposures {
-    all: VecDeque<Exposure>,
-    aside: Vec<PutAside>,
-    next_reconcile_ns: u64,
-    /// Decided at the end of the flight and not reported yet.
-    closing: VecDeque<Event>,
-}
-
-impl Default for Exposures {
-    fn default() -> Self {
-        Self {
-            all: VecDeque::with_capacity(EXPOSURES),
-            aside: Vec::with_capacity(PUT_ASIDE),
-            next_reconcile_ns: 0,
-            closing: VecDeque::new(),
-        }
-    }
-}
-
-impl Exposures {
-    /// One more exposure; the oldest one without a picture when there is no more room.
-    pub(super) fn push(
-        &mut self,
-        trigger: Trigger,
-        mid_boot_ns: u64,
-        heard_ns: u64,
-        awaits_picture: bool,
-    ) -> Option<Trigger> {
-        let evicted = if self.all.len() >= EXPOSURES { self.all.pop_front() } else { None };
-        let partner = if awaits_picture { Partner::Awaited } else { Partner::Unneeded };
-        self.all.push_back(Exposure { trigger, mid_boot_ns, heard_ns, pose: None, partner });
-        evicted.filter(|e| e.partner == Partner::Awaited).map(|e| e.trigger)
-    }
-
-    fn find(&mut self, trigger: &Trigger) -> Option<&mut Exposure> {
-        let same = |e: &&mut Exposure| e.trigger.sequence == trigger.sequence && e.trigger.boot_ns == trigger.boot_ns;
-        self.all.iter_mut().rev().find(same)
-    }
-
-    fn awaited(&self) -> impl Iterator<Item = &Exposure> {
-        self.all.iter().filter(|e| e.partner == Partner::Awaited)
-    }
-
-    /// Whether pictures are still to come.
-    pub(super) fn await_pictures(&self) -> bool {
-        self.awaited().next().is_some()
-    }
-
-    /// Everything is decided and reported.
-    pub(super) fn is_closed(&self) -> bool {
-        self.closing.is_empty()
-    }
-
-    /// Pictures put aside and their exposures, all with all: those paired with at least this confidence.
-    fn reconcile(&mut self, least: f32) -> Vec<(Trigger, PutAside, f32)> {
-        let triggers: Vec<Trigger> = self.awaited().map(|e| e.trigger).collect();
-        let clues: Vec<PictureClues> = self.aside.iter().map(|a| a.clues).collect();
-        let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
-        let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
-        let mut pairs = reconcile(&triggers, &clues, &known);
-        pairs.retain(|p| p.confidence >= least);
-        // From the back, so that indices stay valid.
-        pairs.sort_unstable_by_key(|p| std::cmp::Reverse(p.picture));
-        let take =
-            |p: &crate::matcher::reconcile::Pairing| (triggers[p.exposure], self.aside.remove(p.picture), p.confidence);
-        let mut taken: Vec<(Trigger, PutAside, f32)> = pairs.iter().map(take).collect();
-        taken.sort_by_key(|t| t.0.boot_ns);
-        taken
-    }
 }
 
 fn path_of(picture: &Picture) -> Option<PathBuf> {

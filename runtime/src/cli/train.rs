@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
 use config::mission::{KeyframeSettings, NetworkSettings};
 use config::preset::Preset;
@@ -66,6 +67,10 @@ pub struct Args {
     /// Only key frames by the rule of a flight: [keyframes] of --settings, or its defaults.
     #[arg(long)]
     keyframes: bool,
+    /// Spare this computer as a flight does when it is hot, its supply weak or its memory short: [failsafe] of --settings,
+    /// or its defaults. The same seed then gives another model where it had to.
+    #[arg(long)]
+    failsafe: bool,
     /// Where the first Gaussians come from.
     #[arg(long, value_enum, default_value = "feed-forward")]
     init: Init,
@@ -103,7 +108,7 @@ pub struct Args {
     #[arg(long = "model", value_name = "FILE")]
     network: Option<PathBuf>,
     /// TOML file with any of the mission file's tables [training], [init], [refine], [network],
-    /// [keyframes].
+    /// [keyframes], [failsafe].
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
     /// Seconds between two checkpoints.
@@ -126,6 +131,7 @@ struct Settings {
     refine: RefineSettings,
     network: NetworkSettings,
     keyframes: KeyframeSettings,
+    failsafe: FailsafeSettings,
 }
 
 /// The presets as clap shows them, each with its budgets.
@@ -158,6 +164,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         }
     };
     settings.keyframes.check()?;
+    settings.failsafe.check()?;
     if args.network.is_some() {
         settings.network.pair = args.network;
     }
@@ -180,6 +187,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         split: args.split,
         region: args.region,
         keyframes: args.keyframes.then_some(settings.keyframes),
+        failsafe: args.failsafe.then_some(settings.failsafe),
         init: match args.init {
             Init::FeedForward => InitKind::FeedForward,
             Init::Sfm => InitKind::SparsePoints,

@@ -201,8 +201,9 @@ impl Reconstruct for Reconstruction {
     }
 
     fn is_done(&self, budget: &RunBudget) -> bool {
-        let by_steps = budget.steps.is_some_and(|s| self.trainer.steps() >= s);
-        let by_time = budget.seconds.is_some_and(|s| self.trainer.elapsed_s() >= s);
+        let (steps, seconds) = self.trainer.spent();
+        let by_steps = budget.steps.is_some_and(|s| steps >= s);
+        let by_time = budget.seconds.is_some_and(|s| seconds >= s);
         by_steps || by_time
     }
 
@@ -252,7 +253,9 @@ impl Reconstruct for Reconstruction {
         let Some(&least) = by_opacity.get(by_opacity.len() / 3) else { return Ok(()) };
         let logits = self.cloud.opacity_logits.clone();
         let removed = self.cloud.retain(|i| logits[i] >= least);
+        let (steps, seconds) = self.trainer.spent();
         self.trainer.load(&self.cloud)?;
+        self.trainer.continue_from(steps, seconds);
         tracing::warn!("gave up {removed} Gaussians, {} remain", self.cloud.len());
         Ok(())
     }

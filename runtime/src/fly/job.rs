@@ -5,17 +5,17 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hal::failsafe::{self, Action};
+use hal::failsafe::{Action, Cause, Flags};
 use hal::mavlink::dialect::MavSeverity;
 use hal::traits::Clock;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::handover::Handover;
-use super::health::Health;
 use super::intake::FlightCounters;
 use super::shortage::likely_cause;
 use crate::engine::{PictureSource, Reconstruct, model_path};
 use crate::error::JobError;
+use crate::failsafe::Failsafe;
 use crate::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
 use crate::upload::Offerer;
@@ -35,9 +35,8 @@ pub(super) struct Job<R, K> {
     offerer: Offerer,
     out: PathBuf,
     budget: RunBudget,
-    health: Health,
     clock: K,
-    failsafe: failsafe::State,
+    failsafe: Failsafe,
     /// The device failed; the last checkpoint is what there is.
     training_failed: bool,
     saved_ns: u64,
@@ -62,8 +61,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         offerer: Offerer,
         out: &Path,
         budget: RunBudget,
-        health: Health,
-        timing: failsafe::Timing,
+        failsafe: Failsafe,
         clock: K,
     ) -> Self {
         Self {
@@ -71,10 +69,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             offerer,
             out: out.into(),
             budget,
-            health,
             saved_ns: clock.now_ns(),
             clock,
-            failsafe: failsafe::State::new(timing),
+            failsafe,
             training_failed: false,
             said_ns: None,
             for_a_frame: FOR_A_FRAME,
@@ -138,33 +135,24 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
 
     /// One step of the failsafe ladder; says and does what a new rung asks for.
     fn watch(&mut self, capture: &mut Handover) -> Result<Action, JobError> {
-        let flags =
-            self.health.flags(capture.flags(), self.training_failed, &self.budget, self.reconstruction.keyframes());
-        let before = self.failsafe.action();
-        self.failsafe = failsafe::update(self.clock.now_ns() / 1_000_000, &self.failsafe, &flags);
-        let action = self.failsafe.action();
-        if action != before {
-            let line = format!(
-                "dgtr: {} ({})",
-                action.name(),
-                self.failsafe.cause().map_or("recovered", failsafe::Cause::name)
-            );
-            tracing::warn!("{line}");
-            let worse = action > before;
-            let severity = if worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
-            capture.say(severity, line);
-            match action {
-                Action::UploadBest if self.reconstruction.has_model() && !self.training_failed => {
-                    self.save(capture)?;
-                    self.offerer.offer_urgently(&model_path(&self.out));
-                }
-                Action::HalfResolution => self.reconstruction.halve_resolution(true),
-                Action::SmallerModel if self.reconstruction.has_model() => self.reconstruction.shrink()?,
-                Action::Nominal | Action::Warn => self.reconstruction.halve_resolution(false),
-                _ => {}
-            }
+        let views = self.reconstruction.keyframes();
+        self.failsafe.look(self.clock.now_ns(), capture.flags(), self.training_failed, &self.budget, views);
+        self.act(capture)?;
+        Ok(self.failsafe.state().action())
+    }
+
+    /// Does what a new rung asks for, and tells the ground control station.
+    fn act(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+        let Some(rung) = self.failsafe.act(&mut self.reconstruction)? else { return Ok(()) };
+        let line = format!("dgtr: {rung}");
+        tracing::warn!("{line}");
+        let severity = if rung.is_worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
+        capture.say(severity, line);
+        if rung.action == Action::UploadBest && self.reconstruction.has_model() && !self.training_failed {
+            self.save(capture)?;
+            self.offerer.offer_urgently(&model_path(&self.out));
         }
-        Ok(action)
+        Ok(())
     }
 
     fn build(&mut self, capture: &mut Handover) -> Result<(), JobError> {
@@ -193,14 +181,17 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
         let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
         let mut last = None;
-        let clock = &self.clock;
-        self.reconstruction.train(&self.budget, &mut |report: &StepReport| {
+        let (clock, failsafe, budget) = (&self.clock, &mut self.failsafe, self.budget);
+        let views = self.reconstruction.keyframes();
+        self.reconstruction.train(&budget, &mut |report: &StepReport| {
             last = Some(*report);
+            let now_ns = clock.now_ns();
             let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
-            if undisturbed && clock.now_ns() < due_ns { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            let alarmed = failsafe.glance(now_ns, capture.flags(), &budget, views);
+            if undisturbed && now_ns < due_ns && !alarmed { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
         })?;
         if let Some(report) = last {
-            self.health.note_step(&report);
+            self.failsafe.note_step(&report);
             self.say(capture, &report);
         }
         if self.clock.now_ns() >= due_ns { self.save(capture) } else { Ok(()) }
@@ -230,9 +221,10 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             let keyframes = self.reconstruction.keyframes();
             return Err(JobError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
         }
-        let spared = self.failsafe.forbids_training();
+        let state = self.failsafe.state();
+        let spared = state.forbids_training();
         if spared {
-            let cause = self.failsafe.cause().map_or("", failsafe::Cause::name);
+            let cause = state.cause().map_or("", Cause::name);
             tracing::warn!("{cause}: the rest of the training is left; the same command continues it later");
         }
         let mut finished = !interrupt.requested() && !self.training_failed && !spared;
@@ -260,25 +252,37 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         if self.reconstruction.wants_build(true) && !interrupt.requested() {
             self.build(capture)?;
         }
-        if !self.reconstruction.has_model() || self.failsafe.forbids_training() {
+        if !self.reconstruction.has_model() {
             return Ok(());
         }
+        // What the autopilot said last of its battery holds; the rest of what the HAL saw ended with the flight, and there
+        // is no flight's time any more that training could be behind.
+        let seen = Flags { battery_low: capture.flags().battery_low, ..Flags::default() };
+        let (at_leisure, views) = (RunBudget { seconds: None, ..self.budget }, self.reconstruction.keyframes());
         let mut progress = crate::console::Progress::new("training", 100);
-        while !self.reconstruction.is_done(&self.budget) && !interrupt.requested() {
+        while !self.reconstruction.is_done(&self.budget)
+            && !interrupt.requested()
+            && !self.failsafe.state().forbids_training()
+        {
             let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
-            let clock = &self.clock;
+            let (clock, failsafe) = (&self.clock, &mut self.failsafe);
             let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
                 progress.set((r.progress * 100.0) as u64, || {
                     format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
                 });
+                let now_ns = clock.now_ns();
+                let alarmed = failsafe.glance(now_ns, seen, &at_leisure, views);
                 // Only where saving leaves no trace, as in any training.
-                let go_on = !interrupt.requested() && (clock.now_ns() < due_ns || !r.settled);
+                let go_on = !interrupt.requested() && !alarmed && (now_ns < due_ns || !r.settled);
                 if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             })?;
+            self.act(capture)?;
             if reason != StopReason::Caller || interrupt.requested() {
                 break;
             }
-            self.save(capture)?;
+            if self.clock.now_ns() >= due_ns {
+                self.save(capture)?;
+            }
         }
         Ok(())
     }
@@ -342,7 +346,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
 
     /// Where the failsafe ladder stands, and why.
     #[cfg(all(test, feature = "lab"))]
-    pub(super) fn failsafe(&self) -> failsafe::State {
-        self.failsafe
+    pub(super) fn failsafe(&self) -> hal::failsafe::State {
+        self.failsafe.state()
     }
 }

@@ -13,7 +13,7 @@ use config::geodesy::Geodetic;
 use config::mission::{CameraSettings, KeyframeSettings};
 use config::upload::UploadSettings;
 use hal::camera::FolderCamera;
-use hal::failsafe::{Action, Cause, Timing};
+use hal::failsafe::{Action, Cause};
 use hal::sim::rehearsal::Rehearsal;
 use hal::sim::world::World;
 use hal::sim::{SessionReport, SimSettings};
@@ -26,12 +26,13 @@ use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::geotags::Geotags;
 use super::handover::handover;
-use super::health::Health;
 use super::intake::Intake;
 use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::job::Job;
 use crate::engine::{Reconstruct, model_path};
 use crate::error::JobError;
+use crate::failsafe::Failsafe;
+use crate::health::Health;
 use crate::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
 use crate::upload::{Offerer, Source};
@@ -260,7 +261,7 @@ pub(super) fn rehearse_on(
     let limits = FailsafeSettings { disk_low_mib: 0, ..FailsafeSettings::default() };
     let health = Health::with_sensors(Path::new("/nonexistent"), limits, 1 << 20, &out);
     let mut job =
-        Job::new(ledger, offerer, &out, budget, health, Timing::from(&limits), clock.clone()).without_waiting();
+        Job::new(ledger, offerer, &out, budget, Failsafe::new(health, &limits), clock.clone()).without_waiting();
     let interrupt = Interrupt::default();
     let (mut flying, mut over, mut rungs) = (true, None, Vec::new());
     for turn in 1..=MOST_TURNS {

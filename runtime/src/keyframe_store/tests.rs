@@ -7,6 +7,8 @@ use config::disk::System;
 use config::disk::bounded::{Bounded, bytes_below};
 use glam::{DQuat, DVec3};
 
+use models::camera::PoseSigma;
+
 use super::*;
 
 const CAMERA: CameraSettings = CameraSettings {

@@ -71,6 +71,10 @@ fn exposure(f: &CAMERA_FEEDBACK_DATA) -> Option<Exposure> {
 }
 
 #[cfg(test)]
+#[path = "../../../tests/shared_data.rs"]
+mod shared_data;
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -86,15 +90,7 @@ mod tests {
 
     #[test]
     fn a_recorded_survey_reports_its_forty_exposures() {
-        let root = std::env::var_os("DGTR_DATA").map_or_else(|| "../../shared".into(), std::path::PathBuf::from);
-        let folder = root.join("data/sitl/run8");
-        let log = std::fs::read_dir(&folder).ok().and_then(|entries| {
-            entries.flatten().map(|e| e.path()).find(|p| p.extension().is_some_and(|e| e == "tlog"))
-        });
-        let Some(log) = log else {
-            println!("skipped: no log in {} (set DGTR_DATA)", folder.display());
-            return;
-        };
+        let Some(log) = super::shared_data::shared("data/sitl/run8/survey.tlog") else { return };
         let found = exposures(&log).expect("a log");
         assert_eq!(found.len(), 40);
         assert!(found.windows(2).all(|w| w[0].time_s < w[1].time_s));

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use config::disk::Disk;
+
 use super::folder::{read_bounded, write_whole};
 
 /// The number of the present flight.
@@ -16,6 +18,10 @@ impl FlightNumber {
     /// receipt says where to go on.
     pub fn begin(path: Option<&Path>) -> Self {
         let text = path.and_then(|p| read_bounded(p, 64).ok()).and_then(|bytes| String::from_utf8(bytes).ok());
+        if let Some(folder) = path.and_then(Path::parent) {
+            // Aircraft of one machine share the folder of the keys.
+            Disk::default().sweep_abandoned(folder);
+        }
         let last = text.and_then(|t| t.trim().parse().ok()).unwrap_or(0);
         let mut this = Self { path: path.map(Path::to_path_buf), number: last };
         this.advance_beyond(last);

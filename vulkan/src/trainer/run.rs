@@ -12,7 +12,7 @@ pub struct RunBudget {
 }
 
 /// One step.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
     /// Number of this step, from 1.
     pub step: u32,

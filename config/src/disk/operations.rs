@@ -1,0 +1,94 @@
+//! What a file system is asked to do, and the machine's own.
+
+use std::fmt;
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::Path;
+
+/// What a file system is asked to do. Reading is done directly: it changes nothing.
+pub trait Operations: fmt::Debug + Send + Sync {
+    /// Makes one folder, whose parent is there.
+    ///
+    /// # Errors
+    /// The system's.
+    fn make_folder(&self, path: &Path) -> io::Result<()>;
+    /// Opens a new, empty file for writing; one of that name loses its content.
+    ///
+    /// # Errors
+    /// The system's.
+    fn create(&self, path: &Path) -> io::Result<Box<dyn Output>>;
+    /// Opens a file for writing behind its end, made if absent.
+    ///
+    /// # Errors
+    /// The system's.
+    fn append(&self, path: &Path) -> io::Result<Box<dyn Output>>;
+    /// Gives a file a second name.
+    ///
+    /// # Errors
+    /// The system's; FAT has no links.
+    fn link(&self, from: &Path, to: &Path) -> io::Result<()>;
+    /// Moves a file or folder within the file system, in place of a file of the new name.
+    ///
+    /// # Errors
+    /// The system's.
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
+    /// Removes a file.
+    ///
+    /// # Errors
+    /// The system's.
+    fn remove(&self, path: &Path) -> io::Result<()>;
+    /// Makes the names in a folder durable.
+    ///
+    /// # Errors
+    /// The system's.
+    fn sync_folder(&self, path: &Path) -> io::Result<()>;
+}
+
+/// A file being written.
+pub trait Output: Write + fmt::Debug + Send {
+    /// Makes the content durable.
+    ///
+    /// # Errors
+    /// The system's: the disk may report only here that it is full or broken.
+    fn sync(&mut self) -> io::Result<()>;
+}
+
+impl Output for File {
+    fn sync(&mut self) -> io::Result<()> {
+        self.sync_all()
+    }
+}
+
+/// The machine's own file system.
+#[derive(Clone, Copy, Debug)]
+pub struct System;
+
+impl Operations for System {
+    fn make_folder(&self, path: &Path) -> io::Result<()> {
+        std::fs::create_dir(path)
+    }
+
+    fn create(&self, path: &Path) -> io::Result<Box<dyn Output>> {
+        Ok(Box::new(File::create(path)?))
+    }
+
+    fn append(&self, path: &Path) -> io::Result<Box<dyn Output>> {
+        Ok(Box::new(File::options().append(true).create(true).open(path)?))
+    }
+
+    fn link(&self, from: &Path, to: &Path) -> io::Result<()> {
+        std::fs::hard_link(from, to)
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        std::fs::rename(from, to)
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        std::fs::remove_file(path)
+    }
+
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        File::open(path)?.sync_all()
+    }
+}
