@@ -57,7 +57,7 @@ camera = { folder = "camera" }
 region_enu = [[-240.0, -240.0], [240.0, -240.0], [240.0, 240.0], [-240.0, 240.0]]
 M
 
-"$dgtr" sim --mission mission.toml --link "pty:$PWD/port" --speed "$speed" --forward-overlap 0.5 --side-overlap 0.68 --cross \
+"$dgtr" sim --mission mission.toml --link "pty:$PWD/port" --speed "$speed" --forward-overlap 0.53 --side-overlap 0.68 --cross \
     --linger 30 > sim.log 2>&1 &
 sim=$!
 fly=
@@ -86,7 +86,7 @@ fault() {
         3) note rubbish
            echo "not a picture" > "camera/note$RANDOM.jpg"; : > "camera/empty$RANDOM.jpg"
            # The newest picture, cut in the middle, under another name.
-           newest=$(ls -t camera/*.jpg | head -1); head -c 2000 "$newest" > "camera/half$RANDOM.jpg" ;;
+           newest=$(ls -t camera/*.jpg | sed -n 1p); head -c 2000 "$newest" > "camera/half$RANDOM.jpg" ;;
         4) note second_process
            code=0; "$dgtr" fly --mission mission.toml --out disk/out > second.log 2>&1 || code=$?
            [ "$code" = 2 ] || [ "$code" = 1 ] || { echo "hour.sh: a second process ended with $code" >&2; failed=1; } ;;

@@ -103,6 +103,39 @@ fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, Settled>>,
     Ok((settled.len() == earlier.shots.len()).then_some(settled))
 }
 
+/// What the pictures say, as far as the refiner knows now.
+struct Found<'a> {
+    settled: HashMap<String, Settled>,
+    /// Those that are turned against what they say of themselves, and by how many degrees.
+    contradicted: Vec<(&'a String, f64)>,
+    /// Those that see too little of what others see.
+    untied: Vec<&'a String>,
+}
+
+impl<'a> Found<'a> {
+    fn in_pictures(set: &'a Dataset, refiner: &Refiner) -> Self {
+        let mut found =
+            Self { settled: HashMap::with_capacity(set.frames.len()), contradicted: Vec::new(), untied: Vec::new() };
+        for frame in &set.frames {
+            let name = &frame.name;
+            let (Some(pose), Some(intrinsics)) = (refiner.pose(name), refiner.intrinsics(name)) else { continue };
+            if !refiner.is_tied(name) {
+                found.untied.push(name);
+            } else if let Some(prior) = frame.prior {
+                let away = prior.pose.rotation.angle_between(pose.rotation).to_degrees();
+                let sigma = f64::from(prior.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b))).to_degrees();
+                if away > CONTRADICTION.1.max(CONTRADICTION.0 * sigma) {
+                    found.contradicted.push((name, away));
+                }
+            }
+            // Only a picture without a distortion of its own may have been given one.
+            let distortion = if frame.distortion.is_none() { refiner.distortion() } else { frame.distortion };
+            found.settled.insert(name.clone(), Settled { view: View { intrinsics, pose }, distortion });
+        }
+        found
+    }
+}
+
 fn refined(
     set: &Dataset,
     notes: &CardNotes,
@@ -143,33 +176,21 @@ fn refined(
         return Ok(None);
     }
     remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
-    refiner.solve()?;
+    let first = (refiner.solve()?, Found::in_pictures(set, &refiner));
     refiner.relink()?;
-    let solved = refiner.solve()?;
+    let second = refiner.solve()?;
+    // The second look knows more than the first; where it ties fewer pictures together all the same, the first is believed.
+    let (solved, found) = match second.frames_tied < first.0.frames_tied {
+        true => first,
+        false => (second, Found::in_pictures(set, &refiner)),
+    };
     progress.finish(&format!(
         "{} of {} pictures tied together, reprojection {:.2} px",
         solved.frames_tied,
         all.len(),
         solved.reprojection_rms_px
     ));
-    let mut settled = HashMap::with_capacity(all.len());
-    let (mut contradicted, mut untied) = (Vec::new(), Vec::new());
-    for frame in &set.frames {
-        let name = &frame.name;
-        let (Some(pose), Some(intrinsics)) = (refiner.pose(name), refiner.intrinsics(name)) else { continue };
-        if !refiner.is_tied(name) {
-            untied.push(name);
-        } else if let Some(prior) = frame.prior {
-            let away = prior.pose.rotation.angle_between(pose.rotation).to_degrees();
-            let sigma = f64::from(prior.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b))).to_degrees();
-            if away > CONTRADICTION.1.max(CONTRADICTION.0 * sigma) {
-                contradicted.push((name, away));
-            }
-        }
-        // Only a picture without a distortion of its own may have been given one.
-        let distortion = if frame.distortion.is_none() { refiner.distortion() } else { frame.distortion };
-        settled.insert(name.clone(), Settled { view: View { intrinsics, pose }, distortion });
-    }
+    let Found { settled, contradicted, untied } = found;
     if !contradicted.is_empty() {
         let mut angles: Vec<f64> = contradicted.iter().map(|c| c.1).collect();
         angles.sort_by(f64::total_cmp);
