@@ -28,6 +28,9 @@ mod shortage;
 mod fault_table;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+mod heat;
+#[cfg(test)]
+#[cfg(feature = "lab")]
 mod killed;
 #[cfg(test)]
 #[cfg(feature = "lab")]

@@ -14,9 +14,9 @@ use vulkan::trainer::{RunBudget, Trainer};
 /// Set in the child: what it is to do.
 const ROLE: &str = "DGTR_TEST_ROLE";
 
-/// Two views of a size, growth, relocation and noise: everything that draws random numbers.
-fn growing(steps: u32, (width, height): (u32, u32)) -> Option<Trainer> {
-    let v = view(width, height);
+/// Two views, growth, relocation and noise: everything that draws random numbers.
+fn growing(steps: u32) -> Option<Trainer> {
+    let v = view(64, 48);
     let mut settings = plain();
     settings.density.strategy = config::training::Strategy::Relocate;
     settings.steps = steps;
@@ -57,7 +57,7 @@ fn child(name: &str, threads: &str, save_at: &str) -> Option<String> {
 fn the_same_seed_gives_the_same_model_with_one_thread_and_with_two() {
     let name = "the_same_seed_gives_the_same_model_with_one_thread_and_with_two";
     if std::env::var_os(ROLE).is_some() {
-        let Some(mut trainer) = growing(120, (64, 48)) else { return };
+        let Some(mut trainer) = growing(120) else { return };
         let save_at: usize = std::env::var("DGTR_TEST_SAVE_AT").map_or(0, |at| at.parse().unwrap());
         let mut saved = GaussianCloud::with_capacity(3, 800);
         for step in 0..120 {
@@ -86,7 +86,7 @@ fn high_water() -> u64 {
 fn ten_thousand_steps_need_no_more_memory_than_one_thousand() {
     let name = "ten_thousand_steps_need_no_more_memory_than_one_thousand";
     if std::env::var_os(ROLE).is_some() {
-        let Some(mut trainer) = growing(10_000, (32, 24)) else { return };
+        let Some(mut trainer) = growing(10_000) else { return };
         let mut early = 0;
         let budget = RunBudget { steps: Some(10_000), seconds: None };
         let summary = trainer.run(&budget, &mut |report| {

@@ -67,8 +67,8 @@ pub struct Args {
     /// Only key frames by the rule of a flight: [keyframes] of --settings, or its defaults.
     #[arg(long)]
     keyframes: bool,
-    /// Spare this computer as a flight does when it is hot, its supply weak or its memory short: [failsafe] of --settings,
-    /// or its defaults. The same seed then gives another model where it had to.
+    /// Spare this computer as a flight does when it is hot or throttled or its supply is weak, and warn of a full disk:
+    /// [failsafe] of --settings, or its defaults. The same seed then gives another model where it had to.
     #[arg(long)]
     failsafe: bool,
     /// Where the first Gaussians come from.

@@ -139,22 +139,8 @@ impl Reconstruct for Ledger {
         while !self.is_done(budget) {
             self.steps += 1;
             self.steps_total += 1;
-            let report = StepReport {
-                step: self.steps,
-                view: 0,
-                loss: 1.0 / self.steps as f32,
-                l1: 0.0,
-                ssim: 0.0,
-                depth_correlation: None,
-                gaussians: 0,
-                visible: 0,
-                instances: 0,
-                bands: 1,
-                divisor: 1,
-                elapsed_s: 0.0,
-                progress: 0.0,
-                settled: true,
-            };
+            let report =
+                StepReport { step: self.steps, loss: 1.0 / self.steps as f32, settled: true, ..StepReport::default() };
             if each(&report).is_break() || !self.landed {
                 return Ok(StopReason::Caller);
             }

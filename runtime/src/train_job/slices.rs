@@ -125,7 +125,7 @@ mod tests {
         }
     }
 
-    /// Ten thousand steps on a computer whose temperature follows a script.
+    /// Steps on a computer whose temperature follows a script.
     struct Warming<'a> {
         zone: PathBuf,
         script: &'a [(u32, &'a str)],
