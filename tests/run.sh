@@ -1,23 +1,28 @@
 #!/bin/sh
 # All tests. What a test needs and does not find (the large data sets, python3, the validation layers) it names and skips.
 # Arguments go to `cargo test`; without any, the tests of the whole, which fly by the clock, run beside those of the crates.
+# DGTR_FEATURES=hal/v4l2 adds what is not built by default.
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 cd "$here"
 sh runtime/setup.sh --tests
-if [ $# -gt 0 ]; then exec cargo test --release --locked --workspace "$@"; fi
+all="--release --locked --workspace ${DGTR_FEATURES:+--features $DGTR_FEATURES}"
+# shellcheck disable=SC2086
+if [ $# -gt 0 ]; then exec cargo test $all "$@"; fi
 
-cargo test --release --locked --workspace --no-run
+# shellcheck disable=SC2086
+cargo test $all --no-run
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 # The same packages for both, so that neither compiles anything anew.
 whole=$(for file in tests/tests/*.rs; do echo "--test $(basename "$file" .rs)"; done)
 # shellcheck disable=SC2086
-cargo test --release --locked --workspace --no-fail-fast $whole > "$log" 2>&1 &
+cargo test $all --no-fail-fast $whole > "$log" 2>&1 &
 flying=$!
 failed=0
-# What flies comes first.
-nice -n 10 cargo test --release --locked --workspace --exclude tests || failed=$?
+# What flies comes first. Mesa's driver without threads of its own: the pictures are small, and the tests run side by side.
+# shellcheck disable=SC2086
+LP_NUM_THREADS="${LP_NUM_THREADS:-0}" nice -n 10 cargo test $all --exclude tests || failed=$?
 wait "$flying" || failed=$?
 cat "$log"
 exit "$failed"

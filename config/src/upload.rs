@@ -6,15 +6,28 @@
 
 use std::path::PathBuf;
 
-use crate::settings::{Limits, SettingError, record, table};
+use crate::settings::{Limits, SettingError, choice, record, table};
 
 /// Smallest and largest chunk, KiB. The upper end keeps one lost reply cheap to repeat; the lower one keeps the
 /// list of chunk hashes of a full-size model below [`UploadSettings::max_chunks`].
 pub const CHUNK_KIB: std::ops::RangeInclusive<u32> = 16..=1024;
 
+choice! {
+    /// What is sent of a model.
+    pub enum Encoding {
+        /// The file as it was trained, 236 bytes per Gaussian of SH degree 3.
+        Exact = "exact",
+        /// Rounded and entropy-coded, a thirtieth of that (`models/FORMATS.md`); while it is encoded some 700 bytes of memory
+        /// per Gaussian.
+        Delivery = "delivery",
+    }
+}
+
 table! {
     /// How models travel from the aircraft to the ground.
     pub struct UploadSettings {
+        /// What is sent of a model.
+        pub encoding: Encoding = Encoding::Exact;
         /// A directory both ends can reach, at the same or at different times; absent = not used.
         pub folder: Option<PathBuf> = None;
         /// Where the aircraft finds the ground, zenoh endpoints such as `tcp/10.0.0.2:7447` or `tls/ground.local:7447`.

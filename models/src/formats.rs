@@ -9,6 +9,7 @@ use config::disk::{Disk, DiskError};
 use config::error::{Error, ErrorKind};
 
 pub mod colmap;
+pub mod delivery;
 pub mod model;
 pub mod opensfm;
 pub mod ply;

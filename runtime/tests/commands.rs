@@ -152,6 +152,9 @@ fn export_and_import_give_the_model_back() {
     assert!(dgtr(&["import", &path("m.spz"), "--out", &path("rounded.dgtr")]).status.success());
     let (_, rounded) = model::read(&dir.path().join("rounded.dgtr")).unwrap();
     assert_eq!((rounded.means, rounded.log_scales), (cloud.means, cloud.log_scales), "these are representable");
+    assert!(dgtr(&["export", &path("m.dgtr"), "--to", "delivery"]).status.success());
+    let (header, delivered) = model::read(&dir.path().join("m.delivery.dgtr")).unwrap();
+    assert_eq!((header.origin, delivered.len()), (origin, 1), "read wherever a .dgtr is");
 }
 
 #[test]

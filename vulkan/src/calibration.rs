@@ -189,6 +189,7 @@ fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
     };
     let plan = Plan::with_capacities(&request, GAUSSIANS, INSTANCES * GAUSSIANS);
     let mut trainer = Trainer::with_shape(gpu, &plan, &plain(), shape)?;
+    trainer.time_every_step();
     trainer.load(&gaussians)?;
     trainer.add_view(&posed(&v, &photo(1, &v)), None)?;
     Ok(trainer)

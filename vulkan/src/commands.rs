@@ -28,6 +28,8 @@ pub(crate) struct Commands {
     /// What ran up to each timestamp; none where no kernel did.
     groups: [Cell<Option<Group>>; STAMPS],
     group_ms: Cell<[f64; GROUPS]>,
+    /// How many submissions the timed one stands for; 0: it is not timed.
+    weight: Cell<f64>,
 }
 
 impl Drop for Commands {
@@ -69,6 +71,7 @@ impl Commands {
                 stage_ms: Cell::new([0.0; STAGE_NAMES.len()]),
                 groups: [const { Cell::new(None) }; STAMPS],
                 group_ms: Cell::new([0.0; GROUPS]),
+                weight: Cell::new(1.0),
             };
             let allocate = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
             made.buffer = device.allocate_command_buffers(&allocate).map_err(vulkan("vkAllocateCommandBuffers"))?[0];
@@ -93,13 +96,18 @@ impl Commands {
         self.stage_ms.set([0.0; STAGE_NAMES.len()]);
     }
 
+    /// From here on a submission's times count `weight` times; with 0 it gets no timestamps.
+    pub fn weigh(&self, weight: f64) {
+        self.weight.set(weight);
+    }
+
     /// Starts a recording; the one before was submitted or dropped.
     ///
     /// # Errors
     /// The device fails.
     pub fn begin<'a>(&'a self, pipelines: &'a Pipelines) -> Result<Recording<'a>, GpuError> {
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
-        let timed = self.gpu.timestamp_ns() > 0.0;
+        let timed = self.gpu.timestamp_ns() > 0.0 && self.weight.get() > 0.0;
         // SAFETY: the buffer is not pending: `submit` waits.
         unsafe {
             let device = self.gpu.device();
@@ -132,7 +140,7 @@ impl Commands {
         if read.is_ok() {
             let (mut all, mut groups) = (self.stage_ms.get(), self.group_ms.get());
             for i in 1..stamps {
-                let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns();
+                let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns() * self.weight.get();
                 all[self.stages[i].get() as usize] += ns * 1e-6;
                 if let Some(group) = self.groups[i].get() {
                     groups[group as usize] += ns * 1e-6;

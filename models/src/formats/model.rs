@@ -2,12 +2,14 @@
 //!
 //! ```text
 //! magic "dgtr\r\n\x1a\n" (8) · version u32 · header bytes u32 · Gaussians u64 · SH degree u32
-//! header (postcard) · means 3N f32 · log scales 3N · rotations 4N (w x y z) · opacity logits N · sh N·D·3
+//! header (postcard)
+//! version 1, exact:   means 3N f32 · log scales 3N · rotations 4N (w x y z) · opacity logits N · sh N·D·3
+//! version 2, rounded: u32 words of the delivery encoding (`super::delivery`)
 //! BLAKE3 of everything before (32)
 //! ```
 //!
-//! All little-endian. The magic's line ends betray a transfer as text, the length follows from the fixed part
-//! before anything is allocated, and the hash covers every byte.
+//! All little-endian. The magic's line ends betray a transfer as text, what is allocated follows from the fixed part and
+//! the file's size, and the hash covers every byte.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Write};
@@ -17,12 +19,18 @@ use config::disk::Disk;
 use config::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
+use super::delivery::{self, Rounding};
 use super::{FormatError, write_atomic};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
-const VERSION: u32 = 1;
+/// Columns as they are.
+const EXACT: u32 = 1;
+/// The delivery encoding.
+const ROUNDED: u32 = 2;
+/// Gaussians that a rounded file of any size may hold; beyond them it has at least a byte for each (real scenes: 5 to 9).
+const FREE_GAUSSIANS: u64 = 1 << 10;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 100 bytes per view; this is room for 100,000 of them and long names.
@@ -91,21 +99,63 @@ pub fn read_checkpoint(disk: &Disk, path: &Path) -> Result<Option<(ModelHeader, 
     Ok(newest.found)
 }
 
+/// Writes a model rounded, for delivery: about a thirtieth of the exact file, whole or not at all. Gives the number of
+/// Gaussians it holds.
+///
+/// # Errors
+/// Those of [`write()`].
+pub fn write_rounded(
+    path: &Path,
+    header: &ModelHeader,
+    cloud: &GaussianCloud,
+    rounding: &Rounding,
+) -> Result<usize, FormatError> {
+    let views: Vec<View> = header.views.iter().map(|(_, view)| *view).collect();
+    check_columns(path, cloud)?;
+    let garbled = |e| FormatError::invalid(path, format!("not written: {e}"));
+    let (words, n) = delivery::encode(cloud, &views, rounding).map_err(garbled)?;
+    let head = encode_header(path, header)?;
+    write_atomic(path, |file| {
+        let mut out = begin(file, ROUNDED, &head, n, cloud.sh_degree)?;
+        out.write_all(&words.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>())?;
+        finish(out)
+    })?;
+    Ok(n)
+}
+
 /// What fills the file of a model.
 fn content<'a>(
     path: &Path,
     header: &ModelHeader,
     cloud: &'a GaussianCloud,
 ) -> Result<impl FnOnce(&mut dyn Write) -> std::io::Result<()> + use<'a>, FormatError> {
+    check_columns(path, cloud)?;
+    let head = encode_header(path, header)?;
+    Ok(move |file: &mut dyn Write| {
+        let mut out = begin(file, EXACT, &head, cloud.len(), cloud.sh_degree)?;
+        write_floats(&mut out, cloud.means.as_flattened())?;
+        write_floats(&mut out, cloud.log_scales.as_flattened())?;
+        write_floats(&mut out, cloud.rotations.as_flattened())?;
+        write_floats(&mut out, &cloud.opacity_logits)?;
+        write_floats(&mut out, &cloud.sh)?;
+        finish(out)
+    })
+}
+
+fn check_columns(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatError> {
     let n = cloud.len();
     let columns_fit = cloud.log_scales.len() == n
         && cloud.rotations.len() == n
         && cloud.opacity_logits.len() == n
         && cloud.sh_degree <= 3
         && cloud.sh.len() == n * cloud.sh_stride();
-    if !columns_fit {
-        return Err(FormatError::invalid(path, "not written: the cloud's columns differ in length"));
+    if columns_fit {
+        return Ok(());
     }
+    Err(FormatError::invalid(path, "not written: the cloud's columns differ in length"))
+}
+
+fn encode_header(path: &Path, header: &ModelHeader) -> Result<Vec<u8>, FormatError> {
     check_header(path, header)?;
     let head = postcard::to_allocvec(header)
         .map_err(|e| FormatError::invalid(path, format!("not written: its header cannot be encoded ({e})")))?;
@@ -113,22 +163,30 @@ fn content<'a>(
         let (size, limit) = (head.len() as u64, MAX_HEADER);
         return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size, limit });
     }
-    Ok(move |file: &mut dyn Write| {
-        let mut out = Hashing { inner: file, hasher: blake3::Hasher::new() };
-        out.write_all(&MAGIC)?;
-        out.write_all(&VERSION.to_le_bytes())?;
-        out.write_all(&(head.len() as u32).to_le_bytes())?;
-        out.write_all(&(n as u64).to_le_bytes())?;
-        out.write_all(&u32::from(cloud.sh_degree).to_le_bytes())?;
-        out.write_all(&head)?;
-        write_floats(&mut out, cloud.means.as_flattened())?;
-        write_floats(&mut out, cloud.log_scales.as_flattened())?;
-        write_floats(&mut out, cloud.rotations.as_flattened())?;
-        write_floats(&mut out, &cloud.opacity_logits)?;
-        write_floats(&mut out, &cloud.sh)?;
-        let hash = out.hasher.finalize();
-        out.inner.write_all(hash.as_bytes())
-    })
+    Ok(head)
+}
+
+/// Everything before the Gaussians.
+fn begin<'a>(
+    file: &'a mut dyn Write,
+    version: u32,
+    head: &[u8],
+    n: usize,
+    sh_degree: u8,
+) -> std::io::Result<Hashing<&'a mut dyn Write>> {
+    let mut out = Hashing { inner: file, hasher: blake3::Hasher::new() };
+    out.write_all(&MAGIC)?;
+    out.write_all(&version.to_le_bytes())?;
+    out.write_all(&(head.len() as u32).to_le_bytes())?;
+    out.write_all(&(n as u64).to_le_bytes())?;
+    out.write_all(&u32::from(sh_degree).to_le_bytes())?;
+    out.write_all(head)?;
+    Ok(out)
+}
+
+fn finish(out: Hashing<&mut dyn Write>) -> std::io::Result<()> {
+    let hash = out.hasher.finalize();
+    out.inner.write_all(hash.as_bytes())
 }
 
 /// Reads and verifies a model. Gaussians that hold a number that is not finite are dropped and their number logged.
@@ -138,19 +196,28 @@ fn content<'a>(
 pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
     let mut opened = open(path)?;
     let header = read_header_of(path, &mut opened)?;
-    let Opened { mut input, count, sh_degree, .. } = opened;
+    let Opened { mut input, count, sh_degree, words, .. } = opened;
     let mut cloud = GaussianCloud { sh_degree, ..Default::default() };
-    let mut column = |floats: usize| read_floats(&mut input, floats).map_err(|e| FormatError::io(path, "reading", e));
-    cloud.means = triples(column(3 * count)?);
-    cloud.log_scales = triples(column(3 * count)?);
-    cloud.rotations = column(4 * count)?.as_chunks().0.to_vec();
-    cloud.opacity_logits = column(count)?;
-    cloud.sh = column(count * cloud.sh_stride())?;
+    let failed = |e| FormatError::io(path, "reading", e);
+    let mut coded = Vec::new();
+    if let Some(words) = words {
+        coded = read_words(&mut input, words, u32::from_le_bytes).map_err(failed)?;
+    } else {
+        let mut column = |floats: usize| read_words(&mut input, floats, f32::from_le_bytes).map_err(failed);
+        cloud.means = triples(column(3 * count)?);
+        cloud.log_scales = triples(column(3 * count)?);
+        cloud.rotations = column(4 * count)?.as_chunks().0.to_vec();
+        cloud.opacity_logits = column(count)?;
+        cloud.sh = column(count * cloud.sh_stride())?;
+    }
     let expected = input.hasher.finalize();
     let mut hash = [0; HASH as usize];
-    input.inner.read_exact(&mut hash).map_err(|e| FormatError::io(path, "reading", e))?;
+    input.inner.read_exact(&mut hash).map_err(failed)?;
     if expected != blake3::Hash::from_bytes(hash) {
         return Err(FormatError::Damaged { path: path.to_owned() });
+    }
+    if words.is_some() {
+        cloud = delivery::decode(coded, count, sh_degree).map_err(|e| FormatError::invalid(path, e.to_string()))?;
     }
     let header = decode_header(path, &header)?;
     let dropped = cloud.drop_invalid();
@@ -175,6 +242,8 @@ struct Opened {
     count: usize,
     sh_degree: u8,
     header_len: usize,
+    /// Words of the delivery encoding; `None`: exact columns.
+    words: Option<usize>,
 }
 
 fn open(path: &Path) -> Result<Opened, FormatError> {
@@ -192,9 +261,10 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
     }
     let word = |at: usize| u32::from_le_bytes([fixed[at], fixed[at + 1], fixed[at + 2], fixed[at + 3]]);
     let version = word(8);
-    if version != VERSION {
-        let what =
-            format!("model file version {version}; this dgtr reads version {VERSION}: use the dgtr that wrote it");
+    if ![EXACT, ROUNDED].contains(&version) {
+        let what = format!(
+            "model file version {version}; this dgtr reads versions {EXACT} and {ROUNDED}: use the dgtr that wrote it"
+        );
         return Err(FormatError::invalid(path, what));
     }
     let header_len = u64::from(word(12));
@@ -207,8 +277,24 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
         let limit = MAX_HEADER;
         return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size: header_len, limit });
     }
+    let header_len = header_len as usize;
+    if version == ROUNDED {
+        let Some(coded) = size.checked_sub(FIXED + header_len as u64 + HASH) else {
+            return Err(truncated("its header"));
+        };
+        let limit = coded.max(FREE_GAUSSIANS);
+        if count > limit {
+            let what = "its number of Gaussians";
+            return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
+        }
+        if coded % 4 != 0 {
+            return Err(truncated("its Gaussians"));
+        }
+        let words = Some(coded as usize / 4);
+        return Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len, words });
+    }
     let each = 4 * (11 + 3 * sh_coefficients(degree as u8) as u64);
-    let expected = count.checked_mul(each).and_then(|c| c.checked_add(FIXED + header_len + HASH));
+    let expected = count.checked_mul(each).and_then(|c| c.checked_add(FIXED + header_len as u64 + HASH));
     match expected {
         Some(expected) if expected == size => {}
         Some(expected) if expected < size => {
@@ -217,7 +303,7 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
         }
         _ => return Err(truncated("its Gaussians")),
     }
-    Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len: header_len as usize })
+    Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len, words: None })
 }
 
 fn read_header_of(path: &Path, opened: &mut Opened) -> Result<Vec<u8>, FormatError> {
@@ -266,13 +352,13 @@ fn write_floats(out: &mut impl Write, values: &[f32]) -> std::io::Result<()> {
     Ok(())
 }
 
-fn read_floats(input: &mut impl Read, n: usize) -> std::io::Result<Vec<f32>> {
+fn read_words<T>(input: &mut impl Read, n: usize, word: fn([u8; 4]) -> T) -> std::io::Result<Vec<T>> {
     let mut values = Vec::with_capacity(n);
     let mut buffer = vec![0; 4 * CHUNK.min(n)];
     while values.len() < n {
         let bytes = &mut buffer[..4 * CHUNK.min(n - values.len())];
         input.read_exact(bytes)?;
-        values.extend(bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)));
+        values.extend(bytes.as_chunks().0.iter().map(|b| word(*b)));
     }
     Ok(values)
 }
@@ -306,8 +392,8 @@ impl<T: Read> Read for Hashing<T> {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn the_page_on_formats_states_this_version() {
-        let row = format!("| `.dgtr` model file | {} |", super::VERSION);
+    fn the_page_on_formats_states_these_versions() {
+        let row = format!("| `.dgtr` model file | {} exact, {} rounded |", super::EXACT, super::ROUNDED);
         assert!(include_str!("../../FORMATS.md").contains(&row), "{row}");
     }
 }

@@ -8,6 +8,7 @@ use flate2::read::GzDecoder;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
+use models::formats::delivery::Rounding;
 use models::formats::{model, ply, spz};
 
 use crate::driver::{Random, Read, Reader, Shell, line, survive};
@@ -48,6 +49,30 @@ fn headers() -> [model::ModelHeader; 2] {
     ]
 }
 
+/// The hash that ends a `.dgtr` file.
+const HASHED: Shell = Shell {
+    open: |file| file[..file.len() - 32].to_vec(),
+    close: |mut content| {
+        content.extend_from_slice(blake3::hash(&content).as_bytes());
+        content
+    },
+};
+
+#[test]
+fn rounded_dgtr_models() {
+    let [full, empty] = headers();
+    let rounded =
+        |header, cloud| written(|path| model::write_rounded(path, header, &cloud, &Rounding::default()).map(drop));
+    survive(&Reader {
+        name: "dgtr, rounded",
+        seeds: vec![rounded(&full, cloud(1, 20)), rounded(&empty, cloud(0, 2))],
+        text: false,
+        shell: Some(HASHED),
+        memory: (4 << 20, 16),
+        read: Read::File("m.dgtr", &|path| line(model::read(path), |(_, cloud)| all_valid(&cloud))),
+    });
+}
+
 #[test]
 fn dgtr_models() {
     let [full, empty] = headers();
@@ -55,18 +80,11 @@ fn dgtr_models() {
         written(|path| model::write(path, &full, &cloud(1, 4))),
         written(|path| model::write(path, &empty, &cloud(0, 2))),
     ];
-    let shell = Shell {
-        open: |file| file[..file.len() - 32].to_vec(),
-        close: |mut content| {
-            content.extend_from_slice(blake3::hash(&content).as_bytes());
-            content
-        },
-    };
     survive(&Reader {
         name: "dgtr",
         seeds,
         text: false,
-        shell: Some(shell),
+        shell: Some(HASHED),
         memory: (512 << 10, 16),
         read: Read::File("m.dgtr", &|path| {
             line(model::read(path), |(header, cloud)| {

@@ -147,6 +147,7 @@ pub fn measure(
     };
     let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().sort_lanes()))?;
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
+    trainer.time_every_step();
     trainer.load(&scene.cloud)?;
     for p in &scene.pictures {
         trainer.add_view(p, None)?;

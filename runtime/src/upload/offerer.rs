@@ -5,7 +5,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use config::upload::UploadSettings;
+use config::upload::{Encoding, UploadSettings};
+use models::formats::{FormatError, delivery::Rounding, model};
 
 use super::flight_number::FlightNumber;
 use super::folder::FolderOutlet;
@@ -255,7 +256,18 @@ impl Worker {
 
     fn take_up(&mut self, path: &Path, kind: Kind) {
         let order = Order { flight: self.flight.get(), counter: self.counter + 1 };
-        match OfferedModel::open(path, &self.settings, &self.source, order, kind == Kind::Final) {
+        let rounded = match self.settings.encoding {
+            Encoding::Exact => None,
+            // Rather the whole file than none: the disk may be too full for another.
+            Encoding::Delivery => round(path).inspect_err(|e| self.note_failure(&e.to_string())).ok(),
+        };
+        match OfferedModel::open(
+            rounded.as_deref().unwrap_or(path),
+            &self.settings,
+            &self.source,
+            order,
+            kind == Kind::Final,
+        ) {
             Ok(model) => {
                 let mut inbox = locked(&self.shared.0);
                 inbox.status.offers += 1;
@@ -350,6 +362,14 @@ impl Worker {
         }
         delivered
     }
+}
+
+/// Writes the delivery encoding of a model beside it.
+fn round(path: &Path) -> Result<PathBuf, FormatError> {
+    let (header, cloud) = model::read(path)?;
+    let rounded = path.with_extension("delivery.dgtr");
+    model::write_rounded(&rounded, &header, &cloud, &Rounding::default())?;
+    Ok(rounded)
 }
 
 #[cfg(test)]

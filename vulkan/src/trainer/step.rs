@@ -37,8 +37,10 @@ impl Trainer {
         let divisor = self.prepare_frame(index, progress);
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
+        self.commands.weigh(self.timed_weight());
         let counted = self.forward_count(index)?;
         self.forward_backward()?;
+        self.commands.weigh(1.0);
         self.steps += 1;
         self.flushed = false;
         self.deferred.push(self.steps, self.frame.mean_rate, self.settings.rates.decay(progress));

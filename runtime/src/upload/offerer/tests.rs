@@ -42,6 +42,38 @@ fn admission(ids: &[&str], identity: Identity) -> Admission {
 const LIMIT: Duration = Duration::from_secs(60);
 
 #[test]
+fn a_model_is_rounded_for_delivery_and_the_ground_reads_it() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = UploadSettings {
+        encoding: Encoding::Delivery,
+        folder: Some(dir.path().join("stick")),
+        retry_min_s: 0.05,
+        poll_s: 0.05,
+        ..Default::default()
+    };
+    let path = dir.path().join("model.dgtr");
+    let mut cloud = models::cloud::GaussianCloud::default();
+    for i in 0..2000u32 {
+        let at = |k: u32| (i * k % 997) as f32 / 50.0;
+        cloud.push([at(7), at(13), at(29) / 10.0], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 1.0, &[at(3) / 20.0; 3]);
+    }
+    let header = model::ModelHeader { aircraft: "a1".into(), ..Default::default() };
+    model::write(&path, &header, &cloud).expect("write");
+    let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
+    o.offer_final(&path);
+    assert!(o.wait_delivered(LIMIT, || true));
+    let sent = o.status().bytes;
+    assert!(10 * sent < std::fs::metadata(&path).expect("metadata").len(), "{sent} bytes");
+
+    o.shutdown();
+    let mut r = Receiver::open(&settings, anything(&["a1"]), &dir.path().join("g")).expect("receiver");
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
+    let (received, rounded) = model::read(&r.received()[0].path).expect("a model");
+    assert_eq!((received, rounded.len()), (header, 1900));
+    assert_eq!(model::read(&path).expect("still there").1, cloud, "training goes on from the exact one");
+}
+
+#[test]
 fn a_model_travels_through_a_folder_that_is_plugged_in_late() {
     let dir = tempfile::tempdir().expect("temp dir");
     let stick = dir.path().join("stick");
