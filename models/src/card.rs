@@ -73,7 +73,7 @@ impl Card {
     /// # Errors
     /// A folder cannot be read, nothing in it is a picture, no picture has a position, or a file of positions is bad.
     pub fn open(folders: &[PathBuf], options: &CardOptions) -> Result<Self, CardError> {
-        let scan::Scanned { files, notes: mut lines, geotags } = scan::pictures(folders)?;
+        let scan::Scanned { files, notes: mut lines, geotags, .. } = scan::pictures(folders)?;
         let first = folders.first().cloned().unwrap_or_default();
         let found = files.len();
         let mut notes = notes::Notes::default();

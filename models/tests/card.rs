@@ -317,6 +317,16 @@ fn masks_beside_the_pictures_are_no_pictures() {
 }
 
 #[test]
+fn a_linked_folder_is_followed_once_even_where_it_leads_back() {
+    let (card, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    survey(elsewhere.path(), 3, tags);
+    std::os::unix::fs::symlink(elsewhere.path().join("DCIM"), card.path().join("DCIM")).unwrap();
+    std::os::unix::fs::symlink(card.path(), elsewhere.path().join("DCIM/100MEDIA/back")).unwrap();
+    std::os::unix::fs::symlink(elsewhere.path(), card.path().join("again")).unwrap();
+    assert_eq!(open(card.path()).pictures.len(), 3);
+}
+
+#[test]
 fn tiff_and_png_are_read_like_jpeg() {
     let dir = tempfile::tempdir().unwrap();
     for (i, extension) in ["tif", "png"].iter().enumerate() {

@@ -1,6 +1,8 @@
 //! Which files below a few folders may be pictures.
 
+use std::collections::HashSet;
 use std::fs;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::error::CardError;
@@ -24,6 +26,8 @@ pub(super) struct Scanned {
     pub geotags: Vec<PathBuf>,
     /// One line per folder that could not be read, or for a bound that was met.
     pub notes: Vec<String>,
+    /// Device and number of the folders looked through: a link may lead back.
+    looked_through: HashSet<(u64, u64)>,
 }
 
 /// Looks through `folders`; a folder given by name must be readable, one below it is passed over with a line.
@@ -42,6 +46,10 @@ pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
 }
 
 fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()> {
+    let at = fs::metadata(folder)?;
+    if !found.looked_through.insert((at.dev(), at.ino())) {
+        return Ok(());
+    }
     let mut folders = Vec::new();
     for entry in fs::read_dir(folder)? {
         let Ok(entry) = entry else { continue };
@@ -49,14 +57,15 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
         if name.starts_with('.') {
             continue;
         }
-        // Links to folders are not followed: they may lead back. A pipe or socket is no picture and is never opened.
+        // A pipe or socket is no picture and is never opened.
         let Ok(kind) = entry.file_type() else { continue };
         let path = entry.path();
-        if kind.is_dir() {
+        let is_link = kind.is_symlink();
+        if kind.is_dir() || (is_link && path.is_dir()) {
             if depth < MAX_DEPTH && !SKIPPED.contains(&name.as_str()) {
                 folders.push(path);
             }
-        } else if kind.is_file() || (kind.is_symlink() && path.is_file()) {
+        } else if kind.is_file() || (is_link && path.is_file()) {
             if GEOTAGS.contains(&name.as_str()) {
                 found.geotags.push(path);
             } else if ["jpg", "jpeg", "jpe", "png", "tif", "tiff"].iter().any(|e| name.ends_with(&format!(".{e}"))) {
