@@ -13,16 +13,19 @@ if [ $# -gt 0 ]; then exec cargo test $all "$@"; fi
 # shellcheck disable=SC2086
 cargo test $all --no-run
 log=$(mktemp)
-trap 'rm -f "$log"' EXIT
+flying=
+trap 'rm -f "$log"; [ -z "$flying" ] || kill "$flying" 2>/dev/null || true' EXIT
+trap 'exit 130' INT TERM
 # The same packages for both, so that neither compiles anything anew.
 whole=$(for file in tests/tests/*.rs; do echo "--test $(basename "$file" .rs)"; done)
 # shellcheck disable=SC2086
 cargo test $all --no-fail-fast $whole > "$log" 2>&1 &
 flying=$!
 failed=0
-# What flies comes first. Mesa's driver without threads of its own: the pictures are small, and the tests run side by side.
+# What flies comes first.
 # shellcheck disable=SC2086
-LP_NUM_THREADS="${LP_NUM_THREADS:-0}" nice -n 10 cargo test $all --exclude tests || failed=$?
+nice -n 10 cargo test $all --exclude tests || failed=$?
 wait "$flying" || failed=$?
+flying=
 cat "$log"
 exit "$failed"

@@ -17,8 +17,8 @@ choice! {
     pub enum Encoding {
         /// The file as it was trained, 236 bytes per Gaussian of SH degree 3.
         Exact = "exact",
-        /// Rounded and entropy-coded, a thirtieth of that (`models/FORMATS.md`); while it is encoded some 700 bytes of memory
-        /// per Gaussian.
+        /// Rounded and entropy-coded, about a thirtieth of that (`models/FORMATS.md`); 1.1 kB of `memory.host_mib` per
+        /// Gaussian are planned for the encoding.
         Delivery = "delivery",
     }
 }

@@ -77,6 +77,7 @@ fn usable(mission: &Mission) -> bool {
         key_frames: mission.keyframes.max,
         gaussians: memory.max_gaussians.map_or(1 << 20, |n| n as usize),
         sh_degree: 3,
+        delivered: 0,
     });
     let refusals = [
         mission.check_trust().err().map(|e| e.to_string()),

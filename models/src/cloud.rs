@@ -15,6 +15,28 @@ pub const fn sh_coefficients(degree: u8) -> usize {
 /// Y₀₀, the constant SH basis function.
 pub const SH_C0: f32 = 0.282_094_79;
 
+/// The real SH basis functions above degree 0 at a unit vector, in 3DGS's order and signs.
+pub fn sh_basis([x, y, z]: [f64; 3]) -> [f64; 15] {
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        -0.488_602_511_902_919_9 * y,
+        0.488_602_511_902_919_9 * z,
+        -0.488_602_511_902_919_9 * x,
+        1.092_548_430_592_079_2 * x * y,
+        -1.092_548_430_592_079_2 * y * z,
+        0.315_391_565_252_520_05 * (2.0 * zz - xx - yy),
+        -1.092_548_430_592_079_2 * x * z,
+        0.546_274_215_296_039_6 * (xx - yy),
+        -0.590_043_589_926_643_5 * y * (3.0 * xx - yy),
+        2.890_611_442_640_554 * x * y * z,
+        -0.457_045_799_464_465_8 * y * (4.0 * zz - xx - yy),
+        0.373_176_332_590_115_4 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        -0.457_045_799_464_465_8 * x * (4.0 * zz - xx - yy),
+        1.445_305_721_320_277 * z * (xx - yy),
+        -0.590_043_589_926_643_5 * x * (xx - 3.0 * yy),
+    ]
+}
+
 /// N Gaussians, column by column; every column has the same N.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct GaussianCloud {

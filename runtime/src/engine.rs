@@ -53,6 +53,8 @@ pub struct EngineSettings {
     pub ahead: usize,
     /// Their camera's own pictures wait in memory with them.
     pub ahead_in_memory: bool,
+    /// Models are rounded for delivery while the job goes on.
+    pub delivers: bool,
     /// Pictures are trained at this fraction of the size they come in; matching sees them whole.
     pub scale: f64,
     /// `[network]`: manifests of the user's own networks.
@@ -138,6 +140,7 @@ impl Reconstruction {
             camera_pixels: settings.camera_pixels,
             ahead: settings.ahead as u64,
             ahead_in_memory: settings.ahead_in_memory,
+            delivers: settings.delivers,
         });
         host.fits(settings.host_mib)?;
         report.more.insert("host_bytes_planned".into(), host.total_bytes().into());

@@ -10,9 +10,11 @@ use config::disk::bounded::{Bounded, bytes_below};
 use config::disk::plan::{DiskPlan, DiskRequest};
 use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
+use config::upload::Encoding;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
 use models::camera::Intrinsics;
+use models::formats::delivery::ENCODED_BYTES;
 use models::formats::model::ModelHeader;
 use vulkan::trainer::RunBudget;
 
@@ -111,6 +113,7 @@ pub fn fly(
     let intrinsics = training_lens(mission);
     let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
     let disk = planned_disk(mission, &options.out)?;
+    let source = Source { disk: disk.clone(), ..source };
     let mut reconstruction = open(mission, aircraft, &intrinsics, &disk)?;
     let store =
         KeyframeStore::open(&disk, &options.out.join("keyframes"), &mission.camera, &intrinsics, mission.origin)?;
@@ -143,6 +146,11 @@ pub fn fly(
     Ok(outcome(ended, counters, end, interrupt))
 }
 
+/// Whether models are rounded before they are sent.
+fn delivers(mission: &Mission) -> bool {
+    mission.upload.encoding == Encoding::Delivery
+}
+
 /// What a flight may take of the disk.
 fn disk_plan(mission: &Mission) -> DiskPlan {
     let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
@@ -151,7 +159,8 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
     let held = (u64::from(memory.device_mib) << 20) / each;
     let gaussians = memory.max_gaussians.map_or(held, u64::from).min(held) as usize;
     let CameraSettings { width, height, .. } = mission.camera;
-    DiskPlan::new(&DiskRequest { width, height, key_frames: mission.keyframes.max, gaussians, sh_degree })
+    let delivered = if delivers(mission) { ENCODED_BYTES } else { 0 };
+    DiskPlan::new(&DiskRequest { width, height, key_frames: mission.keyframes.max, gaussians, sh_degree, delivered })
 }
 
 /// The disk a flight writes to, bounded as the mission says; refused when not even a first model would fit.
@@ -199,6 +208,7 @@ fn open(
         ahead: DECODED_AHEAD + handover::AHEAD,
         // Until they are kept on disk; those that are files already wait there.
         ahead_in_memory: !matches!(aircraft.camera, CameraSource::Folder(_)),
+        delivers: delivers(mission),
         // The capture thread has scaled them already.
         scale: 1.0,
         network: mission.network.clone(),

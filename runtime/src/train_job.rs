@@ -163,6 +163,7 @@ impl TrainJob {
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
             ahead: 0,
             ahead_in_memory: false,
+            delivers: false,
             scale,
             network: self.network.clone(),
             training: self.settings(),

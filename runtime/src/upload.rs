@@ -6,6 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
+use config::disk::Disk;
 use config::mission::Mission;
 
 use crate::keys::{Identity, KeyError};
@@ -47,6 +48,8 @@ pub struct Source {
     pub identity: Identity,
     /// Where the number of the last flight is kept; None = every start is flight 1.
     pub flight_number: Option<PathBuf>,
+    /// Where what is made for delivery is written.
+    pub disk: Disk,
 }
 
 impl Source {
@@ -58,14 +61,20 @@ impl Source {
         let identity = Identity::of(mission, aircraft)?;
         let folder = if identity.is_signed() { &mission.upload.keys } else { out };
         let flight_number = Some(folder.join(format!("{aircraft}.flight")));
-        Ok(Self { mission: mission.name.clone(), aircraft: aircraft.into(), identity, flight_number })
+        Ok(Self {
+            mission: mission.name.clone(),
+            aircraft: aircraft.into(),
+            identity,
+            flight_number,
+            disk: Disk::default(),
+        })
     }
 
     /// For tests of what does not depend on keys.
     #[cfg(test)]
     pub(crate) fn unsigned(mission: &str, aircraft: &str) -> Self {
         let (mission, aircraft) = (mission.into(), aircraft.into());
-        Self { mission, aircraft, identity: Identity::unsigned(), flight_number: None }
+        Self { mission, aircraft, identity: Identity::unsigned(), flight_number: None, disk: Disk::default() }
     }
 }
 

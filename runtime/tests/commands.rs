@@ -155,6 +155,9 @@ fn export_and_import_give_the_model_back() {
     assert!(dgtr(&["export", &path("m.dgtr"), "--to", "delivery"]).status.success());
     let (header, delivered) = model::read(&dir.path().join("m.delivery.dgtr")).unwrap();
     assert_eq!((header.origin, delivered.len()), (origin, 1), "read wherever a .dgtr is");
+    let misplaced = dgtr(&["export", &path("m.dgtr"), "--to", "ply", "--fine"]);
+    assert_eq!(misplaced.status.code(), Some(2));
+    assert!(error_line(&misplaced).contains("--to delivery"));
 }
 
 #[test]

@@ -272,7 +272,8 @@ impl Aircraft {
         let aircraft = AIRCRAFT[number].to_owned();
         let received = at.join("out/received").join(&aircraft).join("model.dgtr");
         let flight_number = Some(at.join(format!("{aircraft}.flight")));
-        let source = Source { mission: mission.name.clone(), aircraft, identity: Identity::unsigned(), flight_number };
+        let (mission_name, disk) = (mission.name.clone(), Default::default());
+        let source = Source { mission: mission_name, aircraft, identity: Identity::unsigned(), flight_number, disk };
         let offerer = Offerer::start(&mission.upload, source).expect("offerer");
         let [checkpoint, last] = [1.0, 2.0].map(|stage| local_model(at, number, stage));
         offerer.offer(&checkpoint);

@@ -43,8 +43,17 @@ use config::training::{Strategy, TrainSettings, scene_extent};
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-/// Of so many steps one is timed: on lavapipe timestamps make it a tenth longer (a fox step 103 ms with them, 82 ms without).
+/// Of so many steps one is timed: on lavapipe timestamps make a step longer (`tests/BENCHMARKS.md`).
 const TIMED_EVERY: u32 = 16;
+
+/// How many steps the times of the one after `steps` stand for.
+fn timed_weight(steps: u32, every: u32) -> f64 {
+    match steps {
+        steps if steps < every => 1.0,
+        steps if steps.is_multiple_of(every) => f64::from(every),
+        _ => 0.0,
+    }
+}
 
 /// Gaussians, views and optimiser state on one device.
 pub struct Trainer {
@@ -266,16 +275,6 @@ impl Trainer {
         self.timed_every = 1;
     }
 
-    /// How many steps the next one's times stand for.
-    fn timed_weight(&self) -> f64 {
-        let every = self.timed_every;
-        match self.steps {
-            steps if steps < every => 1.0,
-            steps if steps.is_multiple_of(every) => f64::from(every),
-            _ => 0.0,
-        }
-    }
-
     /// Device milliseconds per stage since `load`, in pipeline order, of all steps as the timed ones let one expect; zeros on
     /// devices without timestamps.
     pub fn stage_ms(&self) -> [(&'static str, f64); STAGE_NAMES.len()] {
@@ -329,5 +328,16 @@ impl Trainer {
     /// What the kernels left; the device must be idle.
     fn status(&self) -> &Status {
         &self.arena.slice::<Status>(self.arena.section("status"))[0]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_timed_steps_stand_for_all_steps() {
+        for (every, steps) in [(1, 37), (16, 16), (16, 32), (16, 1600)] {
+            let stand_for: f64 = (0..steps).map(|step| super::timed_weight(step, every)).sum();
+            assert_eq!(stand_for, f64::from(steps), "one of {every}");
+        }
     }
 }

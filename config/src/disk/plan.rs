@@ -33,6 +33,8 @@ pub struct DiskRequest {
     pub gaussians: usize,
     /// Highest SH degree, 0…3.
     pub sh_degree: u8,
+    /// Most bytes of a Gaussian as it is delivered; 0: the checkpoint itself is.
+    pub delivered: usize,
 }
 
 /// Bytes by what they are for; what a folder takes stays below.
@@ -66,10 +68,16 @@ impl DiskPlan {
         let picture = picture_bytes(r.width, r.height);
         let floats = 11 + 3 * (u64::from(r.sh_degree) + 1).pow(2);
         let model = |views: u64| 4 * floats * r.gaussians as u64 + MODEL_VIEW * views + MODEL_FIXED;
+        let delivered = match r.delivered as u64 * r.gaussians as u64 {
+            0 => 0,
+            coded => coded + MODEL_VIEW * frames + MODEL_FIXED,
+        };
         let sections = vec![
             ("key frames", frames * picture),
             ("their list", GENERATIONS * frames * LIST_ENTRY),
             ("checkpoints", GENERATIONS * model(frames)),
+            // The one on offer, and the one being written.
+            ("delivery", 2 * delivered),
         ];
         Self {
             total_bytes: sections.iter().map(|s| s.1).sum(),
@@ -97,7 +105,8 @@ mod tests {
 
     #[test]
     fn a_flight_that_fits_begins_one_that_nearly_fits_is_told_and_one_without_room_is_refused() {
-        let request = DiskRequest { width: 640, height: 480, key_frames: 128, gaussians: 100_000, sh_degree: 3 };
+        let request =
+            DiskRequest { width: 640, height: 480, key_frames: 128, gaussians: 100_000, sh_degree: 3, delivered: 0 };
         let plan = DiskPlan::new(&request);
         // 128 pictures of 921,600 bytes, three models of 23.6 MB.
         assert!((188 << 20..198 << 20).contains(&plan.total_bytes), "{}", plan.total_bytes);
@@ -106,5 +115,7 @@ mod tests {
         assert_eq!(plan.fits(plan.min_bytes), Ok(false));
         let said = plan.fits(plan.min_bytes - 1).map_err(|e| e.to_string()).unwrap_err();
         assert!(said.contains("memory.disk_mib") && said.lines().count() == 1, "{said}");
+        let delivers = DiskPlan::new(&DiskRequest { delivered: 32, ..request });
+        assert!(delivers.total_bytes >= plan.total_bytes + 2 * 32 * 100_000);
     }
 }

@@ -29,6 +29,17 @@ mod view_basis;
 
 pub use coder::Garbled;
 
+/// Host memory that encoding takes at most per Gaussian of SH degree 3, the cloud that is encoded not counted (measured:
+/// `models/tests/delivery_memory.rs`).
+pub const ENCODING_BYTES: usize = 900;
+/// What a Gaussian takes on the disk at most: noise in every number needs 23 (the same test).
+pub const ENCODED_BYTES: usize = 32;
+/// And at least, beyond [`FREE_GAUSSIANS`]: what is read is bounded by the size of its file. Real scenes take 6 to 12; the words
+/// of a scene that is more regular are filled up.
+const LEAST_BYTES: u64 = 2;
+/// Gaussians that any number of words may hold.
+const FREE_GAUSSIANS: u64 = 1 << 10;
+
 /// Size classes at most; each is an octave.
 const MAX_CLASSES: usize = 40;
 /// A Gaussian's size: this share of the logarithm of its smallest axis, the rest of the middle one's.
@@ -36,8 +47,8 @@ const SMALLEST_SHARE: f64 = 0.33;
 /// Gaussians at either end of the sizes that get no class of their own.
 const OUTERMOST: f64 = 0.005;
 
-/// How finely a cloud is rounded. Source of the defaults: a sweep on sheffield_cross (`../shared/codec`, 6.5 bytes per
-/// Gaussian at -0.18 dB).
+/// How finely a cloud is rounded. Source of the defaults: a sweep of these steps over a model of sheffield_cross, bytes against
+/// held-out PSNR; what they cost is in tests/BENCHMARKS.md.
 #[derive(Clone, Copy, Debug)]
 pub struct Rounding {
     /// Share of the Gaussians kept, the most visible ones.
@@ -65,8 +76,8 @@ impl Default for Rounding {
 }
 
 impl Rounding {
-    /// Twice as finely, about a third more bytes: for scenes seen from near, whose Gaussians are large in the pictures (the
-    /// same sweep on fox).
+    /// Nearly twice as finely for a third more bytes: for scenes seen from near, whose Gaussians are large in the pictures (the
+    /// same sweep over a model of fox).
     pub fn fine() -> Self {
         Self {
             keep: 1.0,
@@ -84,10 +95,10 @@ struct Class {
     /// Grid step, metres.
     step: f64,
     /// Outside the bounds: as they are.
-    strays: Vec<Vec3>,
+    outliers: Vec<Vec3>,
     /// Sorted Morton codes of the others.
     cells: Vec<u64>,
-    /// Rows of the cloud, strays first.
+    /// Rows of the cloud, outliers first.
     rows: Vec<u32>,
 }
 
@@ -109,7 +120,16 @@ pub fn encode(cloud: &GaussianCloud, views: &[View], rounding: &Rounding) -> Res
     let n = given.classes.iter().map(|c| c.rows.len()).sum();
     let mut encoder = Encoder::new();
     code(&mut encoder, n, cloud.sh_degree, Some(&given))?;
-    Ok((encoder.finish(), n))
+    let mut words = encoder.finish();
+    if n as u64 > most_gaussians(4 * words.len() as u64) {
+        words.resize((n * LEAST_BYTES as usize).div_ceil(4), 0);
+    }
+    Ok((words, n))
+}
+
+/// Gaussians that so many bytes of words may hold.
+pub fn most_gaussians(bytes: u64) -> u64 {
+    (bytes / LEAST_BYTES).max(FREE_GAUSSIANS)
 }
 
 /// The cloud of `n` Gaussians in `words`. The caller bounds `n`.
@@ -187,15 +207,15 @@ fn places(coder: &mut impl Coder, n: usize, given: Option<&Given<'_>>) -> Result
         let own = given.map_or(&none, |g| &g.classes[at]);
         let step = f64::from(coder.f32(own.step as f32)?);
         let room = (n - places.len()) as u64;
-        let strays = coder.bits(32, own.strays.len() as u64)?;
+        let outliers = coder.bits(32, own.outliers.len() as u64)?;
         let members = coder.bits(32, own.cells.len() as u64)?;
-        if !(step.is_finite() && step > 0.0) || strays + members > room {
+        if !(step.is_finite() && step > 0.0) || outliers + members > room {
             return Err(Garbled);
         }
         let class = at as u8;
         let mut put = |mean: Vec3| places.push((bounds.rank(mean.as_dvec3()), Place { mean, class }));
-        for i in 0..strays as usize {
-            let known = own.strays.get(i).copied().unwrap_or_default();
+        for i in 0..outliers as usize {
+            let known = own.outliers.get(i).copied().unwrap_or_default();
             let mean = Vec3::new(coder.f32(known.x)?, coder.f32(known.y)?, coder.f32(known.z)?);
             if !mean.is_finite() {
                 return Err(Garbled);
@@ -262,7 +282,7 @@ impl<'a> Given<'a> {
             if bounds.holds(*mean) {
                 members[class].push((bounds.grid(classes[class].step).cell(*mean), *row));
             } else {
-                classes[class].strays.push(*mean);
+                classes[class].outliers.push(*mean);
                 classes[class].rows.push(*row);
             }
         }

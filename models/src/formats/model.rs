@@ -29,8 +29,6 @@ const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 const EXACT: u32 = 1;
 /// The delivery encoding.
 const ROUNDED: u32 = 2;
-/// Gaussians that a rounded file of any size may hold; beyond them it has at least a byte for each (real scenes: 5 to 9).
-const FREE_GAUSSIANS: u64 = 1 << 10;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 100 bytes per view; this is room for 100,000 of them and long names.
@@ -99,12 +97,13 @@ pub fn read_checkpoint(disk: &Disk, path: &Path) -> Result<Option<(ModelHeader, 
     Ok(newest.found)
 }
 
-/// Writes a model rounded, for delivery: about a thirtieth of the exact file, whole or not at all. Gives the number of
-/// Gaussians it holds.
+/// Writes a model rounded, for delivery: about a thirtieth of the exact file, through `disk`, whole or not at all. Gives the
+/// number of Gaussians it holds.
 ///
 /// # Errors
 /// Those of [`write()`].
 pub fn write_rounded(
+    disk: &Disk,
     path: &Path,
     header: &ModelHeader,
     cloud: &GaussianCloud,
@@ -115,11 +114,12 @@ pub fn write_rounded(
     let garbled = |e| FormatError::invalid(path, format!("not written: {e}"));
     let (words, n) = delivery::encode(cloud, &views, rounding).map_err(garbled)?;
     let head = encode_header(path, header)?;
-    write_atomic(path, |file| {
+    disk.replace(path, |file| {
         let mut out = begin(file, ROUNDED, &head, n, cloud.sh_degree)?;
         out.write_all(&words.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>())?;
         finish(out)
-    })?;
+    })
+    .map_err(|e| FormatError::disk(path, e))?;
     Ok(n)
 }
 
@@ -237,6 +237,20 @@ pub fn read_header(path: &Path) -> Result<(ModelHeader, usize), FormatError> {
     Ok((decode_header(path, &header)?, opened.count))
 }
 
+/// Bytes that the Gaussians of a model take as exact columns, in memory or in a file, whatever this file takes.
+///
+/// # Errors
+/// As [`read_header`].
+pub fn unpacked_bytes(path: &Path) -> Result<u64, FormatError> {
+    let opened = open(path)?;
+    Ok(opened.count as u64 * exact_bytes(opened.sh_degree))
+}
+
+/// Bytes of a Gaussian as exact columns.
+fn exact_bytes(sh_degree: u8) -> u64 {
+    4 * (11 + 3 * sh_coefficients(sh_degree) as u64)
+}
+
 struct Opened {
     input: Hashing<BufReader<File>>,
     count: usize,
@@ -282,7 +296,7 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
         let Some(coded) = size.checked_sub(FIXED + header_len as u64 + HASH) else {
             return Err(truncated("its header"));
         };
-        let limit = coded.max(FREE_GAUSSIANS);
+        let limit = delivery::most_gaussians(coded);
         if count > limit {
             let what = "its number of Gaussians";
             return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
@@ -293,8 +307,8 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
         let words = Some(coded as usize / 4);
         return Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len, words });
     }
-    let each = 4 * (11 + 3 * sh_coefficients(degree as u8) as u64);
-    let expected = count.checked_mul(each).and_then(|c| c.checked_add(FIXED + header_len as u64 + HASH));
+    let expected =
+        count.checked_mul(exact_bytes(degree as u8)).and_then(|c| c.checked_add(FIXED + header_len as u64 + HASH));
     match expected {
         Some(expected) if expected == size => {}
         Some(expected) if expected < size => {

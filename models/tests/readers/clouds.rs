@@ -61,8 +61,9 @@ const HASHED: Shell = Shell {
 #[test]
 fn rounded_dgtr_models() {
     let [full, empty] = headers();
-    let rounded =
-        |header, cloud| written(|path| model::write_rounded(path, header, &cloud, &Rounding::default()).map(drop));
+    let rounded = |header, cloud| {
+        written(|path| model::write_rounded(&Default::default(), path, header, &cloud, &Rounding::default()).map(drop))
+    };
     survive(&Reader {
         name: "dgtr, rounded",
         seeds: vec![rounded(&full, cloud(1, 20)), rounded(&empty, cloud(0, 2))],

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::ValueEnum;
+use config::disk::Disk;
 use config::lens::Distortion;
 use models::cloud::{GaussianCloud, SH_C0};
 use models::dataset::Dataset;
@@ -56,6 +57,9 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
+    if args.fine && args.format != Format::Delivery {
+        return Err(CliError::input("--fine is for --to delivery; leave it out"));
+    }
     let (header, cloud) = model::read(&args.model)?;
     let out = args.out.unwrap_or_else(|| match args.format {
         Format::Ply => args.model.with_extension("ply"),
@@ -73,7 +77,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Format::Spz => spz::write(&out, &cloud).map(|()| Some(cloud.len()))?,
         Format::Delivery => {
             let rounding = if args.fine { Rounding::fine() } else { Rounding::default() };
-            Some(model::write_rounded(&out, &header, &cloud, &rounding)?)
+            Some(model::write_rounded(&Disk::default(), &out, &header, &cloud, &rounding)?)
         }
         Format::Colmap | Format::Nerfstudio | Format::Opensfm => None,
     };

@@ -95,7 +95,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     println!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
     let ((width, height), key_frames) = (wanted.size, plan.views as u32);
     let (gaussians, sh_degree) = (plan.gaussians, plan.sh_degree);
-    let disk = DiskPlan::new(&DiskRequest { width, height, key_frames, gaussians, sh_degree });
+    let disk = DiskPlan::new(&DiskRequest { width, height, key_frames, gaussians, sh_degree, delivered: 0 });
     println!("\n  on disk, for a flight:");
     for (name, bytes) in &disk.sections {
         println!("  {name:<18} {:>9.2} MiB", mib(*bytes));

@@ -1,13 +1,14 @@
 //! Host memory of a job, planned like the device's: what it will hold at most, by a formula, before the first picture.
 //!
 //! ```text
-//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·N + A·3·(P [+ C]) + 2·3·C (+ device)
+//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·N + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
 //! ```
 //!
 //! V views, N Gaussians, D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
 
 use config::plan::Plan;
 use config::refine::RefineSettings;
+use models::formats::delivery::ENCODING_BYTES;
 
 use crate::error::JobError;
 
@@ -35,6 +36,8 @@ pub struct HostRequest<'a> {
     pub ahead: u64,
     /// The camera's own pictures wait in memory beside them (those of a folder wait there).
     pub ahead_in_memory: bool,
+    /// Models are rounded for delivery, beside all else.
+    pub delivers: bool,
 }
 
 /// Bytes by what holds them, in the order of the formula.
@@ -65,6 +68,7 @@ impl HostPlan {
             ("density control", LISTS_BYTES * n),
             ("pictures ahead", r.ahead * 3 * (p + if r.ahead_in_memory { r.camera_pixels } else { 0 })),
             ("picture at hand", 2 * 3 * r.camera_pixels),
+            ("delivery", if r.delivers { n * (ENCODING_BYTES as u64 + 4 * (11 + 3 * coefficients)) } else { 0 }),
             ("device", if r.shared { r.plan.total_bytes } else { 0 }),
         ];
         Self { sections }
@@ -107,6 +111,7 @@ mod tests {
             camera_pixels: 640 * 480,
             ahead: 4,
             ahead_in_memory: false,
+            delivers: false,
         };
         of(&mut request);
         HostPlan::new(&request).total_bytes()
@@ -120,6 +125,8 @@ mod tests {
         assert_eq!(total(&plan, |r| r.ahead += 1) - before, 3 * plan.pixels as u64);
         assert_eq!(total(&plan, |r| r.ahead_in_memory = true) - before, 4 * 3 * 640 * 480);
         assert_eq!(total(&plan, |r| r.camera_pixels += 1000) - before, 6000);
+        let delivery = plan.gaussians as u64 * (ENCODING_BYTES as u64 + 4 * (11 + 48));
+        assert_eq!(total(&plan, |r| r.delivers = true) - before, delivery);
         assert!(total(&plan, |r| r.refine = None) < before && total(&plan, |r| r.initialiser = 0) < before);
         let larger = Plan::new(&PlanRequest { device_mib: 1024, ..PlanRequest::default() }).unwrap();
         let more = (larger.gaussians - plan.gaussians) as u64;

@@ -356,6 +356,7 @@ mod tests {
             camera_pixels: 32 * 24,
             ahead: 0,
             ahead_in_memory: false,
+            delivers: false,
             scale: 1.0,
             network: NetworkSettings::default(),
             training: Default::default(),

@@ -20,8 +20,13 @@ use crate::upload::admission::ModelRefusal;
 pub fn admit(mission: &Mission, aircraft: &str, path: &Path) -> Result<LocalModel, ModelRefusal> {
     // Without the path: it lies under a temporary name, and the same reason should read the same.
     let parse = |e: AggregateError| ModelRefusal::Parse(e.to_string().replace(&format!("{}: ", path.display()), ""));
-    let mut model = LocalModel::read(path).map_err(parse)?;
     let refuse = |why: String| Err(ModelRefusal::Meaning(why));
+    // A rounded file is a thirtieth of what it becomes: the bound holds for both.
+    let unpacked = models::formats::model::unpacked_bytes(path).map_err(|e| parse(e.into()))?;
+    if unpacked > mission.upload.max_model_bytes() {
+        return refuse(format!("unpacked it takes {} MiB, more than upload.max_model_mib", unpacked >> 20));
+    }
+    let mut model = LocalModel::read(path).map_err(parse)?;
     let header = &mut model.header;
     // Models made by hand may leave out who made them.
     if !header.mission.is_empty() && header.mission != mission.name {

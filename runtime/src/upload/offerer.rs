@@ -5,6 +5,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use config::disk::Disk;
 use config::upload::{Encoding, UploadSettings};
 use models::formats::{FormatError, delivery::Rounding, model};
 
@@ -259,7 +260,9 @@ impl Worker {
         let rounded = match self.settings.encoding {
             Encoding::Exact => None,
             // Rather the whole file than none: the disk may be too full for another.
-            Encoding::Delivery => round(path).inspect_err(|e| self.note_failure(&e.to_string())).ok(),
+            Encoding::Delivery => write_delivery(&self.source.disk, path)
+                .inspect_err(|e| tracing::warn!("upload: {e}; the exact model is offered instead"))
+                .ok(),
         };
         match OfferedModel::open(
             rounded.as_deref().unwrap_or(path),
@@ -365,10 +368,10 @@ impl Worker {
 }
 
 /// Writes the delivery encoding of a model beside it.
-fn round(path: &Path) -> Result<PathBuf, FormatError> {
+fn write_delivery(disk: &Disk, path: &Path) -> Result<PathBuf, FormatError> {
     let (header, cloud) = model::read(path)?;
     let rounded = path.with_extension("delivery.dgtr");
-    model::write_rounded(&rounded, &header, &cloud, &Rounding::default())?;
+    model::write_rounded(disk, &rounded, &header, &cloud, &Rounding::default())?;
     Ok(rounded)
 }
 

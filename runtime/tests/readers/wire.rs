@@ -37,7 +37,7 @@ fn settings() -> UploadSettings {
 
 fn source() -> Source {
     let (mission, aircraft) = ("park".into(), "west".into());
-    Source { mission, aircraft, identity: Identity::unsigned(), flight_number: None }
+    Source { mission, aircraft, identity: Identity::unsigned(), flight_number: None, disk: Default::default() }
 }
 
 /// A model file of so many bytes, on offer.

@@ -37,7 +37,7 @@ impl Trainer {
         let divisor = self.prepare_frame(index, progress);
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
-        self.commands.weigh(self.timed_weight());
+        self.commands.weigh(super::timed_weight(self.steps, self.timed_every));
         let counted = self.forward_count(index)?;
         self.forward_backward()?;
         self.commands.weigh(1.0);

@@ -9,7 +9,7 @@ pub const LOG_SCALES: (f64, f64) = (-14.0, 8.0);
 /// tan(π/8): of the 24 ways to name a Gaussian's axes one has no component of its Rodrigues vector beyond.
 const WIDEST: f64 = 0.414_213_56;
 /// Differences of log scales below which a rotation between the two axes is coded so many powers of two coarser than the
-/// base: 2^e is about 1.5 × 0.7 / sinh(0.7 d), how little such a rotation shows (`../shared/codec`, codec2.py).
+/// base: 2^e is about 1.5 × 0.7 / sinh(0.7 d), how little such a rotation shows.
 const COARSER: [(f64, i32); 5] = [(0.2637, 3), (0.5189, 2), (0.9826, 1), (1.6924, 0), (2.584, -1)];
 /// As much finer for the longest ones.
 const FINEST: i32 = -2;
@@ -171,7 +171,7 @@ pub fn smallest_rotation(log_scales: [f32; 3], rotation: [f32; 4]) -> ([f32; 3],
     let [w, x, y, z] = rotation.map(f64::from);
     let q = glam::DQuat::from_xyzw(x, y, z, w).normalize();
     let mut best = (f64::NEG_INFINITY, glam::DQuat::IDENTITY, glam::DQuat::IDENTITY);
-    for turn in turns() {
+    for turn in cube_rotations() {
         let turned = q * turn;
         if turned.w.abs() > best.0 + 1e-9 {
             best = (turned.w.abs(), turned, turn);
@@ -193,7 +193,7 @@ pub fn smallest_rotation(log_scales: [f32; 3], rotation: [f32; 4]) -> ([f32; 3],
 }
 
 /// The 24 rotations of a cube.
-fn turns() -> impl Iterator<Item = glam::DQuat> {
+fn cube_rotations() -> impl Iterator<Item = glam::DQuat> {
     use glam::{DQuat, DVec3};
     use std::f64::consts::FRAC_PI_2;
     let faces = [

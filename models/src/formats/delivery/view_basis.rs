@@ -6,6 +6,7 @@
 
 use super::coder::{Coder, Garbled};
 use crate::camera::View;
+use crate::cloud::sh_basis;
 use glam::Vec3;
 
 /// SH coefficients above degree 0 at degree 3.
@@ -45,7 +46,7 @@ impl ViewBasis {
                     && (p.x * k.fx).abs() < reach * k.width as f32
                     && (p.y * k.fy).abs() < reach * k.height as f32
                 {
-                    seen.push(basis((means[i].as_dvec3() - view.pose.center).normalize().to_array()));
+                    seen.push(sh_basis((means[i].as_dvec3() - view.pose.center).normalize().to_array()));
                 }
             }
             for b in &seen {
@@ -89,26 +90,4 @@ impl ViewBasis {
         }
         if self.values[..n].iter().all(|v| *v > 0.0) { Ok(self) } else { Err(Garbled) }
     }
-}
-
-/// Real SH above degree 0 in 3DGS's order and signs.
-fn basis([x, y, z]: [f64; 3]) -> [f64; MOST] {
-    let (xx, yy, zz) = (x * x, y * y, z * z);
-    [
-        -0.488_602_5 * y,
-        0.488_602_5 * z,
-        -0.488_602_5 * x,
-        1.092_548_4 * x * y,
-        -1.092_548_4 * y * z,
-        0.315_391_6 * (2.0 * zz - xx - yy),
-        -1.092_548_4 * x * z,
-        0.546_274_2 * (xx - yy),
-        -0.590_043_6 * y * (3.0 * xx - yy),
-        2.890_611_4 * x * y * z,
-        -0.457_045_8 * y * (4.0 * zz - xx - yy),
-        0.373_176_3 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-        -0.457_045_8 * x * (4.0 * zz - xx - yy),
-        1.445_305_7 * z * (xx - yy),
-        -0.590_043_6 * x * (xx - 3.0 * yy),
-    ]
 }

@@ -46,6 +46,23 @@ fn what_does_not_belong_to_aircraft_and_mission_is_refused_with_its_reason() {
     assert!(refused("west", |m| _ = m.cloud.retain(|_| false)).contains("region"));
 }
 
+#[test]
+fn a_rounded_model_that_unpacks_to_more_than_the_ground_takes_is_refused_before_it_is_unpacked() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let mut mission = mission(dir.path());
+    mission.upload.max_model_mib = 1;
+    let rounded = |spacing: f64| {
+        let local = model("west", &[], carpet([-40.0, -20.0], [40.0, 20.0], spacing));
+        let path = dir.path().join("west.dgtr");
+        let (disk, rounding) = (Default::default(), Default::default());
+        models::formats::model::write_rounded(&disk, &path, &local.header, &local.cloud, &rounding).expect("write");
+        assert!(path.metadata().expect("metadata").len() < 1 << 20, "the file itself would do");
+        admit(&mission, "west", &path).map_or_else(|e| e.to_string(), |_| "admitted".into())
+    };
+    assert_eq!(rounded(1.0), "admitted");
+    assert!(rounded(0.3).contains("upload.max_model_mib"));
+}
+
 /// Such a view ended the ground with a panic, and nobody had a global model.
 #[test]
 fn a_view_larger_than_the_missions_camera_costs_its_own_model_only() {

@@ -41,17 +41,16 @@ fn admission(ids: &[&str], identity: Identity) -> Admission {
 
 const LIMIT: Duration = Duration::from_secs(60);
 
-#[test]
-fn a_model_is_rounded_for_delivery_and_the_ground_reads_it() {
-    let dir = tempfile::tempdir().expect("temp dir");
+/// Settings and a model of 2,000 Gaussians for delivery through a folder.
+fn delivery(dir: &Path) -> (UploadSettings, PathBuf, model::ModelHeader, models::cloud::GaussianCloud) {
     let settings = UploadSettings {
         encoding: Encoding::Delivery,
-        folder: Some(dir.path().join("stick")),
+        folder: Some(dir.join("stick")),
         retry_min_s: 0.05,
         poll_s: 0.05,
         ..Default::default()
     };
-    let path = dir.path().join("model.dgtr");
+    let path = dir.join("model.dgtr");
     let mut cloud = models::cloud::GaussianCloud::default();
     for i in 0..2000u32 {
         let at = |k: u32| (i * k % 997) as f32 / 50.0;
@@ -59,6 +58,24 @@ fn a_model_is_rounded_for_delivery_and_the_ground_reads_it() {
     }
     let header = model::ModelHeader { aircraft: "a1".into(), ..Default::default() };
     model::write(&path, &header, &cloud).expect("write");
+    (settings, path, header, cloud)
+}
+
+#[test]
+fn where_no_rounded_model_can_be_written_the_exact_one_is_offered() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let (settings, path, ..) = delivery(dir.path());
+    std::fs::create_dir(dir.path().join("model.delivery.dgtr")).expect("in the way");
+    let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
+    o.offer_final(&path);
+    assert!(o.wait_delivered(LIMIT, || true));
+    assert_eq!(o.status().bytes, std::fs::metadata(&path).expect("metadata").len());
+}
+
+#[test]
+fn a_model_is_rounded_for_delivery_and_the_ground_reads_it() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let (settings, path, header, cloud) = delivery(dir.path());
     let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(&path);
     assert!(o.wait_delivered(LIMIT, || true));
