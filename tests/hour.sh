@@ -20,7 +20,7 @@ dgtr="${DGTR:-$here/target/release/dgtr}"
 [ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
 rm -rf "$out"; mkdir -p "$out/disk" "$out/camera"
 cd "$out"
-limit_mib=1536 disk_mib=160 quota_mib=200
+limit_mib=1536 disk_mib=360 quota_mib=400
 mounted=
 if mount -t tmpfs -o "size=${quota_mib}m" none "$PWD/disk" 2>/dev/null; then mounted=1; else
     echo "hour.sh: no file system of its own for the disk (not root); it will not fill" >&2

@@ -26,6 +26,8 @@ pub const SECTION_ALIGNMENT: u64 = 256;
 pub const TOTAL_ALIGNMENT: u64 = 64 << 10;
 /// What a driver may want beyond the bytes of the one buffer (V3DV: 256 more for storage and uniform buffers; others round up).
 pub const DRIVER_ROOM: u64 = 64 << 10;
+/// Views on the device at the least: the step's own, and the one that comes in.
+const LEAST_SLOTS: u32 = 2;
 /// Pixels along the side of a tile.
 pub const TILE_SIDE: u64 = 4;
 
@@ -38,8 +40,11 @@ pub struct PlanRequest {
     pub width: u32,
     /// Height of the largest training picture, pixels.
     pub height: u32,
-    /// Training views kept on the device.
+    /// Training views.
     pub views: u32,
+    /// How many of them are on the device at once, the others waiting in a file; `None`: all where they take at most half of the
+    /// memory, else as many as an eighth of it holds, and never more than leave room for a plan.
+    pub view_slots: Option<u32>,
     /// Highest SH degree, 0…3.
     pub sh_degree: u8,
     /// Upper bound on Gaussians; `None` takes what the memory allows.
@@ -58,6 +63,7 @@ impl Default for PlanRequest {
             width: 640,
             height: 480,
             views: 64,
+            view_slots: None,
             sh_degree: 3,
             max_gaussians: None,
             half_moments: false,
@@ -79,6 +85,8 @@ pub struct Plan {
     pub tiles: usize,
     /// Training views.
     pub views: usize,
+    /// Training views on the device at once; the others wait in a file.
+    pub view_slots: usize,
     /// Highest SH degree.
     pub sh_degree: u8,
     /// Adam's moments of SH take 16 bits each instead of 32.
@@ -96,13 +104,13 @@ pub struct Plan {
 pub enum PlanError {
     /// Pictures and views alone exceed the budget.
     #[error(
-        "memory plan: {device_mib} MiB of device memory are too few for {views} views of {width}x{height}; \
+        "memory plan: {device_mib} MiB of device memory are too few for {views} views of {width}x{height} at once; \
          at least {needed_mib} MiB are needed (raise memory.device_mib, or use fewer or smaller views)"
     )]
     TooSmall {
         /// What was allowed.
         device_mib: u32,
-        /// Views asked for.
+        /// Views on the device at once.
         views: u32,
         /// Picture width.
         width: u32,
@@ -137,6 +145,40 @@ pub const fn view_bytes(pixels: u64) -> u64 {
     (4 * pixels + 4 * pixels.div_ceil(2)).next_multiple_of(SECTION_ALIGNMENT)
 }
 
+impl PlanRequest {
+    /// Pixels of a picture, padded: pictures of the same area in another shape need a few more tiles.
+    fn padded_pixels(&self) -> u64 {
+        (u64::from(self.width) * u64::from(self.height)).next_multiple_of(64)
+    }
+
+    /// Training views on the device at once.
+    pub fn slots(&self) -> u32 {
+        let budget = u64::from(self.device_mib) << 20;
+        let held_in = |bytes: u64| u32::try_from(bytes / view_bytes(self.padded_pixels())).unwrap_or(u32::MAX);
+        let slots = match self.view_slots {
+            Some(slots) => slots,
+            None => {
+                let few = if held_in(budget / 2) >= self.views { self.views } else { held_in(budget / 8) };
+                few.min(held_in(budget.saturating_sub(Plan::smallest(self, 0).total_bytes)))
+            }
+        };
+        slots.max(LEAST_SLOTS).min(self.views)
+    }
+
+    /// Gaussians that bindings and request allow.
+    fn most_gaussians(&self) -> usize {
+        // Widest column set in one binding: three vec4 of Adam state per geometry column, or all SH columns.
+        let widest = 144.max(16 * sh_columns(self.sh_degree));
+        let most = (BINDING_LIMIT / widest) as usize;
+        self.max_gaussians.unwrap_or(most).min(most)
+    }
+
+    /// Bytes of the file that holds the views when not all of them are on the device; 0 when all are.
+    pub fn view_file_bytes(&self) -> u64 {
+        if self.slots() < self.views { u64::from(self.views) * view_bytes(self.padded_pixels()) } else { 0 }
+    }
+}
+
 fn within(what: &'static str, value: u64, low: u64, high: u64) -> Result<(), PlanError> {
     if (low..=high).contains(&value) { Ok(()) } else { Err(PlanError::OutOfRange { what, value, low, high }) }
 }
@@ -158,20 +200,16 @@ impl Plan {
         within("sh_degree", r.sh_degree.into(), 0, 3)?;
         within("sort_lanes", r.sort_lanes.into(), SORT_LANES_SOFTWARE.into(), SORT_LANES_GPU.into())?;
         within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, u64::from(u32::MAX) >> 4)?;
-        let budget = u64::from(r.device_mib) << 20;
-        // Widest column set in one binding: three vec4 of Adam state per geometry column, or all SH columns.
-        let widest = 144.max(16 * sh_columns(r.sh_degree));
-        let most = (BINDING_LIMIT / widest) as usize;
-        let most = r.max_gaussians.unwrap_or(most).min(most);
+        let (budget, slots, most) = (u64::from(r.device_mib) << 20, r.slots(), r.most_gaussians());
         let least = most.min(Self::LEAST_GAUSSIANS);
         let pixels = r.width as usize * r.height as usize;
         // A picture of ordinary content needs about 4 instances per pixel of 4 × 4 tiles (measured on fox).
-        let made = |n: usize, per_pixel: usize| Self::laid_out(r, n, n + per_pixel * pixels);
-        let smallest = made(least, 2);
+        let made = |n: usize, per_pixel: usize| Self::laid_out(r, slots, n, n + per_pixel * pixels);
+        let smallest = Self::smallest(r, slots);
         if smallest.total_bytes > budget {
             return Err(PlanError::TooSmall {
                 device_mib: r.device_mib,
-                views: r.views,
+                views: slots,
                 width: r.width,
                 height: r.height,
                 needed_mib: smallest.total_bytes.div_ceil(1 << 20),
@@ -189,18 +227,25 @@ impl Plan {
     }
 
     /// A plan with given capacities instead of a budget (tests, benchmarks). `instances` is raised to `gaussians`, so
-    /// that one tile always fits.
+    /// that one tile always fits. All views are on the device where the request does not say how many.
     pub fn with_capacities(request: &PlanRequest, gaussians: usize, instances: usize) -> Self {
-        Self::laid_out(request, gaussians.max(1), instances)
+        let slots = if request.view_slots.is_some() { request.slots() } else { request.views };
+        Self::laid_out(request, slots, gaussians.max(1), instances)
     }
 
-    fn laid_out(r: &PlanRequest, gaussians: usize, instances: usize) -> Self {
+    /// The least that is worth making with so many views on the device.
+    fn smallest(r: &PlanRequest, slots: u32) -> Self {
+        let n = r.most_gaussians().min(Self::LEAST_GAUSSIANS);
+        Self::laid_out(r, slots, n, n + 2 * r.width as usize * r.height as usize)
+    }
+
+    fn laid_out(r: &PlanRequest, slots: u32, gaussians: usize, instances: usize) -> Self {
         let most_instances = (BINDING_LIMIT / 48) as usize;
         let instances = instances.clamp(gaussians.min(most_instances), most_instances);
         let (n, m) = (gaussians as u64, instances as u64);
-        // Pictures of the same area in another shape (portrait, cropped) need a few more tiles and padding.
-        let p = (u64::from(r.width) * u64::from(r.height)).next_multiple_of(64);
+        let p = r.padded_pixels();
         let (across, down) = (u64::from(r.width).div_ceil(TILE_SIDE), u64::from(r.height).div_ceil(TILE_SIDE));
+        // As do pictures in portrait or cropped ones.
         let tiles = across * down + across.max(down) + 64;
         let sh = 16 * sh_columns(r.sh_degree) * n;
         let lanes = u64::from(r.sort_lanes);
@@ -231,7 +276,7 @@ impl Plan {
             ("transmittance", 4 * p),
             ("image_gradient", 16 * p),
             ("target", 8 * p), // the step's picture (RGBA8) and depth prior at working size
-            ("views", view_bytes(p) * u64::from(r.views)),
+            ("views", view_bytes(p) * u64::from(slots)),
             ("driver_room", DRIVER_ROOM), // behind the buffer, for what the driver adds to it
         ]
         .into_iter()
@@ -244,6 +289,7 @@ impl Plan {
             pixels: p as usize,
             tiles: tiles as usize,
             views: r.views as usize,
+            view_slots: slots as usize,
             sh_degree: r.sh_degree,
             half_moments: r.half_moments,
             sort_lanes: r.sort_lanes,
@@ -326,6 +372,24 @@ mod tests {
         let PlanError::TooSmall { needed_mib, .. } = error else { panic!("{error}") };
         assert!(Plan::new(&request(needed_mib as u32)).is_ok());
         assert!(Plan::new(&request(needed_mib as u32 - 1)).is_err());
+    }
+
+    #[test]
+    fn views_stay_on_the_device_while_they_leave_half_of_it_and_wait_in_a_file_otherwise() {
+        let of = |views: u32, width: u32, height: u32| PlanRequest { views, width, height, ..request(512) };
+        let few = of(50, 640, 480);
+        assert_eq!((few.slots(), few.view_file_bytes()), (50, 0));
+        let many = of(1000, 1280, 960);
+        assert_eq!((many.slots(), many.view_file_bytes()), (9, 1000 * 6 * 1280 * 960));
+        let plan = Plan::new(&many).unwrap();
+        assert!(plan.total_bytes <= 512 << 20 && plan.gaussians > 100_000, "{} Gaussians", plan.gaussians);
+        assert_eq!((plan.views, plan.view_slots, plan.bytes("views")), (1000, 9, 9 * 6 * 1280 * 960));
+        assert_eq!(PlanRequest { view_slots: Some(0), ..many }.slots(), 2, "one in use, one coming in");
+        assert_eq!(PlanRequest { view_slots: Some(2000), ..many }.slots(), 1000);
+        assert_eq!(of(0, 640, 480).slots(), 0);
+        // Where pictures are large for the memory, fewer of them stay rather than that no plan can be made.
+        let tight = PlanRequest { device_mib: 215, ..of(50, 1280, 960) };
+        assert!(tight.slots() == 2 && Plan::new(&tight).is_ok(), "{}", tight.slots());
     }
 
     #[test]

@@ -250,7 +250,8 @@ impl Reconstruction {
     fn initialise_waiting(&mut self, until: usize) -> Result<(), JobError> {
         let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
         for i in self.initialised..until {
-            if let (Some(image), Some(view)) = (self.trainer.view_image(i), self.trainer.view_pose(i)) {
+            if let Some(view) = self.trainer.view_pose(i) {
+                let image = self.trainer.view_image(i)?;
                 let (name, View { pose, .. }) = self.views[i].clone();
                 let view = View { pose, ..view };
                 let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };

@@ -10,10 +10,10 @@ use config::disk::bounded::{Bounded, bytes_below};
 use config::disk::plan::{DiskPlan, DiskRequest};
 use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
+use config::plan::SORT_LANES_GPU;
 use config::upload::Encoding;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
-use models::camera::Intrinsics;
 use models::formats::delivery::ENCODED_BYTES;
 use models::formats::model::ModelHeader;
 use vulkan::trainer::RunBudget;
@@ -44,7 +44,7 @@ mod rehearsal;
 pub use handover::Handover;
 pub use intake::{EndOfFlight, Ended, FlightCounters};
 
-use crate::engine::device::DeviceRequest;
+use crate::engine::device::{DeviceRequest, training_lens};
 use crate::engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path};
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
@@ -92,14 +92,6 @@ pub struct FlyOutcome {
     pub report: RunReport,
 }
 
-/// The lens of the pictures that are trained on.
-pub fn training_lens(mission: &Mission) -> Intrinsics {
-    let c = &mission.camera;
-    let full = Intrinsics { width: c.width, height: c.height, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy };
-    let scaled = |side: u32| ((side as f32 * mission.memory.image_scale).round() as u32).max(1);
-    full.resized(scaled(c.width), scaled(c.height))
-}
-
 /// Flies one aircraft's mission to its end.
 ///
 /// # Errors
@@ -114,7 +106,7 @@ pub fn fly(
     let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
     let disk = planned_disk(mission, &options.out)?;
     let source = Source { disk: disk.clone(), ..source };
-    let mut reconstruction = open(mission, aircraft, &intrinsics, &disk)?;
+    let mut reconstruction = open(mission, aircraft, options, &disk)?;
     let store =
         KeyframeStore::open(&disk, &options.out.join("keyframes"), &mission.camera, &intrinsics, mission.origin)?;
     reconstruction.resume(&options.out)?;
@@ -151,6 +143,12 @@ fn delivers(mission: &Mission) -> bool {
     mission.upload.encoding == Encoding::Delivery
 }
 
+/// Bytes of the file of the views that are not on the device.
+fn view_file_bytes(mission: &Mission) -> u64 {
+    // How many lanes sort matters little; more of them leave less room.
+    DeviceRequest::of_flight(mission, None).plan_request(&mission.training.sh, SORT_LANES_GPU).view_file_bytes()
+}
+
 /// What a flight may take of the disk.
 fn disk_plan(mission: &Mission) -> DiskPlan {
     let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
@@ -159,8 +157,15 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
     let held = (u64::from(memory.device_mib) << 20) / each;
     let gaussians = memory.max_gaussians.map_or(held, u64::from).min(held) as usize;
     let CameraSettings { width, height, .. } = mission.camera;
-    let delivered = if delivers(mission) { ENCODED_BYTES } else { 0 };
-    DiskPlan::new(&DiskRequest { width, height, key_frames: mission.keyframes.max, gaussians, sh_degree, delivered })
+    DiskPlan::new(&DiskRequest {
+        width,
+        height,
+        key_frames: mission.keyframes.max,
+        view_file: view_file_bytes(mission),
+        gaussians,
+        sh_degree,
+        delivered: if delivers(mission) { ENCODED_BYTES } else { 0 },
+    })
 }
 
 /// The disk a flight writes to, bounded as the mission says; refused when not even a first model would fit.
@@ -175,7 +180,9 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
         let (room, total) = (room >> 20, plan.total_bytes >> 20);
         tracing::warn!("disk: {room} MiB for a flight that may take {total} MiB; see dgtr plan for what it is for");
     }
-    Ok(Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(limit)))))
+    // The file of the views has no name: what is counted below `out` is the rest.
+    let rest = limit.saturating_sub(plan.view_file_bytes());
+    Ok(Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(rest)))))
 }
 
 /// Waits for the ground to have the finished model, then says what became of everything.
@@ -188,20 +195,12 @@ fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, in
 }
 
 /// The engine for `aircraft`, with everything it will ever need.
-fn open(
-    mission: &Mission,
-    aircraft: &Aircraft,
-    intrinsics: &Intrinsics,
-    disk: &Disk,
-) -> Result<Reconstruction, JobError> {
+fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Disk) -> Result<Reconstruction, JobError> {
     let settings = EngineSettings {
         disk: disk.clone(),
         device: DeviceRequest {
             device: aircraft.device.clone(),
-            device_mib: mission.memory.device_mib,
-            size: (intrinsics.width, intrinsics.height),
-            views: mission.keyframes.max as usize,
-            max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
+            ..DeviceRequest::of_flight(mission, Some(options.out.clone()))
         },
         host_mib: Some(mission.memory.host_mib),
         camera_pixels: u64::from(mission.camera.width) * u64::from(mission.camera.height),

@@ -67,6 +67,8 @@ pub struct TrainJob {
     pub budget_mib: u32,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
+    /// Views on the device at once; `None`: as [`config::plan::PlanRequest::slots`] says.
+    pub view_slots: Option<u32>,
     /// Image scale; `None`: as large as the plan holds.
     pub scale: Option<f64>,
     /// Part of the Vulkan device's name.
@@ -89,6 +91,8 @@ pub struct TrainJob {
 
 /// Scales that are tried where none is asked for: halves, at which JPEG files are decoded for less, and between.
 const SCALES: [f64; 9] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125];
+/// Pictures are not made smaller than this only because they are many, pixels of the longer side.
+const WORKING_SIDE: u32 = 640;
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;
 /// Shares that a sort is done in at most; fewer need less memory.
@@ -157,6 +161,8 @@ impl TrainJob {
                 device_mib: self.budget_mib,
                 size,
                 views: frames.len(),
+                view_slots: self.view_slots,
+                folder: Some(self.out.clone()),
                 max_gaussians: self.max_gaussians,
             },
             host_mib: None,
@@ -214,7 +220,8 @@ impl TrainJob {
         TrainSettings { steps, seconds, ..self.training.clone() }
     }
 
-    /// The scale asked for; else the largest for which the plan holds all pictures and, for a card, Gaussians worth the name.
+    /// The scale asked for; else the largest for which the device holds all pictures and, for a card, Gaussians worth the name;
+    /// for more pictures than that a working size, and some of them wait in a file.
     fn picture_scale(&self, set: &Dataset, is_card: bool) -> Result<f64, JobError> {
         if let Some(scale) = self.scale {
             return Ok(scale);
@@ -222,17 +229,23 @@ impl TrainJob {
         let frames = set.select(&self.split, self.region.as_deref())?;
         let wanted = if is_card { self.max_gaussians.unwrap_or(usize::MAX).min(GAUSSIANS_OF_A_CARD) } else { 0 };
         for scale in SCALES {
-            let request = DeviceRequest {
+            let all_on_device = DeviceRequest {
                 device: None,
                 device_mib: self.budget_mib,
                 size: largest(set, &frames, scale)?,
                 views: frames.len(),
+                view_slots: self.view_slots.or(Some(frames.len() as u32)),
+                folder: None,
                 max_gaussians: self.max_gaussians,
             };
-            let plan = Plan::new(&request.plan_request(&self.training.sh, MOST_SORT_LANES));
-            if plan.is_ok_and(|p| p.gaussians >= wanted) {
+            let some_in_file = DeviceRequest { view_slots: self.view_slots, ..all_on_device.clone() };
+            let holds = |request: &DeviceRequest| {
+                let plan = Plan::new(&request.plan_request(&self.training.sh, MOST_SORT_LANES));
+                plan.is_ok_and(|p| p.gaussians >= wanted)
+            };
+            let (w, h) = all_on_device.size;
+            if holds(&all_on_device) || (w.max(h) <= WORKING_SIDE && holds(&some_in_file)) {
                 if is_card || scale < 1.0 {
-                    let (w, h) = request.size;
                     tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {} MiB hold", self.budget_mib);
                 }
                 return Ok(scale);

@@ -78,6 +78,12 @@ impl Arena {
         self.sections.iter().find(|s| s.0 == name).map_or(Section { offset: 0, bytes: 0 }, |s| s.1)
     }
 
+    /// Slot `slot` of the views.
+    pub fn view_slot(&self, plan: &Plan, slot: usize) -> Section {
+        let bytes = config::plan::view_bytes(plan.pixels as u64);
+        Section { offset: self.section("views").offset + slot as u64 * bytes, bytes }
+    }
+
     /// The section's content as `T`s. The device must be idle.
     pub fn slice<T: bytemuck::AnyBitPattern>(&self, section: Section) -> &[T] {
         // SAFETY: sections lie inside the mapping, are 256-byte aligned and T is plain data; the caller waits for the

@@ -173,9 +173,9 @@ impl Recording<'_> {
         self.stamp_kernel(kernel);
     }
 
-    /// As [`Self::run`], with view `index`'s descriptor set.
-    pub fn run_view(&self, kernel: Kernel, index: usize, lanes: usize) {
-        self.dispatch(kernel, self.pipelines.view_set(index), lanes, Push::default());
+    /// As [`Self::run`], with the descriptor set of view slot `slot`.
+    pub fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize) {
+        self.dispatch(kernel, self.pipelines.view_set(slot), lanes, Push::default());
         self.stamp_kernel(kernel);
     }
 

@@ -127,7 +127,7 @@ impl Pipelines {
                 .stage_flags(vk::ShaderStageFlags::COMPUTE)
         };
         let bindings: Vec<_> = (0..FIRST_TEXELS + TEXEL_BINDINGS).map(binding).collect();
-        let set_count = (KERNELS.len() + plan.views) as u32;
+        let set_count = (KERNELS.len() + plan.view_slots) as u32;
         let sizes = [
             vk::DescriptorPoolSize { ty: vk::DescriptorType::UNIFORM_BUFFER, descriptor_count: set_count },
             vk::DescriptorPoolSize {
@@ -172,10 +172,13 @@ impl Pipelines {
             let allocate = vk::DescriptorSetAllocateInfo::default().descriptor_pool(made.pool).set_layouts(&all);
             made.sets = device.allocate_descriptor_sets(&allocate).map_err(vulkan("vkAllocateDescriptorSets"))?;
             made.view_sets = made.sets.split_off(KERNELS.len());
+            for slot in 0..plan.view_slots {
+                made.bind_slot(slot, arena, arena.view_slot(plan, slot));
+            }
             for (index, kernel) in KERNELS.iter().enumerate() {
                 for (i, name) in kernel.bindings.iter().enumerate() {
                     if *name == "view" {
-                        continue; // bound per view
+                        continue; // bound per slot
                     }
                     made.bind(made.sets[index], i as u32 + 1, arena, bound(arena, plan, name));
                 }
@@ -214,9 +217,9 @@ impl Pipelines {
         }
     }
 
-    /// Points view `index`'s set at its pixels.
-    pub fn bind_view(&self, index: usize, arena: &Arena, view: Section) {
-        let set = self.view_sets[index];
+    /// Points the set of view slot `slot` at its pixels.
+    fn bind_slot(&self, slot: usize, arena: &Arena, view: Section) {
+        let set = self.view_sets[slot];
         self.bind(set, 0, arena, arena.section("frame"));
         self.bind(set, 1, arena, view);
         self.bind(set, 2, arena, arena.section("target"));
@@ -308,7 +311,7 @@ impl Pipelines {
         self.sets[kernel as usize]
     }
 
-    pub fn view_set(&self, index: usize) -> vk::DescriptorSet {
-        self.view_sets[index]
+    pub fn view_set(&self, slot: usize) -> vk::DescriptorSet {
+        self.view_sets[slot]
     }
 }

@@ -18,6 +18,7 @@ mod pose;
 mod render;
 mod run;
 mod sampler;
+mod slots;
 mod state;
 mod step;
 mod views;
@@ -67,7 +68,8 @@ pub struct Trainer {
     parameters: parameters::Parameters,
     frame: Box<Frame>,
     deferred: deferred::Deferred,
-    views: Vec<views::Resident>,
+    views: Vec<views::TrainingView>,
+    slots: slots::Slots,
     sampler: sampler::Sampler,
     density: density::Scratch,
     degrees: degrees::Degrees,
@@ -144,6 +146,7 @@ impl Trainer {
             frame: Box::new(Frame::zeroed()),
             deferred: deferred::Deferred::new(&settings.adam),
             views: Vec::with_capacity(plan.views),
+            slots: slots::Slots::new(plan),
             sampler: sampler::Sampler::new(settings.seed, plan.views),
             density: density::Scratch::new(plan.gaussians),
             degrees: degrees::Degrees::new(plan.gaussians),

@@ -16,6 +16,9 @@ table! {
         pub device_mib: u32 = 512, in Limits::within(16.0, 131_072.0);
         /// Bound on the host's resident memory (refused at start when the plan exceeds it).
         pub host_mib: u32 = 2048, in Limits::within(64.0, 1_048_576.0);
+        /// Training views on the device at once, the others waiting in a file in the output folder; absent = all while they leave
+        /// half of `device_mib`, else what an eighth of it holds.
+        pub view_slots: Option<u32> = None, in Limits::within(2.0, 4096.0);
         /// Cap on the number of Gaussians below what the budget would hold; absent = what it holds.
         pub max_gaussians: Option<u32> = None;
         /// Bound on what an aircraft's output folder takes of the disk, MiB; absent = what is free.
@@ -32,6 +35,7 @@ struct Given {
     preset: Option<Preset>,
     device_mib: Option<u32>,
     host_mib: Option<u32>,
+    view_slots: Option<u32>,
     max_gaussians: Option<u32>,
     disk_mib: Option<u32>,
     image_scale: Option<f32>,
@@ -47,6 +51,7 @@ impl From<Given> for MemorySettings {
         }
         all.device_mib = given.device_mib.unwrap_or(all.device_mib);
         all.host_mib = given.host_mib.unwrap_or(all.host_mib);
+        all.view_slots = given.view_slots;
         all.max_gaussians = given.max_gaussians.or(all.max_gaussians);
         all.disk_mib = given.disk_mib;
         all.image_scale = given.image_scale.unwrap_or(all.image_scale);

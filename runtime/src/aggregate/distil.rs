@@ -125,6 +125,9 @@ pub fn distil(
         device_mib: settings.device_mib,
         size: (side(|k| k.width), side(|k| k.height)),
         views: lessons.len(),
+        // Their targets are in the host's memory anyway.
+        view_slots: Some(lessons.len() as u32),
+        folder: None,
         max_gaussians: Some(largest),
     };
     let steps = settings.epochs.saturating_mul(lessons.len() as u32);

@@ -143,6 +143,8 @@ pub fn measure(
         device_mib: MOST_MIB,
         size: (width, height),
         views: scene.pictures.len(),
+        view_slots: Some(scene.pictures.len() as u32),
+        folder: None,
         max_gaussians: Some(scene.cloud.len()),
     };
     let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().sort_lanes()))?;

@@ -7,7 +7,8 @@ use config::disk::Disk;
 use config::mission::Mission;
 
 use super::CliError;
-use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly, training_lens};
+use crate::engine::device::training_lens;
+use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly};
 use crate::interrupt::Interrupt;
 use crate::run_json::RunReport;
 use crate::session::{Owner, Session};

@@ -17,7 +17,7 @@ use crate::engine::device::DeviceRequest;
 pub struct Args {
     /// The plan of an aircraft of this mission, instead of the numbers below.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "scale", "budget_mib", "width", "height", "views",
-        "sh_degree", "max_gaussians", "half_moments"])]
+        "view_slots", "sh_degree", "max_gaussians", "half_moments"])]
     pub mission: Option<PathBuf>,
     /// Take picture size and number of views from this data set instead of --width, --height and --views.
     #[arg(long)]
@@ -43,6 +43,9 @@ pub struct Args {
     /// Training views.
     #[arg(long, default_value_t = 64)]
     pub views: u32,
+    /// Views on the device at once, the others waiting in a file [default: all while they leave half of the memory].
+    #[arg(long, value_name = "N")]
+    pub view_slots: Option<u32>,
     /// Highest SH degree, 0 to 3.
     #[arg(long, default_value_t = 3)]
     pub sh_degree: u8,
@@ -66,7 +69,10 @@ pub struct Args {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let (wanted, sh) = match &args.mission {
-        Some(path) => of_mission(&Mission::read(path)?),
+        Some(path) => {
+            let mission = Mission::read(path)?;
+            (DeviceRequest::of_flight(&mission, None), mission.training.sh)
+        }
         None => of_arguments(&args)?,
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
@@ -75,15 +81,16 @@ pub fn run(args: Args) -> Result<(), CliError> {
         (Err(_), None) => SORT_LANES_SOFTWARE,
         (Err(e), Some(_)) => return Err(e.into()),
     };
-    let plan = Plan::new(&wanted.plan_request(&sh, sort_lanes))?;
+    let request = wanted.plan_request(&sh, sort_lanes);
+    let plan = Plan::new(&request)?;
     if args.json {
         println!("{}", serde_json::to_string(&plan).map_err(CliError::failed)?);
         return Ok(());
     }
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     println!(
-        "{} views of {} x {}, SH degree {}, {} MiB allowed",
-        plan.views, wanted.size.0, wanted.size.1, plan.sh_degree, wanted.device_mib
+        "{} views of {} x {}, {} of them on the device at once, SH degree {}, {} MiB allowed",
+        plan.views, wanted.size.0, wanted.size.1, plan.view_slots, plan.sh_degree, wanted.device_mib
     );
     println!(
         "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n  sort lanes{:>10}\n",
@@ -93,9 +100,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
         println!("  {name:<18} {:>9.2} MiB", mib(*bytes));
     }
     println!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
-    let ((width, height), key_frames) = (wanted.size, plan.views as u32);
-    let (gaussians, sh_degree) = (plan.gaussians, plan.sh_degree);
-    let disk = DiskPlan::new(&DiskRequest { width, height, key_frames, gaussians, sh_degree, delivered: 0 });
+    let disk = DiskPlan::new(&DiskRequest {
+        width: request.width,
+        height: request.height,
+        key_frames: request.views,
+        view_file: request.view_file_bytes(),
+        gaussians: plan.gaussians,
+        sh_degree: plan.sh_degree,
+        delivered: 0,
+    });
     println!("\n  on disk, for a flight:");
     for (name, bytes) in &disk.sections {
         println!("  {name:<18} {:>9.2} MiB", mib(*bytes));
@@ -114,22 +127,8 @@ fn of_arguments(args: &Args) -> Result<(DeviceRequest, ShSettings), CliError> {
         }
     };
     let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
-    let (device_mib, max_gaussians) = (args.budget_mib, args.max_gaussians);
-    Ok((DeviceRequest { device: None, device_mib, size, views, max_gaussians }, sh))
-}
-
-/// As `dgtr fly` plans: pictures at the working size, and as many views as there may be key frames.
-fn of_mission(mission: &Mission) -> (DeviceRequest, ShSettings) {
-    let Mission { camera, memory, keyframes, training, .. } = mission;
-    let scaled = |side: u32| ((side as f32 * memory.image_scale).round() as u32).max(1);
-    let request = DeviceRequest {
-        device: None,
-        device_mib: memory.device_mib,
-        size: (scaled(camera.width), scaled(camera.height)),
-        views: keyframes.max as usize,
-        max_gaussians: memory.max_gaussians.map(|n| n as usize),
-    };
-    (request, training.sh)
+    let (device_mib, max_gaussians, view_slots) = (args.budget_mib, args.max_gaussians, args.view_slots);
+    Ok((DeviceRequest { device: None, device_mib, size, views, view_slots, folder: None, max_gaussians }, sh))
 }
 
 /// The widest and the highest picture of `frames` at `scale`.

@@ -95,6 +95,9 @@ pub struct Args {
     /// Most Gaussians; default: what the budget holds.
     #[arg(long)]
     max_gaussians: Option<usize>,
+    /// Pictures on the device at once, the others waiting in a file in --out [default: all while they leave half of the budget].
+    #[arg(long, value_name = "N")]
+    view_slots: Option<u32>,
     /// Image scale, above 0 and at most 1 [default: as large as the budget holds].
     #[arg(long)]
     scale: Option<f64>,
@@ -202,6 +205,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         seconds,
         budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)).unwrap_or(512),
         max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
+        view_slots: args.view_slots,
         scale: args.scale.or(preset.map(|p| p.image_scale.into())),
         device: args.device,
         network: settings.network,

@@ -1,9 +1,16 @@
 //! What every job opens before its first picture: the device, the plan of its memory, the trainer. The one place that asks
 //! for a plan.
 
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use config::mission::Mission;
 use config::plan::{Plan, PlanError, PlanRequest};
 use config::training::{ShSettings, TrainSettings};
+use models::camera::Intrinsics;
 use models::cloud::GaussianCloud;
+use rustix::fs::{FallocateFlags, fallocate};
+use rustix::io::Errno;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{TrainError, Trainer};
 
@@ -12,6 +19,14 @@ use crate::kernels;
 
 /// Gaussian–tile instances that a renderer holds at once, per pixel; pictures with more are rendered in bands.
 const INSTANCES_PER_PIXEL: usize = 8;
+
+/// The lens of the pictures that a flight trains on.
+pub fn training_lens(mission: &Mission) -> Intrinsics {
+    let c = &mission.camera;
+    let full = Intrinsics { width: c.width, height: c.height, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy };
+    let scaled = |side: u32| ((side as f32 * mission.memory.image_scale).round() as u32).max(1);
+    full.resized(scaled(c.width), scaled(c.height))
+}
 
 /// What a job wants of which device.
 #[derive(Clone, Debug)]
@@ -22,8 +37,12 @@ pub struct DeviceRequest {
     pub device_mib: u32,
     /// Width and height of the largest picture, pixels; the trainer fits the others in.
     pub size: (u32, u32),
-    /// Views that are resident at once.
+    /// Training views.
     pub views: usize,
+    /// How many of them are on the device at once; `None`: as [`PlanRequest::slots`] says.
+    pub view_slots: Option<u32>,
+    /// Where the file of the others lies; absent: the system's temporary folder.
+    pub folder: Option<PathBuf>,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
 }
@@ -36,10 +55,25 @@ impl DeviceRequest {
             width: self.size.0,
             height: self.size.1,
             views: self.views as u32,
+            view_slots: self.view_slots,
             sh_degree: sh.degree,
             max_gaussians: self.max_gaussians,
             half_moments: sh.half_moments,
             sort_lanes,
+        }
+    }
+
+    /// What a flight of `mission` asks for: pictures at the working size, as many views as there may be key frames.
+    pub fn of_flight(mission: &Mission, folder: Option<PathBuf>) -> Self {
+        let (memory, lens) = (&mission.memory, training_lens(mission));
+        Self {
+            device: None,
+            device_mib: memory.device_mib,
+            size: (lens.width, lens.height),
+            views: mission.keyframes.max as usize,
+            view_slots: memory.view_slots,
+            folder,
+            max_gaussians: memory.max_gaussians.map(|n| n as usize),
         }
     }
 
@@ -50,9 +84,27 @@ impl DeviceRequest {
     /// No device, or a plan that does not fit into it or into `device_mib`.
     pub fn open<E: From<PlanError> + From<TrainError>>(&self, training: &TrainSettings) -> Result<Trainer, E> {
         let gpu = Gpu::open(self.device.as_deref()).map_err(TrainError::from)?;
-        let plan = Plan::new(&self.plan_request(&training.sh, gpu.info().sort_lanes()))?;
-        Ok(Trainer::with_shape(&gpu, &plan, training, kernels::shape_of(&gpu))?)
+        let request = self.plan_request(&training.sh, gpu.info().sort_lanes());
+        let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
+        if request.view_file_bytes() > 0 {
+            let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
+            let file = view_file(&folder, request.view_file_bytes());
+            trainer.keep_views_in(file.map_err(|e| TrainError::ViewFile(format!("{}: {e}", folder.display())))?);
+        }
+        Ok(trainer)
     }
+}
+
+/// A file without a name in `folder`, as large as it will ever be: it goes with the process, however that ends.
+fn view_file(folder: &Path, bytes: u64) -> std::io::Result<File> {
+    std::fs::create_dir_all(folder)?;
+    let file = tempfile::tempfile_in(folder)?;
+    match fallocate(&file, FallocateFlags::empty(), 0, bytes) {
+        // Some file systems cannot set room aside: there it is taken as views come.
+        Err(Errno::OPNOTSUPP) => file.set_len(bytes)?,
+        other => other?,
+    }
+    Ok(file)
 }
 
 /// A trained model ready to be rendered, with as little memory as rendering takes: `cloud` on the device for pictures of up
@@ -69,7 +121,15 @@ pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height:
     let mut settings = TrainSettings::default();
     settings.sh.degree = cloud.sh_degree;
     let max_gaussians = Some(cloud.len());
-    let request = DeviceRequest { device: None, device_mib: u32::MAX, size: (width, height), views: 0, max_gaussians };
+    let request = DeviceRequest {
+        device: None,
+        device_mib: u32::MAX,
+        size: (width, height),
+        views: 0,
+        view_slots: None,
+        folder: None,
+        max_gaussians,
+    };
     let request = request.plan_request(&settings.sh, gpu.info().sort_lanes());
     let pixels = width as usize * height as usize;
     let plan = Plan::with_capacities(&request, cloud.len(), cloud.len() + INSTANCES_PER_PIXEL * pixels);

@@ -231,6 +231,7 @@ impl Reconstruct for Reconstruction {
         }
         let work = serde_json::json!({ "instances": c.instances, "evaluations": c.evaluations });
         self.report.more.insert("work".into(), work);
+        self.report.more.insert("views_read_back".into(), self.trainer.views_read_back().into());
         if let Some(last) = summary.last.filter(|last| last.loss.is_finite()) {
             self.report.more.insert("loss".into(), f64::from(last.loss).into());
         }
@@ -351,7 +352,15 @@ mod tests {
         }
         let settings = EngineSettings {
             disk: Default::default(),
-            device: DeviceRequest { device: None, device_mib: 64, size: (32, 24), views: 3, max_gaussians: Some(300) },
+            device: DeviceRequest {
+                device: None,
+                device_mib: 64,
+                size: (32, 24),
+                views: 3,
+                view_slots: None,
+                folder: None,
+                max_gaussians: Some(300),
+            },
             host_mib: None,
             camera_pixels: 32 * 24,
             ahead: 0,

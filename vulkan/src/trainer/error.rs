@@ -28,6 +28,9 @@ pub enum TrainError {
         /// Views in the plan.
         planned: usize,
     },
+    /// The file of the views that are not on the device.
+    #[error("the file of the views that are not on the device: {0}")]
+    ViewFile(String),
     /// A picture, pose, lens or depth prior that cannot be used.
     #[error("picture '{name}' cannot be used: {why}")]
     BadView {
@@ -50,6 +53,7 @@ impl Error for TrainError {
     fn kind(&self) -> ErrorKind {
         match self {
             Self::Gpu(e) => e.kind(),
+            Self::ViewFile(_) => ErrorKind::Failed,
             _ => ErrorKind::Input,
         }
     }

@@ -32,6 +32,11 @@ impl Sampler {
         &mut self.rng
     }
 
+    /// The view that [`Self::next`] will give, when its epoch has begun.
+    pub fn peek(&self) -> Option<usize> {
+        self.order.last().map(|v| *v as usize)
+    }
+
     /// `losses(view)` is the view's last loss; `views` is at least 1.
     pub fn next(&mut self, views: usize, residual_share: f32, losses: impl Fn(usize) -> f32) -> usize {
         if self.order.is_empty() {

@@ -39,6 +39,7 @@ impl Trainer {
         self.write_frame();
         self.commands.weigh(super::timed_weight(self.steps, self.timed_every));
         let counted = self.forward_count(index)?;
+        self.read_ahead();
         self.forward_backward()?;
         self.commands.weigh(1.0);
         self.steps += 1;
@@ -112,8 +113,9 @@ impl Trainer {
     /// First submission: picture, projection, sort, counts.
     pub(super) fn forward_count(&mut self, index: usize) -> Result<Counted, TrainError> {
         let _phase = tracing::trace_span!("project, sort, count").entered();
+        let slot = self.resident(index)?;
         let commands = self.take_recording()?;
-        commands.run_view(Kernel::Target, index, self.frame.pixels());
+        commands.run_view(Kernel::Target, slot, self.frame.pixels());
         self.record_counting(&commands);
         commands.submit()?;
         self.cut_bands()

@@ -1,12 +1,11 @@
-//! Training views: pixels resident on the device, pose and exposure on the host.
+//! Training views: pixels in a slot of the device or in a file, pose and exposure on the host.
 
 use super::{TrainError, Trainer};
-use crate::arena::Section;
 use image::RgbImage;
 use models::camera::{DepthPrior, Pose, PosedImage, View};
 
 /// What the trainer keeps of a view.
-pub(crate) struct Resident {
+pub(crate) struct TrainingView {
     pub view: View,
     pub width: u32,
     pub height: u32,
@@ -17,12 +16,12 @@ pub(crate) struct Resident {
 }
 
 impl Trainer {
-    /// Makes a picture resident, with an optional depth prior of any size; returns its index.
+    /// Takes a picture in, with an optional depth prior of any size; returns its index.
     /// A picture with more pixels than planned is reduced to fit.
     ///
     /// # Errors
     /// [`TrainError::TooManyViews`]; [`TrainError::BadView`] for empty pictures, poses or lenses that are not finite, or a
-    /// prior whose maps do not have the size it states.
+    /// prior whose maps do not have the size it states; [`TrainError::ViewFile`].
     pub fn add_view(&mut self, picture: &PosedImage, prior: Option<&DepthPrior>) -> Result<usize, TrainError> {
         let index = self.views.len();
         if index >= self.plan.views {
@@ -36,37 +35,39 @@ impl Trainer {
             reduced = image::imageops::resize(image, width, height, image::imageops::FilterType::Triangle);
             image = &reduced;
         }
-        let pixels = width as usize * height as usize;
-        let views = self.arena.section("views");
-        let section = Section {
-            offset: views.offset + index as u64 * config::plan::view_bytes(self.plan.pixels as u64),
-            bytes: config::plan::view_bytes(pixels as u64),
-        };
+        let mut view = picture.view;
+        view.intrinsics = view.intrinsics.resized(width, height);
+        let adjust = super::pose::Adjust::default();
+        self.views.push(TrainingView { view, width, height, depth_at: 0, last_loss: f32::INFINITY, adjust });
+        let slot = self.slot_for_new(index);
+        let section = self.pixels_in(slot, index);
         let words = self.arena.slice_mut::<u32>(section);
         for (word, p) in words.iter_mut().zip(image.pixels()) {
             *word = u32::from_le_bytes([p[0], p[1], p[2], 0]);
         }
-        self.pipelines.bind_view(index, &self.arena, section);
-        let mut view = picture.view;
-        view.intrinsics = view.intrinsics.resized(width, height);
-        let adjust = super::pose::Adjust::default();
-        self.views.push(Resident { view, width, height, depth_at: 0, last_loss: f32::INFINITY, adjust });
         self.sampler.forget();
-        self.set_prior(index, prior)?;
+        if let Err(e) = self.set_prior(index, prior) {
+            // A view without its pixels is none.
+            self.views.pop();
+            return Err(e);
+        }
         Ok(index)
     }
 
     /// Replaces the depth prior of view `index`, of any size; its pixels stay.
     ///
     /// # Errors
-    /// [`TrainError::BadView`] when there is no such view, or the prior's maps do not have the size it states.
+    /// [`TrainError::BadView`] when there is no such view, or the prior's maps do not have the size it states;
+    /// [`TrainError::ViewFile`].
     pub fn set_prior(&mut self, index: usize, prior: Option<&DepthPrior>) -> Result<(), TrainError> {
-        let section = self.view_section(index)?;
-        let resident = &mut self.views[index];
+        self.view_is_there(index)?;
         if let Some(why) = prior.and_then(broken) {
             return Err(TrainError::BadView { name: format!("view {index}"), why: why.to_owned() });
         }
-        let (width, pixels) = (resident.width, resident.width as usize * resident.height as usize);
+        let slot = self.resident(index)?;
+        let section = self.pixels_in(slot, index);
+        let TrainingView { width, height, .. } = self.views[index];
+        let pixels = width as usize * height as usize;
         let (colours, depths) = self.arena.slice_mut::<u32>(section).split_at_mut(pixels);
         let range = prior.and_then(depth_range);
         depths.fill(0);
@@ -74,7 +75,7 @@ impl Trainer {
             let mut confidence = 0u8;
             if let (Some(prior), Some((low, high))) = (prior, range) {
                 let x = ((i as u32 % width) as f32 + 0.5) / width as f32 * prior.width as f32;
-                let y = ((i as u32 / width) as f32 + 0.5) / resident.height as f32 * prior.height as f32;
+                let y = ((i as u32 / width) as f32 + 0.5) / height as f32 * prior.height as f32;
                 let at = (y as usize).min(prior.height as usize - 1) * prior.width as usize
                     + (x as usize).min(prior.width as usize - 1);
                 if usable(prior, at) {
@@ -85,7 +86,8 @@ impl Trainer {
             }
             *colour = (*colour & 0x00ff_ffff) | u32::from(confidence) << 24;
         }
-        resident.depth_at = if range.is_some() { pixels as u32 } else { 0 };
+        self.keep(slot, index)?;
+        self.views[index].depth_at = if range.is_some() { pixels as u32 } else { 0 };
         Ok(())
     }
 
@@ -95,7 +97,7 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::BadView`] when there is no such view, or the camera is not usable.
     pub fn renew_view(&mut self, index: usize, view: View) -> Result<(), TrainError> {
-        self.view_section(index)?;
+        self.view_is_there(index)?;
         if let Some(why) = unusable(&view) {
             return Err(TrainError::BadView { name: format!("view {index}"), why: why.to_owned() });
         }
@@ -106,23 +108,28 @@ impl Trainer {
         Ok(())
     }
 
-    /// The picture of view `index` as it is trained on; `None` when there is no such view.
-    pub fn view_image(&mut self, index: usize) -> Option<RgbImage> {
-        let section = self.view_section(index).ok()?;
-        let (width, height) = (self.views[index].width, self.views[index].height);
-        let words = self.arena.slice::<u32>(section);
-        let rgb = words.iter().take(width as usize * height as usize).flat_map(|w| w.to_le_bytes().into_iter().take(3));
-        RgbImage::from_raw(width, height, rgb.collect())
+    /// The picture of view `index` as it is trained on.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] when there is no such view; [`TrainError::ViewFile`].
+    pub fn view_image(&mut self, index: usize) -> Result<RgbImage, TrainError> {
+        self.view_is_there(index)?;
+        let slot = self.resident(index)?;
+        let TrainingView { width, height, .. } = self.views[index];
+        let words = self.arena.slice::<u32>(self.pixels_in(slot, index)).iter();
+        // As many words as the image has pixels: what is behind them is the depth prior.
+        let mut pixels = words.map(|w| w.to_le_bytes());
+        Ok(RgbImage::from_fn(width, height, |_, _| {
+            let [r, g, b, _] = pixels.next().unwrap_or_default();
+            image::Rgb([r, g, b])
+        }))
     }
 
-    fn view_section(&self, index: usize) -> Result<Section, TrainError> {
-        let Some(resident) = self.views.get(index) else {
-            return Err(TrainError::BadView { name: format!("view {index}"), why: "does not exist".to_owned() });
-        };
-        let offset =
-            self.arena.section("views").offset + index as u64 * config::plan::view_bytes(self.plan.pixels as u64);
-        let pixels = u64::from(resident.width) * u64::from(resident.height);
-        Ok(Section { offset, bytes: config::plan::view_bytes(pixels) })
+    fn view_is_there(&self, index: usize) -> Result<(), TrainError> {
+        match index < self.views.len() {
+            true => Ok(()),
+            false => Err(TrainError::BadView { name: format!("view {index}"), why: "does not exist".to_owned() }),
+        }
     }
 
     /// The largest size of the same shape that the plan holds.
