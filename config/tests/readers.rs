@@ -75,7 +75,7 @@ fn usable(mission: &Mission) -> bool {
         width: camera.width,
         height: camera.height,
         key_frames: mission.keyframes.max,
-        view_file: 0,
+        scratch: 0,
         gaussians: memory.max_gaussians.map_or(1 << 20, |n| n as usize),
         sh_degree: 3,
         delivered: 0,

@@ -138,7 +138,7 @@ pub struct PosedImage {
 }
 
 /// An estimated depth map that the Pearson loss correlates with the rendered one.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct DepthPrior {
     /// Width of both maps, pixels.
     pub width: u32,

@@ -6,6 +6,7 @@ mod consistency;
 mod depth_frame;
 mod fill;
 mod finish;
+mod frame_file;
 mod ground;
 mod initialiser;
 mod merge;
@@ -19,7 +20,7 @@ mod tests;
 mod unposed;
 
 pub use baselines::{from_sfm, random};
-pub use initialiser::Initialiser;
+pub use initialiser::{Initialiser, most_frame_bytes};
 pub use pairs::SkippedPairs;
 pub use range::mutual_matches;
 pub use report::{InitReport, Initialisation};
@@ -73,6 +74,9 @@ pub enum InitError {
         /// Pairs refused.
         skipped: usize,
     },
+    /// The file of what waits of the pictures.
+    #[error("initialisation: the file of the pictures' depths: {0}")]
+    FrameFile(#[from] std::io::Error),
     /// The network or ONNX Runtime.
     #[error(transparent)]
     Network(#[from] OnnxError),
@@ -82,6 +86,7 @@ impl Error for InitError {
     fn kind(&self) -> ErrorKind {
         match self {
             Self::Network(e) => e.kind(),
+            Self::FrameFile(_) => ErrorKind::Failed,
             _ => ErrorKind::Input,
         }
     }

@@ -54,7 +54,7 @@ fn peaks(settings: &InitSettings, network: Option<&Path>, pictures: usize, size:
         init.add(&picture(i, size)).unwrap();
     }
     let planned = init.planned_bytes(pictures, 200_000);
-    let out = init.build(200_000).unwrap();
+    let out = init.build(200_000, &mut |_, _| {}).unwrap();
     assert!(out.cloud.len() > 1000 && out.cloud.len() <= 200_000, "{:?}", out.report);
     assert_eq!(out.report.planned_bytes, planned);
     let rust = (MOST.load(Ordering::Relaxed) - before) as u64;

@@ -11,12 +11,13 @@ use std::time::Instant;
 use config::disk::Disk;
 use config::init::InitSettings;
 use config::mission::NetworkSettings;
+use config::plan::PlanRequest;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
-use models::camera::{PoseSigma, PosedImage, View};
+use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
-use models::init::Initialiser;
+use models::init::{Initialiser, most_frame_bytes};
 use models::onnx::depth::DepthNetwork;
 use models::refine::{RefineReport, Refiner};
 use vulkan::trainer::Trainer;
@@ -37,6 +38,16 @@ pub use first_gaussians::{InitKind, Point};
 use host::{HostPlan, HostRequest};
 pub use reconstruct::Reconstruct;
 pub use source::PictureSource;
+
+/// Pictures and depths that wait for the initialiser in memory, bytes; more of them wait in a file.
+const FRAMES_IN_MEMORY: u64 = 256 << 20;
+
+/// Bytes of the scratch files of a job: views that find no room on the device, and what waits for the initialiser.
+pub fn scratch_bytes(request: &PlanRequest, init: &InitSettings, network: &NetworkSettings) -> u64 {
+    let each = most_frame_bytes(init, (request.width, request.height), network.pair.is_some());
+    let waiting = u64::from(request.views) * each;
+    request.view_file_bytes() + if waiting > FRAMES_IN_MEMORY { waiting } else { 0 }
+}
 
 /// What the engine needs to know before the first picture.
 #[derive(Clone, Debug)]
@@ -124,11 +135,17 @@ impl Reconstruction {
             Refiner::open(&RefineSettings { max_keyframes: refine.max_keyframes.max(views), ..refine.clone() })
         });
         init.max_pictures = init.max_pictures.max(views);
-        let initialiser = match settings.start {
+        let mut initialiser = match settings.start {
             InitKind::FeedForward => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
             InitKind::SparsePoints | InitKind::Random => None,
         };
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
+        if let Some(initialiser) = &mut initialiser {
+            let waiting = views as u64 * initialiser.frame_bytes_at(settings.device.size);
+            if waiting > FRAMES_IN_MEMORY {
+                initialiser.keep_frames_in(settings.device.scratch(waiting)?);
+            }
+        }
         let mut report = RunReport::new(command);
         let host = HostPlan::new(&HostRequest {
             plan: trainer.plan(),
@@ -275,7 +292,17 @@ impl Reconstruction {
         }
         self.initialise_waiting(self.views.len())?;
         if let Some(initialiser) = &mut self.initialiser {
-            return feed_forward(initialiser, self.views.len(), capacity, at_once, go_on);
+            let index: HashMap<&str, usize> = self.views.iter().enumerate().map(|(i, v)| (v.0.as_str(), i)).collect();
+            let (trainer, own_network) = (&mut self.trainer, self.depth.is_some());
+            let mut failed = Ok(());
+            let mut prior = |name: &str, depth: DepthPrior| {
+                if let (Some(&i), Ok(()), false) = (index.get(name), &failed, own_network) {
+                    failed = trainer.set_prior(i, Some(&depth));
+                }
+            };
+            let made = feed_forward(initialiser, self.views.len(), capacity, at_once, &mut prior, go_on)?;
+            failed?;
+            return Ok(made);
         }
         let views: Vec<View> = self.views.iter().map(|v| v.1).collect();
         Ok(Some(match self.settings.start {

@@ -45,7 +45,7 @@ pub use handover::Handover;
 pub use intake::{EndOfFlight, Ended, FlightCounters};
 
 use crate::engine::device::{DeviceRequest, training_lens};
-use crate::engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path};
+use crate::engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path, scratch_bytes};
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
 use crate::health::Health;
@@ -143,12 +143,6 @@ fn delivers(mission: &Mission) -> bool {
     mission.upload.encoding == Encoding::Delivery
 }
 
-/// Bytes of the file of the views that are not on the device.
-fn view_file_bytes(mission: &Mission) -> u64 {
-    // How many lanes sort matters little; more of them leave less room.
-    DeviceRequest::of_flight(mission, None).plan_request(&mission.training.sh, SORT_LANES_GPU).view_file_bytes()
-}
-
 /// What a flight may take of the disk.
 fn disk_plan(mission: &Mission) -> DiskPlan {
     let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
@@ -157,11 +151,13 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
     let held = (u64::from(memory.device_mib) << 20) / each;
     let gaussians = memory.max_gaussians.map_or(held, u64::from).min(held) as usize;
     let CameraSettings { width, height, .. } = mission.camera;
+    // How many lanes sort matters little; more of them leave less room.
+    let request = DeviceRequest::of_flight(mission, None).plan_request(&mission.training.sh, SORT_LANES_GPU);
     DiskPlan::new(&DiskRequest {
         width,
         height,
         key_frames: mission.keyframes.max,
-        view_file: view_file_bytes(mission),
+        scratch: scratch_bytes(&request, &mission.init, &mission.network),
         gaussians,
         sh_degree,
         delivered: if delivers(mission) { ENCODED_BYTES } else { 0 },
@@ -180,8 +176,8 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
         let (room, total) = (room >> 20, plan.total_bytes >> 20);
         tracing::warn!("disk: {room} MiB for a flight that may take {total} MiB; see dgtr plan for what it is for");
     }
-    // The file of the views has no name: what is counted below `out` is the rest.
-    let rest = limit.saturating_sub(plan.view_file_bytes());
+    // Scratch files have no names: what is counted below `out` is the rest.
+    let rest = limit.saturating_sub(plan.scratch_bytes());
     Ok(Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(rest)))))
 }
 

@@ -17,8 +17,8 @@ pub fn picture_bytes(width: u32, height: u32) -> u64 {
 /// A model's header per view, and its fixed part.
 const MODEL_VIEW: u64 = 128;
 const MODEL_FIXED: u64 = 4 << 10;
-/// The one file that is taken as a whole at the start.
-const VIEW_FILE: &str = "views not on the device";
+/// What is taken as a whole at the start.
+const SCRATCH: &str = "scratch";
 /// Two generations, and the one being written.
 const GENERATIONS: u64 = 3;
 
@@ -31,8 +31,8 @@ pub struct DiskRequest {
     pub height: u32,
     /// Most key frames.
     pub key_frames: u32,
-    /// Bytes of the file of the views that are not on the device (`PlanRequest::view_file_bytes`).
-    pub view_file: u64,
+    /// Bytes of scratch files: views that are not on the device, what waits of pictures for the initialiser.
+    pub scratch: u64,
     /// Most Gaussians.
     pub gaussians: usize,
     /// Highest SH degree, 0…3.
@@ -79,7 +79,7 @@ impl DiskPlan {
         let sections = vec![
             ("key frames", frames * picture),
             ("their list", GENERATIONS * frames * LIST_ENTRY),
-            (VIEW_FILE, r.view_file),
+            (SCRATCH, r.scratch),
             ("checkpoints", GENERATIONS * model(frames)),
             // The one on offer, and the one being written.
             ("delivery", 2 * delivered),
@@ -87,13 +87,13 @@ impl DiskPlan {
         Self {
             total_bytes: sections.iter().map(|s| s.1).sum(),
             sections,
-            min_bytes: r.view_file + MIN_KEY_FRAMES * (picture + GENERATIONS * LIST_ENTRY) + 2 * model(MIN_KEY_FRAMES),
+            min_bytes: r.scratch + MIN_KEY_FRAMES * (picture + GENERATIONS * LIST_ENTRY) + 2 * model(MIN_KEY_FRAMES),
         }
     }
 
-    /// Bytes of the file of the views that are not on the device.
-    pub fn view_file_bytes(&self) -> u64 {
-        self.sections.iter().find(|s| s.0 == VIEW_FILE).map_or(0, |s| s.1)
+    /// Bytes of scratch files.
+    pub fn scratch_bytes(&self) -> u64 {
+        self.sections.iter().find(|s| s.0 == SCRATCH).map_or(0, |s| s.1)
     }
 
     /// Whether a flight can begin with `bytes` to write to; false when it can, but not to its planned end.
@@ -119,7 +119,7 @@ mod tests {
             width: 640,
             height: 480,
             key_frames: 128,
-            view_file: 0,
+            scratch: 0,
             gaussians: 100_000,
             sh_degree: 3,
             delivered: 0,
@@ -132,8 +132,8 @@ mod tests {
         assert_eq!(plan.fits(plan.min_bytes), Ok(false));
         let said = plan.fits(plan.min_bytes - 1).map_err(|e| e.to_string()).unwrap_err();
         assert!(said.contains("memory.disk_mib") && said.lines().count() == 1, "{said}");
-        let paged = DiskPlan::new(&DiskRequest { view_file: 1 << 28, ..request });
-        assert_eq!((paged.view_file_bytes(), paged.min_bytes - plan.min_bytes), (1 << 28, 1 << 28));
+        let paged = DiskPlan::new(&DiskRequest { scratch: 1 << 28, ..request });
+        assert_eq!((paged.scratch_bytes(), paged.min_bytes - plan.min_bytes), (1 << 28, 1 << 28));
         assert_eq!(paged.total_bytes - plan.total_bytes, 1 << 28);
         let delivers = DiskPlan::new(&DiskRequest { delivered: 32, ..request });
         assert!(delivers.total_bytes >= plan.total_bytes + 2 * 32 * 100_000);

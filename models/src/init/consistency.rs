@@ -39,6 +39,9 @@ pub struct ConsistencyCount {
 
 /// The depth grid of `frames[r]` after comparison with `others`; `None` when it has no depth.
 ///
+/// # Errors
+/// Reading the frames' file fails.
+///
 /// `tolerance` is a share of the depth; `fill` holds depths for places that nobody knows (0 = none).
 pub fn resolve(
     frames: &[DepthFrame],
@@ -46,14 +49,18 @@ pub fn resolve(
     others: &[usize],
     tolerance: f32,
     fill: Option<&[f32]>,
-) -> Option<(DepthGrid, ConsistencyCount)> {
-    let own = frames[r].depth.as_ref()?;
+) -> std::io::Result<Option<(DepthGrid, ConsistencyCount)>> {
+    let Some(own) = frames[r].depth()? else { return Ok(None) };
+    let own = own.as_ref();
+    let mut grids = Vec::with_capacity(others.len());
+    for &n in others {
+        grids.extend(frames[n].depth()?.map(|grid| (n, grid)));
+    }
     let witness = |n: usize, grid| {
         let view = &frames[n].view;
         Witness { grid, project: Projector::new(view), unproject: Unprojector::new(view) }
     };
-    let others: Vec<Witness<'_>> =
-        others.iter().filter_map(|&n| frames[n].depth.as_ref().map(|g| witness(n, g))).collect();
+    let others: Vec<Witness<'_>> = grids.iter().map(|(n, grid)| witness(*n, grid.as_ref())).collect();
     let me = witness(r, own);
     let rows: Vec<(Vec<(f32, f32)>, ConsistencyCount)> = (0..own.height)
         .into_par_iter()
@@ -99,7 +106,7 @@ pub fn resolve(
         total.removed += count.removed;
         total.filled += count.filled;
     }
-    Some((grid, total))
+    Ok(Some((grid, total)))
 }
 
 /// Whether another picture that sees a place has a depth for it.
@@ -172,14 +179,10 @@ mod tests {
         let rotation = DQuat::from_rotation_x(std::f64::consts::PI);
         let depths: Vec<f32> = (0..64 * 48).map(&depth).collect();
         let grid = DepthGrid { width: 64, height: 48, stride: 1, depth: depths, confidence: vec![0.6; 64 * 48] };
-        DepthFrame {
-            name: x.to_string(),
-            image: RgbImage::new(64, 48),
-            view: View { intrinsics, pose: Pose { rotation, center: DVec3::new(x, 0.0, 50.0) } },
-            depth: Some(grid),
-            made_with: Vec::new(),
-            made_as: None,
-        }
+        let view = View { intrinsics, pose: Pose { rotation, center: DVec3::new(x, 0.0, 50.0) } };
+        let mut frame = DepthFrame::new(x.to_string(), RgbImage::new(64, 48), view, None).unwrap();
+        frame.set_depth(Some(grid)).unwrap();
+        frame
     }
 
     #[test]
@@ -188,14 +191,14 @@ mod tests {
         let floater = 24 * 64 + 32;
         let frames =
             [frame(0.0, |i| if i == floater { 30.0 } else { 50.2 }), frame(5.0, |_| 50.0), frame(-5.0, |_| 50.0)];
-        let (grid, count) = resolve(&frames, 0, &[1, 2], 0.01, None).unwrap();
+        let (grid, count) = resolve(&frames, 0, &[1, 2], 0.01, None).unwrap().unwrap();
         assert_eq!(grid.confidence[floater], 0.0);
         assert_eq!(count.removed, 1);
         let middle = 20 * 64 + 30;
         assert!((grid.depth[middle] - 50.067).abs() < 1e-2, "{}", grid.depth[middle]);
         assert!(grid.confidence[middle] > 0.9);
         // The plane is not hurt by the floater hiding it in the first view.
-        let (grid, count) = resolve(&frames, 1, &[0], 0.01, None).unwrap();
+        let (grid, count) = resolve(&frames, 1, &[0], 0.01, None).unwrap().unwrap();
         assert_eq!(count.removed, 0);
         assert!(grid.confidence.iter().all(|&c| c > 0.2));
     }
@@ -203,7 +206,7 @@ mod tests {
     #[test]
     fn a_view_without_partners_keeps_its_depth_at_half_the_confidence() {
         let frames = [frame(0.0, |_| 50.0)];
-        let (grid, count) = resolve(&frames, 0, &[], 0.01, None).unwrap();
+        let (grid, count) = resolve(&frames, 0, &[], 0.01, None).unwrap().unwrap();
         assert_eq!(count.alone, 64 * 48);
         assert!(grid.depth.iter().all(|&d| d == 50.0) && grid.confidence.iter().all(|&c| (c - 0.3).abs() < 1e-6));
     }

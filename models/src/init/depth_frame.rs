@@ -1,8 +1,13 @@
 //! One key frame while it waits for, and after it got, its depth. Everything is kept at the network's size, u8 and
-//! strided, so that memory is known from the number of pictures alone.
+//! strided, so that memory is known from the number of pictures alone, and on long flights in a file.
+
+use std::borrow::Cow;
+use std::io;
+use std::sync::Arc;
 
 use image::RgbImage;
 
+use super::frame_file::{AsBytes, FrameFile, Kept};
 use crate::camera::{Projector, Unprojector, View};
 
 /// Depth of one picture on a grid of every `stride`-th pixel.
@@ -62,21 +67,112 @@ impl DepthGrid {
     }
 }
 
+impl AsBytes for RgbImage {
+    type Shape = (u32, u32);
+
+    fn shape(&self) -> (u32, u32) {
+        self.dimensions()
+    }
+
+    fn to_bytes(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(self.as_raw())
+    }
+
+    fn byte_count((width, height): (u32, u32)) -> usize {
+        3 * width as usize * height as usize
+    }
+
+    fn from_bytes((width, height): (u32, u32), bytes: Vec<u8>) -> Self {
+        Self::from_raw(width, height, bytes).unwrap_or_default()
+    }
+}
+
+impl AsBytes for DepthGrid {
+    /// Columns, rows, stride.
+    type Shape = [usize; 3];
+
+    fn shape(&self) -> [usize; 3] {
+        [self.width, self.height, self.stride]
+    }
+
+    fn to_bytes(&self) -> Cow<'_, [u8]> {
+        let [depth, confidence] = [&self.depth, &self.confidence].map(|v| bytemuck::cast_slice::<f32, u8>(v));
+        Cow::Owned([depth, confidence].concat())
+    }
+
+    fn byte_count([width, height, _]: [usize; 3]) -> usize {
+        8 * width * height
+    }
+
+    fn from_bytes([width, height, stride]: [usize; 3], bytes: Vec<u8>) -> Self {
+        let [depth, confidence]: [Vec<f32>; 2] = {
+            let (depth, confidence) = bytes.split_at(bytes.len() / 2);
+            [depth, confidence].map(bytemuck::pod_collect_to_vec)
+        };
+        Self { width, height, stride, depth, confidence }
+    }
+}
+
 /// One key frame.
 #[derive(Debug)]
 pub struct DepthFrame {
     /// Name of the picture.
     pub name: String,
-    /// The picture at the network's size.
-    pub image: RgbImage,
     /// Its camera, intrinsics at the network's size.
     pub view: View,
-    /// Its depth, once known.
-    pub depth: Option<DepthGrid>,
     /// The source views that the depth was made from, as they were then.
     pub made_with: Vec<(usize, View)>,
     /// The reference view that the depth was made from.
     pub made_as: Option<View>,
+    image: Kept<RgbImage>,
+    depth: Option<Kept<DepthGrid>>,
+    file: Option<Arc<FrameFile>>,
+}
+
+impl DepthFrame {
+    /// A picture at the network's size with its camera, without depth yet, kept in `file` where there is one.
+    ///
+    /// # Errors
+    /// Writing to the file fails.
+    pub fn new(name: String, image: RgbImage, view: View, file: Option<&Arc<FrameFile>>) -> io::Result<Self> {
+        let image = Kept::new(image, file)?;
+        Ok(Self { name, view, made_with: Vec::new(), made_as: None, image, depth: None, file: file.cloned() })
+    }
+
+    /// The picture at the network's size.
+    ///
+    /// # Errors
+    /// Reading the file fails.
+    pub fn image(&self) -> io::Result<Cow<'_, RgbImage>> {
+        self.image.get()
+    }
+
+    /// Whether its depth is known.
+    pub fn has_depth(&self) -> bool {
+        self.depth.is_some()
+    }
+
+    /// Its depth, once known.
+    ///
+    /// # Errors
+    /// Reading the file fails.
+    pub fn depth(&self) -> io::Result<Option<Cow<'_, DepthGrid>>> {
+        self.depth.as_ref().map(Kept::get).transpose()
+    }
+
+    /// Takes a new depth, or forgets the one there was.
+    ///
+    /// # Errors
+    /// Writing to the file fails.
+    pub fn set_depth(&mut self, depth: Option<DepthGrid>) -> io::Result<()> {
+        match (depth, &mut self.depth) {
+            (Some(depth), Some(old)) => old.replace(depth)?,
+            (Some(depth), none) => *none = Some(Kept::new(depth, self.file.as_ref())?),
+            // What it took of the file is not used again.
+            (None, some) => *some = None,
+        }
+        Ok(())
+    }
 }
 
 /// Largest shift, in pixels, of the reference's corners and centre in the source between two pairs of poses.

@@ -2,6 +2,7 @@
 //! network, resolve conflicts, merge into the budget. Works while flying: pictures come one by one, poses may be
 //! refined afterwards, and only depths whose geometry really changed are made again.
 
+use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -10,7 +11,7 @@ use config::init::InitSettings;
 use config::settings::SettingError;
 use rayon::prelude::*;
 
-use crate::camera::{Pose, PosedImage, View};
+use crate::camera::{DepthPrior, Pose, PosedImage, View};
 use crate::onnx::features::{FeatureNetwork, Features};
 use crate::onnx::manifest::{Contract, Poses};
 use crate::onnx::network::{LazySession, Network};
@@ -19,6 +20,7 @@ use crate::onnx::session::check_library;
 
 use super::InitError;
 use super::depth_frame::{DepthFrame, shift};
+use super::frame_file::FrameFile;
 use super::pairs::{Relation, SkippedPairs, partners, relate};
 use super::posed::{PosedNetwork, Request};
 use super::range::DepthRange;
@@ -27,6 +29,8 @@ use super::unposed::{Appearance, Heads, PairNetwork, align_frames, appearance, k
 
 mod assemble;
 mod memory;
+
+pub use memory::most_frame_bytes;
 
 /// Features per picture for the depth range.
 const RANGE_FEATURES: usize = 600;
@@ -72,6 +76,8 @@ pub struct Initialiser {
     /// Of the last picture that was looked at, with its camera at the size that features were found in.
     last_features: Option<(usize, View, Features)>,
     frames: Vec<DepthFrame>,
+    /// Where the frames are kept when not in memory.
+    file: Option<Arc<FrameFile>>,
     range: DepthRange,
     /// Depth range of each picture, as [`Self::build`] found it.
     ranges: Vec<Option<[f32; 2]>>,
@@ -119,11 +125,18 @@ impl Initialiser {
             features,
             last_features: None,
             frames: Vec::new(),
+            file: None,
             range: DepthRange::default(),
             ranges: Vec::new(),
             appearance: Vec::new(),
             report,
         })
+    }
+
+    /// Keeps pictures and depths in `file`, which is empty, instead of in memory: bit for bit the same. Call it before the first
+    /// picture; the file takes [`Self::frame_bytes_at`] for each.
+    pub fn keep_frames_in(&mut self, file: File) {
+        self.file = Some(FrameFile::new(file));
     }
 
     /// Other settings for the next [`Self::build`]; depths made so far are kept (they depend on `stride`, `depth_m` and the
@@ -133,7 +146,7 @@ impl Initialiser {
     /// A setting is out of range, or `stride` differs after depths were made.
     pub fn reconfigure(&mut self, settings: &InitSettings) -> Result<(), InitError> {
         settings.check()?;
-        if settings.stride != self.settings.stride && self.frames.iter().any(|f| f.depth.is_some()) {
+        if settings.stride != self.settings.stride && self.frames.iter().any(DepthFrame::has_depth) {
             let wanted = "as it was when depths were made";
             return Err(SettingError::new("stride", &settings.stride, wanted).into());
         }
@@ -174,14 +187,8 @@ impl Initialiser {
             // What knows no intrinsics was trained on square pixels: crop to its shape, never stretch.
             Pairs::Unposed(_) => center_crop(&picture.image, k, w, h),
         };
-        self.frames.push(DepthFrame {
-            name: picture.name.clone(),
-            image,
-            view: View { intrinsics, pose: picture.view.pose },
-            depth: None,
-            made_with: Vec::new(),
-            made_as: None,
-        });
+        let view = View { intrinsics, pose: picture.view.pose };
+        self.frames.push(DepthFrame::new(picture.name.clone(), image, view, self.file.as_ref())?);
         self.report.pictures = self.frames.len();
         self.report.add_ms += started.elapsed().as_secs_f64() * 1e3;
         self.measure_range()
@@ -216,11 +223,16 @@ impl Initialiser {
         Ok(ready.len())
     }
 
-    /// All pictures so far into at most `max_gaussians` Gaussians. May be called again after more pictures.
+    /// All pictures so far into at most `max_gaussians` Gaussians; `prior` takes D_est of each picture that has a depth (depth ×
+    /// confidence of the same network pass), at the grid's resolution. May be called again after more pictures.
     ///
     /// # Errors
-    /// The network fails; no depth range can be found; no picture has a partner.
-    pub fn build(&mut self, max_gaussians: usize) -> Result<Initialisation, InitError> {
+    /// The network or the frames' file fails; no depth range can be found; no picture has a partner.
+    pub fn build(
+        &mut self,
+        max_gaussians: usize,
+        prior: &mut dyn FnMut(&str, DepthPrior),
+    ) -> Result<Initialisation, InitError> {
         let started = Instant::now();
         self.report.skipped = SkippedPairs::default();
         if let Some(features) = &mut self.features {
@@ -242,10 +254,10 @@ impl Initialiser {
         }
         self.pairs.close();
         self.report.depth_ms += started.elapsed().as_secs_f64() * 1e3;
-        if self.frames.iter().all(|f| f.depth.is_none()) {
+        if !self.frames.iter().any(DepthFrame::has_depth) {
             return Err(InitError::NoDepth { pictures: self.frames.len(), skipped: self.report.skipped.total() });
         }
-        self.assemble(max_gaussians)
+        self.assemble(max_gaussians, prior)
     }
 
     fn measure_range(&mut self) -> Result<(), InitError> {
@@ -254,12 +266,12 @@ impl Initialiser {
         // Two pictures in a row out of every few; all until there are enough.
         let wanted = i % RANGE_EVERY < 2 || self.range.of(&self.frames[i].view).is_none();
         let Some(network) = self.features.as_mut().filter(|_| wanted) else { return Ok(()) };
-        let frame = &self.frames[i];
-        let (w, h) = frame.image.dimensions();
+        let (frame, image) = (&self.frames[i], self.frames[i].image()?);
+        let (w, h) = image.dimensions();
         let shrink = (f64::from(RANGE_SIDE) / f64::from(w.max(h))).min(1.0);
         let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
         let view = View { intrinsics: frame.view.intrinsics.resized(fit(w), fit(h)), pose: frame.view.pose };
-        let found = network.extract(&resized(&frame.image, fit(w), fit(h)), RANGE_FEATURES)?;
+        let found = network.extract(&resized(&image, fit(w), fit(h)), RANGE_FEATURES)?;
         if let Some((j, previous_view, previous)) = &self.last_features
             && j + 1 == i
         {
@@ -341,7 +353,7 @@ impl Initialiser {
                 self.report.searched(range);
             }
             let frame = &mut self.frames[i];
-            frame.depth = made.map(|m| m.grid);
+            frame.set_depth(made.map(|m| m.grid))?;
             frame.made_with = made_with;
             frame.made_as = Some(frame.view);
         }
@@ -375,19 +387,20 @@ impl Initialiser {
         }
         let residual = network.pair().sh_residual;
         let started = Instant::now();
-        let alignment = align_frames(&mut self.frames, &edges, &self.settings);
+        let alignment = align_frames(&mut self.frames, &edges, &self.settings)?;
         self.report.edges = edges.len();
         self.report.edges_without_scale = alignment.sigma.iter().filter(|s| s.is_none()).count();
         self.report.components = crate::align::graph::components(views.len(), &edges).1;
         self.report.align_steps = alignment.steps;
         self.report.align_residual_m = alignment.mean_residual;
-        self.appearance = (0..views.len())
-            .map(|v| {
-                let heads = heads[v].as_ref()?;
+        self.appearance.clear();
+        for (frame, heads) in self.frames.iter().zip(&heads) {
+            let made = frame.depth()?.zip(heads.as_ref()).and_then(|(grid, heads)| {
                 let first = &views[edges[heads.edge].first];
-                appearance(heads, &self.frames[v], first, &alignment, &self.settings, residual)
-            })
-            .collect();
+                appearance(heads, (&frame.view, &grid), first, &alignment, &self.settings, residual)
+            });
+            self.appearance.push(made);
+        }
         self.report.align_ms += started.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }

@@ -12,10 +12,10 @@ use std::time::Instant;
 use glam::{DMat3, DMat4, DVec3};
 
 use crate::camera::{Intrinsics, View};
-use crate::onnx::OnnxError;
 use crate::onnx::network::{LazySession, Network};
 use crate::onnx::picture::push_planes;
 
+use super::InitError;
 use super::depth_frame::{DepthFrame, DepthGrid};
 
 /// Floats that the embedded network's session holds per pixel of a picture while it runs, inputs and outputs included
@@ -108,10 +108,10 @@ impl PosedNetwork {
     /// Makes the depths of all requests, in their order, on every `stride`-th pixel.
     ///
     /// # Errors
-    /// Of the first request that failed: ONNX Runtime or the contract.
-    pub fn run_all(&mut self, requests: &[Request<'_>], stride: usize) -> Result<Vec<Made>, OnnxError> {
+    /// Of the first request that failed: ONNX Runtime, the contract, or the frames' file.
+    pub fn run_all(&mut self, requests: &[Request<'_>], stride: usize) -> Result<Vec<Made>, InitError> {
         let next = AtomicUsize::new(0);
-        let done: Mutex<Vec<(usize, Result<Made, OnnxError>)>> = Mutex::new(Vec::with_capacity(requests.len()));
+        let done: Mutex<Vec<(usize, Result<Made, InitError>)>> = Mutex::new(Vec::with_capacity(requests.len()));
         let views = self.views;
         let work = |lane: &mut Lane| {
             loop {
@@ -157,18 +157,18 @@ impl PosedNetwork {
 
 impl Lane {
     /// When the network wants more sources than there are, the best is given again.
-    fn run(&mut self, views: usize, request: &Request<'_>, stride: usize) -> Result<Made, OnnxError> {
+    fn run(&mut self, views: usize, request: &Request<'_>, stride: usize) -> Result<Made, InitError> {
         let started = Instant::now();
         let opened = self.session.opening_ms();
         let reference = request.reference;
-        let (w, h) = reference.image.dimensions();
         let k = &reference.view.intrinsics;
+        let (w, h) = (k.width, k.height);
         self.planes.clear();
-        push_planes(&reference.image, w, h, &self.session.manifest().input, &mut self.planes);
+        push_planes(reference.image()?.as_ref(), w, h, &self.session.manifest().input, &mut self.planes);
         let mut projections = Vec::with_capacity(16 * (views - 1));
         for i in 0..views - 1 {
             let source = request.sources.get(i).or(request.sources.first()).copied().unwrap_or(reference);
-            push_planes(&source.image, w, h, &self.session.manifest().input, &mut self.planes);
+            push_planes(source.image()?.as_ref(), w, h, &self.session.manifest().input, &mut self.planes);
             projections.extend(relative_projection(&reference.view, &source.view));
         }
         let k_ref = [k.fx, 0.0, k.cx - 0.5, 0.0, k.fy, k.cy - 0.5, 0.0, 0.0, 1.0];

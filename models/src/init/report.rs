@@ -2,7 +2,6 @@
 
 use serde::Serialize;
 
-use crate::camera::DepthPrior;
 use crate::cloud::GaussianCloud;
 
 use super::pairs::SkippedPairs;
@@ -12,8 +11,6 @@ use super::pairs::SkippedPairs;
 pub struct Initialisation {
     /// The Gaussians, SH degree 0.
     pub cloud: GaussianCloud,
-    /// D_est of each picture that has a depth (depth × confidence of the same network pass), at the grid's resolution.
-    pub depth_priors: Vec<(String, DepthPrior)>,
     /// What happened.
     pub report: InitReport,
 }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use config::init::InitSettings;
 
-use super::depth_frame::{DepthFrame, DepthGrid};
+use super::depth_frame::DepthGrid;
 use super::merge::Sample;
 use super::unposed::Appearance;
 use crate::camera::{Unprojector, View};
@@ -29,18 +29,19 @@ fn unit_extent(view: &View, stride: usize) -> f32 {
     EXTENT * stride as f32 / view.intrinsics.fx.max(view.intrinsics.fy)
 }
 
-/// Samples of one picture, in reading order.
+/// Samples of one picture, in reading order; `image` is the frame's.
 ///
 /// `appearance` is what an unposed network says about the Gaussians; without it extent and colour come from the grid and the
 /// picture.
 pub fn samples(
-    frame: &DepthFrame,
+    view: &View,
+    image: &RgbImage,
     grid: &DepthGrid,
     appearance: Option<&Appearance>,
     settings: &InitSettings,
     global_scale: f32,
 ) -> Vec<Sample> {
-    let unproject = Unprojector::new(&frame.view);
+    let unproject = Unprojector::new(view);
     let points: Vec<Vec3> = (0..grid.depth.len())
         .into_par_iter()
         .map(|at| {
@@ -49,11 +50,12 @@ pub fn samples(
         })
         .collect();
     let scene = Scene {
-        frame,
+        view,
+        image,
         grid,
         points,
         appearance,
-        axes: Mat3::from_quat(frame.view.pose.rotation.normalize().as_quat()),
+        axes: Mat3::from_quat(view.pose.rotation.normalize().as_quat()),
     };
     let rows: Vec<Vec<Sample>> = (0..grid.height)
         .into_par_iter()
@@ -64,7 +66,8 @@ pub fn samples(
 
 /// A depth grid with its points in the world.
 struct Scene<'a> {
-    frame: &'a DepthFrame,
+    view: &'a View,
+    image: &'a RgbImage,
     grid: &'a DepthGrid,
     points: Vec<Vec3>,
     appearance: Option<&'a Appearance>,
@@ -81,7 +84,7 @@ impl Scene<'_> {
             return None;
         }
         let (x, y) = grid.pixel(i, j);
-        let picture = mean_color(&self.frame.image, x, y, grid.stride);
+        let picture = mean_color(self.image, x, y, grid.stride);
         if let Some(a) = self.appearance {
             let color = if a.residual { picture + a.colors[at] } else { a.colors[at] };
             return Some(Sample {
@@ -95,7 +98,7 @@ impl Scene<'_> {
         let covariance = if settings.local_scale {
             self.covariance((i, j))
         } else {
-            let extent = unit_extent(&self.frame.view, grid.stride) * if settings.global_scale { global } else { 1.0 };
+            let extent = unit_extent(self.view, grid.stride) * if settings.global_scale { global } else { 1.0 };
             Mat3::IDENTITY * (extent * extent)
         };
         Some(Sample {
@@ -109,7 +112,7 @@ impl Scene<'_> {
 
     /// Spread over half the way to the neighbours in both directions of the grid, and a little along the normal.
     fn covariance(&self, (i, j): (usize, usize)) -> Mat3 {
-        let (grid, k) = (self.grid, &self.frame.view.intrinsics);
+        let (grid, k) = (self.grid, &self.view.intrinsics);
         let footprint = grid.depth[j * grid.width + i] * grid.stride as f32;
         let footprint = [footprint / k.fx, footprint / k.fy];
         let mut tangents = [self.axes.x_axis * footprint[0], self.axes.y_axis * footprint[1]];

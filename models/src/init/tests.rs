@@ -43,6 +43,44 @@ fn settings() -> InitSettings {
     InitSettings { threads: 1, ..InitSettings::default() }
 }
 
+fn no_prior(_: &str, _: crate::camera::DepthPrior) {}
+
+#[test]
+fn frames_that_wait_in_a_file_give_the_same_bits_and_one_that_is_cut_is_an_error() {
+    if no_runtime() {
+        return;
+    }
+    let run = |file: Option<&std::fs::File>| {
+        let mut init = Initialiser::open(&settings(), None).unwrap();
+        if let Some(file) = file {
+            init.keep_frames_in(file.try_clone().unwrap());
+        }
+        for i in 0..5 {
+            init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
+            init.advance(1).unwrap();
+        }
+        let mut priors = Vec::new();
+        let cloud = init.build(3000, &mut |name, prior| priors.push((name.to_owned(), prior))).unwrap().cloud;
+        // A depth that is made again lies where the old one lay.
+        let mut moved = picture(4, 48.0, 0.0).view.pose;
+        moved.center.x += 2.0;
+        init.update_pose("4", &moved);
+        let again = init.build(3000, &mut no_prior).unwrap().cloud;
+        (init, cloud, priors, again)
+    };
+    let (_, cloud, priors, again) = run(None);
+    let file = tempfile::tempfile().unwrap();
+    let (mut init, same_cloud, same_priors, same_again) = run(Some(&file));
+    assert_eq!((same_cloud, same_again), (cloud, again));
+    assert_eq!(same_priors, priors);
+    let size = file.metadata().unwrap().len();
+    let planned = init.frame_bytes_at(picture(0, 0.0, 0.0).image.dimensions());
+    assert!(size > 4 * planned && size <= 5 * planned, "{size} of {planned} each");
+    file.set_len(size / 2).unwrap();
+    let cut = init.build(3000, &mut no_prior).unwrap_err();
+    assert!(matches!(cut, super::InitError::FrameFile(_)) && cut.to_string().lines().count() == 1, "{cut}");
+}
+
 #[test]
 fn a_plane_comes_out_flat_within_the_budget_and_the_same_every_time() {
     if no_runtime() {
@@ -54,15 +92,17 @@ fn a_plane_comes_out_flat_within_the_budget_and_the_same_every_time() {
             init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
             init.advance(1).unwrap();
         }
-        init.build(5000).unwrap()
+        let mut priors = 0;
+        let made = init.build(5000, &mut |_, _| priors += 1).unwrap();
+        (made, priors)
     };
-    let a = run();
+    let (a, priors) = run();
     assert!(a.cloud.len() <= 5000 && a.cloud.len() > 2000, "{:?}", a.report);
     // 3 % of the height is a third of a pixel of the coarse level at this size.
     let near = a.cloud.means.iter().filter(|m| m[2].abs() < 1.5).count();
     assert!(near as f64 > 0.8 * a.cloud.len() as f64, "{near} of {} within 1.5 m", a.cloud.len());
-    assert_eq!(a.depth_priors.len(), 5);
-    assert_eq!(a.cloud, run().cloud);
+    assert_eq!(priors, 5);
+    assert_eq!(a.cloud, run().0.cloud);
 }
 
 #[test]
@@ -74,12 +114,12 @@ fn only_depths_whose_poses_moved_are_made_again() {
     for i in 0..4 {
         init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
     }
-    assert_eq!(init.build(3000).unwrap().report.runs, 4);
-    assert_eq!(init.build(1000).unwrap().report.runs, 4);
+    assert_eq!(init.build(3000, &mut no_prior).unwrap().report.runs, 4);
+    assert_eq!(init.build(1000, &mut no_prior).unwrap().report.runs, 4);
     let mut moved = picture(3, 36.0, 0.0).view.pose;
     moved.center.x += 2.0;
     init.update_pose("3", &moved);
-    let runs = init.build(1000).unwrap().report.runs;
+    let runs = init.build(1000, &mut no_prior).unwrap().report.runs;
     assert!(runs > 4 && runs < 8, "{runs}");
 }
 
@@ -94,11 +134,11 @@ fn hovering_alone_and_too_many_pictures_are_one_clear_line() {
         init.add(&picture(i, 0.0, 0.0)).unwrap();
     }
     assert!(init.add(&picture(3, 9.0, 0.0)).unwrap_err().to_string().contains("max_pictures"));
-    let e = init.build(100).unwrap_err().to_string();
+    let e = init.build(100, &mut no_prior).unwrap_err().to_string();
     assert!(e.contains("none of 3 pictures has a partner"), "{e}");
     let mut blind = Initialiser::open(&settings(), None).unwrap();
     blind.add(&picture(0, 0.0, 0.0)).unwrap();
-    assert!(blind.build(100).unwrap_err().to_string().contains("depth_m"));
+    assert!(blind.build(100, &mut no_prior).unwrap_err().to_string().contains("depth_m"));
 }
 
 #[test]
@@ -111,9 +151,10 @@ fn two_places_and_a_picture_taken_twice_become_one_cloud_and_useless_pairs_are_c
     for (i, x) in [0.0, 12.0, 12.0, 5000.0, 5012.0].into_iter().enumerate() {
         init.add(&picture(i, x, 0.0)).unwrap();
     }
-    let out = init.build(6000).unwrap();
+    let mut priors = 0;
+    let out = init.build(6000, &mut |_, _| priors += 1).unwrap();
     // The copy has its depth from the picture beside it; with its original it has no baseline.
-    assert_eq!((out.report.runs, out.depth_priors.len()), (5, 5), "{:?}", out.report);
+    assert_eq!((out.report.runs, priors), (5, 5), "{:?}", out.report);
     assert_eq!((out.report.skipped.no_baseline, out.report.skipped.too_wide), (1, 3), "{:?}", out.report.skipped);
     let here = out.cloud.means.iter().filter(|m| m[0] < 100.0).count();
     let there = out.cloud.means.iter().filter(|m| m[0] > 4900.0).count();
@@ -132,7 +173,7 @@ fn an_unposed_network_runs_the_whole_way_and_its_plane_is_put_at_its_height() {
     for i in 0..4 {
         init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
     }
-    let out = init.build(4000).unwrap();
+    let out = init.build(4000, &mut no_prior).unwrap();
     assert!(out.cloud.len() > 500 && out.cloud.len() <= 4000, "{:?}", out.report);
     assert_eq!((out.report.components, out.report.edges_without_scale), (1, 0), "{:?}", out.report);
     assert_eq!(out.report.depth_m, [40.0, 60.0]);
@@ -182,7 +223,7 @@ fn the_scale_switches_of_the_ablation_set_the_extent_of_the_gaussians() {
     }
     let mut extent = |global: bool, local: bool| {
         init.reconfigure(&InitSettings { global_scale: global, local_scale: local, ..known.clone() }).unwrap();
-        let cloud = init.build(60_000).unwrap().cloud;
+        let cloud = init.build(60_000, &mut no_prior).unwrap().cloud;
         let mut longest: Vec<f32> = cloud.log_scales.iter().map(|s| s[0].exp()).collect();
         longest.sort_by(f32::total_cmp);
         (longest[longest.len() / 20], longest[longest.len() / 2])

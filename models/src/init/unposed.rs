@@ -8,12 +8,12 @@ use glam::{Mat3, Quat, Vec3};
 
 use config::init::InitSettings;
 
+use super::InitError;
 use crate::align::graph::{Edge, PointMap};
 use crate::align::icp::icp;
 use crate::align::solve::{Alignment, align};
 use crate::camera::{Pose, Unprojector, View};
 use crate::cloud::SH_C0;
-use crate::onnx::OnnxError;
 use crate::onnx::manifest::{OpacityUnit, PairSettings, QuaternionOrder, ScaleUnit};
 use crate::onnx::network::{LazySession, Network};
 use crate::onnx::picture::push_planes;
@@ -96,12 +96,13 @@ impl PairNetwork {
         pair: [usize; 2],
         stride: usize,
         edge: usize,
-    ) -> Result<(Edge, [Heads; 2]), OnnxError> {
+    ) -> Result<(Edge, [Heads; 2]), InitError> {
         let [first, second] = pair.map(|i| &frames[i]);
-        let (w, h) = first.image.dimensions();
+        let images = [first.image()?, second.image()?];
+        let (w, h) = images[0].dimensions();
         let mut planes = [Vec::new(), Vec::new()];
-        push_planes(&first.image, w, h, &self.session.manifest().input, &mut planes[0]);
-        push_planes(&second.image, w, h, &self.session.manifest().input, &mut planes[1]);
+        push_planes(images[0].as_ref(), w, h, &self.session.manifest().input, &mut planes[0]);
+        push_planes(images[1].as_ref(), w, h, &self.session.manifest().input, &mut planes[1]);
         let out = self.session.run((w, h), &[&planes[0], &planes[1]])?;
         let thin = Thinning { pair: &self.pair, size: (w as usize, h as usize), stride, edge };
         let (map1, heads1) = thin.outputs(&out[..6], None);
@@ -209,12 +210,15 @@ pub fn grid_view(view: &View, stride: usize) -> View {
 }
 
 /// Aligns all edges and writes χ into the frames' depth grids; returns the alignment.
-pub fn align_frames(frames: &mut [DepthFrame], edges: &[Edge], settings: &InitSettings) -> Alignment {
+///
+/// # Errors
+/// Writing to the frames' file fails.
+pub fn align_frames(frames: &mut [DepthFrame], edges: &[Edge], settings: &InitSettings) -> std::io::Result<Alignment> {
     let stride = settings.stride as usize;
     let views: Vec<View> = frames.iter().map(|f| grid_view(&f.view, stride)).collect();
     let alignment = align(&views, edges, settings.align_steps);
     for (frame, map) in frames.iter_mut().zip(&alignment.maps) {
-        frame.depth = map.as_ref().map(|m| DepthGrid {
+        let grid = map.as_ref().map(|m| DepthGrid {
             width: m.width,
             height: m.height,
             stride,
@@ -222,21 +226,21 @@ pub fn align_frames(frames: &mut [DepthFrame], edges: &[Edge], settings: &InitSe
             // From 0…∞ to 0…1.
             confidence: m.confidence.iter().map(|c| c / (1.0 + c)).collect(),
         });
+        frame.set_depth(grid)?;
     }
-    alignment
+    Ok(alignment)
 }
 
 /// Σ of a picture's heads in the world: sᵍ from ICP between the original and the aligned points, sˡ from the distance to the
 /// neighbours before and after. `first` is the camera of [`Heads::edge`]'s first picture.
 pub fn appearance(
     heads: &Heads,
-    frame: &DepthFrame,
+    (view, grid): (&View, &DepthGrid),
     first: &View,
     alignment: &Alignment,
     settings: &InitSettings,
     residual: bool,
 ) -> Option<Appearance> {
-    let (grid, view) = (frame.depth.as_ref()?, &frame.view);
     let sigma = alignment.sigma.get(heads.edge).copied().flatten()? as f32;
     let turn = first.pose.rotation.normalize().as_quat();
     let unproject = Unprojector::new(view);

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use config::disk::plan::{DiskPlan, DiskRequest};
-use config::mission::Mission;
+use config::init::InitSettings;
+use config::mission::{Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
 use config::training::ShSettings;
 use models::dataset::{Dataset, scaled};
@@ -11,6 +12,7 @@ use vulkan::gpu::Gpu;
 
 use super::CliError;
 use crate::engine::device::DeviceRequest;
+use crate::engine::scratch_bytes;
 
 /// Arguments of `dgtr plan`.
 #[derive(Debug, clap::Args)]
@@ -68,12 +70,15 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let (wanted, sh) = match &args.mission {
+    let (wanted, sh, init, network) = match &args.mission {
         Some(path) => {
             let mission = Mission::read(path)?;
-            (DeviceRequest::of_flight(&mission, None), mission.training.sh)
+            (DeviceRequest::of_flight(&mission, None), mission.training.sh, mission.init, mission.network)
         }
-        None => of_arguments(&args)?,
+        None => {
+            let (wanted, sh) = of_arguments(&args)?;
+            (wanted, sh, InitSettings::default(), NetworkSettings::default())
+        }
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
     let sort_lanes = match (Gpu::open(args.device.as_deref()), &args.device) {
@@ -104,7 +109,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         width: request.width,
         height: request.height,
         key_frames: request.views,
-        view_file: request.view_file_bytes(),
+        scratch: scratch_bytes(&request, &init, &network),
         gaussians: plan.gaussians,
         sh_degree: plan.sh_degree,
         delivered: 0,

@@ -87,16 +87,21 @@ impl DeviceRequest {
         let request = self.plan_request(&training.sh, gpu.info().sort_lanes());
         let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
         if request.view_file_bytes() > 0 {
-            let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
-            let file = view_file(&folder, request.view_file_bytes());
-            trainer.keep_views_in(file.map_err(|e| TrainError::ViewFile(format!("{}: {e}", folder.display())))?);
+            trainer.keep_views_in(self.scratch(request.view_file_bytes())?);
         }
         Ok(trainer)
+    }
+
+    /// A scratch file of so many bytes in the job's folder.
+    pub(super) fn scratch(&self, bytes: u64) -> Result<File, TrainError> {
+        let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
+        scratch_file(&folder, bytes)
+            .map_err(|e| TrainError::ViewFile(format!("{} MiB in {}: {e}", bytes >> 20, folder.display())))
     }
 }
 
 /// A file without a name in `folder`, as large as it will ever be: it goes with the process, however that ends.
-fn view_file(folder: &Path, bytes: u64) -> std::io::Result<File> {
+fn scratch_file(folder: &Path, bytes: u64) -> std::io::Result<File> {
     std::fs::create_dir_all(folder)?;
     let file = tempfile::tempfile_in(folder)?;
     match fallocate(&file, FallocateFlags::empty(), 0, bytes) {

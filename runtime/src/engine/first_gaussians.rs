@@ -1,6 +1,6 @@
 //! The first Gaussians: of the feed-forward network, of sparse points, or at random.
 
-use std::collections::HashMap;
+use std::collections::HashSet;
 
 use models::camera::{DepthPrior, View};
 use models::cloud::GaussianCloud;
@@ -31,24 +31,26 @@ pub type Point = ([f64; 3], [u8; 3]);
 /// What training starts from.
 pub(super) struct FirstGaussians {
     pub cloud: GaussianCloud,
-    pub priors: HashMap<String, DepthPrior>,
+    /// Pictures that have a depth.
+    pub with_depth: HashSet<String>,
     /// Of the feed-forward network.
     pub report: Option<InitReport>,
 }
 
 impl From<GaussianCloud> for FirstGaussians {
     fn from(cloud: GaussianCloud) -> Self {
-        Self { cloud, priors: HashMap::new(), report: None }
+        Self { cloud, with_depth: HashSet::new(), report: None }
     }
 }
 
 /// All pictures of `initialiser` into at most `capacity` Gaussians; `None` when `go_on` said no. With `at_once` no picture
-/// is still to come, and every depth is made once, from its best partners, on all threads.
+/// is still to come, and every depth is made once, from its best partners, on all threads. `prior` takes the depths one by one.
 pub(super) fn feed_forward(
     initialiser: &mut Initialiser,
     pictures: usize,
     capacity: usize,
     at_once: bool,
+    prior: &mut dyn FnMut(&str, DepthPrior),
     go_on: &dyn Fn() -> bool,
 ) -> Result<Option<FirstGaussians>, JobError> {
     let mut progress = Progress::new("initialising", pictures as u64);
@@ -61,11 +63,14 @@ pub(super) fn feed_forward(
             return Ok(None);
         }
     }
-    let made = initialiser.build(capacity)?;
-    let (gaussians, maps) = (made.cloud.len(), made.depth_priors.len());
+    let mut with_depth = HashSet::with_capacity(pictures);
+    let made = initialiser.build(capacity, &mut |name, depth| {
+        with_depth.insert(name.to_owned());
+        prior(name, depth);
+    })?;
+    let (gaussians, maps) = (made.cloud.len(), with_depth.len());
     progress.finish(&format!("{gaussians} Gaussians of {maps} depth maps by {}", made.report.network));
-    let priors = made.depth_priors.into_iter().collect();
-    Ok(Some(FirstGaussians { cloud: made.cloud, priors, report: Some(made.report) }))
+    Ok(Some(FirstGaussians { cloud: made.cloud, with_depth, report: Some(made.report) }))
 }
 
 /// The points themselves.

@@ -159,10 +159,11 @@ impl Reconstruct for Reconstruction {
         let mut with_prior = 0;
         for (i, (name, view)) in self.views.iter().enumerate() {
             self.trainer.renew_view(i, *view)?;
-            if self.depth.is_none() {
-                self.trainer.set_prior(i, fresh.priors.get(name))?;
+            let has_depth = fresh.with_depth.contains(name);
+            if self.depth.is_none() && !has_depth {
+                self.trainer.set_prior(i, None)?;
             }
-            with_prior += u64::from(self.depth.is_some() || fresh.priors.contains_key(name));
+            with_prior += u64::from(self.depth.is_some() || has_depth);
         }
         self.built = self.views.iter().map(|v| v.1).collect();
         let network = self.depth.as_ref().map(|network| network.name().to_owned());

@@ -19,7 +19,7 @@ use crate::init::{InitError, finish};
 /// Pictures that are checked at once, while as many others are being merged.
 pub(super) const AHEAD: usize = 2;
 /// Views that a depth is compared with.
-const WITNESSES: usize = 6;
+pub(super) const WITNESSES: usize = 6;
 /// Edge of the finest voxels, in sample spacings.
 const VOXEL: f32 = 0.7;
 /// A cell's Gaussian reaches this many spreads of its samples: a square's is 0.29 edges, and 0.5 edges close the gaps.
@@ -27,7 +27,11 @@ const SPREAD: f32 = 1.7;
 
 impl Initialiser {
     /// Consistency, samples, merge.
-    pub(super) fn assemble(&mut self, max_gaussians: usize) -> Result<Initialisation, InitError> {
+    pub(super) fn assemble(
+        &mut self,
+        max_gaussians: usize,
+        prior: &mut dyn FnMut(&str, DepthPrior),
+    ) -> Result<Initialisation, InitError> {
         let started = Instant::now();
         let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
         let mut spacing = Vec::new();
@@ -43,17 +47,17 @@ impl Initialiser {
         let (edge, global_scale) = spacing.get(spacing.len() / 2).copied().unwrap_or((1.0, 1.0));
         let capacity = max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN);
         let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), capacity);
-        let mut depth_priors = Vec::with_capacity(self.frames.len());
         let report = &mut self.report;
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
         (report.consistency_ms, report.samples_ms, report.voxels_ms) = (0.0, 0.0, 0.0);
-        let with_depth: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].depth.is_some()).collect();
+        let with_depth: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].has_depth()).collect();
         // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
         let mut waiting: Vec<Checked> = Vec::new();
         for next in with_depth.chunks(AHEAD).map(Some).chain([None]) {
             let this = &*self;
-            let check = || -> Vec<Checked> {
-                next.unwrap_or(&[]).par_iter().filter_map(|&i| this.check(i, &views, global_scale)).collect()
+            let check = || -> Result<Vec<Checked>, InitError> {
+                let checked = next.unwrap_or(&[]).par_iter().map(|&i| this.check(i, &views, global_scale).transpose());
+                checked.flatten_iter().collect()
             };
             let sort = || {
                 let started = Instant::now();
@@ -63,7 +67,7 @@ impl Initialiser {
             let (checked, voxels_ms) = rayon::join(check, sort);
             let report = &mut self.report;
             report.voxels_ms += voxels_ms;
-            for done in std::mem::replace(&mut waiting, checked) {
+            for done in std::mem::replace(&mut waiting, checked?) {
                 report.consistency_ms += done.consistency_ms;
                 report.samples_ms += done.samples_ms;
                 report.samples += done.samples.len();
@@ -71,7 +75,7 @@ impl Initialiser {
                 report.alone += done.count.alone;
                 report.removed += done.count.removed;
                 report.filled += done.count.filled;
-                depth_priors.push((self.frames[done.index].name.clone(), done.prior));
+                prior(&self.frames[done.index].name, done.prior);
             }
         }
         let report = &mut self.report;
@@ -88,13 +92,13 @@ impl Initialiser {
         report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
         let planned = self.planned_bytes(self.frames.len(), max_gaussians);
         self.report.planned_bytes = planned;
-        Ok(Initialisation { cloud, depth_priors, report: self.report.clone() })
+        Ok(Initialisation { cloud, report: self.report.clone() })
     }
 
     /// The depths of picture `i` after comparison with the pictures that see the same ground, as samples and as a prior.
-    fn check(&self, i: usize, views: &[View], global_scale: f32) -> Option<Checked> {
+    fn check(&self, i: usize, views: &[View], global_scale: f32) -> Result<Option<Checked>, InitError> {
         let started = Instant::now();
-        let own = self.frames[i].depth.as_ref()?;
+        let Some(own) = self.frames[i].depth()? else { return Ok(None) };
         let range = self.known_range(i);
         let mut count = ConsistencyCount::default();
         let mut grid = None;
@@ -104,21 +108,28 @@ impl Initialiser {
             let mut others = partners(i, views, depth, &wide, &mut SkippedPairs::default());
             others.truncate(WITNESSES);
             let others: Vec<usize> = others.into_iter().map(|o| o.0).collect();
-            let fill = range.filter(|_| self.settings.fill).and_then(|range| continued(own, range));
+            let fill = range.filter(|_| self.settings.fill).and_then(|range| continued(&own, range));
             if let Some((resolved, found)) =
-                resolve(&self.frames, i, &others, self.settings.depth_tolerance, fill.as_deref())
+                resolve(&self.frames, i, &others, self.settings.depth_tolerance, fill.as_deref())?
             {
                 (grid, count) = (Some(resolved), found);
             }
         }
-        let grid = grid.unwrap_or_else(|| own.clone());
+        let grid = grid.unwrap_or_else(|| own.into_owned());
         let consistency_ms = started.elapsed().as_secs_f64() * 1e3;
         let appearance = self.appearance.get(i).and_then(Option::as_ref);
-        let samples = samples(&self.frames[i], &grid, appearance, &self.settings, global_scale);
+        let samples = samples(
+            &self.frames[i].view,
+            self.frames[i].image()?.as_ref(),
+            &grid,
+            appearance,
+            &self.settings,
+            global_scale,
+        );
         let samples_ms = started.elapsed().as_secs_f64() * 1e3 - consistency_ms;
         let (width, height) = (grid.width as u32, grid.height as u32);
         let prior = DepthPrior { width, height, depth: grid.depth, confidence: grid.confidence };
-        Some(Checked { index: i, samples, prior, count, consistency_ms, samples_ms })
+        Ok(Some(Checked { index: i, samples, prior, count, consistency_ms, samples_ms }))
     }
 }
 
