@@ -26,6 +26,8 @@ pub const SECTION_ALIGNMENT: u64 = 256;
 pub const TOTAL_ALIGNMENT: u64 = 64 << 10;
 /// What a driver may want beyond the bytes of the one buffer (V3DV: 256 more for storage and uniform buffers; others round up).
 pub const DRIVER_ROOM: u64 = 64 << 10;
+/// Longer side of pictures where nobody says another, pixels: what the networks see, and what is measured here.
+pub const WORKING_SIDE: u32 = 640;
 /// Views on the device at the least: the step's own, and the one that comes in.
 const LEAST_SLOTS: u32 = 2;
 /// Pixels along the side of a tile.

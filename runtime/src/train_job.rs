@@ -9,7 +9,7 @@ use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
 use config::mission::{KeyframeSettings, NetworkSettings};
-use config::plan::Plan;
+use config::plan::{Plan, WORKING_SIDE};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use hal::time::MonotonicClock;
@@ -91,8 +91,6 @@ pub struct TrainJob {
 
 /// Scales that are tried where none is asked for: halves, at which JPEG files are decoded for less, and between.
 const SCALES: [f64; 9] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125];
-/// Pictures are not made smaller than this only because they are many, pixels of the longer side.
-const WORKING_SIDE: u32 = 640;
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;
 /// Shares that a sort is done in at most; fewer need less memory.

@@ -4,6 +4,7 @@
 use super::Mission;
 use super::reference::{comment, explain};
 use crate::geodesy::Geodetic;
+use crate::plan::WORKING_SIDE;
 use crate::preset::Preset;
 use crate::settings::{Setting, Value};
 
@@ -26,9 +27,7 @@ pub struct Draft {
     pub preset: Option<Preset>,
 }
 
-/// Longer side of the pictures that presets and defaults were measured with, pixels.
-const MEASURED_SIDE: u32 = 640;
-/// And their number.
+/// Pictures that the presets were measured with.
 const MEASURED_VIEWS: u32 = 48;
 /// Tables that are written with all their settings; those that are not have theirs in the reference.
 const SHOWN: [&str; 5] = ["mount", "link", "keyframes", "memory", "upload"];
@@ -59,7 +58,7 @@ impl Draft {
         section(&mut out, &all, "camera", &camera, true);
         let preset = self.preset.and_then(|p| Preset::ALL.iter().find(|a| a.1 == p));
         // The presets and the defaults of [memory] were chosen with pictures of this side, and the presets with 48 of them.
-        let side = f64::from(MEASURED_SIDE) / f64::from(self.picture[0].max(self.picture[1]));
+        let side = f64::from(WORKING_SIDE) / f64::from(self.picture[0].max(self.picture[1]));
         let scale = side.min(1.0) * preset.map_or(1.0, |p| f64::from(p.1.values().image_scale));
         let mut memory: Vec<_> = preset.iter().map(|p| ("preset", quoted(p.0))).collect();
         if scale < 1.0 {
@@ -147,7 +146,7 @@ mod tests {
         assert_eq!(regions[0], [[-100.0, -50.0], [0.0, -50.0], [0.0, 50.0], [-100.0, 50.0]]);
         assert_eq!(regions[1][0], [0.0, -50.0]);
         assert_eq!((m.memory.device_mib, m.training.seconds), (96, Some(10.0)));
-        assert_eq!((m.memory.image_scale, m.keyframes.max), (0.0789, 48));
+        assert_eq!((m.memory.image_scale, m.keyframes.max), (Some(0.0789), 48));
     }
 
     #[test]
@@ -159,11 +158,11 @@ mod tests {
             let text = Draft { preset, picture, ..draft() }.text();
             let mission =
                 Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{preset:?} {picture:?}: {e}"));
-            let side = |n: u32| ((n as f32 * mission.memory.image_scale).round() as u32).max(1);
+            let (width, height) = mission.memory.training_size((picture[0], picture[1]));
             let request = PlanRequest {
                 device_mib: mission.memory.device_mib,
-                width: side(picture[0]),
-                height: side(picture[1]),
+                width,
+                height,
                 views: mission.keyframes.max,
                 max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
                 sort_lanes: SORT_LANES_GPU,

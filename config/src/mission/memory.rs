@@ -2,6 +2,7 @@
 
 use serde::Deserialize;
 
+use crate::plan::WORKING_SIDE;
 use crate::preset::Preset;
 use crate::settings::{Limits, table};
 
@@ -23,8 +24,19 @@ table! {
         pub max_gaussians: Option<u32> = None;
         /// Bound on what an aircraft's output folder takes of the disk, MiB; absent = what is free.
         pub disk_mib: Option<u32> = None;
-        /// Pictures are trained at this fraction of their size.
-        pub image_scale: f32 = 1.0, in Limits::above(0.0).up_to(1.0);
+        /// Pictures are trained at this fraction of their size; absent = whole, or at 640 pixels of the longer side where that is
+        /// less.
+        pub image_scale: Option<f32> = None, in Limits::above(0.0).up_to(1.0);
+    }
+}
+
+impl MemorySettings {
+    /// The size at which pictures of a camera are trained.
+    pub fn training_size(&self, (width, height): (u32, u32)) -> (u32, u32) {
+        let scale =
+            self.image_scale.unwrap_or_else(|| WORKING_SIDE as f32 / width.max(height).max(WORKING_SIDE) as f32);
+        let scaled = |side: u32| ((side as f32 * scale).round() as u32).max(1);
+        (scaled(width), scaled(height))
     }
 }
 
@@ -47,14 +59,14 @@ impl From<Given> for MemorySettings {
         if let Some(values) = given.preset.map(Preset::values) {
             all.device_mib = values.device_mib;
             all.max_gaussians = Some(values.max_gaussians);
-            all.image_scale = values.image_scale;
+            all.image_scale = Some(values.image_scale);
         }
         all.device_mib = given.device_mib.unwrap_or(all.device_mib);
         all.host_mib = given.host_mib.unwrap_or(all.host_mib);
         all.view_slots = given.view_slots;
         all.max_gaussians = given.max_gaussians.or(all.max_gaussians);
         all.disk_mib = given.disk_mib;
-        all.image_scale = given.image_scale.unwrap_or(all.image_scale);
+        all.image_scale = given.image_scale.or(all.image_scale);
         all
     }
 }
@@ -69,11 +81,20 @@ mod tests {
         assert_eq!(of(""), MemorySettings::default());
         let values = Preset::Medium.values();
         let all = of("preset = \"medium\"");
-        assert_eq!((all.device_mib, all.image_scale), (values.device_mib, values.image_scale));
+        assert_eq!((all.device_mib, all.image_scale), (values.device_mib, Some(values.image_scale)));
         assert_eq!(all.max_gaussians, Some(values.max_gaussians));
         let some = of("preset = \"medium\"\ndevice_mib = 100");
         assert_eq!((some.device_mib, some.max_gaussians), (100, Some(values.max_gaussians)));
         assert!(toml::from_str::<MemorySettings>("preset = \"toaster\"").is_err());
         assert!(toml::from_str::<MemorySettings>("devce_mib = 3").is_err());
+    }
+
+    #[test]
+    fn pictures_are_trained_at_a_working_size_unless_the_mission_says_another() {
+        let size = |text: &str, full| toml::from_str::<MemorySettings>(text).unwrap().training_size(full);
+        assert_eq!(size("", (640, 480)), (640, 480));
+        assert_eq!(size("", (4000, 3000)), (640, 480));
+        assert_eq!(size("", (300, 48_000_000)), (1, 640));
+        assert_eq!(size("image_scale = 0.5", (4000, 3000)), (2000, 1500));
     }
 }

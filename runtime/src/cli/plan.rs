@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use config::disk::plan::{DiskPlan, DiskRequest};
 use config::init::InitSettings;
-use config::mission::{Mission, NetworkSettings};
+use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
 use config::training::ShSettings;
 use models::dataset::{Dataset, scaled};
@@ -30,9 +30,9 @@ pub struct Args {
     /// Region whose pictures are counted, with --dataset.
     #[arg(long, requires = "dataset")]
     pub region: Option<String>,
-    /// Image scale, above 0 and at most 1.
-    #[arg(long, default_value_t = 1.0)]
-    pub scale: f64,
+    /// Image scale, above 0 and at most 1 [default: whole, or 640 pixels of the longer side where that is less].
+    #[arg(long)]
+    pub scale: Option<f64>,
     /// Device memory, MiB.
     #[arg(long, default_value_t = 512)]
     pub budget_mib: u32,
@@ -70,14 +70,15 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let (wanted, sh, init, network) = match &args.mission {
+    let (wanted, full, sh, init, network) = match &args.mission {
         Some(path) => {
             let mission = Mission::read(path)?;
-            (DeviceRequest::of_flight(&mission, None), mission.training.sh, mission.init, mission.network)
+            let full = (mission.camera.width, mission.camera.height);
+            (DeviceRequest::of_flight(&mission, None), full, mission.training.sh, mission.init, mission.network)
         }
         None => {
-            let (wanted, sh) = of_arguments(&args)?;
-            (wanted, sh, InitSettings::default(), NetworkSettings::default())
+            let (wanted, full, sh) = of_arguments(&args)?;
+            (wanted, full, sh, InitSettings::default(), NetworkSettings::default())
         }
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
@@ -106,8 +107,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     println!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
     let disk = DiskPlan::new(&DiskRequest {
-        width: request.width,
-        height: request.height,
+        width: full.0,
+        height: full.1,
         key_frames: request.views,
         scratch: scratch_bytes(&request, &init, &network),
         gaussians: plan.gaussians,
@@ -122,18 +123,23 @@ pub fn run(args: Args) -> Result<(), CliError> {
     Ok(())
 }
 
-fn of_arguments(args: &Args) -> Result<(DeviceRequest, ShSettings), CliError> {
-    let (size, views) = match &args.dataset {
+/// The request, the size of whole pictures, and SH.
+fn of_arguments(args: &Args) -> Result<(DeviceRequest, (u32, u32), ShSettings), CliError> {
+    let (full, views) = match &args.dataset {
         None => ((args.width, args.height), args.views as usize),
         Some(root) => {
             let set = Dataset::open(root)?;
             let chosen = set.select(&args.split, args.region.as_deref())?;
-            (largest(&set, &chosen, args.scale)?, chosen.len())
+            (largest(&set, &chosen, 1.0)?, chosen.len())
         }
     };
+    let memory = MemorySettings { image_scale: args.scale.map(|s| s as f32), ..MemorySettings::default() };
+    memory.check().map_err(|e| CliError::input(format!("--scale: {e}")))?;
+    let size = memory.training_size(full);
     let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
     let (device_mib, max_gaussians, view_slots) = (args.budget_mib, args.max_gaussians, args.view_slots);
-    Ok((DeviceRequest { device: None, device_mib, size, views, view_slots, folder: None, max_gaussians }, sh))
+    let request = DeviceRequest { device: None, device_mib, size, views, view_slots, folder: None, max_gaussians };
+    Ok((request, full, sh))
 }
 
 /// The widest and the highest picture of `frames` at `scale`.

@@ -24,8 +24,8 @@ const INSTANCES_PER_PIXEL: usize = 8;
 pub fn training_lens(mission: &Mission) -> Intrinsics {
     let c = &mission.camera;
     let full = Intrinsics { width: c.width, height: c.height, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy };
-    let scaled = |side: u32| ((side as f32 * mission.memory.image_scale).round() as u32).max(1);
-    full.resized(scaled(c.width), scaled(c.height))
+    let (width, height) = mission.memory.training_size((c.width, c.height));
+    full.resized(width, height)
 }
 
 /// What a job wants of which device.
