@@ -104,6 +104,28 @@ impl GaussianCloud {
             && self.sh[i * stride..(i + 1) * stride].iter().all(|v| v.is_finite())
     }
 
+    /// Opacity-weighted area of the disc spanned by a Gaussian's two longest axes, m²: how much of the ground it covers.
+    pub fn covered_m2(&self, index: usize) -> f64 {
+        let mut s = self.log_scales[index].map(f64::from);
+        s.sort_by(f64::total_cmp);
+        let opacity = 1.0 / (1.0 + (-f64::from(self.opacity_logits[index])).exp());
+        opacity * std::f64::consts::PI * (s[1] + s[2]).exp()
+    }
+
+    /// Which rows remain when those that cover least are left out until `budget` are left.
+    pub fn most_covering(&self, budget: usize) -> Vec<bool> {
+        let over = self.len().saturating_sub(budget);
+        let mut keep = vec![true; self.len()];
+        if over > 0 {
+            let mut order: Vec<(f64, u32)> = (0..self.len()).map(|i| (self.covered_m2(i), i as u32)).collect();
+            let by_area = |a: &(f64, u32), b: &(f64, u32)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
+            // With a budget of nothing there is no row behind the last one that goes.
+            order.select_nth_unstable_by(over.min(self.len() - 1), by_area);
+            order[..over].iter().for_each(|&(_, i)| keep[i as usize] = false);
+        }
+        keep
+    }
+
     /// Keeps the rows for which `keep(index)` holds, in order; returns how many were removed.
     pub fn retain(&mut self, mut keep: impl FnMut(usize) -> bool) -> usize {
         let (n, stride) = (self.len(), self.sh_stride());

@@ -28,6 +28,7 @@ use crate::run_json::RunReport;
 mod carry;
 pub mod device;
 mod first_gaussians;
+mod follow;
 pub mod host;
 mod reconstruct;
 pub mod source;

@@ -138,9 +138,9 @@ pub fn fly(
     Ok(outcome(ended, counters, end, interrupt))
 }
 
-/// Whether models are rounded before they are sent.
-fn delivers(mission: &Mission) -> bool {
-    mission.upload.encoding == Encoding::Delivery
+/// Most bytes of a Gaussian as it is delivered; 0: models are sent as they are.
+pub fn delivered_bytes(mission: &Mission) -> usize {
+    if mission.upload.encoding == Encoding::Delivery { ENCODED_BYTES } else { 0 }
 }
 
 /// What a flight may take of the disk.
@@ -160,7 +160,7 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
         scratch: scratch_bytes(&request, &mission.init, &mission.network),
         gaussians,
         sh_degree,
-        delivered: if delivers(mission) { ENCODED_BYTES } else { 0 },
+        delivered: delivered_bytes(mission),
     })
 }
 
@@ -183,8 +183,9 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
 
 /// Waits for the ground to have the finished model, then says what became of everything.
 fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, interrupt: &Interrupt) -> FlyOutcome {
-    let JobEnd { reconstruction, offerer, model, gaussians, finished } = end;
+    let JobEnd { mut reconstruction, offerer, model, gaussians, finished } = end;
     let delivered = finished && offerer.wait_delivered(DELIVERY, || !interrupt.requested());
+    reconstruction.report.more.insert("bytes_sent".into(), offerer.status().sent.into());
     offerer.shutdown();
     let keyframes = reconstruction.keyframes();
     FlyOutcome { model, gaussians, ended, finished, delivered, flight, keyframes, report: reconstruction.report }
@@ -203,7 +204,7 @@ fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Dis
         ahead: DECODED_AHEAD + handover::AHEAD,
         // Until they are kept on disk; those that are files already wait there.
         ahead_in_memory: !matches!(aircraft.camera, CameraSource::Folder(_)),
-        delivers: delivers(mission),
+        delivers: delivered_bytes(mission) > 0,
         // The capture thread has scaled them already.
         scale: 1.0,
         network: mission.network.clone(),

@@ -122,5 +122,6 @@ fn missing_and_black_pictures_are_counted_and_left_out_of_a_model_that_is_made_a
     assert!(announced > count("pictures"), "{run}");
     assert!(said.contains("no picture came") && said.contains(": black, left out"), "{said}");
     let views = run["views"].as_u64().expect("views");
+    assert!(run["views_read_back"].as_u64() > Some(0), "{run}");
     assert!(views >= 3 && views <= announced - count("triggers_unmatched") - count("pictures_black"), "{run}");
 }

@@ -55,8 +55,8 @@ pub struct DiskPlan {
 /// Why a flight cannot begin.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "disk plan: {allowed_mib} MiB are too few for the first {MIN_KEY_FRAMES} key frames and two checkpoints; at least {needed_mib} \
-     MiB are needed (make room, raise memory.disk_mib, or use fewer Gaussians or smaller pictures)"
+    "disk plan: {allowed_mib} MiB are too few for the first {MIN_KEY_FRAMES} key frames, two checkpoints and scratch files; at least \
+     {needed_mib} MiB are needed (make room, raise memory.disk_mib, or lower keyframes.max, memory.image_scale or max_gaussians)"
 )]
 pub struct DiskPlanError {
     /// What there is.

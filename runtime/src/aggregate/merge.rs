@@ -49,13 +49,6 @@ pub fn opacity(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())
 }
 
-/// Opacity-weighted area of the disc spanned by a Gaussian's two longest axes, m²: how much of the ground it covers.
-fn covered_m2(cloud: &GaussianCloud, i: usize) -> f64 {
-    let mut s = cloud.log_scales[i].map(f64::from);
-    s.sort_by(f64::total_cmp);
-    f64::from(opacity(cloud.opacity_logits[i])) * std::f64::consts::PI * (s[1] + s[2]).exp()
-}
-
 fn ground(mean: [f32; 3]) -> DVec2 {
     DVec2::new(f64::from(mean[0]), f64::from(mean[1]))
 }
@@ -91,7 +84,7 @@ impl Coverage {
         for (m, model) in models.iter().enumerate() {
             for i in 0..model.cloud.len() {
                 if let Some(cell) = this.cell(ground(model.cloud.means[i])) {
-                    this.area[m][cell] += covered_m2(&model.cloud, i).min(side * side) as f32;
+                    this.area[m][cell] += model.cloud.covered_m2(i).min(side * side) as f32;
                 }
             }
         }
@@ -172,12 +165,9 @@ impl Merged {
         if n <= budget {
             return 0;
         }
-        let mut order: Vec<(f64, u32)> = (0..n).map(|i| (covered_m2(&self.cloud, i), i as u32)).collect();
-        order.select_nth_unstable_by(n - budget, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let mut keep = vec![true; n];
-        for &(_, i) in &order[..n - budget] {
-            keep[i as usize] = false;
-            self.kept[usize::from(self.source[i as usize])].over_budget += 1;
+        let keep = self.cloud.most_covering(budget);
+        for (_, source) in keep.iter().zip(&self.source).filter(|(keep, _)| !**keep) {
+            self.kept[usize::from(*source)].over_budget += 1;
         }
         self.retain(|i| keep[i])
     }

@@ -13,6 +13,7 @@ use vulkan::gpu::Gpu;
 use super::CliError;
 use crate::engine::device::DeviceRequest;
 use crate::engine::scratch_bytes;
+use crate::fly::delivered_bytes;
 
 /// Arguments of `dgtr plan`.
 #[derive(Debug, clap::Args)]
@@ -70,16 +71,9 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let (wanted, full, sh, init, network) = match &args.mission {
-        Some(path) => {
-            let mission = Mission::read(path)?;
-            let full = (mission.camera.width, mission.camera.height);
-            (DeviceRequest::of_flight(&mission, None), full, mission.training.sh, mission.init, mission.network)
-        }
-        None => {
-            let (wanted, full, sh) = of_arguments(&args)?;
-            (wanted, full, sh, InitSettings::default(), NetworkSettings::default())
-        }
+    let job = match &args.mission {
+        Some(path) => Job::of_flight(Mission::read(path)?),
+        None => Job::of_arguments(&args)?,
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
     let sort_lanes = match (Gpu::open(args.device.as_deref()), &args.device) {
@@ -87,7 +81,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         (Err(_), None) => SORT_LANES_SOFTWARE,
         (Err(e), Some(_)) => return Err(e.into()),
     };
-    let request = wanted.plan_request(&sh, sort_lanes);
+    let request = job.device.plan_request(&job.sh, sort_lanes);
     let plan = Plan::new(&request)?;
     if args.json {
         println!("{}", serde_json::to_string(&plan).map_err(CliError::failed)?);
@@ -96,7 +90,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     println!(
         "{} views of {} x {}, {} of them on the device at once, SH degree {}, {} MiB allowed",
-        plan.views, wanted.size.0, wanted.size.1, plan.view_slots, plan.sh_degree, wanted.device_mib
+        plan.views, request.width, request.height, plan.view_slots, plan.sh_degree, request.device_mib
     );
     println!(
         "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n  sort lanes{:>10}\n",
@@ -107,13 +101,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     println!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
     let disk = DiskPlan::new(&DiskRequest {
-        width: full.0,
-        height: full.1,
+        width: job.picture.0,
+        height: job.picture.1,
         key_frames: request.views,
-        scratch: scratch_bytes(&request, &init, &network),
+        scratch: scratch_bytes(&request, &job.init, &job.network),
         gaussians: plan.gaussians,
         sh_degree: plan.sh_degree,
-        delivered: 0,
+        delivered: job.delivered,
     });
     println!("\n  on disk, for a flight:");
     for (name, bytes) in &disk.sections {
@@ -123,23 +117,54 @@ pub fn run(args: Args) -> Result<(), CliError> {
     Ok(())
 }
 
-/// The request, the size of whole pictures, and SH.
-fn of_arguments(args: &Args) -> Result<(DeviceRequest, (u32, u32), ShSettings), CliError> {
-    let (full, views) = match &args.dataset {
-        None => ((args.width, args.height), args.views as usize),
-        Some(root) => {
-            let set = Dataset::open(root)?;
-            let chosen = set.select(&args.split, args.region.as_deref())?;
-            (largest(&set, &chosen, 1.0)?, chosen.len())
+/// What is planned for.
+struct Job {
+    device: DeviceRequest,
+    /// Width and height of whole pictures.
+    picture: (u32, u32),
+    sh: ShSettings,
+    init: InitSettings,
+    network: NetworkSettings,
+    /// Most bytes of a Gaussian as it is delivered.
+    delivered: usize,
+}
+
+impl Job {
+    fn of_flight(mission: Mission) -> Self {
+        Self {
+            device: DeviceRequest::of_flight(&mission, None),
+            picture: (mission.camera.width, mission.camera.height),
+            delivered: delivered_bytes(&mission),
+            sh: mission.training.sh,
+            init: mission.init,
+            network: mission.network,
         }
-    };
-    let memory = MemorySettings { image_scale: args.scale.map(|s| s as f32), ..MemorySettings::default() };
-    memory.check().map_err(|e| CliError::input(format!("--scale: {e}")))?;
-    let size = memory.training_size(full);
-    let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
-    let (device_mib, max_gaussians, view_slots) = (args.budget_mib, args.max_gaussians, args.view_slots);
-    let request = DeviceRequest { device: None, device_mib, size, views, view_slots, folder: None, max_gaussians };
-    Ok((request, full, sh))
+    }
+
+    fn of_arguments(args: &Args) -> Result<Self, CliError> {
+        let (picture, views) = match &args.dataset {
+            None => ((args.width, args.height), args.views as usize),
+            Some(root) => {
+                let set = Dataset::open(root)?;
+                let chosen = set.select(&args.split, args.region.as_deref())?;
+                (largest(&set, &chosen, 1.0)?, chosen.len())
+            }
+        };
+        let memory = MemorySettings { image_scale: args.scale.map(|s| s as f32), ..MemorySettings::default() };
+        memory.check().map_err(|e| CliError::input(format!("--scale: {e}")))?;
+        let device = DeviceRequest {
+            device: None,
+            device_mib: args.budget_mib,
+            size: memory.training_size(picture),
+            views,
+            view_slots: args.view_slots,
+            folder: None,
+            max_gaussians: args.max_gaussians,
+        };
+        let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
+        let (init, network) = (InitSettings::default(), NetworkSettings::default());
+        Ok(Self { device, picture, sh, init, network, delivered: 0 })
+    }
 }
 
 /// The widest and the highest picture of `frames` at `scale`.

@@ -100,7 +100,7 @@ pub fn write(
         peak_bytes = peak_bytes.max(run.host_rss_peak);
         let model = folder.join("out/model.dgtr");
         let naive = figure.local.baselines.as_ref();
-        let uploaded = std::fs::metadata(&model).map_or(0, |m| m.len());
+        let uploaded = run.more.get("bytes_sent").and_then(|n| n.as_u64()).unwrap_or(0);
         let row = Row {
             name: figure.name.into(),
             views: run.views,

@@ -7,6 +7,9 @@ use std::collections::HashSet;
 
 use models::cloud::GaussianCloud;
 
+/// Share of the trained Gaussians given up for new ground; beyond it holes would be left where they stood.
+const MOST_GIVEN_UP: f64 = 0.4;
+
 type Cell = [i32; 3];
 
 fn cell(mean: [f32; 3], edge_m: f32) -> Cell {
@@ -14,7 +17,9 @@ fn cell(mean: [f32; 3], edge_m: f32) -> Cell {
 }
 
 /// `trained` plus those of `fresh` that stand in cells (edge `edge_m`, metres) without a trained Gaussian, at most
-/// `capacity` in all; fresh ones beyond it are left out from the end of their list. Returns how many were added.
+/// `capacity` in all. Where that is too few for both, new ground gets what it has in `fresh`, whose Gaussians are spread evenly,
+/// and the trained ones that cover least go; when more would go than [`MOST_GIVEN_UP`], everything starts anew. Returns how many
+/// fresh ones there are.
 pub fn carry_over(trained: &mut GaussianCloud, fresh: &GaussianCloud, edge_m: f32, capacity: usize) -> usize {
     if trained.is_empty() || edge_m.is_nan() || edge_m <= 0.0 {
         trained.clone_from(fresh);
@@ -29,13 +34,17 @@ pub fn carry_over(trained: &mut GaussianCloud, fresh: &GaussianCloud, edge_m: f3
         .filter(|(_, o)| claims(**o))
         .map(|(m, _)| cell(*m, edge_m))
         .collect();
-    let mut room = capacity.saturating_sub(trained.len());
     let mut new = fresh.clone();
-    new.retain(|i| {
-        let add = room > 0 && !taken.contains(&cell(fresh.means[i], edge_m));
-        room -= usize::from(add);
-        add
-    });
+    new.retain(|i| !taken.contains(&cell(fresh.means[i], edge_m)));
+    let room = capacity.saturating_sub(new.len());
+    if trained.len() > room {
+        if (room as f64) < (1.0 - MOST_GIVEN_UP) * trained.len() as f64 {
+            trained.clone_from(fresh);
+            return trained.len();
+        }
+        let keep = trained.most_covering(room);
+        trained.retain(|i| keep[i]);
+    }
     trained.extend(&new);
     new.len()
 }
@@ -60,10 +69,14 @@ mod tests {
     }
 
     #[test]
-    fn the_cap_holds_and_an_empty_model_takes_everything() {
-        let mut trained = cloud(&[0.1]);
-        assert_eq!(carry_over(&mut trained, &cloud(&[5.0, 6.0, 7.0]), 1.0, 3), 2);
-        assert_eq!(trained.len(), 3);
+    fn new_ground_gets_its_share_of_the_cap_and_an_empty_model_takes_everything() {
+        let mut trained = cloud(&[0.1, 0.2, 0.3, 0.4, 0.5]);
+        trained.log_scales[1] = [-5.0; 3];
+        assert_eq!(carry_over(&mut trained, &cloud(&[0.3, 7.0]), 1.0, 5), 1);
+        assert_eq!(trained, cloud(&[0.1, 0.3, 0.4, 0.5, 7.0]), "the one that covers least made room");
+        // More new ground than known: the known one would be left with holes.
+        assert_eq!(carry_over(&mut trained, &cloud(&[0.3, 9.0, 10.0, 11.0]), 1.0, 5), 4);
+        assert_eq!(trained, cloud(&[0.3, 9.0, 10.0, 11.0]));
         let mut empty = cloud(&[]);
         assert_eq!(carry_over(&mut empty, &cloud(&[5.0, 6.0]), 1.0, 3), 2);
     }

@@ -12,6 +12,7 @@ use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::carry::carry_over;
 use super::first_gaussians::FirstGaussians;
+use super::follow::{Motion, follow};
 use super::{Reconstruction, model_path};
 use crate::error::JobError;
 
@@ -20,9 +21,10 @@ const FIRST_BUILD: usize = 3;
 /// A model is rebuilt when the key frames have grown by this share since the last build: often enough that new ground
 /// is trained on soon, seldom enough that building does not eat the time of training.
 const REBUILD_GROWTH: f64 = 0.34;
-/// Trained Gaussians are kept over a rebuild only when refinement moved no earlier key frame further than this,
-/// in pixels at the ground.
-const CARRY_LIMIT_PX: f64 = 1.5;
+/// Key frames that refinement moved less than this have not moved, pixels at the ground.
+const MOVED_PX: f64 = 0.05;
+/// Trained Gaussians are kept over a rebuild only where their key frames' motions agree to this, pixels.
+const CONTRADICTED_PX: f64 = 1.5;
 
 /// What makes a model out of key frames: the seam at which a rehearsal stands in for networks, device and disk.
 pub trait Reconstruct {
@@ -292,30 +294,30 @@ impl Reconstruction {
         match made {
             _ if self.is_continued() => {}
             Some(made) => {
-                let moved_px = self.moved_px(0.5 * (made.depth_m[0] + made.depth_m[1]));
-                if moved_px > CARRY_LIMIT_PX {
-                    tracing::info!(
-                        "refinement moved earlier key frames by {moved_px:.1} px: starting from a fresh cloud"
-                    );
-                    self.cloud.clone_from(&fresh.cloud);
-                } else {
-                    carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().gaussians);
-                }
+                self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
+                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().gaussians);
             }
             None => self.cloud.clone_from(&fresh.cloud),
         }
         Ok(())
     }
 
-    /// How far refinement moved the key frames of the last build since then: the largest, in pixels at `depth_m`.
-    fn moved_px(&self, depth_m: f32) -> f64 {
-        let depth = f64::from(depth_m).max(1e-3);
-        let moved = |(then, (_, now)): (&View, &(String, View))| {
-            let shift = now.pose.center.distance(then.pose.center) / depth;
-            let angle = 2.0 * now.pose.rotation.dot(then.pose.rotation).abs().min(1.0).acos();
-            (shift + angle) * f64::from(then.intrinsics.fx)
+    /// Moves what is trained with the key frames that refinement moved since, at `depth_m`.
+    fn follow_key_frames(&mut self, depth_m: f32) {
+        let then = |(i, (name, now)): (usize, &(String, View))| {
+            let then = self.built.get(i).or_else(|| self.resumed.get(name))?;
+            Some(Motion { then: *then, now: *now })
         };
-        self.built.iter().zip(&self.views).map(moved).fold(0.0, f64::max)
+        let motions: Vec<Motion> = self.views.iter().enumerate().filter_map(then).collect();
+        let most_px = motions.iter().map(|m| m.pixels_at(depth_m.into())).fold(0.0, f64::max);
+        if most_px > MOVED_PX {
+            let dropped = follow(&mut self.cloud, &motions, CONTRADICTED_PX);
+            self.report.skip("gaussians_contradicted", dropped as u64);
+            tracing::info!(
+                "refinement moved earlier key frames by up to {most_px:.1} px: {} Gaussians follow, {dropped} are made anew",
+                self.cloud.len()
+            );
+        }
     }
 }
 

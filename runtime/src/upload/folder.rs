@@ -51,13 +51,15 @@ pub struct FolderOutlet {
     /// Chunks of the offer before the current one, kept for a ground station that is just reading them.
     previous: Vec<Hash>,
     current: Option<(Hash, Vec<Hash>)>,
+    /// Bytes written to it.
+    sent: u64,
 }
 
 impl FolderOutlet {
     /// Offers below `root`; nothing is touched before the first offer.
     pub fn new(root: &Path, source: Source) -> Self {
         let dir = root.join(&source.mission).join(&source.aircraft);
-        Self { root: root.into(), medium: Medium::of(root), dir, source, previous: Vec::new(), current: None }
+        Self { root: root.into(), medium: Medium::of(root), dir, source, previous: Vec::new(), current: None, sent: 0 }
     }
 
     fn drop_stale_chunks(&self, offer: &Offer) {
@@ -94,10 +96,12 @@ impl Outlet for FolderOutlet {
             if !whole {
                 let bytes = model.chunk(index).map_err(TransportError::io(&path))?;
                 write_whole(&path, &bytes).map_err(TransportError::io(&path))?;
+                self.sent += bytes.len() as u64;
             }
         }
-        let path = self.dir.join("offer");
-        write_whole(&path, &model.offer.encode()).map_err(TransportError::io(&path))?;
+        let (path, offer) = (self.dir.join("offer"), model.offer.encode());
+        write_whole(&path, &offer).map_err(TransportError::io(&path))?;
+        self.sent += offer.len() as u64;
         if let Some((_, chunks)) = self.current.replace((model.offer.model, model.offer.chunks.clone())) {
             self.previous = chunks;
         }
@@ -112,6 +116,10 @@ impl Outlet for FolderOutlet {
         let told = Receipt::open(&bytes, identity, mission, aircraft).and_then(|r| r.bearing(offer));
         let here = self.current.as_ref().is_some_and(|c| c.0 == offer.model);
         told.unwrap_or(if here { Delivery::Delivered } else { Delivery::Waiting })
+    }
+
+    fn sent(&self) -> u64 {
+        self.sent
     }
 }
 

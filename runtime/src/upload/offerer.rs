@@ -26,6 +26,8 @@ pub struct OffererStatus {
     pub offers: u64,
     /// Bytes of the newest one.
     pub bytes: u64,
+    /// Bytes of offers and chunks that left the aircraft, those of models that were replaced included.
+    pub sent: u64,
     /// Failed attempts, each of which is repeated.
     pub failures: u64,
     /// The newest model has arrived on the ground, or lies complete in the folder.
@@ -333,6 +335,8 @@ impl Worker {
         let Some(model) = self.model.clone() else { return true };
         let caught_up = self.ways.iter_mut().filter(|w| !w.behind).filter_map(|w| w.outlet.as_mut());
         let deliveries: Vec<Delivery> = caught_up.map(|o| o.delivery(&model.offer)).collect();
+        let sent = self.ways.iter().filter_map(|w| w.outlet.as_ref()).map(|outlet| outlet.sent()).sum();
+        locked(&self.shared.0).status.sent = sent;
         let newest =
             deliveries.iter().filter_map(|d| if let Delivery::Behind(order) = d { Some(*order) } else { None });
         if let Some(order) = newest.max() {

@@ -74,6 +74,9 @@ pub trait Outlet: Send {
 
     /// What has become of the model on offer.
     fn delivery(&mut self, offer: &Offer) -> Delivery;
+
+    /// Bytes of offers and chunks that left the aircraft this way.
+    fn sent(&self) -> u64;
 }
 
 /// How long the ground waits for one answer.

@@ -78,7 +78,7 @@ pub fn wait_until(what: &str, log: &Path, patience: Duration, mut holds: impl Fn
     }
 }
 
-/// A mission of one small aircraft, flown by `dgtr sim`.
+/// A mission of one small aircraft, flown by `dgtr sim`; all but two of its views wait in a file.
 pub fn small_mission(folder: &Path) -> PathBuf {
     let path = folder.join("mission.toml");
     let text = r#"
@@ -87,7 +87,7 @@ seed = 3
 origin = { lat_deg = 46.0, lon_deg = 7.0, alt_m = 500.0 }
 camera = { width = 256, height = 192, fx = 200.0, fy = 200.0, cx = 128.0, cy = 96.0, exposure_delay_ms = 60.0 }
 keyframes = { t_min_m = 6.0, max = 24 }
-memory = { device_mib = 96, host_mib = 1024, max_gaussians = 15000 }
+memory = { device_mib = 96, host_mib = 1024, max_gaussians = 15000, view_slots = 2 }
 training = { seconds = 600.0 }
 upload = { folder = "upload" }
 

@@ -1,7 +1,7 @@
 //! The aircraft's end: holds the models on offer and answers for them.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -43,6 +43,8 @@ struct Shared {
     /// When the next chunk may leave, under `max_kib_s`.
     pace: Mutex<Instant>,
     max_kib_s: Option<u32>,
+    /// Bytes of offers and chunks that were asked for and handed to the network.
+    sent: AtomicU64,
     stop: AtomicBool,
 }
 
@@ -95,6 +97,7 @@ impl NetworkOutlet {
             receipt: Mutex::default(),
             pace: Mutex::new(Instant::now()),
             max_kib_s: settings.max_kib_s,
+            sent: AtomicU64::new(0),
             stop: AtomicBool::new(false),
         });
         let (state, own) = (shared.clone(), prefix.clone());
@@ -148,10 +151,12 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
         },
         _ => None,
     };
-    if let Some(payload) = payload
-        && let Err(e) = query.reply(format!("{prefix}/{what}"), payload).wait()
-    {
-        tracing::debug!("upload: reply to {asked} not sent: {e}");
+    if let Some(payload) = payload {
+        let bytes = payload.len() as u64;
+        match query.reply(format!("{prefix}/{what}"), payload).wait() {
+            Ok(()) => _ = shared.sent.fetch_add(bytes, Ordering::Relaxed),
+            Err(e) => tracing::debug!("upload: reply to {asked} not sent: {e}"),
+        }
     }
 }
 
@@ -201,6 +206,10 @@ impl Outlet for NetworkOutlet {
         let told = locked(&self.shared.receipt).as_ref().and_then(|r| r.bearing(offer));
         let fetching = || locked(&self.shared.models).iter().any(Kept::is_under_way);
         told.unwrap_or_else(|| if fetching() { Delivery::Fetching } else { Delivery::Waiting })
+    }
+
+    fn sent(&self) -> u64 {
+        self.shared.sent.load(Ordering::Relaxed)
     }
 }
 

@@ -81,6 +81,8 @@ fn a_model_is_rounded_for_delivery_and_the_ground_reads_it() {
     assert!(o.wait_delivered(LIMIT, || true));
     let sent = o.status().bytes;
     assert!(10 * sent < std::fs::metadata(&path).expect("metadata").len(), "{sent} bytes");
+    let left = o.status().sent;
+    assert!(left > sent && left < sent + 1000, "{left} bytes left, the model and its offer");
 
     o.shutdown();
     let mut r = Receiver::open(&settings, anything(&["a1"]), &dir.path().join("g")).expect("receiver");
