@@ -100,7 +100,7 @@ table! {
         /// Or least rotation from it.
         pub r_max_deg: f32 = 15.0, in Limits::above(0.0).up_to(180.0), from "NeuralRecon";
         /// Most key frames of one aircraft: the size of the rings, and what the memory is planned for.
-        pub max: u32 = 512, in Limits::within(2.0, 4096.0);
+        pub max: u32 = 256, in Limits::within(2.0, 4096.0);
         /// Leave out pictures from where an earlier key frame already stood.
         pub skip_covered: bool = true;
     }

@@ -5,6 +5,10 @@
 
 use serde::Serialize;
 
+mod request;
+
+pub use request::PlanRequest;
+
 /// Lanes that sort and emit on a processor; each owns one histogram. How many there are says nothing about the result.
 ///
 /// Enough to keep the cores of a small board busy; every lane more is one more histogram to clear, fill and sum (128
@@ -28,51 +32,8 @@ pub const TOTAL_ALIGNMENT: u64 = 64 << 10;
 pub const DRIVER_ROOM: u64 = 64 << 10;
 /// Longer side of pictures where nobody says another, pixels: what the networks see, and what is measured here.
 pub const WORKING_SIDE: u32 = 640;
-/// Views on the device at the least: the step's own, and the one that comes in.
-const LEAST_SLOTS: u32 = 2;
 /// Pixels along the side of a tile.
 pub const TILE_SIDE: u64 = 4;
-
-/// What the job will ask of the device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PlanRequest {
-    /// Device memory that may be used, MiB.
-    pub device_mib: u32,
-    /// Width of the largest training picture, pixels.
-    pub width: u32,
-    /// Height of the largest training picture, pixels.
-    pub height: u32,
-    /// Training views.
-    pub views: u32,
-    /// How many of them are on the device at once, the others waiting in a file; `None`: all where they take at most half of the
-    /// memory, else as many as an eighth of it holds, and never more than leave room for a plan.
-    pub view_slots: Option<u32>,
-    /// Highest SH degree, 0…3.
-    pub sh_degree: u8,
-    /// Upper bound on Gaussians; `None` takes what the memory allows.
-    pub max_gaussians: Option<usize>,
-    /// Adam's moments of SH in 16 bits each.
-    pub half_moments: bool,
-    /// Lanes that sort and emit: [`SORT_LANES_SOFTWARE`] or [`SORT_LANES_GPU`].
-    pub sort_lanes: u32,
-}
-
-impl Default for PlanRequest {
-    /// A first guess for `dgtr plan`: 64 pictures of 640 × 480 in 512 MiB, on a processor.
-    fn default() -> Self {
-        Self {
-            device_mib: 512,
-            width: 640,
-            height: 480,
-            views: 64,
-            view_slots: None,
-            sh_degree: 3,
-            max_gaussians: None,
-            half_moments: false,
-            sort_lanes: SORT_LANES_SOFTWARE,
-        }
-    }
-}
 
 /// Capacities and the size of every section.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -145,40 +106,6 @@ pub const fn sh_columns(degree: u8) -> u64 {
 /// every view can be bound on its own.
 pub const fn view_bytes(pixels: u64) -> u64 {
     (4 * pixels + 4 * pixels.div_ceil(2)).next_multiple_of(SECTION_ALIGNMENT)
-}
-
-impl PlanRequest {
-    /// Pixels of a picture, padded: pictures of the same area in another shape need a few more tiles.
-    fn padded_pixels(&self) -> u64 {
-        (u64::from(self.width) * u64::from(self.height)).next_multiple_of(64)
-    }
-
-    /// Training views on the device at once.
-    pub fn slots(&self) -> u32 {
-        let budget = u64::from(self.device_mib) << 20;
-        let held_in = |bytes: u64| u32::try_from(bytes / view_bytes(self.padded_pixels())).unwrap_or(u32::MAX);
-        let slots = match self.view_slots {
-            Some(slots) => slots,
-            None => {
-                let few = if held_in(budget / 2) >= self.views { self.views } else { held_in(budget / 8) };
-                few.min(held_in(budget.saturating_sub(Plan::smallest(self, 0).total_bytes)))
-            }
-        };
-        slots.max(LEAST_SLOTS).min(self.views)
-    }
-
-    /// Gaussians that bindings and request allow.
-    fn most_gaussians(&self) -> usize {
-        // Widest column set in one binding: three vec4 of Adam state per geometry column, or all SH columns.
-        let widest = 144.max(16 * sh_columns(self.sh_degree));
-        let most = (BINDING_LIMIT / widest) as usize;
-        self.max_gaussians.unwrap_or(most).min(most)
-    }
-
-    /// Bytes of the file that holds the views when not all of them are on the device; 0 when all are.
-    pub fn view_file_bytes(&self) -> u64 {
-        if self.slots() < self.views { u64::from(self.views) * view_bytes(self.padded_pixels()) } else { 0 }
-    }
 }
 
 fn within(what: &'static str, value: u64, low: u64, high: u64) -> Result<(), PlanError> {
@@ -374,24 +301,6 @@ mod tests {
         let PlanError::TooSmall { needed_mib, .. } = error else { panic!("{error}") };
         assert!(Plan::new(&request(needed_mib as u32)).is_ok());
         assert!(Plan::new(&request(needed_mib as u32 - 1)).is_err());
-    }
-
-    #[test]
-    fn views_stay_on_the_device_while_they_leave_half_of_it_and_wait_in_a_file_otherwise() {
-        let of = |views: u32, width: u32, height: u32| PlanRequest { views, width, height, ..request(512) };
-        let few = of(50, 640, 480);
-        assert_eq!((few.slots(), few.view_file_bytes()), (50, 0));
-        let many = of(1000, 1280, 960);
-        assert_eq!((many.slots(), many.view_file_bytes()), (9, 1000 * 6 * 1280 * 960));
-        let plan = Plan::new(&many).unwrap();
-        assert!(plan.total_bytes <= 512 << 20 && plan.gaussians > 100_000, "{} Gaussians", plan.gaussians);
-        assert_eq!((plan.views, plan.view_slots, plan.bytes("views")), (1000, 9, 9 * 6 * 1280 * 960));
-        assert_eq!(PlanRequest { view_slots: Some(0), ..many }.slots(), 2, "one in use, one coming in");
-        assert_eq!(PlanRequest { view_slots: Some(2000), ..many }.slots(), 1000);
-        assert_eq!(of(0, 640, 480).slots(), 0);
-        // Where pictures are large for the memory, fewer of them stay rather than that no plan can be made.
-        let tight = PlanRequest { device_mib: 215, ..of(50, 1280, 960) };
-        assert!(tight.slots() == 2 && Plan::new(&tight).is_ok(), "{}", tight.slots());
     }
 
     #[test]

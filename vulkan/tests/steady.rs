@@ -1,35 +1,13 @@
 //! Nothing is allocated once training runs: no heap in a step, one device allocation as large as the plan says.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
+#[path = "../../tests/counting_allocator.rs"]
+mod counting_allocator;
 mod scenes;
 
+use counting_allocator::allocations;
 use scenes::device::{empty_trainer, plain, posed};
 use scenes::{cloud, photo, view};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system allocator unchanged; the counter is a plain thread-local cell.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller guarantees.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as the caller guarantees.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 #[test]
 fn steps_allocate_nothing_density_control_and_bands_included() {
@@ -47,9 +25,9 @@ fn steps_allocate_nothing_density_control_and_bands_included() {
     for _ in 0..4 {
         trainer.step().unwrap();
     }
-    let before = ALLOCATIONS.with(Cell::get);
+    let before = allocations();
     let grown = (0..40).map(|_| trainer.step().unwrap().gaussians).last().unwrap();
-    let made = ALLOCATIONS.with(Cell::get) - before;
+    let made = allocations() - before;
     println!("40 steps, {grown} Gaussians: {made} heap allocations");
     assert_eq!(made, 0);
     assert!(grown > 300, "density control did not run");

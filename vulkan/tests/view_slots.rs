@@ -1,12 +1,12 @@
 //! Training does not depend on how many of its views are on the device: the others wait in a file and come back as they were.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
+#[path = "../../tests/counting_allocator.rs"]
+mod counting_allocator;
 mod scenes;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
 use config::plan::{Plan, PlanRequest};
+use counting_allocator::allocations;
 use models::camera::{DepthPrior, View};
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
@@ -15,29 +15,6 @@ use vulkan::gpu::Gpu;
 use vulkan::trainer::{TrainError, Trainer};
 
 const VIEWS: u32 = 5;
-
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system allocator unchanged; the counter is a plain thread-local cell.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller guarantees.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as the caller guarantees.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 /// A trainer for views of `view`'s size with so many slots on the device and the others in a file.
 fn trainer(view: &View, slots: u32) -> Option<Trainer> {
@@ -113,9 +90,9 @@ fn a_view_that_comes_back_allocates_nothing() {
     }
     // The first epoch fills the view order and measures the scene.
     (0..8).for_each(|_| _ = trainer.step().unwrap());
-    let before = (ALLOCATIONS.with(Cell::get), trainer.views_read_back());
+    let before = (allocations(), trainer.views_read_back());
     (0..30).for_each(|_| _ = trainer.step().unwrap());
-    assert_eq!(ALLOCATIONS.with(Cell::get), before.0);
+    assert_eq!(allocations(), before.0);
     assert!(trainer.views_read_back() >= before.1 + 10);
     assert_eq!(trainer.device_bytes(), trainer.plan().total_bytes);
 }

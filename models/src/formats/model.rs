@@ -12,6 +12,8 @@
 //! the file's size, and the hash covers every byte.
 
 use std::fs::File;
+mod hashing;
+
 use std::io::{BufReader, Read, Write};
 use std::path::Path;
 
@@ -23,6 +25,7 @@ use super::delivery::{self, Rounding};
 use super::{FormatError, write_atomic};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
+use hashing::Hashing;
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.
@@ -375,32 +378,6 @@ fn read_words<T>(input: &mut impl Read, n: usize, word: fn([u8; 4]) -> T) -> std
         values.extend(bytes.as_chunks().0.iter().map(|b| word(*b)));
     }
     Ok(values)
-}
-
-/// Hashes what passes through.
-struct Hashing<T> {
-    inner: T,
-    hasher: blake3::Hasher,
-}
-
-impl<T: Write> Write for Hashing<T> {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        let n = self.inner.write(bytes)?;
-        self.hasher.update(&bytes[..n]);
-        Ok(n)
-    }
-
-    fn flush(&mut self) -> std::io::Result<()> {
-        self.inner.flush()
-    }
-}
-
-impl<T: Read> Read for Hashing<T> {
-    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
-        let n = self.inner.read(bytes)?;
-        self.hasher.update(&bytes[..n]);
-        Ok(n)
-    }
 }
 
 #[cfg(test)]

@@ -125,7 +125,9 @@ pub struct DepthFrame {
     /// The reference view that the depth was made from.
     pub made_as: Option<View>,
     image: Kept<RgbImage>,
+    /// The last depth, which is known no more when `has_depth` is false: a new one takes its place in the file.
     depth: Option<Kept<DepthGrid>>,
+    has_depth: bool,
     file: Option<Arc<FrameFile>>,
 }
 
@@ -136,7 +138,16 @@ impl DepthFrame {
     /// Writing to the file fails.
     pub fn new(name: String, image: RgbImage, view: View, file: Option<&Arc<FrameFile>>) -> io::Result<Self> {
         let image = Kept::new(image, file)?;
-        Ok(Self { name, view, made_with: Vec::new(), made_as: None, image, depth: None, file: file.cloned() })
+        Ok(Self {
+            name,
+            view,
+            made_with: Vec::new(),
+            made_as: None,
+            image,
+            depth: None,
+            has_depth: false,
+            file: file.cloned(),
+        })
     }
 
     /// The picture at the network's size.
@@ -149,7 +160,7 @@ impl DepthFrame {
 
     /// Whether its depth is known.
     pub fn has_depth(&self) -> bool {
-        self.depth.is_some()
+        self.has_depth
     }
 
     /// Its depth, once known.
@@ -157,7 +168,7 @@ impl DepthFrame {
     /// # Errors
     /// Reading the file fails.
     pub fn depth(&self) -> io::Result<Option<Cow<'_, DepthGrid>>> {
-        self.depth.as_ref().map(Kept::get).transpose()
+        self.depth.as_ref().filter(|_| self.has_depth).map(Kept::get).transpose()
     }
 
     /// Takes a new depth, or forgets the one there was.
@@ -165,12 +176,13 @@ impl DepthFrame {
     /// # Errors
     /// Writing to the file fails.
     pub fn set_depth(&mut self, depth: Option<DepthGrid>) -> io::Result<()> {
-        match (depth, &mut self.depth) {
-            (Some(depth), Some(old)) => old.replace(depth)?,
-            (Some(depth), none) => *none = Some(Kept::new(depth, self.file.as_ref())?),
-            // What it took of the file is not used again.
-            (None, some) => *some = None,
+        self.has_depth = false;
+        let Some(depth) = depth else { return Ok(()) };
+        match &mut self.depth {
+            Some(old) => old.replace(depth)?,
+            none => *none = Some(Kept::new(depth, self.file.as_ref())?),
         }
+        self.has_depth = true;
         Ok(())
     }
 }
@@ -191,4 +203,29 @@ pub fn shift(reference: &View, source: &View, old_reference: &View, old_source: 
             }
         })
         .fold(0.0, f32::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Intrinsics, Pose};
+
+    #[test]
+    fn a_depth_that_is_forgotten_and_made_again_takes_no_more_of_the_file() {
+        let file = tempfile::tempfile().unwrap();
+        let intrinsics = Intrinsics { width: 8, height: 4, fx: 8.0, fy: 8.0, cx: 4.0, cy: 2.0 };
+        let view = View { intrinsics, pose: Pose { rotation: glam::DQuat::IDENTITY, center: glam::DVec3::ZERO } };
+        let image = RgbImage::from_fn(8, 4, |x, y| image::Rgb([x as u8, y as u8, 7]));
+        let kept = FrameFile::new(file.try_clone().unwrap());
+        let mut frame = DepthFrame::new("a".into(), image.clone(), view, Some(&kept)).unwrap();
+        for depth in [1.0f32, 2.0, 3.0] {
+            let grid = DepthGrid { width: 4, height: 2, stride: 2, depth: vec![depth; 8], confidence: vec![0.5; 8] };
+            frame.set_depth(Some(grid)).unwrap();
+            assert_eq!(frame.depth().unwrap().unwrap().depth, [depth; 8]);
+            frame.set_depth(None).unwrap();
+            assert!(!frame.has_depth() && frame.depth().unwrap().is_none());
+        }
+        assert_eq!(frame.image().unwrap().as_ref(), &image);
+        assert_eq!(file.metadata().unwrap().len(), 3 * 32 + 8 * 8);
+    }
 }

@@ -25,10 +25,11 @@ use super::pairs::{Relation, SkippedPairs, partners, relate};
 use super::posed::{PosedNetwork, Request};
 use super::range::DepthRange;
 use super::report::{InitReport, Initialisation};
-use super::unposed::{Appearance, Heads, PairNetwork, align_frames, appearance, keep_better};
+use super::unposed::{Appearance, PairNetwork};
 
 mod assemble;
 mod memory;
+mod unposed_pairs;
 
 pub use memory::most_frame_bytes;
 
@@ -357,51 +358,6 @@ impl Initialiser {
             frame.made_with = made_with;
             frame.made_as = Some(frame.view);
         }
-        Ok(())
-    }
-
-    /// All pairs through an unposed network, then the global alignment.
-    fn align_pairs(&mut self, views: &[View]) -> Result<(), InitError> {
-        let mut pairs: Vec<[usize; 2]> = Vec::new();
-        for i in 0..views.len() {
-            let Some(range) = self.known_range(i) else {
-                return Err(InitError::NoRange { points: self.range.len() });
-            };
-            self.report.searched(range);
-            let good = partners(i, views, middle(range), &self.settings, &mut SkippedPairs::default());
-            pairs.extend(good.into_iter().map(|(j, _)| [i.min(j), i.max(j)]));
-        }
-        pairs.sort_unstable();
-        pairs.dedup();
-        let Pairs::Unposed(network) = &mut self.pairs else { return Ok(()) };
-        let mut edges = Vec::with_capacity(pairs.len());
-        let mut heads: Vec<Option<Heads>> = vec![None; views.len()];
-        for (e, pair) in pairs.into_iter().enumerate() {
-            let started = Instant::now();
-            let (edge, [first, second]) = network.run(&self.frames, pair, self.settings.stride as usize, e)?;
-            keep_better(&mut heads[pair[0]], first);
-            keep_better(&mut heads[pair[1]], second);
-            edges.push(edge);
-            self.report.runs += 1;
-            self.report.run_ms += started.elapsed().as_secs_f64() * 1e3;
-        }
-        let residual = network.pair().sh_residual;
-        let started = Instant::now();
-        let alignment = align_frames(&mut self.frames, &edges, &self.settings)?;
-        self.report.edges = edges.len();
-        self.report.edges_without_scale = alignment.sigma.iter().filter(|s| s.is_none()).count();
-        self.report.components = crate::align::graph::components(views.len(), &edges).1;
-        self.report.align_steps = alignment.steps;
-        self.report.align_residual_m = alignment.mean_residual;
-        self.appearance.clear();
-        for (frame, heads) in self.frames.iter().zip(&heads) {
-            let made = frame.depth()?.zip(heads.as_ref()).and_then(|(grid, heads)| {
-                let first = &views[edges[heads.edge].first];
-                appearance(heads, (&frame.view, &grid), first, &alignment, &self.settings, residual)
-            });
-            self.appearance.push(made);
-        }
-        self.report.align_ms += started.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }
 }

@@ -2,8 +2,8 @@
 //!
 //! A key frame whose camera went from pose A to pose B takes what stands before it along: p → c_B + R_B R_Aᵀ (p − c_A). A
 //! Gaussian moves by the mean of its nearest key frames' motions, weighed by how near their optical axes pass. Where those
-//! motions contradict each other it was trained with a wrong camera, and fresh ones take its place. SH stays as it is: a
-//! correction turns the world by a degree or two.
+//! motions contradict each other it was trained with a wrong camera, and fresh ones take its place. SH is not rotated: where
+//! the world turned further than shows in it, fresh ones take the place as well. (Linear blend skinning, with cameras as bones.)
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use models::camera::View;
@@ -50,8 +50,11 @@ impl Motion {
     }
 }
 
-/// What a Gaussian's key frames say about it.
-struct Told {
+/// Furthest turn that SH is left as it is over: a tenth of the 60° between a third-degree lobe and the next.
+const MOST_TURN: f64 = 0.1;
+
+/// The blended motion of a Gaussian's key frames.
+struct Blended {
     shift: DVec3,
     turn: DQuat,
     /// Standard deviation of their shifts, pixels.
@@ -59,7 +62,7 @@ struct Told {
 }
 
 /// `None` where no key frame saw it: it stays where it is.
-fn told(p: DVec3, motions: &[Motion]) -> Option<Told> {
+fn blend(p: DVec3, motions: &[Motion]) -> Option<Blended> {
     let mut nearest: [Option<(f64, f64, &Motion)>; NEAREST] = [None; NEAREST];
     for motion in motions {
         let Some((depth, weight)) = motion.weight(p) else { continue };
@@ -85,23 +88,25 @@ fn told(p: DVec3, motions: &[Motion]) -> Option<Told> {
         weight / total * pixels.powi(2)
     });
     let apart_px = apart.sum::<f64>().sqrt();
-    (shift.is_finite() && turn.length_squared() > 1e-12).then(|| Told { shift, turn: turn.normalize(), apart_px })
+    (shift.is_finite() && turn.length_squared() > 1e-12).then(|| Blended { shift, turn: turn.normalize(), apart_px })
 }
 
-/// Moves the Gaussians of `cloud` with their key frames; those whose key frames disagree by more than `limit_px` are taken out.
+/// Moves the Gaussians of `cloud` with their key frames; those whose key frames disagree by more than `limit_px`, or turn them further
+/// than [`MOST_TURN`], are taken out.
 /// Returns how many those were.
 pub fn follow(cloud: &mut GaussianCloud, motions: &[Motion], limit_px: f64) -> usize {
-    let told: Vec<Option<Told>> =
-        cloud.means.par_iter().map(|m| told(Vec3::from_array(*m).as_dvec3(), motions)).collect();
-    for (i, told) in told.iter().enumerate() {
-        let Some(told) = told else { continue };
-        let mean = Vec3::from_array(cloud.means[i]).as_dvec3() + told.shift;
+    let blended: Vec<Option<Blended>> =
+        cloud.means.par_iter().map(|m| blend(Vec3::from_array(*m).as_dvec3(), motions)).collect();
+    for (i, motion) in blended.iter().enumerate() {
+        let Some(motion) = motion else { continue };
+        let mean = Vec3::from_array(cloud.means[i]).as_dvec3() + motion.shift;
         cloud.means[i] = mean.as_vec3().to_array();
         let [w, x, y, z] = cloud.rotations[i];
-        let turned = told.turn.as_quat() * Quat::from_xyzw(x, y, z, w);
+        let turned = motion.turn.as_quat() * Quat::from_xyzw(x, y, z, w);
         cloud.rotations[i] = [turned.w, turned.x, turned.y, turned.z];
     }
-    cloud.retain(|i| told[i].as_ref().is_none_or(|told| told.apart_px <= limit_px))
+    let holds = |m: &Blended| m.apart_px <= limit_px && 2.0 * m.turn.w.abs().min(1.0).acos() <= MOST_TURN;
+    cloud.retain(|i| blended[i].as_ref().is_none_or(holds))
 }
 
 #[cfg(test)]
@@ -171,6 +176,16 @@ mod tests {
         let far = |m: &&[f32; 3]| m[0] > 20.0;
         let kept: Vec<_> = after.means.iter().filter(far).collect();
         assert_eq!(kept, cloud().means.iter().filter(far).collect::<Vec<_>>(), "far from it nothing moves");
+    }
+
+    #[test]
+    fn what_turned_further_than_sh_hides_is_made_anew() {
+        let turned = |by: f64| {
+            let turn = DQuat::from_rotation_z(by);
+            moved(&grid(), |_, p| Pose { rotation: turn * p.rotation, center: turn * p.center })
+        };
+        assert_eq!(follow(&mut cloud(), &turned(0.09), 1.5), 0);
+        assert_eq!(follow(&mut cloud(), &turned(0.11), 1.5), 64);
     }
 
     #[test]
