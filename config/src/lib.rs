@@ -26,6 +26,8 @@ pub mod lens;
 #[cfg(feature = "std")]
 pub mod link;
 #[cfg(feature = "std")]
+pub mod map;
+#[cfg(feature = "std")]
 pub mod mission;
 #[cfg(feature = "std")]
 pub mod plan;

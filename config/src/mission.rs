@@ -15,6 +15,7 @@ use crate::ground::GroundSettings;
 use crate::init::InitSettings;
 use crate::keys::PublicKey;
 use crate::link::LinkSettings;
+use crate::map::MapSettings;
 use crate::preset::Preset;
 use crate::refine::RefineSettings;
 use crate::settings::{Limits, SettingError, record, table};
@@ -80,6 +81,9 @@ record! {
         /// The training recipe.
         #[serde(default)]
         pub training: TrainSettings = TrainSettings::default();
+        /// When orthophoto and heights are drawn.
+        #[serde(default)]
+        pub map: MapSettings = MapSettings::default();
         /// When a flight counts as in trouble.
         #[serde(default)]
         pub failsafe: FailsafeSettings = FailsafeSettings::default();

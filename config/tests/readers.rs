@@ -79,6 +79,7 @@ fn usable(mission: &Mission) -> bool {
         gaussians: memory.max_gaussians.map_or(1 << 20, |n| n as usize),
         sh_degree: 3,
         delivered: 0,
+        map: mission.map.disk_bytes(),
     });
     let refusals = [
         mission.check_trust().err().map(|e| e.to_string()),

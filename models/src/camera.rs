@@ -102,6 +102,19 @@ impl View {
     }
 }
 
+/// A view from infinitely far: parallel rays along the optical axis. What maps are drawn with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OrthographicView {
+    /// Picture width, pixels.
+    pub width: u32,
+    /// Picture height, pixels.
+    pub height: u32,
+    /// Scale along x and y.
+    pub pixels_per_metre: [f64; 2],
+    /// `center` is drawn in the picture's middle; depth counts from there, and what lies before it is not drawn.
+    pub pose: Pose,
+}
+
 /// How far a pose may be wrong, one standard deviation; infinite where nothing is known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseSigma {

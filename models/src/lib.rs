@@ -14,6 +14,7 @@ pub mod formats;
 pub mod init;
 pub mod metrics;
 pub mod onnx;
+pub mod ortho;
 pub mod picture;
 pub mod refine;
 pub mod undistort;

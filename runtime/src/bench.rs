@@ -4,6 +4,7 @@
 pub mod child;
 pub mod figures;
 pub mod front;
+pub mod map;
 pub mod memory;
 pub mod skips;
 pub mod slopes;

@@ -21,6 +21,7 @@ mod fly;
 mod import;
 mod init;
 mod keys;
+mod ortho;
 mod plan;
 mod render;
 #[cfg(feature = "lab")]
@@ -74,6 +75,8 @@ enum Command {
     Eval(eval::Args),
     /// Renders colour and depth of given cameras.
     Render(render::Args),
+    /// Draws a model as a map: orthophoto and heights as Cloud-Optimised GeoTIFF.
+    Ortho(ortho::Args),
     /// Merges local models into a global one.
     Aggregate(aggregate::Args),
     /// Receives the models of all aircraft of a mission and merges them.
@@ -132,6 +135,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Command::Train(args) => train::run(*args),
         Command::Eval(args) => eval::run(args),
         Command::Render(args) => render::run(args),
+        Command::Ortho(args) => ortho::run(args),
         Command::Aggregate(args) => aggregate::run(args),
         Command::Serve(args) => serve::run(args),
         Command::Fly(args) => fly::run(args),

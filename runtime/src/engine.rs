@@ -10,6 +10,7 @@ use std::time::Instant;
 
 use config::disk::Disk;
 use config::init::InitSettings;
+use config::map::MapSettings;
 use config::mission::NetworkSettings;
 use config::plan::PlanRequest;
 use config::refine::RefineSettings;
@@ -30,6 +31,7 @@ pub mod device;
 mod first_gaussians;
 mod follow;
 pub mod host;
+mod map;
 mod reconstruct;
 pub mod source;
 
@@ -67,6 +69,8 @@ pub struct EngineSettings {
     pub ahead_in_memory: bool,
     /// Models are rounded for delivery while the job goes on.
     pub delivers: bool,
+    /// `[map]`: what is drawn after each build; `None` draws nothing.
+    pub map: Option<MapSettings>,
     /// Pictures are trained at this fraction of the size they come in; matching sees them whole.
     pub scale: f64,
     /// `[network]`: manifests of the user's own networks.
@@ -114,6 +118,8 @@ pub struct Reconstruction {
     /// The last refinement.
     refined: Option<RefineReport>,
     builds: u32,
+    /// The build that the last map shows.
+    mapped: u32,
     /// Seconds of training over all continuations.
     train_s: f64,
     /// What was done and what it took.
@@ -159,6 +165,7 @@ impl Reconstruction {
             ahead: settings.ahead as u64,
             ahead_in_memory: settings.ahead_in_memory,
             delivers: settings.delivers,
+            map: settings.map.map_or(0, |m| m.host_bytes()),
         });
         host.fits(settings.host_mib)?;
         report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
@@ -179,6 +186,7 @@ impl Reconstruction {
             points: Vec::new(),
             refined: None,
             builds: 0,
+            mapped: 0,
             train_s: 0.0,
             header,
             settings,

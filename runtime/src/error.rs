@@ -10,6 +10,7 @@ use models::dataset::DatasetError;
 use models::formats::FormatError;
 use models::init::InitError;
 use models::onnx::OnnxError;
+use models::ortho::OrthoError;
 use models::refine::RefineError;
 use vulkan::gpu::GpuError;
 use vulkan::trainer::TrainError;
@@ -66,6 +67,9 @@ pub enum JobError {
     /// Vulkan device or driver.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+    /// Maps.
+    #[error(transparent)]
+    Ortho(#[from] OrthoError),
     /// Training and rendering.
     #[error(transparent)]
     Train(#[from] TrainError),
@@ -152,6 +156,7 @@ impl Error for JobError {
             Self::Refine(e) => e.kind(),
             Self::Init(e) => e.kind(),
             Self::Gpu(e) => e.kind(),
+            Self::Ortho(e) => e.kind(),
             Self::Train(e) => e.kind(),
             Self::Upload(e) => e.kind(),
             Self::Report(e) => e.kind(),

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+pub mod heights;
+
 use models::baselines::{MeanColor, nearest_view, warp_over_ground};
 use models::camera::{PosedImage, View};
 use models::dataset::Dataset;

@@ -161,6 +161,7 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
         gaussians,
         sh_degree,
         delivered: delivered_bytes(mission),
+        map: mission.map.disk_bytes(),
     })
 }
 
@@ -205,6 +206,7 @@ fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Dis
         // Until they are kept on disk; those that are files already wait there.
         ahead_in_memory: !matches!(aircraft.camera, CameraSource::Folder(_)),
         delivers: delivered_bytes(mission) > 0,
+        map: Some(mission.map).filter(|m| m.pixels > 0),
         // The capture thread has scaled them already.
         scale: 1.0,
         network: mission.network.clone(),

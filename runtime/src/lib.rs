@@ -18,6 +18,7 @@ pub mod interrupt;
 pub mod kernels;
 pub mod keyframe_store;
 pub mod keys;
+pub mod ortho;
 #[cfg(test)]
 mod power_cut;
 pub mod report;

@@ -92,6 +92,7 @@ impl Session {
             Err(e) => tracing::warn!("{}: cannot be locked ({e}); nothing keeps a second dgtr out", out.display()),
         }
         disk.sweep(out);
+        disk.sweep(&out.join("map"));
         let path = out.join(FILE);
         let newest = disk.newest(&path, read_owner).map_err(failed("setting session.json aside"))?;
         newest.damaged.iter().for_each(|d| tracing::warn!("{d}; what is here is taken for this session's"));

@@ -168,6 +168,7 @@ impl TrainJob {
             ahead: 0,
             ahead_in_memory: false,
             delivers: false,
+            map: None,
             scale,
             network: self.network.clone(),
             training: self.settings(),

@@ -1,4 +1,6 @@
-// Blends colour and depth front to back: C = sum c a T + T_end background, D = sum z a T (paper, depth equation).
+// Blends colour and depth front to back: C = sum c a T + T_end background, D = sum z a T (paper, depth equation). With
+// MEDIAN_DEPTH, D is the depth of the Gaussian that takes the second half of the light: what floats thinly in front of a surface
+// does not pull it up.
 
 layout(std430, set = 0, binding = 1) buffer Starts { uint starts[]; };
 layout(std430, set = 0, binding = 2) writeonly buffer Image { vec4 image[]; };
@@ -39,8 +41,13 @@ void main() {
                     float next = T[k] - weight;
                     bool taken = next >= TRANSMITTANCE_MIN;
                     weight = taken ? weight : 0.0;
-                    T[k] = taken ? next : -abs(T[k]);
+#ifdef MEDIAN_DEPTH
+                    sum[k].w = T[k] > 0.5 && next <= 0.5 ? value.w : sum[k].w;
+                    sum[k].xyz += weight * value.xyz;
+#else
                     sum[k] += weight * value;
+#endif
+                    T[k] = taken ? next : -abs(T[k]);
                     most = max(most, T[k]);
                 }
             }

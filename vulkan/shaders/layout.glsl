@@ -1,6 +1,8 @@
 // Generated from src/layout.rs, where each field is described once; DGTR_BLESS=1 remakes it.
 // The depth loss does not reach scales and rotations.
 const uint FLAG_FREEZE_SHAPE = 1u;
+// Parallel rays along the view's axis; focal lengths in pixels per metre. Drawn only, never trained on.
+const uint FLAG_ORTHOGRAPHIC = 2u;
 // The view has a depth prior.
 const uint FLAG_DEPTH = 4u;
 // No culling at the picture's edges.

@@ -4,6 +4,8 @@
 // Mode 1 writes the gradient to where the first moment is and changes nothing else (gradient checks).
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
+// Orthographic views are drawn, never trained on.
+#define PERSPECTIVE_ONLY
 #include "projection.glsl"
 #include "harmonics.glsl"
 #include "deferred.glsl"

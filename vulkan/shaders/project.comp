@@ -52,7 +52,7 @@ void main() {
     bool visible = z >= frame.near && z < 1.0e30 && opacity >= faintest && !dropped;
 
     Projection s = project_gaussian(p0.xyz, p1.xyz, p2);
-    vec2 centre = s.p.xy / s.p.z * frame.focal + frame.principal_point;
+    vec2 centre = s.p.xy / s.divisor * frame.focal + frame.principal_point;
     float inverse_det = 1.0 / s.det;
     vec3 conic = vec3(s.cov.z, -s.cov.y, s.cov.x) * inverse_det;
     // Inside the ellipse d'Kd <= reach the Gaussian's alpha is at least ALPHA_MIN.

@@ -3,6 +3,7 @@
 
 struct Projection {
     vec3 p;          // camera space
+    float divisor;   // z; 1 in an orthographic view
     vec2 ratio;      // x/z, y/z clamped for the Jacobian
     bvec2 clamped;
     mat3 rotation;   // own axes → world
@@ -33,18 +34,25 @@ vec3 to_world(vec3 v) {
     return v.x * frame.view_rows[0].xyz + v.y * frame.view_rows[1].xyz + v.z * frame.view_rows[2].xyz;
 }
 
-// p.z must be positive.
+#ifdef PERSPECTIVE_ONLY
+const bool ORTHOGRAPHIC = false;
+#else
+#define ORTHOGRAPHIC ((frame.flags & FLAG_ORTHOGRAPHIC) != 0u)
+#endif
+
+// p.z must be positive. In an orthographic view nothing is divided by depth: J = [[fx, 0, 0], [0, fy, 0]], f in pixels per metre.
 Projection project_gaussian(vec3 mean, vec3 log_scale, vec4 rotation) {
     Projection s;
     s.p = to_camera(mean) + vec3(frame.view_rows[0].w, frame.view_rows[1].w, frame.view_rows[2].w);
-    float inverse_z = 1.0 / s.p.z;
-    vec2 ratio = s.p.xy * inverse_z;
+    s.divisor = ORTHOGRAPHIC ? 1.0 : s.p.z;
+    float inverse_z = 1.0 / s.divisor;
+    vec2 ratio = ORTHOGRAPHIC ? vec2(0.0) : s.p.xy * inverse_z;
     s.ratio = clamp(ratio, frame.min_ratio, frame.max_ratio);
     s.clamped = notEqual(ratio, s.ratio);
     s.q_length = max(length(rotation), 1.0e-20);
     s.q = rotation / s.q_length;
     s.rotation = rotation_of(s.q);
-    float limit = SCALE_LIMIT * s.p.z;
+    float limit = SCALE_LIMIT * (ORTHOGRAPHIC ? float(frame.size.x) / frame.focal.x : s.p.z);
     vec3 scale = exp(min(log_scale, vec3(80.0)));
     s.scale = min(scale, vec3(limit));
     s.scale_clamped = greaterThan(scale, vec3(limit));

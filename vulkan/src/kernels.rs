@@ -116,6 +116,7 @@ kernels! {
     TileScan "tile_scan" Count Scan ["tile_starts" "status"] [];
     Emit "emit" Emit Walk ["tiles" "status" "instances" "slot_ranges"] ["projected" "order" "tile_starts"];
     Rasterise "rasterise" Rasterise Tiles ["tile_starts" "image" "transmittance"] ["shaded" "instances"];
+    RasteriseMedian "rasterise_median" Rasterise Tiles ["tile_starts" "image" "transmittance"] ["shaded" "instances"];
     DepthSums "depth_sums" Loss Wide ["image" "target" "lane_sums"] [];
     DepthFinish "depth_finish" Loss Wide ["lane_sums" "status"] [];
     SsimRows "ssim_rows" Loss Wide ["moments"] ["image" "target"];

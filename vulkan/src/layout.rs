@@ -259,11 +259,13 @@ macro_rules! flags {
     };
 }
 
-// Bits of `Frame::flags`. All but the first two switch a skip off, for the benchmark that says what each is worth; those
-// change no picture.
+// Bits of `Frame::flags`. FLAG_KEEP_… and those after it switch a skip off, for the benchmark that says what each is worth;
+// they change no picture.
 flags! {
     /// The depth loss does not reach scales and rotations.
     FLAG_FREEZE_SHAPE = 1;
+    /// Parallel rays along the view's axis; focal lengths in pixels per metre. Drawn only, never trained on.
+    FLAG_ORTHOGRAPHIC = 2;
     /// The view has a depth prior.
     FLAG_DEPTH = 4;
     /// No culling at the picture's edges.

@@ -7,7 +7,7 @@
 use config::training::LossSettings;
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use vulkan::twin::camera::Camera;
+use vulkan::twin::camera::{Camera, Rays};
 use vulkan::twin::gaussian::{Gaussian, PARAMETERS};
 use vulkan::twin::loss::{Exposure, Target, loss};
 use vulkan::twin::project::Limits;
@@ -47,6 +47,7 @@ impl Scene {
             focal: [24.0, 25.5],
             principal: [16.3, 8.9],
             size: SIZE,
+            rays: Rays::Perspective,
         };
         let camera = base.moved([0.2, -0.3, 0.4, 0.1, -0.2, 0.3]);
         let mut cloud = Vec::new();
@@ -214,6 +215,34 @@ fn pose_and_exposure_agree_with_central_differences() {
         pose.assert();
         exposure.assert();
     }
+}
+
+#[test]
+fn parallel_rays_have_their_own_gradients() {
+    let mut scene = Scene::random(3, 3);
+    scene.camera = Camera { rays: Rays::Orthographic, focal: [6.0, 6.4], ..scene.camera };
+    // The median depth has none.
+    scene.settings = LossSettings { depth: 0.0, ..Default::default() };
+    let gradient = scene.gradient();
+    for (name, range) in [("means", 0..3), ("log scales", 3..6), ("rotations", 6..10), ("sh 1", 14..23)] {
+        let mut check = Check::new(format!("orthographic: {name}"));
+        for i in 0..scene.cloud.len() {
+            for k in range.clone() {
+                let analytic = *gradient.gaussians[i].clone().parameter(k);
+                check.compare(&scene, analytic, 1e-7, |s, h| *s.cloud[i].parameter(k) += h);
+            }
+        }
+        check.assert();
+    }
+    let mut pose = Check::new("orthographic: pose");
+    for k in 0..6 {
+        pose.compare(&scene, gradient.pose[k], 1e-9, |s, h| {
+            let mut xi = [0.0; 6];
+            xi[k] = h;
+            s.camera = s.camera.moved(xi);
+        });
+    }
+    pose.assert();
 }
 
 #[test]

@@ -7,7 +7,7 @@
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use vulkan::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
-use vulkan::twin::camera::Camera;
+use vulkan::twin::camera::{Camera, Rays};
 use vulkan::twin::gaussian::Gaussian;
 use vulkan::twin::project::Limits;
 use vulkan::twin::step::forward;
@@ -23,6 +23,7 @@ fn scene(seed: u64) -> (Vec<Gaussian<f64>>, Camera<f64>) {
         focal: [80.0, 84.0],
         principal: [53.7, 29.2],
         size: SIZE,
+        rays: Rays::Perspective,
     }
     .moved([0.3, -0.1, 0.7, 0.4, 0.2, 0.5]);
     // What f32 can hold exactly, so that both sides see the same numbers.

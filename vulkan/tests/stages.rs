@@ -3,14 +3,17 @@
 
 mod scenes;
 
+use models::camera::{OrthographicView, Pose};
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed, trainer};
 use scenes::{answer, cloud, photo, view};
-use vulkan::trainer::Rendering;
+use vulkan::trainer::{Rendering, TrainError};
 use vulkan::twin::camera::Camera;
 use vulkan::twin::gaussian::{Gaussian, PARAMETERS};
 use vulkan::twin::loss::Target;
 use vulkan::twin::project::Limits;
+use vulkan::twin::rasterise::Pixel;
+use vulkan::twin::step::forward;
 use vulkan::twin::trainer::TwinTrainer;
 
 #[test]
@@ -22,20 +25,66 @@ fn the_picture_is_the_twins() {
         let mut drawn = Rendering::default();
         trainer.render(&v, &mut drawn).unwrap();
         let expected = answer(&c, &v, &photo(seed, &v), &Default::default());
-        let (mut worst, mut beyond) = (0.0f32, 0);
-        for (i, p) in expected.picture.iter().enumerate() {
-            let mut error = (drawn.transmittance[i] - p.transmittance).abs();
-            error = error.max((drawn.depth[i] - p.depth).abs() / 8.0);
-            for k in 0..3 {
-                error = error.max((drawn.rgb[3 * i + k] - p.rgb[k]).abs());
-            }
-            worst = worst.max(error);
-            beyond += usize::from(error > 2e-4);
-        }
-        println!("{n} Gaussians, {w}x{h}: worst {worst:.1e}, {beyond} pixels beyond 2e-4");
-        // A contribution at the cut-off may fall on the other side: one grey level, rarely.
-        assert!(worst < 1.5 / 255.0 && beyond * 50 <= expected.picture.len(), "{n} {w}x{h}: {worst} {beyond}");
+        assert_same(&format!("{n} Gaussians, {w}x{h}"), &drawn, &expected.picture);
     }
+}
+
+#[test]
+fn the_orthographic_picture_is_the_twins() {
+    for (seed, n, w, h) in [(2, 30, 37, 29), (3, 300, 96, 70)] {
+        let v = view(w, h);
+        let c = cloud(seed, n, 3);
+        let Some(mut trainer) = trainer(&c, &v, &plain()) else { return };
+        // As much in the picture as the perspective view shows a few metres away; pixels that are not square.
+        let per_metre = f64::from(v.intrinsics.fx) / 4.0;
+        let map =
+            OrthographicView { width: w, height: h, pixels_per_metre: [per_metre, 1.25 * per_metre], pose: v.pose };
+        let mut drawn = Rendering::default();
+        trainer.render_orthographic(&map, &mut drawn).unwrap();
+        let gaussians = Gaussian::<f32>::of_cloud(&c);
+        let expected = forward(&gaussians, &Camera::orthographic(&map), |_| 3, |_| 1.0, &Limits::default());
+        assert!(expected.picture.iter().any(|p| p.transmittance < 0.95), "something is in the picture");
+        assert_same(&format!("{n} Gaussians, {w}x{h}, orthographic"), &drawn, &expected.picture);
+        // The next perspective picture knows nothing of it.
+        let (mut before, mut after) = (Rendering::default(), Rendering::default());
+        trainer.render(&v, &mut before).unwrap();
+        trainer.render_orthographic(&map, &mut after).unwrap();
+        assert!(after == drawn);
+        trainer.render(&v, &mut after).unwrap();
+        assert!(after == before);
+    }
+}
+
+#[test]
+fn an_orthographic_camera_that_is_no_number_is_refused() {
+    let v = view(16, 16);
+    let Some(mut trainer) = trainer(&cloud(1, 3, 0), &v, &plain()) else { return };
+    let good = OrthographicView { width: 16, height: 16, pixels_per_metre: [4.0; 2], pose: v.pose };
+    for bad in [
+        OrthographicView { width: 0, ..good },
+        OrthographicView { pixels_per_metre: [4.0, f64::NAN], ..good },
+        OrthographicView { pixels_per_metre: [0.0, 4.0], ..good },
+        OrthographicView { pose: Pose { center: glam::DVec3::NAN, ..v.pose }, ..good },
+    ] {
+        let refused = trainer.render_orthographic(&bad, &mut Rendering::default());
+        assert!(matches!(refused, Err(TrainError::BadView { .. })), "{bad:?}");
+    }
+}
+
+/// A contribution at the cut-off may fall on the other side: one grey level, rarely.
+fn assert_same(what: &str, drawn: &Rendering, expected: &[Pixel<f32>]) {
+    let (mut worst, mut beyond) = (0.0f32, 0);
+    for (i, p) in expected.iter().enumerate() {
+        let mut error = (drawn.transmittance[i] - p.transmittance).abs();
+        error = error.max((drawn.depth[i] - p.depth).abs() / 8.0);
+        for k in 0..3 {
+            error = error.max((drawn.rgb[3 * i + k] - p.rgb[k]).abs());
+        }
+        worst = worst.max(error);
+        beyond += usize::from(error > 2e-4);
+    }
+    println!("{what}: worst {worst:.1e}, {beyond} pixels beyond 2e-4");
+    assert!(worst < 1.5 / 255.0 && beyond * 50 <= expected.len(), "{what}: {worst} {beyond}");
 }
 
 #[test]

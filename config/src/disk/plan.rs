@@ -39,6 +39,8 @@ pub struct DiskRequest {
     pub sh_degree: u8,
     /// Most bytes of a Gaussian as it is delivered; 0: the checkpoint itself is.
     pub delivered: usize,
+    /// Bytes of the aircraft's map.
+    pub map: u64,
 }
 
 /// Bytes by what they are for; what a folder takes stays below.
@@ -83,6 +85,7 @@ impl DiskPlan {
             ("checkpoints", GENERATIONS * model(frames)),
             // The one on offer, and the one being written.
             ("delivery", 2 * delivered),
+            ("map", r.map),
         ];
         Self {
             total_bytes: sections.iter().map(|s| s.1).sum(),
@@ -123,6 +126,7 @@ mod tests {
             gaussians: 100_000,
             sh_degree: 3,
             delivered: 0,
+            map: 0,
         };
         let plan = DiskPlan::new(&request);
         // 128 pictures of 921,600 bytes, three models of 23.6 MB.
@@ -137,5 +141,7 @@ mod tests {
         assert_eq!(paged.total_bytes - plan.total_bytes, 1 << 28);
         let delivers = DiskPlan::new(&DiskRequest { delivered: 32, ..request });
         assert!(delivers.total_bytes >= plan.total_bytes + 2 * 32 * 100_000);
+        let drawn = DiskPlan::new(&DiskRequest { map: 1 << 25, ..request });
+        assert_eq!(drawn.total_bytes - plan.total_bytes, 1 << 25);
     }
 }

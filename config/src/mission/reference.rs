@@ -89,6 +89,7 @@ mod tests {
     use super::*;
     use crate::failsafe::FailsafeSettings;
     use crate::link::Signing;
+    use crate::map::MapSettings;
     use crate::mission::*;
     use crate::training::*;
     use crate::upload::TlsSettings;
@@ -171,6 +172,7 @@ mod tests {
         }
         default!(seed: u64, mount: MountSettings, link: LinkSettings, keyframes: KeyframeSettings, memory: MemorySettings);
         default!(network: NetworkSettings, upload: UploadSettings, ground: GroundSettings, init: InitSettings);
+        default!(map: MapSettings);
         default!(refine: RefineSettings, training: TrainSettings, faults: FaultSettings, failsafe: FailsafeSettings);
         assert!(file.is_empty(), "compared with nothing: {file:?}");
         let given: toml::Table = "id = \"a\"\nlink = \"tcpin:1\"\ncamera = { folder = \"a\" }".parse().expect("TOML");

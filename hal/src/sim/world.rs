@@ -14,13 +14,15 @@ use glam::{DMat3, DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 
-use solids::Solids;
+use solids::{Material, Solids};
 use terrain::Terrain;
 
 /// Direction to the sun (not of unit length): fixed, so that shadows are part of the scene.
 const SUN: DVec3 = DVec3::new(0.42, -0.30, 0.86);
 /// Share of light in shadow.
 const AMBIENT: f32 = 0.46;
+/// Above all that stands in any world, metres.
+const SUMMIT: f64 = 1000.0;
 /// Colour of the sky, and depth 0.
 const SKY: [f32; 3] = [0.62, 0.74, 0.88];
 
@@ -67,6 +69,30 @@ pub struct World {
     seed: u32,
     terrain: Terrain,
     solids: Solids,
+}
+
+/// What a map shows at a place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FromAbove {
+    /// Red, green, blue, 0 to 1.
+    pub color: [f32; 3],
+    /// Metres above z = 0.
+    pub height: f64,
+    /// What it is.
+    pub kind: MapKind,
+}
+
+/// What a map shows at a place, by what can be said of its height.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MapKind {
+    /// The bare ground.
+    Ground,
+    /// A house.
+    Roof,
+    /// A car.
+    Car,
+    /// Leaves and straw, which have no one height.
+    Plant,
 }
 
 /// What kind of thing a ray met.
@@ -160,6 +186,22 @@ impl World {
         let picture = RgbImage::from_raw(view.width, view.height, pixels)
             .unwrap_or_else(|| RgbImage::from_pixel(view.width, view.height, Rgb([0, 0, 0])));
         (picture, centres.iter().map(|hit| hit.t as f32).collect())
+    }
+
+    /// What a map shows at a place, from straight above; its texture is what a square of `footprint_m` shows of it.
+    pub fn from_above(&self, x: f64, y: f64, footprint_m: f64) -> FromAbove {
+        let (origin, direction) = (DVec3::new(x, y, SUMMIT), -DVec3::Z);
+        let hit = self.cast(origin, direction);
+        let color = self.shade(&hit, origin, direction, (footprint_m / hit.t) as f32);
+        let kind = match hit.surface {
+            Surface::Solid(index) => match self.solids.get(index).material {
+                Material::House => MapKind::Roof,
+                Material::Car => MapKind::Car,
+                Material::Leaves | Material::Straw => MapKind::Plant,
+            },
+            Surface::Ground | Surface::Sky => MapKind::Ground,
+        };
+        FromAbove { color, height: SUMMIT - hit.t, kind }
     }
 
     /// Depth along the optical axis at one pixel position, metres; None for the sky.

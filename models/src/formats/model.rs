@@ -12,8 +12,6 @@
 //! the file's size, and the hash covers every byte.
 
 use std::fs::File;
-mod hashing;
-
 use std::io::{BufReader, Read, Write};
 use std::path::Path;
 
@@ -26,6 +24,8 @@ use super::{FormatError, write_atomic};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
 use hashing::Hashing;
+
+mod hashing;
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.

@@ -6,6 +6,7 @@ use config::geodesy::Geodetic;
 use models::formats::reconstruction::Reconstruction;
 use models::formats::{opensfm, split, telemetry, transforms};
 use models::onnx::manifest::Manifest;
+use models::ortho;
 
 use crate::driver::{Read, Reader, line, survive};
 
@@ -29,6 +30,28 @@ fn nerfstudio_transforms() {
         shell: None,
         memory: (64 << 10, 256),
         read: Read::File("transforms.json", &|path| line(transforms::read(path), |file| finite(&file))),
+    });
+}
+
+#[test]
+fn check_points() {
+    let origin = Geodetic { lat_deg: 28.04, lon_deg: -82.7, alt_m: 3.0 };
+    let seeds = [
+        "WGS84 UTM 17N\n333158.20 3102916.18 3 2699.43 1668.72 a.jpg\n333100.5 3102900 4.5 1 1 b.jpg first\n",
+        "+proj=utm +zone=17 +datum=WGS84 +units=m +no_defs\n333158.20 3102916.18 3\n",
+        "EPSG:4326\n-82.7 28.04 3\n-82.701 28.041 5\n",
+        "name,lat,lon,alt\na,28.04,-82.7,3\nb,28.041,-82.701,4\n",
+        "x y z\n1 2 3\n4 5 6\n",
+    ];
+    survive(&Reader {
+        name: "check points",
+        seeds: seeds.map(|s| s.as_bytes().to_vec()).into(),
+        text: true,
+        shell: None,
+        memory: (64 << 10, 256),
+        read: Read::File("gcp_list.txt", &|path| {
+            line(ortho::check_points::read(path, Some(origin)), |points| points.iter().all(|p| p.is_finite()))
+        }),
     });
 }
 

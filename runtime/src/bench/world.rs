@@ -22,13 +22,18 @@ const SIZE: [u32; 2] = [320, 240];
 /// Focal length, pixels.
 const FOCAL: f64 = 260.0;
 
+/// The world of the data set.
+pub fn world(seed: u64) -> World {
+    World::new(seed, &WorldSettings { half_extent_m: 60.0, ..WorldSettings::default() })
+}
+
 /// Writes `GRID` nadir pictures with their true poses to `root`; every 8th is held out, as in any data set without
 /// `split.json`.
 ///
 /// # Errors
 /// The folder cannot be written to.
 pub fn write_data_set(root: &Path, seed: u64) -> Result<(), JobError> {
-    let world = World::new(seed, &WorldSettings { half_extent_m: 60.0, ..WorldSettings::default() });
+    let world = world(seed);
     let (cx, cy) = (f64::from(SIZE[0]) / 2.0, f64::from(SIZE[1]) / 2.0);
     // Camera axes right, down, forward; the picture's top is north.
     let rotation = DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0);

@@ -1,5 +1,6 @@
 //! `dgtr bench …`: one subcommand per question; results as Markdown on standard output, JSON and CSV on request.
 
+mod map;
 mod memory;
 mod skips;
 mod stages;
@@ -21,6 +22,8 @@ pub struct Args {
 enum Command {
     /// Milliseconds, bytes and operations per stage, against what the device can do.
     Stages(stages::Args),
+    /// Orthophoto and heights of a simulated survey against the exact ones.
+    Map(map::Args),
     /// Planned against measured bytes, and quality, across memory budgets.
     Memory(memory::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
@@ -52,6 +55,7 @@ impl Init {
 pub fn run(args: Args) -> Result<(), CliError> {
     match args.command {
         Command::Stages(args) => stages::run(args),
+        Command::Map(args) => map::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),

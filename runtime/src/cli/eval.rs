@@ -1,16 +1,19 @@
-//! `dgtr eval MODEL DATASET --split test`: PSNR and SSIM on pictures the model has not seen.
+//! `dgtr eval MODEL DATASET --split test`: PSNR and SSIM on pictures the model has not seen. `dgtr eval MODEL --heights
+//! REFERENCE`: its heights against points.
 
 use std::collections::HashSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use models::dataset::Dataset;
 use models::formats::model::{self, ModelHeader};
+use models::ortho::grid::BLOCK;
 use serde::Serialize;
 
 use super::CliError;
 use super::plan::largest;
 use crate::engine::device::renderer;
-use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, open_metric};
+use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, heights, open_metric};
+use crate::ortho::{Map, MapRequest};
 use crate::transfer::{PoseTransfer, stem};
 
 /// Arguments of `dgtr eval`.
@@ -19,7 +22,12 @@ pub struct Args {
     /// The .dgtr model.
     pub model: PathBuf,
     /// Folder of posed pictures.
-    pub dataset: PathBuf,
+    #[arg(required_unless_present = "heights")]
+    pub dataset: Option<PathBuf>,
+    /// Instead: heights of the model's map (`dgtr ortho`) against a gcp_list.txt, a table of points (columns lat, lon, alt or
+    /// x, y, z), or the triangulated points of a data set's folder.
+    #[arg(long, value_name = "REFERENCE", conflicts_with = "dataset")]
+    pub heights: Option<PathBuf>,
     /// Which pictures (a list of split.json; without that file every 8th is `test`; `all` always works).
     #[arg(long, default_value = "test")]
     pub split: String,
@@ -65,10 +73,14 @@ struct Answer<'a> {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let set = Dataset::open(&args.dataset)?;
+    if let Some(reference) = &args.heights {
+        return compare_heights(&args, reference);
+    }
+    let dataset = args.dataset.clone().unwrap_or_default();
+    let set = Dataset::open(&dataset)?;
     let frames = set.select(&args.split, args.region.as_deref())?;
     if frames.is_empty() {
-        return Err(CliError::input(format!("{}: split {:?} holds no pictures", args.dataset.display(), args.split)));
+        return Err(CliError::input(format!("{}: split {:?} holds no pictures", dataset.display(), args.split)));
     }
     let (header, cloud) = model::read(&args.model)?;
     let (width, height) = largest(&set, &frames, args.scale)?;
@@ -110,6 +122,24 @@ pub fn run(args: Args) -> Result<(), CliError> {
         row("mean colour", &naive.mean_color);
     }
     println!("{} Gaussians after {} steps", cloud.len(), header.steps);
+    Ok(())
+}
+
+fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
+    let (header, cloud) = model::read(&args.model)?;
+    let points = heights::reference(reference, &header)?;
+    let map = Map::of(&header, &cloud, &MapRequest::default())?;
+    let mut trainer = renderer(args.device.as_deref(), &cloud, BLOCK, BLOCK)?;
+    let scores = heights::compare(&map, &mut trainer, &points)?;
+    if args.json {
+        println!("{}", serde_json::to_string(&scores).map_err(CliError::failed)?);
+        return Ok(());
+    }
+    println!("{} points ({} beside the map or where it has no height)", scores.points, scores.missing);
+    println!(
+        "bias {:+.3} m  RMSE {:.3} m  median {:.3} m  LE90 {:.3} m",
+        scores.bias_m, scores.rmse_m, scores.median_abs_m, scores.le90_m
+    );
     Ok(())
 }
 

@@ -10,6 +10,7 @@ use super::CliError;
 use crate::engine::device::training_lens;
 use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly};
 use crate::interrupt::Interrupt;
+use crate::ortho::keep_scratch_in;
 use crate::run_json::RunReport;
 use crate::session::{Owner, Session};
 
@@ -66,6 +67,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         picture: [lens.width, lens.height],
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    keep_scratch_in(&args.out);
     let options = FlyOptions { out: args.out.clone(), end };
     let outcome = fly(&mission, &aircraft, &options, &interrupt)?;
     let mut report = report(&outcome);

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use config::disk::plan::{DiskPlan, DiskRequest};
 use config::init::InitSettings;
+use config::map::MapSettings;
 use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
 use config::training::ShSettings;
@@ -108,6 +109,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         gaussians: plan.gaussians,
         sh_degree: plan.sh_degree,
         delivered: job.delivered,
+        map: job.map.disk_bytes(),
     });
     println!("\n  on disk, for a flight:");
     for (name, bytes) in &disk.sections {
@@ -127,6 +129,8 @@ struct Job {
     network: NetworkSettings,
     /// Most bytes of a Gaussian as it is delivered.
     delivered: usize,
+    /// What an aircraft draws.
+    map: MapSettings,
 }
 
 impl Job {
@@ -135,6 +139,7 @@ impl Job {
             device: DeviceRequest::of_flight(&mission, None),
             picture: (mission.camera.width, mission.camera.height),
             delivered: delivered_bytes(&mission),
+            map: mission.map,
             sh: mission.training.sh,
             init: mission.init,
             network: mission.network,
@@ -163,7 +168,7 @@ impl Job {
         };
         let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
         let (init, network) = (InitSettings::default(), NetworkSettings::default());
-        Ok(Self { device, picture, sh, init, network, delivered: 0 })
+        Ok(Self { device, picture, sh, init, network, delivered: 0, map: MapSettings::default() })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use config::disk::Disk;
 use config::mission::Mission;
@@ -10,6 +10,7 @@ use config::mission::Mission;
 use crate::aggregate::summary;
 use crate::console::Progress;
 use crate::interrupt::Interrupt;
+use crate::ortho::{draw_file, keep_scratch_in};
 use crate::report::{ReportData, Timing, bytes};
 use crate::serve::{self, Reception, ServeError};
 use crate::session::{Owner, Session};
@@ -54,6 +55,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         picture: [0; 2],
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    keep_scratch_in(&args.out);
     let stop = AtomicBool::new(false);
     let mut bar = Progress::new("receive", mission.aircraft.len() as u64);
     let reception = serve::receive(&mission, &args.out, timeout, &stop, &mut |p| {
@@ -86,6 +88,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
     args.settings.compare(&locals, &outcome, metric, (&mut run, &mut data))?;
     for (path, why) in left_out {
         data.warnings.push(format!("{} was received but cannot be used: {why}", path.display()));
+    }
+    if mission.map.ground {
+        let from = Instant::now();
+        match draw_file(&outcome.path, mission.ground.device.as_deref(), &args.out.join("map")) {
+            Ok(map) => data.files.extend(["orthophoto", "heights"].map(str::to_owned).into_iter().zip(map.files)),
+            Err(e) => data.warnings.push(format!("There is no new map: {e}.")),
+        }
+        run.stage("map", from);
     }
     let missing = reception.missing;
     if !missing.is_empty() {

@@ -38,6 +38,8 @@ pub struct HostRequest<'a> {
     pub ahead_in_memory: bool,
     /// Models are rounded for delivery, beside all else.
     pub delivers: bool,
+    /// Bytes that drawing the map takes, when nothing is rounded.
+    pub map: u64,
 }
 
 /// Bytes by what holds them, in the order of the formula.
@@ -68,7 +70,13 @@ impl HostPlan {
             ("density control", LISTS_BYTES * n),
             ("pictures ahead", r.ahead * 3 * (p + if r.ahead_in_memory { r.camera_pixels } else { 0 })),
             ("picture at hand", 2 * 3 * r.camera_pixels),
-            ("delivery", if r.delivers { n * (ENCODING_BYTES as u64 + 4 * (11 + 3 * coefficients)) } else { 0 }),
+            (
+                "delivery, or map",
+                r.map.max(match r.delivers {
+                    true => n * (ENCODING_BYTES as u64 + 4 * (11 + 3 * coefficients)),
+                    false => 0,
+                }),
+            ),
             ("device", if r.shared { r.plan.total_bytes } else { 0 }),
         ];
         Self { sections }
@@ -112,6 +120,7 @@ mod tests {
             ahead: 4,
             ahead_in_memory: false,
             delivers: false,
+            map: 0,
         };
         of(&mut request);
         HostPlan::new(&request).total_bytes()
@@ -127,6 +136,7 @@ mod tests {
         assert_eq!(total(&plan, |r| r.camera_pixels += 1000) - before, 6000);
         let delivery = plan.gaussians as u64 * (ENCODING_BYTES as u64 + 4 * (11 + 48));
         assert_eq!(total(&plan, |r| r.delivers = true) - before, delivery);
+        assert_eq!(total(&plan, |r| r.map = 1 << 20) - before, 1 << 20);
         assert!(total(&plan, |r| r.refine = None) < before && total(&plan, |r| r.initialiser = 0) < before);
         let larger = Plan::new(&PlanRequest { device_mib: 1024, ..PlanRequest::default() }).unwrap();
         let more = (larger.gaussians - plan.gaussians) as u64;
@@ -143,6 +153,7 @@ mod tests {
         // pictures decoded ahead as it asks for, rounded up.
         let defaults = |r: &mut HostRequest<'_>| {
             (r.shared, r.initialiser, r.camera_pixels, r.ahead) = (true, 909 << 20, 4056 * 3040, 24);
+            r.map = config::map::MapSettings::default().host_bytes();
         };
         let bytes = total(&plan, defaults);
         assert!(bytes <= u64::from(memory.host_mib) << 20, "{} MiB", bytes >> 20);

@@ -280,6 +280,9 @@ impl Reconstruct for Reconstruction {
         let path = model_path(out);
         model::write_checkpoint(&self.settings.disk, &path, &self.header, &self.cloud)?;
         self.report.stage("checkpoint", from);
+        if let Some(map) = self.settings.map.filter(|_| self.has_model() && (finished || self.mapped < self.builds)) {
+            self.draw_map(map, &out.join("map"));
+        }
         Ok((path, self.cloud.len()))
     }
 }
@@ -369,6 +372,7 @@ mod tests {
             ahead: 0,
             ahead_in_memory: false,
             delivers: false,
+            map: None,
             scale: 1.0,
             network: NetworkSettings::default(),
             training: Default::default(),

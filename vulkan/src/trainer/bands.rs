@@ -4,7 +4,7 @@ use super::{TrainError, Trainer};
 use crate::commands::Recording;
 use crate::gpu::GpuError;
 use crate::kernels::Kernel;
-use crate::layout::Push;
+use crate::layout::{FLAG_ORTHOGRAPHIC, Push};
 use crate::stages::Stage;
 use config::plan::LOOP_LANES;
 
@@ -67,7 +67,8 @@ impl Trainer {
 
     pub(super) fn record_blend(&self, recording: &Recording<'_>, band: Band) {
         let push = Push { first: band.first, last: band.last, ..Push::default() };
-        recording.run(Kernel::Rasterise, (band.last - band.first) as usize, push);
+        let blend = if self.frame.has(FLAG_ORTHOGRAPHIC) { Kernel::RasteriseMedian } else { Kernel::Rasterise };
+        recording.run(blend, (band.last - band.first) as usize, push);
     }
 
     /// Reads the counts and cuts the tiles into bands. Counting is done again with twice the rounds for as long as some

@@ -1,9 +1,11 @@
 //! How a camera fills the uniform block of a step.
 
 use crate::constants::{FRUSTUM_MARGIN, NEAR, TILE_HEIGHT, TILE_WIDTH};
-use crate::layout::{FLAG_KEEP_FAINT, FLAG_KEEP_OUTSIDE, FLAG_NO_EARLY_END, FLAG_WHOLE_BOXES, Frame};
+use crate::layout::{
+    FLAG_KEEP_FAINT, FLAG_KEEP_OUTSIDE, FLAG_NO_EARLY_END, FLAG_ORTHOGRAPHIC, FLAG_WHOLE_BOXES, Frame,
+};
 use config::training::SkipSettings;
-use models::camera::View;
+use models::camera::{OrthographicView, Pose, View};
 
 /// The flags of the skips that are switched off.
 pub(crate) fn flags_of(skips: &SkipSettings) -> u32 {
@@ -37,16 +39,9 @@ impl Frame {
     /// Sets camera and picture size.
     pub fn look(&mut self, view: &View) {
         let lens = view.intrinsics;
-        let rotation = glam::DMat3::from_quat(view.pose.rotation.normalize()).transpose();
-        let translation = -(rotation * view.pose.center);
-        for (i, row) in self.view_rows.iter_mut().enumerate() {
-            let r = rotation.row(i);
-            *row = [r.x as f32, r.y as f32, r.z as f32, translation[i] as f32];
-        }
+        self.stand(&view.pose);
         self.focal = [lens.fx, lens.fy];
         self.principal_point = [lens.cx, lens.cy];
-        self.camera_center = view.pose.center.as_vec3().to_array();
-        self.near = NEAR;
         let (width, height) = (lens.width as f32, lens.height as f32);
         let margin_x = FRUSTUM_MARGIN * 0.5 * width / lens.fx;
         let margin_y = FRUSTUM_MARGIN * 0.5 * height / lens.fy;
@@ -54,6 +49,28 @@ impl Frame {
         self.max_ratio = [(width - lens.cx) / lens.fx + margin_x, (height - lens.cy) / lens.fy + margin_y];
         self.size = [lens.width, lens.height];
         self.show(Window::whole(lens.width, lens.height));
+    }
+
+    /// Sets an orthographic camera and its picture's size.
+    pub fn look_parallel(&mut self, view: &OrthographicView) {
+        self.flags |= FLAG_ORTHOGRAPHIC;
+        self.stand(&view.pose);
+        self.focal = view.pixels_per_metre.map(|f| f as f32);
+        self.principal_point = [0.5 * view.width as f32, 0.5 * view.height as f32];
+        (self.min_ratio, self.max_ratio) = ([0.0; 2], [0.0; 2]);
+        self.size = [view.width, view.height];
+        self.show(Window::whole(view.width, view.height));
+    }
+
+    fn stand(&mut self, pose: &Pose) {
+        let rotation = glam::DMat3::from_quat(pose.rotation.normalize()).transpose();
+        let translation = -(rotation * pose.center);
+        for (i, row) in self.view_rows.iter_mut().enumerate() {
+            let r = rotation.row(i);
+            *row = [r.x as f32, r.y as f32, r.z as f32, translation[i] as f32];
+        }
+        self.camera_center = pose.center.as_vec3().to_array();
+        self.near = NEAR;
     }
 
     /// Renders only `window`.

@@ -3,7 +3,8 @@
 use super::frame::Window;
 use super::views::is_usable;
 use super::{TrainError, Trainer};
-use models::camera::View;
+use crate::layout::Frame;
+use models::camera::{OrthographicView, View};
 
 /// A rendering on the host; reused from call to call.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -14,7 +15,7 @@ pub struct Rendering {
     pub height: u32,
     /// r, g, b per pixel over black; not clamped above.
     pub rgb: Vec<f32>,
-    /// Alpha-blended depth along the optical axis (paper, depth equation), per pixel.
+    /// Alpha-blended depth along the optical axis (paper, depth equation), per pixel; of an orthographic view the median.
     pub depth: Vec<f32>,
     /// What remains of the light behind all Gaussians, per pixel, 0…1.
     pub transmittance: Vec<f32>,
@@ -33,10 +34,32 @@ impl Trainer {
             let why = "size, lens and pose of the camera must be finite and positive".to_owned();
             return Err(TrainError::BadView { name: "rendering".into(), why });
         }
+        self.draw((lens.width, lens.height), into, |frame| frame.look(view))
+    }
+
+    /// As [`Trainer::render`], with parallel rays. Depth is the distance from the view's plane to where half of the light is
+    /// gone (the median, not the mean; 0 where less than half goes): what floats thinly above the ground does not raise it.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::render`].
+    pub fn render_orthographic(&mut self, view: &OrthographicView, into: &mut Rendering) -> Result<(), TrainError> {
+        let whole = view.width > 0 && view.height > 0;
+        if !whole || !is_usable(&view.pose) || view.pixels_per_metre.iter().any(|f| !(f.is_finite() && *f > 0.0)) {
+            let why = "size, scale and pose of the orthographic camera must be finite and positive".to_owned();
+            return Err(TrainError::BadView { name: "rendering".into(), why });
+        }
+        self.draw((view.width, view.height), into, |frame| frame.look_parallel(view))
+    }
+
+    fn draw(
+        &mut self,
+        (width, height): (u32, u32),
+        into: &mut Rendering,
+        look: impl FnOnce(&mut Frame),
+    ) -> Result<(), TrainError> {
         self.flush()?;
-        into.width = lens.width;
-        into.height = lens.height;
-        let pixels = lens.pixels();
+        (into.width, into.height) = (width, height);
+        let pixels = width as usize * height as usize;
         into.rgb.resize(3 * pixels, 0.0);
         into.depth.resize(pixels, 0.0);
         into.transmittance.resize(pixels, 1.0);
@@ -45,9 +68,9 @@ impl Trainer {
         let degree = self.settings.sh.degree_at(1.0).min(self.plan.sh_degree);
         (f.gaussians, f.sh_degree, f.divisor) = (self.gaussians as u32, degree.into(), 1);
         f.step = self.steps + 1;
-        f.look(view);
-        let whole = Window::whole(lens.width, lens.height);
-        let rows = self.rows_per_window(&whole, lens.width)?;
+        look(f);
+        let whole = Window::whole(width, height);
+        let rows = self.rows_per_window(&whole, width)?;
         let mut row = 0;
         while row < whole.rows {
             let window = Window { row, rows: rows.min(whole.rows - row), ..whole };

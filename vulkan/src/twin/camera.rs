@@ -1,10 +1,19 @@
 //! The camera as the shaders take it: rows of world → camera, lens in pixels.
 
-use models::camera::View;
+use models::camera::{OrthographicView, Pose, View};
 
 use super::real::{Mat3, Real, Vec3, apply, apply_transposed, cross};
 
-/// A pinhole camera in OpenCV axes.
+/// What a point's place in the picture is divided by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Rays {
+    /// Its depth: rays through the camera's centre.
+    Perspective,
+    /// Nothing: parallel rays along the optical axis, focal lengths in pixels per metre.
+    Orthographic,
+}
+
+/// A camera in OpenCV axes.
 #[derive(Clone, Copy, Debug)]
 pub struct Camera<R> {
     /// World → camera rotation.
@@ -19,23 +28,62 @@ pub struct Camera<R> {
     pub principal: [R; 2],
     /// Width, height.
     pub size: [u32; 2],
+    /// How it projects.
+    pub rays: Rays,
 }
 
 impl<R: Real> Camera<R> {
     /// The camera of a view.
     pub fn of(view: &View) -> Self {
         let i = &view.intrinsics;
-        let r = view.pose.rotation.conjugate().normalize();
+        Self {
+            focal: [R::of(i.fx.into()), R::of(i.fy.into())],
+            principal: [R::of(i.cx.into()), R::of(i.cy.into())],
+            size: [i.width, i.height],
+            ..Self::at(&view.pose, Rays::Perspective)
+        }
+    }
+
+    /// The camera of an orthographic view.
+    pub fn orthographic(view: &OrthographicView) -> Self {
+        let size = [view.width, view.height];
+        Self {
+            focal: view.pixels_per_metre.map(R::of),
+            principal: size.map(|n| R::of(0.5 * f64::from(n))),
+            size,
+            ..Self::at(&view.pose, Rays::Orthographic)
+        }
+    }
+
+    fn at(pose: &Pose, rays: Rays) -> Self {
+        let r = pose.rotation.conjugate().normalize();
         let m = glam::DMat3::from_quat(r);
-        let t = -(r * view.pose.center);
+        let t = -(r * pose.center);
         let row = |k: usize| m.row(k).to_array().map(R::of);
         Self {
             rotation: [row(0), row(1), row(2)],
             translation: t.to_array().map(R::of),
-            center: view.pose.center.to_array().map(R::of),
-            focal: [R::of(i.fx.into()), R::of(i.fy.into())],
-            principal: [R::of(i.cx.into()), R::of(i.cy.into())],
-            size: [i.width, i.height],
+            center: pose.center.to_array().map(R::of),
+            focal: [R::ONE; 2],
+            principal: [R::ZERO; 2],
+            size: [0; 2],
+            rays,
+        }
+    }
+
+    /// What a point at this depth is divided by.
+    pub fn divisor(&self, depth: R) -> R {
+        match self.rays {
+            Rays::Perspective => depth,
+            Rays::Orthographic => R::ONE,
+        }
+    }
+
+    /// Where the Gaussian at `mean` is seen along, not normalised.
+    pub fn sight(&self, mean: Vec3<R>) -> Vec3<R> {
+        match self.rays {
+            Rays::Perspective => std::array::from_fn(|k| mean[k] - self.center[k]),
+            Rays::Orthographic => self.rotation[2],
         }
     }
 
@@ -49,12 +97,17 @@ impl<R: Real> Camera<R> {
             focal: self.focal.map(|x| S::of(x.f64())),
             principal: self.principal.map(|x| S::of(x.f64())),
             size: self.size,
+            rays: self.rays,
         }
     }
 
     /// Least and greatest x/z and y/z at which the projection is linearised: the picture's edges plus
-    /// `margin` half-widths (gsplat's form of 3DGS's 1.3 × tan(fov/2), exact for any principal point).
+    /// `margin` half-widths (gsplat's form of 3DGS's 1.3 × tan(fov/2), exact for any principal point). Zero for parallel
+    /// rays: their Jacobian does not know depth.
     pub fn clamp_range(&self, margin: f64) -> ([R; 2], [R; 2]) {
+        if self.rays == Rays::Orthographic {
+            return ([R::ZERO; 2], [R::ZERO; 2]);
+        }
         let half = |k: usize| R::of(0.5 * f64::from(self.size[k])) / self.focal[k] * R::of(margin);
         let size = |k: usize| R::of(f64::from(self.size[k]));
         (

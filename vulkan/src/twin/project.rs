@@ -6,7 +6,7 @@
 //! the clamp is taken around the true principal point (as gsplat does), and det Σ₂ is a sum of squares
 //! (Cauchy–Binet over the columns of J R S), so that it can be neither negative nor lost to cancellation.
 
-use super::camera::Camera;
+use super::camera::{Camera, Rays};
 use super::gaussian::Gaussian;
 use super::real::{Mat3, Real, Vec3, apply, rotation_of, sigmoid};
 use super::shade::shade;
@@ -100,7 +100,7 @@ pub(crate) fn geometry<R: Real>(g: &Gaussian<R>, camera: &Camera<R>, limits: &Li
     if !(p[2] > R::of(limits.near) && p.iter().all(|v| v.is_finite())) {
         return Err(Culled::Near);
     }
-    let inverse_z = R::ONE / p[2];
+    let inverse_z = R::ONE / camera.divisor(p[2]);
     let (low, high) = camera.clamp_range(FRUSTUM_MARGIN.into());
     let raw = [p[0] * inverse_z, p[1] * inverse_z];
     let clamped: [R; 2] = std::array::from_fn(|k| raw[k].max(low[k]).min(high[k]));
@@ -110,7 +110,11 @@ pub(crate) fn geometry<R: Real>(g: &Gaussian<R>, camera: &Camera<R>, limits: &Li
         std::array::from_fn(|k| focal[row] * (camera.rotation[row][k] - clamped[row] * camera.rotation[2][k]))
     });
     let rotation = rotation_of(g.rotation);
-    let scale_max = R::of(SCALE_LIMIT.into()) * p[2];
+    let across = match camera.rays {
+        Rays::Perspective => p[2],
+        Rays::Orthographic => R::of(camera.size[0].into()) / camera.focal[0],
+    };
+    let scale_max = R::of(SCALE_LIMIT.into()) * across;
     let raw_scale = g.log_scale.map(|v| v.min(R::of(80.0)).exp());
     let scale = raw_scale.map(|v| v.min(scale_max));
     let scale_active = std::array::from_fn(|k| raw_scale[k] > scale_max);
@@ -149,12 +153,13 @@ pub fn project<R: Real>(
     if opacity <= R::ZERO || opacity < R::of(limits.alpha_min) {
         return Err(Culled::Transparent);
     }
-    let v: Vec3<R> = std::array::from_fn(|k| g.mean[k] - camera.center[k]);
+    let v = camera.sight(g.mean);
     let norm = super::real::dot(v, v).sqrt();
     let colour = shade(degree, v.map(|k| k / norm), &g.sh);
     let inverse_det = R::ONE / geo.det;
     let conic = [geo.cov[2] * inverse_det, -geo.cov[1] * inverse_det, geo.cov[0] * inverse_det];
-    let mean2d: [R; 2] = std::array::from_fn(|k| camera.focal[k] * geo.p[k] / geo.p[2] + camera.principal[k]);
+    let mean2d: [R; 2] =
+        std::array::from_fn(|k| camera.focal[k] * geo.p[k] / camera.divisor(geo.p[2]) + camera.principal[k]);
     let projected = Projected { mean2d, conic, opacity, colour, depth: geo.p[2] };
     if limits.alpha_min > 0.0 && !projected.touches(camera, &geo.cov, limits) {
         return Err(Culled::Outside);

@@ -5,9 +5,10 @@
 //! Q is bounded by 1/0.3 because of the dilation.
 //!
 //! Pose: camera-space points move as p' = exp(ω) p + v. Then dL/dv = Σ dL/dp, dL/dω = Σ p × dL/dp + Σ r × dL/dr over
-//! the columns r of R; the view direction of the SH sees v only (the camera centre moves by −Rᵀ v).
+//! the columns r of R; the view direction of the SH sees v only (the camera centre moves by −Rᵀ v). With parallel rays it is
+//! the last row of R.
 
-use super::camera::Camera;
+use super::camera::{Camera, Rays};
 use super::gaussian::Gaussian;
 use super::project::{Culled, Limits, Projected, geometry};
 use super::real::{Mat3, Real, Vec3, apply, apply_transposed, cross, dot, rotation_of_backward, sigmoid};
@@ -30,7 +31,8 @@ pub fn project_backward<R: Real>(
     upstream: &ProjectedGradient<R>,
 ) -> Result<(Gaussian<R>, [R; 6]), Culled> {
     let geo = geometry(g, camera, limits)?;
-    let inverse_z = R::ONE / geo.p[2];
+    let inverse_z = R::ONE / camera.divisor(geo.p[2]);
+    let perspective = camera.rays == Rays::Perspective;
     let half = R::of(0.5);
 
     // Conic → Σ₂. The conic's xy entry stands for both off-diagonal entries.
@@ -65,8 +67,10 @@ pub fn project_backward<R: Real>(
     let mut dw = [[R::ZERO; 3]; 3];
     for row in 0..2 {
         let f = camera.focal[row] * inverse_z;
-        dp[2] -= inverse_z * dot(geo.jr[row], djr[row]);
-        if !geo.clamp_active[row] {
+        if perspective {
+            dp[2] -= inverse_z * dot(geo.jr[row], djr[row]);
+        }
+        if perspective && !geo.clamp_active[row] {
             let dc = -f * dot(djr[row], w[2]);
             dp[row] += dc * inverse_z;
             dp[2] -= dc * geo.clamped[row] * inverse_z;
@@ -81,12 +85,18 @@ pub fn project_backward<R: Real>(
     for row in 0..2 {
         let f = camera.focal[row] * inverse_z * upstream.mean2d[row];
         dp[row] += f;
-        dp[2] -= f * geo.p[row] * inverse_z;
+        if perspective {
+            dp[2] -= f * geo.p[row] * inverse_z;
+        }
     }
     dp[2] += upstream.depth;
 
-    let v: Vec3<R> = std::array::from_fn(|k| g.mean[k] - camera.center[k]);
-    let (sh, d_direction) = shade_backward(degree, v, &g.sh, upstream.colour);
+    let (sh, mut d_direction) = shade_backward(degree, camera.sight(g.mean), &g.sh, upstream.colour);
+    if !perspective {
+        // The direction is the camera's axis: it turns with the camera and moves with nothing.
+        dw[2] = std::array::from_fn(|k| dw[2][k] + d_direction[k]);
+        d_direction = [R::ZERO; 3];
+    }
     let world = apply_transposed(w, dp);
     let mean = std::array::from_fn(|k| world[k] + d_direction[k]);
 

@@ -7,7 +7,7 @@
 //! Backward walks in the same direction, so that T is reproduced by the same multiplications; what lies behind
 //! Gaussian i is the pixel's total minus what has been passed: dL/dαᵢ = Tᵢ (cᵢ·g) − (rest behind)/(1 − αᵢ).
 
-use super::camera::Camera;
+use super::camera::{Camera, Rays};
 use super::emit::{Instances, tile_grid};
 use super::project::{Limits, Projected};
 use super::real::Real;
@@ -18,7 +18,8 @@ use crate::constants::{ALPHA_MAX, TILE_HEIGHT, TILE_WIDTH};
 pub struct Pixel<R> {
     /// Linear colour, without background.
     pub rgb: [R; 3],
-    /// Alpha-blended depth, metres (not divided by the coverage).
+    /// Alpha-blended depth, metres (not divided by the coverage); with parallel rays the median: where half of the light is
+    /// gone.
     pub depth: R,
     /// What is left of the light from behind everything.
     pub transmittance: R,
@@ -66,6 +67,7 @@ pub fn rasterise<R: Real>(
     camera: &Camera<R>,
     limits: &Limits,
 ) -> Vec<Pixel<R>> {
+    let half = R::of(0.5);
     let mut picture = vec![Pixel::default(); (camera.size[0] * camera.size[1]) as usize];
     for_each_pixel(camera.size, |tile, x, y| {
         let out = &mut picture[(y * camera.size[0] + x) as usize];
@@ -81,7 +83,11 @@ pub fn rasterise<R: Real>(
             for c in 0..3 {
                 out.rgb[c] += p.colour[c] * weight;
             }
-            out.depth += p.depth * weight;
+            match camera.rays {
+                Rays::Perspective => out.depth += p.depth * weight,
+                Rays::Orthographic if out.transmittance > half && next <= half => out.depth = p.depth,
+                Rays::Orthographic => {}
+            }
             out.transmittance = next;
         }
     });

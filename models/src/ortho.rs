@@ -1,0 +1,12 @@
+//! Maps of a scene: the reference system they are drawn in, their grid and how each block of it is seen, what ground they
+//! cover, and the files they become (Cloud-Optimised GeoTIFF, world file, preview).
+
+pub mod check_points;
+pub mod crs;
+mod error;
+pub mod extent;
+pub mod files;
+pub mod grid;
+mod preview;
+
+pub use error::OrthoError;

@@ -1,0 +1,82 @@
+//! `dgtr ortho MODEL --out DIR`: orthophoto and heights as Cloud-Optimised GeoTIFF.
+
+use std::path::PathBuf;
+
+use config::disk::Disk;
+use models::formats::model;
+use models::ortho::grid::BLOCK;
+
+use super::CliError;
+use crate::engine::device::renderer;
+use crate::error::JobError;
+use crate::ortho::{Map, MapRequest, keep_scratch_in};
+use crate::{console, interrupt};
+
+/// Arguments of `dgtr ortho`.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Example: dgtr ortho global.dgtr --out map --gsd 5\n\nWrites ortho.tif (colour and alpha), dsm.tif \
+                        (heights, metres), world files, small pictures of both, and map.georef.json. The reference system \
+                        is the UTM zone of the model's origin."
+)]
+pub struct Args {
+    /// The .dgtr model.
+    pub model: PathBuf,
+    /// Folder to write to.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Side of a pixel on the ground, centimetres; default: that of the training pictures.
+    #[arg(long, value_name = "CM")]
+    pub gsd: Option<f64>,
+    /// West, south, east, north in metres of the reference system; default: what the pictures cover, inside the region.
+    #[arg(long, value_name = "W,S,E,N", value_delimiter = ',', num_args = 4, allow_hyphen_values = true)]
+    pub bounds: Option<Vec<f64>>,
+    /// Another projected reference system in metres, by its EPSG code.
+    #[arg(long, value_name = "CODE")]
+    pub epsg: Option<u16>,
+    /// Leave out ground that fewer training pictures saw.
+    #[arg(long, value_name = "N", default_value_t = MapRequest::default().min_views)]
+    pub min_views: usize,
+    /// Vulkan device whose name contains this.
+    #[arg(long)]
+    pub device: Option<String>,
+}
+
+/// Runs `dgtr ortho`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let (header, cloud) = model::read(&args.model)?;
+    let request = MapRequest {
+        gsd: args.gsd.map(|cm| cm / 100.0),
+        epsg: args.epsg,
+        bounds: args.bounds.and_then(|b| b.try_into().ok()),
+        min_views: args.min_views,
+        ..MapRequest::default()
+    };
+    let map = Map::of(&header, &cloud, &request)?;
+    let mut trainer = renderer(args.device.as_deref(), &cloud, BLOCK, BLOCK)?;
+    drop(cloud);
+    let stop = interrupt::Interrupt::install()?;
+    let [columns, rows] = map.grid().size();
+    let total = map.grid().blocks().count() as u64;
+    let mut progress = console::Progress::new("drawing", total);
+    std::fs::create_dir_all(&args.out).map_err(JobError::io(&args.out))?;
+    keep_scratch_in(&args.out);
+    let written = map.write(&mut trainer, &header, (&Disk::default(), &args.out), |done, _| {
+        progress.set(done as u64, || format!("{columns} × {rows} pixels"));
+        !stop.requested()
+    })?;
+    let Some(written) = written else {
+        return Err(CliError::interrupted(format!("stopped; no new map in {}", args.out.display())));
+    };
+    let crs = map.grid().crs().epsg().map_or("the model's own metres".to_owned(), |code| format!("EPSG:{code}"));
+    progress.finish(&format!(
+        "{}: {columns} × {rows} pixels of {:.3} m in {crs}, {:.1} % covered",
+        args.out.display(),
+        map.grid().gsd(),
+        100.0 * written.covered as f64 / (f64::from(columns) * f64::from(rows)),
+    ));
+    Ok(())
+}

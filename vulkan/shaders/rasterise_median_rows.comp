@@ -1,0 +1,11 @@
+#version 450
+// The blend with the median depth, four lanes per tile; see blend.glsl.
+#extension GL_GOOGLE_include_directive : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+#define LANE_PER_ROW
+#define MEDIAN_DEPTH
+
+#include "frame.glsl"
+#include "tile.glsl"
+#include "blend.glsl"
