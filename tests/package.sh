@@ -1,10 +1,11 @@
 #!/bin/bash
 # Builds the Debian packages into target/debian and checks them: lintian, then, in a bare Debian (as root, mmdebstrap), the
-# units (systemd-analyze verify), the udev rule (udevadm verify), and `apt install ./dgtr.deb && dgtr demo`.
+# units (systemd-analyze verify), the udev rule (udevadm verify), `apt install ./dgtr.deb && dgtr demo`, and the units started by a
+# systemd of its own (systemd-nspawn).
 # Not part of .ci/run: it builds the release anew and loads a few hundred MB.
 #   tests/package.sh [--arch amd64|arm64] [--no-root] [--transcript FILE]
 # An arm64 package is built here with the std of its target and aarch64-linux-gnu-gcc; it is not started.
-# Wants: cargo install cargo-deb --locked; apt-get install lintian mmdebstrap python3-pip (and gcc-aarch64-linux-gnu).
+# Wants: cargo install cargo-deb --locked; apt-get install lintian mmdebstrap systemd-container python3-pip (and gcc-aarch64-linux-gnu).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -32,10 +33,11 @@ fi
 made=target/package
 rm -rf "$made" && mkdir -p "$made"
 
-# ONNX Runtime of the target's architecture, out of its published Python package.
+# ONNX Runtime of the target's architecture, out of its published Python package. 1.24.4 has no client of its makers' telemetry
+# in it; 1.32 has one (with libcurl and mbedTLS), although dgtr turns it off.
 python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --implementation cp \
     --python-version 3.13 --abi cp313 --platform "manylinux_2_28_$machine" --platform "manylinux_2_27_$machine" \
-    --dest "$made/wheel" onnxruntime
+    --dest "$made/wheel" onnxruntime==1.24.4
 python3 - "$made" <<'PY'
 import glob, gzip, sys, zipfile
 made = sys.argv[1]
@@ -93,10 +95,25 @@ lintian --allow-root --fail-on error,warning $debs
 # A Debian with nothing but what is required, and apt.
 bare=$(mktemp -d)
 chmod 755 "$bare"
-trap 'umount "$bare/proc" 2>/dev/null || true; rm -rf --one-file-system "$bare"' EXIT
+trap 'umount "$bare/dev/pts" "$bare/proc" 2>/dev/null || true; rm -rf --one-file-system "$bare"' EXIT
 mmdebstrap --quiet --variant=minbase "$suite" "$bare"
 mount -t proc proc "$bare/proc"
+mount -t devpts -o newinstance,ptmxmode=0666 devpts "$bare/dev/pts"
 # shellcheck disable=SC2086
-cp $debs "$bare/root/"
-cp tests/package-root.sh "$bare/root/"
-chroot "$bare" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root TERM=dumb sh /root/package-root.sh 2>&1 | tee "$transcript"
+cp $debs tests/package/root.sh tests/package/units.sh "$bare/root/"
+inside() { chroot "$bare" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root TERM=dumb "$@"; }
+inside sh /root/root.sh 2>&1 | tee "$transcript"
+command -v systemd-nspawn >/dev/null || { echo "package.sh: units not started (apt-get install systemd-container)"; exit 0; }
+umount "$bare/dev/pts" "$bare/proc"
+cat > "$bare/etc/systemd/system/units.service" <<'UNIT'
+[Unit]
+After=multi-user.target
+[Service]
+Type=oneshot
+ExecStart=/bin/bash -c '/root/units.sh > /root/units.txt 2>&1'
+UNIT
+mkdir -p "$bare/etc/systemd/system/multi-user.target.wants"
+ln -s ../units.service "$bare/etc/systemd/system/multi-user.target.wants/"
+timeout 300 systemd-nspawn --quiet -D "$bare" --register=no --keep-unit /lib/systemd/systemd </dev/null >/dev/null 2>&1 || true
+tee -a "$transcript" < "$bare/root/units.txt"
+tail -n 3 "$bare/root/units.txt" | grep -q "units: all is well"

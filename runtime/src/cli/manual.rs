@@ -41,8 +41,10 @@ fn with_subcommands(program: &Command, keep: impl Fn(&Command) -> bool) -> Comma
 
 fn write(out: &Path, mut program: Command) -> io::Result<()> {
     std::fs::create_dir_all(out)?;
+    // Before the completions, which add a `help` to every command that the pages would describe.
+    clap_mangen::generate_to(program.clone(), out)?;
     for shell in [Shell::Bash, Shell::Zsh, Shell::Fish] {
         clap_complete::generate_to(shell, &mut program, "dgtr", out)?;
     }
-    clap_mangen::generate_to(program, out)
+    Ok(())
 }

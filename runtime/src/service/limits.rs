@@ -21,8 +21,8 @@ pub struct ServiceLimits {
     host_mib: u64,
     /// The part of the bound that is the device's; 0: it lies elsewhere or is counted already.
     device_mib: u64,
-    /// Processors for the job.
-    processors: usize,
+    /// Processors for the job, and all that there are.
+    processors: (usize, usize),
 }
 
 impl ServiceLimits {
@@ -30,16 +30,23 @@ impl ServiceLimits {
     /// the autopilot's bridge, wherever there are two.
     pub fn of_flight(memory: &MemorySettings, device: DeviceMemory, processors: usize) -> Self {
         let device_mib = if device == DeviceMemory::Shared { memory.device_mib.into() } else { 0 };
-        Self { host_mib: memory.host_mib.into(), device_mib, processors: processors.saturating_sub(1).max(1) }
+        Self {
+            host_mib: memory.host_mib.into(),
+            device_mib,
+            processors: (processors.saturating_sub(1).max(1), processors),
+        }
     }
 }
 
 /// The text of a drop-in.
 impl fmt::Display for ServiceLimits {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "[Service]\n# memory.host_mib = {} and {} MiB of the device's", self.host_mib, self.device_mib)?;
-        writeln!(f, "MemoryMax={}M", self.host_mib + self.device_mib)?;
-        writeln!(f, "# {} processors, one more for the system\nCPUQuota={}%", self.processors, 100 * self.processors)
+        let Self { host_mib, device_mib, processors: (ours, all) } = self;
+        writeln!(f, "[Service]\n# memory.host_mib = {host_mib}")?;
+        if *device_mib > 0 {
+            writeln!(f, "# memory.device_mib = {device_mib}, in the same memory")?;
+        }
+        writeln!(f, "MemoryMax={}M\n# {ours} of {all} processors\nCPUQuota={}%", host_mib + device_mib, 100 * ours)
     }
 }
 

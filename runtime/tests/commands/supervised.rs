@@ -83,8 +83,8 @@ fn an_onboard_job_says_when_capture_listens_and_its_loop_gives_the_signs_of_life
     }
     let dir = tempfile::tempdir().unwrap();
     let (mission, out) = (mission(dir.path()), dir.path().join("out"));
-    let fly = ["fly", "--mission", &mission, "--out", out.to_str().unwrap(), "--patience", "2"];
-    let (words, _) = heard(dir.path(), &fly, "800000");
+    let fly = ["fly", "--mission", &mission, "--out", out.to_str().unwrap(), "--patience", "1"];
+    let (words, _) = heard(dir.path(), &fly, "400000");
     is_whole(&words, "listening on udpin:127.0.0.1:0");
     assert!(words[0].starts_with("STATUS=opening"), "{words:?}");
 }
