@@ -31,7 +31,7 @@ apt-get install -y -qq ./dgtr-onboard_*.deb >/dev/null 2>&1
 dgtr fly --help >/dev/null
 if dgtr demo --help >/dev/null 2>&1; then exit 1; fi
 apt-get purge -y -qq dgtr-onboard >/dev/null 2>&1
-if command -v dgtr; then exit 1; fi
+test ! -e /usr/bin/dgtr
 test ! -e /etc/default/dgtr
 # For the units' turn.
 apt-get install -y -qq ./dgtr-onboard_*.deb >/dev/null 2>&1

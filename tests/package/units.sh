@@ -1,8 +1,8 @@
 #!/bin/bash
 # Inside of a booted systemd: the units as they are shipped, but that a hang is found within seconds. Started by
 # tests/package.sh by way of systemd-nspawn; ends by switching off.
-trap 'systemctl --no-block poweroff' EXIT
-set -eux
+trap 'systemctl --no-block start poweroff.target' EXIT
+set -euxo pipefail
 mkdir -p /etc/dgtr /var/lib/dgtr/pictures
 chown -R dgtr: /var/lib/dgtr
 cat > /etc/dgtr/mission.toml <<'M'
