@@ -81,9 +81,9 @@ cp "$here" "$made/dgtr-here" && here=$made/dgtr-here
 
 mkdir -p target/debian && rm -f target/debian/dgtr*_"$arch".deb
 manual
-cargo deb -p runtime "${cross[@]}" --output target/debian/ -- --locked
+cargo deb -p runtime "${cross[@]}" --locked --output target/debian/
 manual --onboard
-cargo deb -p runtime --variant onboard "${cross[@]}" --output target/debian/ -- --locked
+cargo deb -p runtime --variant onboard "${cross[@]}" --locked --output target/debian/
 ls -l target/debian/
 
 debs=$(ls target/debian/dgtr*_"$arch".deb)

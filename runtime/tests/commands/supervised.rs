@@ -37,17 +37,18 @@ fn heard(dir: &Path, arguments: &[&str], watchdog_us: &str) -> (Vec<String>, Opt
     let mut command = program();
     command.args(arguments).env("NOTIFY_SOCKET", &address).env("WATCHDOG_USEC", watchdog_us);
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-    let (began, mut words, mut code) = (Instant::now(), Vec::new(), None);
+    let (began, mut words, mut ended) = (Instant::now(), Vec::new(), false);
     let mut bytes = [0; 1024];
     loop {
         match socket.recv(&mut bytes) {
             Ok(n) => words.push(String::from_utf8_lossy(&bytes[..n]).into_owned()),
-            // Ended, and nothing is left to hear.
-            Err(_) if code.is_some() => return (words, code.flatten()),
-            Err(_) => code = child.try_wait().unwrap().map(|status| status.code()),
+            // Nothing is left to hear.
+            Err(_) if ended => break,
+            Err(_) => ended = child.try_wait().unwrap().is_some(),
         }
         assert!(began.elapsed() < Duration::from_secs(60), "{words:?}");
     }
+    (words, child.wait().unwrap().code())
 }
 
 /// Position of a word, which was said once.
