@@ -21,6 +21,8 @@ mod fly;
 mod import;
 mod init;
 mod keys;
+#[cfg(feature = "lab")]
+mod manual;
 mod ortho;
 mod plan;
 mod render;
@@ -83,22 +85,10 @@ enum Command {
     Serve(serve::Args),
     /// The onboard job: from MAVLink and pictures to a model, while flying.
     Fly(fly::Args),
-    /// The whole system with nothing attached.
-    #[cfg(feature = "lab")]
-    Demo(demo::Args),
-    /// Recorded pictures or a recorded log as a living aircraft.
-    #[cfg(feature = "lab")]
-    Replay(replay::Args),
-    /// A simulated aircraft over a ray-cast world.
-    #[cfg(feature = "lab")]
-    Sim(sim::Args),
     /// Writes a model in a format that other programs read.
     Export(export::Args),
     /// Makes a model of another program's file.
     Import(import::Args),
-    /// Measures run time, memory, error, skips and numerical promises.
-    #[cfg(feature = "lab")]
-    Bench(bench::Args),
     /// Makes the keys of aircraft and ground, and prints the public ones for the mission file.
     Keys(keys::Args),
     /// Writes a mission file to start from, or prints the reference of all settings.
@@ -107,6 +97,26 @@ enum Command {
     Plan(plan::Args),
     /// Checks device, driver, ONNX Runtime, ports: what is there, what is missing, how to mend it.
     Doctor(doctor::Args),
+    #[cfg(feature = "lab")]
+    #[command(flatten)]
+    Lab(Lab),
+}
+
+/// What does not fly.
+#[cfg(feature = "lab")]
+#[derive(Debug, Subcommand)]
+enum Lab {
+    /// The whole system with nothing attached.
+    Demo(demo::Args),
+    /// Recorded pictures or a recorded log as a living aircraft.
+    Replay(replay::Args),
+    /// A simulated aircraft over a ray-cast world.
+    Sim(sim::Args),
+    /// Measures run time, memory, error, skips and numerical promises.
+    Bench(bench::Args),
+    /// Writes manual pages and shell completions.
+    #[command(hide = true)]
+    Manual(manual::Args),
 }
 
 /// Parses `arguments` (the first is the program's name), runs the command and says how it went: results on standard
@@ -139,20 +149,24 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Command::Aggregate(args) => aggregate::run(args),
         Command::Serve(args) => serve::run(args),
         Command::Fly(args) => fly::run(args),
-        #[cfg(feature = "lab")]
-        Command::Sim(args) => sim::run(args),
-        #[cfg(feature = "lab")]
-        Command::Replay(args) => replay::run(args),
-        #[cfg(feature = "lab")]
-        Command::Demo(args) => demo::run(args),
         Command::Export(args) => export::run(args),
         Command::Import(args) => import::run(args),
-        #[cfg(feature = "lab")]
-        Command::Bench(args) => bench::run(args),
         Command::Keys(args) => keys::run(args),
         Command::Init(args) => init::run(args),
         Command::Plan(args) => plan::run(args),
         Command::Doctor(args) => doctor::run(args),
+        #[cfg(feature = "lab")]
+        Command::Lab(Lab::Sim(args)) => sim::run(args),
+        #[cfg(feature = "lab")]
+        Command::Lab(Lab::Replay(args)) => replay::run(args),
+        #[cfg(feature = "lab")]
+        Command::Lab(Lab::Demo(args)) => demo::run(args),
+        #[cfg(feature = "lab")]
+        Command::Lab(Lab::Bench(args)) => bench::run(args),
+        #[cfg(feature = "lab")]
+        Command::Lab(Lab::Manual(args)) => {
+            manual::run(args, <Cli as clap::CommandFactory>::command(), Lab::has_subcommand)
+        }
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

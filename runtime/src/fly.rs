@@ -53,6 +53,7 @@ use crate::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
 use crate::resources;
 use crate::run_json::RunReport;
+use crate::service::Supervisor;
 use crate::upload::{Offerer, Source, UploadError};
 use flight::Flight;
 use geotags::Geotags;
@@ -92,7 +93,7 @@ pub struct FlyOutcome {
     pub report: RunReport,
 }
 
-/// Flies one aircraft's mission to its end.
+/// Flies one aircraft's mission to its end; `supervisor` hears of it.
 ///
 /// # Errors
 /// Whatever keeps the job from going on; what was saved before stays valid.
@@ -101,7 +102,9 @@ pub fn fly(
     aircraft: &Aircraft,
     options: &FlyOptions,
     interrupt: &Interrupt,
+    supervisor: Supervisor,
 ) -> Result<FlyOutcome, JobError> {
+    supervisor.status("opening the device and the networks");
     let intrinsics = training_lens(mission);
     let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
     let disk = planned_disk(mission, &options.out)?;
@@ -126,10 +129,13 @@ pub fn fly(
     })?;
     flight.handover().keep_in(store, model_path(&options.out));
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
+    supervisor.ready();
+    supervisor.status(&format!("listening on {}", aircraft.link));
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };
     let health = Health::new(mission.failsafe, mission.memory.host_mib, &options.out);
     let failsafe = Failsafe::new(health, &mission.failsafe);
-    let mut job = Job::new(reconstruction, offerer, &options.out, budget, failsafe, MonotonicClock::default());
+    let job = Job::new(reconstruction, offerer, &options.out, budget, failsafe, MonotonicClock::default());
+    let mut job = job.supervised(supervisor);
     while job.turn(flight.handover(), interrupt)? {}
     let (mut capture, ended, counters) = flight.finish()?;
     tracing::info!("capture is over ({ended:?}): {} key frames", job.keyframes());
@@ -184,8 +190,13 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
 
 /// Waits for the ground to have the finished model, then says what became of everything.
 fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, interrupt: &Interrupt) -> FlyOutcome {
-    let JobEnd { mut reconstruction, offerer, model, gaussians, finished } = end;
-    let delivered = finished && offerer.wait_delivered(DELIVERY, || !interrupt.requested());
+    let JobEnd { mut reconstruction, offerer, supervisor, model, gaussians, finished } = end;
+    supervisor.status(&format!("{gaussians} Gaussians of {} key frames; delivering", reconstruction.keyframes()));
+    let go_on = || {
+        supervisor.alive();
+        !interrupt.requested()
+    };
+    let delivered = finished && offerer.wait_delivered(DELIVERY, go_on);
     reconstruction.report.more.insert("bytes_sent".into(), offerer.status().sent.into());
     offerer.shutdown();
     let keyframes = reconstruction.keyframes();

@@ -25,6 +25,7 @@ pub mod report;
 pub mod resources;
 pub mod run_json;
 pub mod serve;
+pub mod service;
 pub mod session;
 pub mod train_job;
 pub mod transfer;

@@ -15,6 +15,11 @@ use models::formats::transforms::pose_to_opengl;
 
 #[path = "commands/keys.rs"]
 mod keys;
+#[path = "commands/manual.rs"]
+#[cfg(feature = "lab")]
+mod manual;
+#[path = "commands/supervised.rs"]
+mod supervised;
 
 /// `dgtr`, which measures no kernels and leaves the user's cache folder alone.
 fn program() -> Command {

@@ -22,6 +22,8 @@ pub struct GpuInfo {
     pub version: (u32, u32),
     /// Whether this is a software renderer.
     pub is_cpu: bool,
+    /// Whether its memory is the host's although it is none (a board's GPU).
+    pub is_integrated: bool,
     /// Invocations that run in lockstep.
     pub subgroup_size: u32,
     /// Whether a kernel's lanes can read each other's registers (shuffle and vote, at least four lanes in lockstep).
@@ -252,6 +254,7 @@ fn devices(instance: &Instance) -> Result<Vec<Found>, GpuError> {
             name: CStr::to_string_lossy(name).into_owned(),
             version: (vk::api_version_major(p.api_version), vk::api_version_minor(p.api_version)),
             is_cpu: p.device_type == vk::PhysicalDeviceType::CPU,
+            is_integrated: p.device_type == vk::PhysicalDeviceType::INTEGRATED_GPU,
             subgroup_size: subgroup.subgroup_size,
             shuffles: subgroup.subgroup_size >= 4
                 && subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE)

@@ -109,6 +109,7 @@ mod tests {
             name: "device".into(),
             version: (1, 1),
             is_cpu,
+            is_integrated: true,
             subgroup_size,
             shuffles: subgroup_size >= 16,
             heap_bytes: 1 << 30,

@@ -150,6 +150,8 @@ fn library_candidates() -> Vec<PathBuf> {
     if let Some(folder) = std::env::current_exe().ok().and_then(|p| p.parent().map(PathBuf::from)) {
         places.push(folder.join(FILE));
         places.push(folder.join("../lib").join(FILE));
+        // The Debian package's own.
+        places.push(folder.join("../lib/dgtr").join(FILE));
     }
     for folder in ["/usr/local/lib", "/usr/lib", "/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/lib"] {
         places.push(PathBuf::from(folder).join(FILE));

@@ -12,6 +12,7 @@ use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly};
 use crate::interrupt::Interrupt;
 use crate::ortho::keep_scratch_in;
 use crate::run_json::RunReport;
+use crate::service::Supervisor;
 use crate::session::{Owner, Session};
 
 /// Reads pose and triggers from the autopilot and pictures from the camera, and builds the model while flying.
@@ -69,7 +70,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
     keep_scratch_in(&args.out);
     let options = FlyOptions { out: args.out.clone(), end };
-    let outcome = fly(&mission, &aircraft, &options, &interrupt)?;
+    let outcome = fly(&mission, &aircraft, &options, &interrupt, Supervisor::from_environment())?;
     let mut report = report(&outcome);
     report.wall_s = started.elapsed().as_secs_f64();
     let path = report.write(&args.out)?;

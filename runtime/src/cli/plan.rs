@@ -9,12 +9,13 @@ use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
 use config::training::ShSettings;
 use models::dataset::{Dataset, scaled};
-use vulkan::gpu::Gpu;
+use vulkan::gpu::{Gpu, GpuInfo};
 
 use super::CliError;
 use crate::engine::device::DeviceRequest;
 use crate::engine::scratch_bytes;
 use crate::fly::delivered_bytes;
+use crate::service::limits::{DeviceMemory, ServiceLimits};
 
 /// Arguments of `dgtr plan`.
 #[derive(Debug, clap::Args)]
@@ -65,6 +66,9 @@ pub struct Args {
     /// JSON instead of a table.
     #[arg(long)]
     pub json: bool,
+    /// Instead of a table, a drop-in for dgtr-fly.service with the bounds of this plan on this computer.
+    #[arg(long, requires = "mission", conflicts_with = "json")]
+    pub systemd: bool,
 }
 
 /// Runs `dgtr plan`.
@@ -77,13 +81,19 @@ pub fn run(args: Args) -> Result<(), CliError> {
         None => Job::of_arguments(&args)?,
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
-    let sort_lanes = match (Gpu::open(args.device.as_deref()), &args.device) {
-        (Ok(gpu), _) => gpu.info().sort_lanes(),
-        (Err(_), None) => SORT_LANES_SOFTWARE,
+    let (sort_lanes, lies) = match (Gpu::open(args.device.as_deref()), &args.device) {
+        (Ok(gpu), _) => (gpu.info().sort_lanes(), device_memory(gpu.info())),
+        // A bound that is too large ends no flight.
+        (Err(_), None) => (SORT_LANES_SOFTWARE, DeviceMemory::Shared),
         (Err(e), Some(_)) => return Err(e.into()),
     };
     let request = job.device.plan_request(&job.sh, sort_lanes);
     let plan = Plan::new(&request)?;
+    if args.systemd {
+        let processors = std::thread::available_parallelism().map_or(1, usize::from);
+        print!("{}", ServiceLimits::of_flight(&job.memory, lies, processors));
+        return Ok(());
+    }
     if args.json {
         println!("{}", serde_json::to_string(&plan).map_err(CliError::failed)?);
         return Ok(());
@@ -119,9 +129,18 @@ pub fn run(args: Args) -> Result<(), CliError> {
     Ok(())
 }
 
+fn device_memory(device: &GpuInfo) -> DeviceMemory {
+    match (device.is_cpu, device.is_integrated) {
+        (true, _) => DeviceMemory::Planned,
+        (_, true) => DeviceMemory::Shared,
+        _ => DeviceMemory::Separate,
+    }
+}
+
 /// What is planned for.
 struct Job {
     device: DeviceRequest,
+    memory: MemorySettings,
     /// Width and height of whole pictures.
     picture: (u32, u32),
     sh: ShSettings,
@@ -137,6 +156,7 @@ impl Job {
     fn of_flight(mission: Mission) -> Self {
         Self {
             device: DeviceRequest::of_flight(&mission, None),
+            memory: mission.memory,
             picture: (mission.camera.width, mission.camera.height),
             delivered: delivered_bytes(&mission),
             map: mission.map,
@@ -168,7 +188,7 @@ impl Job {
         };
         let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
         let (init, network) = (InitSettings::default(), NetworkSettings::default());
-        Ok(Self { device, picture, sh, init, network, delivered: 0, map: MapSettings::default() })
+        Ok(Self { device, memory, picture, sh, init, network, delivered: 0, map: MapSettings::default() })
     }
 }
 

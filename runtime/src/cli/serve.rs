@@ -13,6 +13,7 @@ use crate::interrupt::Interrupt;
 use crate::ortho::{draw_file, keep_scratch_in};
 use crate::report::{ReportData, Timing, bytes};
 use crate::serve::{self, Reception, ServeError};
+use crate::service::Supervisor;
 use crate::session::{Owner, Session};
 
 use super::CliError;
@@ -57,9 +58,16 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
     keep_scratch_in(&args.out);
     let stop = AtomicBool::new(false);
+    let supervisor = Supervisor::from_environment();
+    let mut told = None;
     let mut bar = Progress::new("receive", mission.aircraft.len() as u64);
     let reception = serve::receive(&mission, &args.out, timeout, &stop, &mut |p| {
         stop.store(interrupt.requested(), Ordering::Relaxed);
+        supervisor.ready();
+        supervisor.alive();
+        if told.replace(p.finished) != Some(p.finished) {
+            supervisor.status(&format!("{} of {} final models", p.finished, p.aircraft));
+        }
         bar.set(p.finished as u64, || {
             let under_way: Vec<String> = p.transfers.iter().map(|(id, n, of)| format!("{id} {n}/{of}")).collect();
             format!("{} received {}", bytes(p.bytes), under_way.join(", "))
@@ -72,7 +80,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
         mission.aircraft.len()
     ));
     // A first Ctrl-C ends the reception; what is here is merged all the same, and a second one ends at once.
-    let (outcome, left_out) = serve::merge(&mission, &reception, &args.out, &|| true)?;
+    supervisor.status(&format!("merging {} models", reception.received.len()));
+    let at_work = || {
+        supervisor.alive();
+        true
+    };
+    let (outcome, left_out) = serve::merge(&mission, &reception, &args.out, &at_work)?;
     let mut run = summary::run_report("serve", &outcome, mission.ground.seed);
     run.wall_s += reception.seconds;
     run.stage_ms.insert("receive".into(), reception.seconds * 1e3);

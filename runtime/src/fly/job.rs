@@ -18,6 +18,7 @@ use crate::error::JobError;
 use crate::failsafe::Failsafe;
 use crate::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
+use crate::service::Supervisor;
 use crate::upload::Offerer;
 
 /// Between two checkpoints: what a power cut may cost.
@@ -37,6 +38,7 @@ pub(super) struct Job<R, K> {
     budget: RunBudget,
     clock: K,
     failsafe: Failsafe,
+    supervisor: Supervisor,
     /// The device failed; the last checkpoint is what there is.
     training_failed: bool,
     saved_ns: u64,
@@ -49,6 +51,7 @@ pub(super) struct Job<R, K> {
 pub(super) struct JobEnd<R> {
     pub(super) reconstruction: R,
     pub(super) offerer: Offerer,
+    pub(super) supervisor: Supervisor,
     pub(super) model: PathBuf,
     pub(super) gaussians: usize,
     /// Whether the schedule was finished (false: the model is a checkpoint).
@@ -72,11 +75,17 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             saved_ns: clock.now_ns(),
             clock,
             failsafe,
+            supervisor: Supervisor::default(),
             training_failed: false,
             said_ns: None,
             for_a_frame: FOR_A_FRAME,
             idle: IDLE,
         }
+    }
+
+    /// A service manager hears of every turn and every step.
+    pub(super) fn supervised(self, supervisor: Supervisor) -> Self {
+        Self { supervisor, ..self }
     }
 
     /// Key frames taken so far.
@@ -86,7 +95,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
 
     /// One turn in flight; false when capture is over and everything it handed over is taken.
     pub(super) fn turn(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<bool, JobError> {
+        self.supervisor.alive();
         if interrupt.requested() {
+            self.supervisor.stopping();
             return Ok(false);
         }
         // Asked before looking into the channel: what was handed over before the end is still there.
@@ -146,6 +157,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let Some(rung) = self.failsafe.act(&mut self.reconstruction)? else { return Ok(()) };
         let line = format!("dgtr: {rung}");
         tracing::warn!("{line}");
+        self.supervisor.status(&line);
         let severity = if rung.is_worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
         capture.say(severity, line);
         if rung.action == Action::UploadBest && self.reconstruction.has_model() && !self.training_failed {
@@ -156,7 +168,12 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     fn build(&mut self, capture: &mut Handover) -> Result<(), JobError> {
-        match self.reconstruction.build(&|| true) {
+        let supervisor = &self.supervisor;
+        let at_work = || {
+            supervisor.alive();
+            true
+        };
+        match self.reconstruction.build(&at_work) {
             Ok(_) => {
                 capture.refined(|name| self.reconstruction.pose(name))?;
                 self.save(capture)
@@ -181,10 +198,11 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
         let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
         let mut last = None;
-        let (clock, failsafe, budget) = (&self.clock, &mut self.failsafe, self.budget);
+        let (clock, failsafe, supervisor, budget) = (&self.clock, &mut self.failsafe, &self.supervisor, self.budget);
         let views = self.reconstruction.keyframes();
         self.reconstruction.train(&budget, &mut |report: &StepReport| {
             last = Some(*report);
+            supervisor.alive();
             let now_ns = clock.now_ns();
             let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
             let alarmed = failsafe.glance(now_ns, capture.flags(), &budget, views);
@@ -215,7 +233,14 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         if !self.reconstruction.has_model() && interrupt.requested() && before.0.is_file() {
             // Stopped before everything was taken up again: the checkpoint stays as it is.
             let (reconstruction, offerer, (model, gaussians)) = (self.reconstruction, self.offerer, before);
-            return Ok(JobEnd { reconstruction, offerer, model, gaussians, finished: false });
+            return Ok(JobEnd {
+                reconstruction,
+                offerer,
+                supervisor: self.supervisor,
+                model,
+                gaussians,
+                finished: false,
+            });
         }
         if !self.reconstruction.has_model() {
             let keyframes = self.reconstruction.keyframes();
@@ -245,7 +270,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         } else {
             self.offerer.offer(&model);
         }
-        Ok(JobEnd { reconstruction: self.reconstruction, offerer: self.offerer, model, gaussians, finished })
+        let Self { reconstruction, offerer, supervisor, .. } = self;
+        Ok(JobEnd { reconstruction, offerer, supervisor, model, gaussians, finished })
     }
 
     fn finish_schedule(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
@@ -265,8 +291,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             && !self.failsafe.state().forbids_training()
         {
             let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
-            let (clock, failsafe) = (&self.clock, &mut self.failsafe);
+            let (clock, failsafe, supervisor) = (&self.clock, &mut self.failsafe, &self.supervisor);
             let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
+                supervisor.alive();
                 progress.set((r.progress * 100.0) as u64, || {
                     format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
                 });
@@ -330,6 +357,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             report.loss
         );
         tracing::info!("{line}");
+        self.supervisor.status(&line);
         capture.say(MavSeverity::MAV_SEVERITY_INFO, line);
     }
 

@@ -132,6 +132,7 @@ mod tests {
             name: name.into(),
             version: (1, 3),
             is_cpu: false,
+            is_integrated: true,
             subgroup_size: 16,
             shuffles: true,
             heap_bytes: 1 << 30,

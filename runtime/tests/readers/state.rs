@@ -171,6 +171,7 @@ fn measured_kernels() {
         name: "V3D \"7.1\"".into(),
         version: (1, 3),
         is_cpu: false,
+        is_integrated: true,
         subgroup_size: 16,
         shuffles: true,
         heap_bytes: 1 << 30,
