@@ -87,6 +87,7 @@ mod tests {
     use serde::de::{Deserialize, Deserializer, Visitor, value::Error};
 
     use super::*;
+    use crate::coverage::CoverageSettings;
     use crate::failsafe::FailsafeSettings;
     use crate::link::Signing;
     use crate::mission::*;
@@ -150,7 +151,7 @@ mod tests {
         same!(MemorySettings, Preset, NetworkSettings, UploadSettings, TlsSettings, GroundSettings, InitSettings);
         same!(RefineSettings, TrainSettings, LossSettings, RateSettings, AdamSettings, DensitySettings, Strategy);
         same!(ShSettings, ResolutionSettings, ViewSettings, StopSettings, RegulariseSettings, SkipSettings);
-        same!(FaultSettings, FailsafeSettings, Aircraft);
+        same!(FaultSettings, FailsafeSettings, CoverageSettings, Aircraft);
     }
 
     /// All tables of the reference, as the structs that would be read from it.
@@ -172,6 +173,7 @@ mod tests {
         default!(seed: u64, mount: MountSettings, link: LinkSettings, keyframes: KeyframeSettings, memory: MemorySettings);
         default!(network: NetworkSettings, upload: UploadSettings, ground: GroundSettings, init: InitSettings);
         default!(refine: RefineSettings, training: TrainSettings, faults: FaultSettings, failsafe: FailsafeSettings);
+        default!(coverage: CoverageSettings);
         assert!(file.is_empty(), "compared with nothing: {file:?}");
         let given: toml::Table = "id = \"a\"\nlink = \"tcpin:1\"\ncamera = { folder = \"a\" }".parse().expect("TOML");
         let mut full = aircraft[0].as_table().expect("a table").clone();

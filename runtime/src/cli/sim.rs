@@ -1,16 +1,18 @@
 //! `dgtr sim`: an aircraft that is not there, for tests without an autopilot.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use config::geodesy::{EnuFrame, Geodetic};
 use config::mission::{CameraSource, Mission};
 use hal::sim::aircraft::Imperfections;
 use hal::sim::autopilot::{Announcing, AutopilotSettings};
 use hal::sim::reference::Lens;
-use hal::sim::survey::SurveySettings;
+use hal::sim::survey::{Route, SurveySettings, Waypoint};
 use hal::sim::world::WorldSettings;
 use hal::sim::{SessionSettings, SimSettings};
+use models::formats::flight_plan;
 
 mod card;
 
@@ -39,6 +41,10 @@ pub struct Args {
     /// Instead of flying: write the survey's pictures here as a camera's card, with EXIF and XMP.
     #[arg(long, value_name = "DIR")]
     card: Option<PathBuf>,
+    /// Instead of a survey: fly this plan (QGroundControl's `.plan`, as `dgtr fly` writes it), with its heights, headings and
+    /// pictures.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["height", "forward_overlap", "side_overlap", "cross"])]
+    plan: Option<PathBuf>,
     /// Seconds of flight per second of wall clock.
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     speed: f64,
@@ -113,6 +119,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             cy: c.cy.into(),
         },
         region: mission.region(aircraft),
+        route: args.plan.as_deref().map(|path| route(path, mission.origin, args.pitch)).transpose()?,
         survey: SurveySettings {
             height_m: args.height,
             forward_overlap: args.forward_overlap,
@@ -150,6 +157,22 @@ pub fn run(args: Args) -> Result<(), CliError> {
         report.flight_s
     );
     if report.completed { Ok(()) } else { Err(CliError::interrupted("the flight was ended early")) }
+}
+
+/// The waypoints of a plan around `origin`; where it says nothing of the camera's pitch it is `pitch_deg`.
+fn route(path: &Path, origin: Geodetic, pitch_deg: f64) -> Result<Route, CliError> {
+    let plan = flight_plan::read(path)?;
+    let frame = EnuFrame::new(origin);
+    let waypoint = |w: &flight_plan::Waypoint| Waypoint {
+        position: frame.to_enu(w.position),
+        yaw_deg: w.yaw_deg,
+        picture: w.picture,
+    };
+    Ok(Route {
+        waypoints: plan.waypoints.iter().map(waypoint).collect(),
+        speed_ms: plan.speed_m_s,
+        gimbal_pitch_deg: plan.pitch_deg.unwrap_or(pitch_deg),
+    })
 }
 
 /// A flag that Ctrl-C sets.

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use config::coverage::CoverageSettings;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::geodesy::Geodetic;
@@ -235,6 +236,8 @@ pub(super) fn rehearse_on(
         vehicle: script.vehicle.clone(),
         intrinsics: intrinsics(&script.vehicle.lens),
         keyframes: KeyframeSettings::default(),
+        coverage: CoverageSettings::default(),
+        region: script.sim.region.clone(),
         earlier: store.poses(),
         earlier_names: script.earlier_names.iter().cloned().collect(),
         end: script.end,
