@@ -20,7 +20,7 @@ table! {
         pub least_m2: f32 = 25.0, in Limits::within(0.0, 1e9), unit "square metres";
         /// Noise of a measured point in a picture: what the expected error of a height follows from.
         pub pixel_sigma: f32 = 0.5, in Limits::within(0.01, 100.0), unit "pixels",
-            from "refined poses of sheffield_cross: reprojection 0.4 px";
+            from "refine.pixel_sigma, which holds for key points, and a little more for surfaces";
     }
 }
 
@@ -31,9 +31,12 @@ mod tests {
     #[test]
     fn the_defaults_are_accepted_and_nonsense_is_named() {
         assert_eq!(CoverageSettings::default().check(), Ok(()));
-        for (text, field) in
-            [("pictures = 0", "pictures"), ("angle_deg = nan", "angle_deg"), ("cell_m = 0.0", "cell_m"), ("ground_m = inf", "ground_m")]
-        {
+        for (text, field) in [
+            ("pictures = 0", "pictures"),
+            ("angle_deg = nan", "angle_deg"),
+            ("cell_m = 0.0", "cell_m"),
+            ("ground_m = inf", "ground_m"),
+        ] {
             let settings: CoverageSettings = toml::from_str(text).expect("TOML");
             assert_eq!(settings.check().expect_err(text).field, field);
         }

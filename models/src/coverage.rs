@@ -15,12 +15,12 @@ pub mod gaps;
 pub mod geojson;
 mod ground;
 mod outline;
-mod region;
 pub mod reflight;
+mod region;
 mod sight;
 
-pub use cell::CellReport;
 use cell::Cell;
+pub use cell::CellReport;
 pub use ground::Heights;
 pub use region::{Region, hull};
 use sight::{Seen, Sight};

@@ -13,6 +13,14 @@ use models::formats::flight_plan::{FlightPlan, Waypoint};
 
 use crate::run_json::RunReport;
 
+#[cfg(feature = "lab")]
+mod route;
+#[cfg(all(test, feature = "lab"))]
+mod tests;
+
+#[cfg(feature = "lab")]
+pub use route::route;
+
 /// The gaps, in the output folder.
 pub const GAPS: &str = "coverage.geojson";
 /// The flight that closes them.
@@ -98,8 +106,11 @@ impl Coverage {
     fn flight_plan(&self) -> Option<FlightPlan> {
         let (reflight, frame) = (self.reflight.as_ref()?, EnuFrame::new(self.origin?));
         let first = reflight.stations.first()?.center;
-        let waypoint =
-            |s: &reflight::Station| Waypoint { position: frame.to_geodetic(s.center), yaw_deg: s.yaw_deg, picture: true };
+        let waypoint = |s: &reflight::Station| Waypoint {
+            position: frame.to_geodetic(s.center),
+            yaw_deg: s.yaw_deg,
+            picture: true,
+        };
         Some(FlightPlan {
             home: frame.to_geodetic(first.truncate().extend(self.home_m)),
             speed_m_s: SPEED_M_S,

@@ -27,6 +27,9 @@ mod shortage;
 
 #[cfg(test)]
 #[cfg(feature = "lab")]
+mod again;
+#[cfg(test)]
+#[cfg(feature = "lab")]
 mod fault_table;
 #[cfg(test)]
 #[cfg(feature = "lab")]

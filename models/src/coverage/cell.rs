@@ -87,7 +87,9 @@ impl Cell {
         let step = (ANOTHER * STEPS) as i32;
         let another = || {
             let mut steps = along(ray).into_iter().enumerate();
-            steps.any(|(k, s)| i32::from(s) < i32::from(self.low[k]) - step || i32::from(s) > i32::from(self.high[k]) + step)
+            steps.any(|(k, s)| {
+                i32::from(s) < i32::from(self.low[k]) - step || i32::from(s) > i32::from(self.high[k]) + step
+            })
         };
         u32::from(lacks_picture) + u32::from(lacks_angle && another())
     }

@@ -41,9 +41,11 @@ impl Region {
     /// Whether a point lies inside (even-odd rule).
     pub fn contains(&self, p: DVec2) -> bool {
         let next = self.corners.iter().cycle().skip(1);
-        let crossings = self.corners.iter().zip(next).filter(|(a, b)| {
-            (a.y > p.y) != (b.y > p.y) && p.x < a.x + (p.y - a.y) / (b.y - a.y) * (b.x - a.x)
-        });
+        let crossings = self
+            .corners
+            .iter()
+            .zip(next)
+            .filter(|(a, b)| (a.y > p.y) != (b.y > p.y) && p.x < a.x + (p.y - a.y) / (b.y - a.y) * (b.x - a.x));
         crossings.count() % 2 == 1
     }
 }

@@ -21,7 +21,7 @@ const NAV_RETURN_TO_LAUNCH: u32 = 20;
 const NAV_TAKEOFF: u32 = 22;
 const CONDITION_YAW: u32 = 115;
 const DO_CHANGE_SPEED: u32 = 178;
-/// Understood as a mission item by ArduPilot of every version and by PX4; IMAGE_START_CAPTURE by ArduPilot since 4.4 only.
+/// One picture; written because older ArduPilot takes this as a mission item and IMAGE_START_CAPTURE not, and PX4 takes both.
 const DO_DIGICAM_CONTROL: u32 = 203;
 const DO_MOUNT_CONTROL: u32 = 205;
 const IMAGE_START_CAPTURE: u32 = 2000;
@@ -308,7 +308,8 @@ mod tests {
         assert!(file["groundStation"].is_string());
         assert_eq!((&file["geoFence"]["version"], &file["rallyPoints"]["version"]), (&json!(2), &json!(2)));
         let mission = &file["mission"];
-        for number in ["version", "firmwareType", "vehicleType", "globalPlanAltitudeMode", "cruiseSpeed", "hoverSpeed"] {
+        for number in ["version", "firmwareType", "vehicleType", "globalPlanAltitudeMode", "cruiseSpeed", "hoverSpeed"]
+        {
             assert!(mission[number].is_number(), "{number}");
         }
         assert_eq!(mission["plannedHomePosition"], json!([47.4, 8.5, 430.0]));
@@ -319,7 +320,10 @@ mod tests {
         }
         let commands: Vec<u64> = items.iter().filter_map(|i| i["command"].as_u64()).collect();
         assert_eq!(commands, [22, 178, 205, 16, 203, 115, 16, 203, 16, 20]);
-        assert_eq!((&items[3]["frame"], &items[3]["Altitude"], &items[3]["AltitudeMode"]), (&json!(3), &json!(40.25), &json!(1)));
+        assert_eq!(
+            (&items[3]["frame"], &items[3]["Altitude"], &items[3]["AltitudeMode"]),
+            (&json!(3), &json!(40.25), &json!(1))
+        );
     }
 
     #[test]
@@ -332,7 +336,13 @@ mod tests {
         assert!(refused("\"command\": 178", "\"command\": 206").contains("mission item 2: command 206"));
         assert!(refused("\"SimpleItem\"", "\"ComplexItem\"").contains("mission item 1: surveys"));
         assert!(refused("47.4001", "147.4").contains("mission item 4: its latitude"));
-        assert!(refused("\"frame\": 3,\n        \"params\": [\n          1.0", "\"frame\": 10,\n        \"params\": [\n          1.0").contains("item 4: heights"));
+        assert!(
+            refused(
+                "\"frame\": 3,\n        \"params\": [\n          1.0",
+                "\"frame\": 10,\n        \"params\": [\n          1.0"
+            )
+            .contains("item 4: heights")
+        );
         assert!(refused("\"Plan\"", "\"Fence\"").contains("fileType"));
         assert!(refused("430.0", "4.3e9").contains("plannedHomePosition"));
         assert!(read_text("{}").expect_err("empty").contains("not a plan"));

@@ -1,15 +1,14 @@
 //! `dgtr sim`: an aircraft that is not there, for tests without an autopilot.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use config::geodesy::{EnuFrame, Geodetic};
 use config::mission::{CameraSource, Mission};
 use hal::sim::aircraft::Imperfections;
 use hal::sim::autopilot::{Announcing, AutopilotSettings};
 use hal::sim::reference::Lens;
-use hal::sim::survey::{Route, SurveySettings, Waypoint};
+use hal::sim::survey::SurveySettings;
 use hal::sim::world::WorldSettings;
 use hal::sim::{SessionSettings, SimSettings};
 use models::formats::flight_plan;
@@ -17,6 +16,7 @@ use models::formats::flight_plan;
 mod card;
 
 use super::CliError;
+use crate::coverage::route;
 use crate::interrupt::Interrupt;
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
@@ -105,6 +105,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let address = args.link.parse()?;
     let number = mission.aircraft.iter().position(|a| a.id == aircraft.id).unwrap_or(0) as u64;
     let c = &mission.camera;
+    let plan = args.plan.as_deref().map(flight_plan::read).transpose()?;
     let settings = SimSettings {
         world_seed: mission.seed,
         seed: mission.seed.wrapping_mul(1000).wrapping_add(number),
@@ -119,7 +120,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             cy: c.cy.into(),
         },
         region: mission.region(aircraft),
-        route: args.plan.as_deref().map(|path| route(path, mission.origin, args.pitch)).transpose()?,
+        route: plan.map(|plan| route(&plan, mission.origin, args.pitch)),
         survey: SurveySettings {
             height_m: args.height,
             forward_overlap: args.forward_overlap,
@@ -157,22 +158,6 @@ pub fn run(args: Args) -> Result<(), CliError> {
         report.flight_s
     );
     if report.completed { Ok(()) } else { Err(CliError::interrupted("the flight was ended early")) }
-}
-
-/// The waypoints of a plan around `origin`; where it says nothing of the camera's pitch it is `pitch_deg`.
-fn route(path: &Path, origin: Geodetic, pitch_deg: f64) -> Result<Route, CliError> {
-    let plan = flight_plan::read(path)?;
-    let frame = EnuFrame::new(origin);
-    let waypoint = |w: &flight_plan::Waypoint| Waypoint {
-        position: frame.to_enu(w.position),
-        yaw_deg: w.yaw_deg,
-        picture: w.picture,
-    };
-    Ok(Route {
-        waypoints: plan.waypoints.iter().map(waypoint).collect(),
-        speed_ms: plan.speed_m_s,
-        gimbal_pitch_deg: plan.pitch_deg.unwrap_or(pitch_deg),
-    })
 }
 
 /// A flag that Ctrl-C sets.

@@ -74,6 +74,7 @@ fn script(row: &Row) -> Script {
     };
     let end = EndOfFlight { silence: Duration::from_secs(20), patience: Some(Duration::from_secs(120)) };
     let mut script = Script {
+        ground: sim.region.clone(),
         sim,
         vehicle,
         end,
