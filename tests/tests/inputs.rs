@@ -26,7 +26,6 @@ fn missing_and_wrong_files_are_named_in_one_line_with_exit_code_2() {
     refused(at, &["sim", "--mission", "mission.toml", "--link", "pty", "--height=-3"], 2, &["height"]);
     std::fs::write(at.join("bad.plan"), "{ \"fileType\": \"Plan\" }").expect("write");
     refused(at, &["sim", "--mission", "mission.toml", "--link", "pty", "--plan", "bad.plan"], 2, &["bad.plan"]);
-    refused(at, &["sim", "--mission", "mission.toml", "--plan", "bad.plan", "--height", "9"], 2, &["--height"]);
 }
 
 #[test]
