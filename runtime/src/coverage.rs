@@ -15,7 +15,8 @@ use crate::run_json::RunReport;
 
 #[cfg(feature = "lab")]
 mod route;
-#[cfg(all(test, feature = "lab"))]
+#[cfg(test)]
+#[cfg(feature = "lab")]
 mod tests;
 
 #[cfg(feature = "lab")]
