@@ -5,6 +5,8 @@
 #![cfg_attr(not(feature = "std"), no_std)]
 
 #[cfg(feature = "std")]
+pub mod coverage;
+#[cfg(feature = "std")]
 pub mod disk;
 pub mod error;
 #[cfg(feature = "std")]

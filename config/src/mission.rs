@@ -8,6 +8,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use crate::coverage::CoverageSettings;
 use crate::failsafe::FailsafeSettings;
 use crate::faults::FaultSettings;
 use crate::geodesy::{EnuFrame, Geodetic};
@@ -25,6 +26,7 @@ use crate::upload::UploadSettings;
 mod camera;
 mod draft;
 mod error;
+mod keyframes;
 mod memory;
 mod origin;
 mod reference;
@@ -33,6 +35,7 @@ mod validate;
 pub use camera::{CameraSettings, CameraSource, MountAttitude, MountSettings};
 pub use draft::Draft;
 pub use error::MissionError;
+pub use keyframes::KeyframeSettings;
 pub use memory::MemorySettings;
 pub use reference::reference;
 
@@ -60,6 +63,9 @@ record! {
         /// When a picture becomes a key frame: it moved more than `t_min_m` or turned more than `r_max_deg`.
         #[serde(default)]
         pub keyframes: KeyframeSettings = KeyframeSettings::default();
+        /// When a piece of ground counts as covered; what is missing is told after the landing, as a file and as a flight that gets it.
+        #[serde(default)]
+        pub coverage: CoverageSettings = CoverageSettings::default();
         /// The budgets everything is planned from.
         #[serde(default)]
         pub memory: MemorySettings = MemorySettings::default();
@@ -93,21 +99,6 @@ record! {
         /// Who flies, and where.
         pub aircraft: Vec<Aircraft>;
     } where Self::fits_together
-}
-
-table! {
-    /// The key-frame rule of the paper (after NeuralRecon): moved more than `t_min_m` **or** turned more than `r_max_deg`.
-    #[derive(Copy)]
-    pub struct KeyframeSettings {
-        /// Least translation from the last key frame.
-        pub t_min_m: f32 = 5.0, in Limits::at_least(0.0);
-        /// Or least rotation from it.
-        pub r_max_deg: f32 = 15.0, in Limits::above(0.0).up_to(180.0), from "NeuralRecon";
-        /// Most key frames of one aircraft: the size of the rings, and what the memory is planned for.
-        pub max: u32 = 256, in Limits::within(2.0, 4096.0);
-        /// Leave out pictures from where an earlier key frame already stood.
-        pub skip_covered: bool = true;
-    }
 }
 
 table! {

@@ -59,7 +59,7 @@ pub enum Handled {
 }
 
 /// What the autopilot says about itself.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct AutopilotState {
     /// Companion time of the last heartbeat, ns.
     pub heartbeat_ns: Option<u64>,
@@ -71,6 +71,8 @@ pub struct AutopilotState {
     pub gps_fix: Option<u8>,
     /// Remaining battery, percent.
     pub battery_percent: Option<u8>,
+    /// Height of home, where it takes off and lands, metres on the scale of its positions.
+    pub home_alt_m: Option<f64>,
 }
 
 /// The autopilot's side of the HAL.

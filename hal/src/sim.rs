@@ -28,12 +28,15 @@ pub(crate) use messages::heartbeat;
 pub use session::{SessionReport, SessionSettings};
 
 use crate::link::LinkAddress;
-use aircraft::{Flight, Imperfections};
+use aircraft::{Flight, Imperfections, Leg, Manner};
 use autopilot::{Autopilot, AutopilotSettings};
 use photographer::{Photographer, to_jpeg, write_whole};
 use reference::{Lens, flown_views};
-use survey::SurveySettings;
+use survey::{Route, SurveySettings, lines};
 use world::{World, WorldSettings};
+
+/// No waypoint lies further from the mission's origin, metres.
+const FARTHEST: f64 = 10_000.0;
 
 /// One simulated aircraft over one world.
 #[derive(Clone, Debug)]
@@ -52,6 +55,8 @@ pub struct SimSettings {
     pub region: Vec<[f64; 2]>,
     /// How it is flown.
     pub survey: SurveySettings,
+    /// Flown instead of a survey of the region.
+    pub route: Option<Route>,
     /// What is not as it should be.
     pub imperfections: Imperfections,
     /// Ids, clocks, signing and faults; its seed and clock drift are taken from here.
@@ -88,11 +93,27 @@ impl SimSettings {
         if !(0.0..1.0).contains(&survey.forward_overlap) || !(0.0..1.0).contains(&survey.side_overlap) {
             return wrong("survey", "overlaps must be at least 0 and below 1".into());
         }
+        let named = |legs: &[Leg], manner| {
+            aircraft::fly(self.origin, legs, manner, &self.imperfections, &self.prefix, self.seed)
+        };
+        if let Some(route) = &self.route {
+            let manner = Manner { speed_ms: route.speed_ms, gimbal_pitch_deg: route.gimbal_pitch_deg };
+            let near = |w: &survey::Waypoint| w.position.is_finite() && w.position.length() < FARTHEST;
+            let flyable = route.speed_ms > 0.1 && route.speed_ms < 100.0 && route.waypoints.iter().all(near);
+            let flight = flyable.then(|| named(&Leg::of_route(route), manner)).flatten();
+            return flight.ok_or_else(|| SimError::Settings {
+                what: "route",
+                why: "needs waypoints within 10 km of the mission's origin and a speed of 0.1..100 m/s".into(),
+            });
+        }
         let region: Vec<DVec2> = self.region.iter().map(|c| DVec2::from(*c)).collect();
         let footprint = DVec2::new(f64::from(lens.width) / lens.fx, f64::from(lens.height) / lens.fy) * survey.height_m;
-        aircraft::fly(self.origin, &region, footprint, survey, &self.imperfections, &self.prefix, self.seed).ok_or_else(
-            || SimError::Settings { what: "region", why: "needs at least three corners around an area".into() },
-        )
+        let legs = Leg::of_lines(&lines(&region, footprint, survey), survey.height_m);
+        let manner = Manner { speed_ms: survey.speed_ms, gimbal_pitch_deg: survey.gimbal_pitch_deg };
+        named(&legs, manner).ok_or_else(|| SimError::Settings {
+            what: "region",
+            why: "needs at least three corners around an area".into(),
+        })
     }
 }
 

@@ -214,6 +214,11 @@ where
         self.autopilot.state(self.now_ns())
     }
 
+    /// Height of the place where the aircraft takes off, metres above the mission's origin, as the autopilot says.
+    pub fn home_m(&self) -> Option<f64> {
+        self.autopilot().home_alt_m.map(|alt_m| alt_m - self.settings.origin.alt_m)
+    }
+
     /// Undistorted pixels of a frame. One that shows nothing is counted and the ground control station told: once when they
     /// begin, and how many there were when they are over.
     ///

@@ -10,6 +10,7 @@ use config::error::{Error, ErrorKind};
 
 pub mod colmap;
 pub mod delivery;
+pub mod flight_plan;
 pub mod model;
 pub mod opensfm;
 pub mod ply;

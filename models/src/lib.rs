@@ -9,6 +9,7 @@ pub mod baselines;
 pub mod camera;
 pub mod card;
 pub mod cloud;
+pub mod coverage;
 pub mod dataset;
 pub mod formats;
 pub mod init;

@@ -2,10 +2,13 @@
 //!
 //! The paper's rule (after NeuralRecon): a picture becomes a key frame when the camera moved more than `t_min` or
 //! turned more than `r_max` since the last key frame. On top of it, a picture from where an earlier key frame already
-//! stood sees nothing new and is skipped, so that a second pass over a covered line costs nothing.
+//! stood sees nothing new and is skipped, so that a second pass over a covered line costs nothing; unless the map of the
+//! flight's ground, where there is one, says that the ground in sight still lacks pictures. The same map is reported after
+//! the flight.
 
 use config::mission::KeyframeSettings;
-use models::camera::Pose;
+use models::camera::{Intrinsics, Pose, View};
+use models::coverage::CoverageMap;
 use serde::Serialize;
 
 /// What became of a picture.
@@ -15,7 +18,7 @@ pub enum Decision {
     Key,
     /// It moved and turned too little since the last key frame.
     TooClose,
-    /// An earlier key frame was taken from there.
+    /// An earlier key frame was taken from there, and the ground in sight is covered.
     Covered,
     /// Its pose is not finite.
     BadPose,
@@ -47,13 +50,55 @@ pub struct KeyframeCounters {
 pub struct KeyframeSelector {
     settings: KeyframeSettings,
     chosen: Vec<Pose>,
+    ground: Option<Ground>,
     counters: KeyframeCounters,
+}
+
+/// The ground as the key frames see it.
+#[derive(Debug)]
+struct Ground {
+    map: CoverageMap,
+    lens: Intrinsics,
+    /// Key frames that the map knows. The newest is noted late: its picture may turn out to show nothing.
+    noted: usize,
+}
+
+impl Ground {
+    fn note(&mut self, chosen: &[Pose]) {
+        for pose in &chosen[self.noted.min(chosen.len())..] {
+            self.map.add(&View { intrinsics: self.lens, pose: *pose });
+        }
+        self.noted = chosen.len();
+    }
+
+    fn wants(&self, pose: &Pose) -> bool {
+        self.map.wants(&View { intrinsics: self.lens, pose: *pose })
+    }
 }
 
 impl KeyframeSelector {
     /// A selector that has chosen nothing yet.
     pub fn new(settings: KeyframeSettings) -> Self {
-        Self { settings, chosen: Vec::with_capacity(settings.max as usize), counters: KeyframeCounters::default() }
+        let chosen = Vec::with_capacity(settings.max as usize);
+        Self { settings, chosen, ground: None, counters: KeyframeCounters::default() }
+    }
+
+    /// Keeps a map of the ground that pictures of `lens` see, and asks it.
+    pub fn over(&mut self, map: CoverageMap, lens: Intrinsics) {
+        self.ground = Some(Ground { map, lens, noted: 0 });
+    }
+
+    /// Whether there is a map.
+    pub fn has_ground(&self) -> bool {
+        self.ground.is_some()
+    }
+
+    /// The map with all key frames noted, and their views; `None` without one.
+    pub fn ground(&mut self) -> Option<(&CoverageMap, Vec<View>)> {
+        let ground = self.ground.as_mut()?;
+        ground.note(&self.chosen);
+        let views = self.chosen.iter().map(|&pose| View { intrinsics: ground.lens, pose }).collect();
+        Some((&ground.map, views))
     }
 
     /// Takes a key frame of an earlier run as chosen.
@@ -65,6 +110,9 @@ impl KeyframeSelector {
 
     /// Decides on the next picture, in the order of capture.
     pub fn consider(&mut self, pose: &Pose) -> Decision {
+        if let Some(ground) = &mut self.ground {
+            ground.note(&self.chosen);
+        }
         let decision = self.decide(pose);
         let counter = match decision {
             Decision::Key => &mut self.counters.key,
@@ -107,7 +155,10 @@ impl KeyframeSelector {
         };
         if near(last, t_min) {
             Decision::TooClose
-        } else if self.settings.skip_covered && self.chosen.iter().any(|k| near(k, 0.5 * t_min)) {
+        } else if self.settings.skip_covered
+            && self.chosen.iter().any(|k| near(k, 0.5 * t_min))
+            && !self.ground.as_ref().is_some_and(|g| g.wants(pose))
+        {
             Decision::Covered
         } else if self.chosen.len() >= self.settings.max as usize {
             Decision::Full
@@ -172,6 +223,46 @@ mod tests {
         for x in [0.0, 6.0, 0.0] {
             assert_eq!(s.consider(&at(x, 0.0)), Decision::Key);
         }
+    }
+
+    /// Straight down from 40 m on a lens of 90°: 80 m of ground across.
+    fn over_ground(max: u32) -> KeyframeSelector {
+        let corners = [[-5.0, -5.0], [17.0, -5.0], [17.0, 5.0], [-5.0, 5.0]].map(glam::DVec2::from).to_vec();
+        let region = models::coverage::Region::new(corners).expect("an area");
+        let map = CoverageMap::new(&region, 0.0, config::coverage::CoverageSettings::default()).expect("a map");
+        let mut s = selector(max);
+        s.over(map, Intrinsics { width: 80, height: 80, fx: 40.0, fy: 40.0, cx: 40.0, cy: 40.0 });
+        s
+    }
+
+    fn down(x: f64) -> Pose {
+        Pose { rotation: DQuat::from_rotation_x(std::f64::consts::PI), center: DVec3::new(x, 0.0, 40.0) }
+    }
+
+    #[test]
+    fn a_picture_from_an_earlier_place_is_taken_as_long_as_the_ground_there_lacks_pictures() {
+        let mut s = over_ground(10);
+        use Decision::{Covered, Key};
+        // Three pictures are wanted: the third may come from near the first. The fourth brings neither number nor angle.
+        let fates = [0.0, 6.0, 0.5, 6.4].map(|x| s.consider(&down(x)));
+        assert_eq!(fates, [Key, Key, Key, Covered]);
+        let (map, views) = s.ground().expect("a map");
+        assert_eq!((map.covered_share(), map.pictures().0, views.len()), (0.0, 3, 3), "8.5° between them, 10° wanted");
+        let mut s = over_ground(10);
+        let fates = [0.0, 6.0, 12.0, 1.0].map(|x| s.consider(&down(x)));
+        assert_eq!(fates, [Key, Key, Key, Covered]);
+        assert_eq!(s.ground().expect("a map").0.covered_share(), 1.0);
+    }
+
+    #[test]
+    fn a_picture_that_shows_nothing_never_reaches_the_map() {
+        let mut s = over_ground(10);
+        assert_eq!(s.consider(&down(0.0)), Decision::Key);
+        s.retract();
+        assert_eq!(s.consider(&down(0.5)), Decision::Key);
+        assert_eq!(s.ground().expect("a map").0.pictures(), (1, 0));
+        s.restore(down(9.0));
+        assert_eq!(s.ground().expect("a map").0.pictures(), (2, 0));
     }
 
     #[test]

@@ -238,6 +238,11 @@ impl Reconstruction {
         &self.header
     }
 
+    /// The model's Gaussians, as of the last checkpoint.
+    pub fn cloud(&self) -> &GaussianCloud {
+        &self.cloud
+    }
+
     /// Seconds of training over all continuations.
     pub fn train_seconds(&self) -> f64 {
         self.train_s

@@ -27,6 +27,9 @@ mod shortage;
 
 #[cfg(test)]
 #[cfg(feature = "lab")]
+mod again;
+#[cfg(test)]
+#[cfg(feature = "lab")]
 mod fault_table;
 #[cfg(test)]
 #[cfg(feature = "lab")]
@@ -121,6 +124,8 @@ pub fn fly(
         },
         intrinsics,
         keyframes: mission.keyframes,
+        coverage: mission.coverage,
+        region: mission.region(aircraft),
         earlier: store.poses(),
         earlier_names: store.names().collect(),
         end: options.end,
@@ -139,6 +144,12 @@ pub fn fly(
     while job.turn(flight.handover(), interrupt)? {}
     let (mut capture, ended, counters) = flight.finish()?;
     tracing::info!("capture is over ({ended:?}): {} key frames", job.keyframes());
+    if let Some(coverage) = &counters.coverage {
+        match coverage.write(&disk, &options.out) {
+            Ok(files) => files.iter().for_each(|file| tracing::info!("wrote {}", file.display())),
+            Err(e) => tracing::warn!("{e}; what the flight did not cover is not written"),
+        }
+    }
     let mut end = job.land(&mut capture, &counters, interrupt)?;
     end.reconstruction.report.skip("key_frames_without_room_on_disk", capture.without_room());
     Ok(outcome(ended, counters, end, interrupt))

@@ -6,6 +6,7 @@ pub mod bench;
 pub mod capture;
 pub mod cli;
 pub mod console;
+pub mod coverage;
 #[cfg(feature = "lab")]
 pub mod demo;
 pub mod engine;

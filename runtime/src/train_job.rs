@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use config::coverage::CoverageSettings;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
@@ -33,6 +34,7 @@ use crate::transfer::PoseTransfer;
 use slices::{REST, Slices};
 
 mod card;
+mod ground;
 pub mod log;
 mod slices;
 
@@ -83,6 +85,8 @@ pub struct TrainJob {
     pub evaluate: bool,
     /// `[training]`.
     pub training: TrainSettings,
+    /// `[coverage]`.
+    pub coverage: CoverageSettings,
     /// `[init]`.
     pub init_settings: InitSettings,
     /// `[refine]`.
@@ -199,7 +203,13 @@ impl TrainJob {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
         let steps = engine.header().steps;
+        let covered = ground::coverage(engine.header(), engine.cloud(), self.coverage).filter(|_| finished);
         let mut report = engine.report;
+        if let Some(covered) = covered {
+            covered.write(&Disk::default(), &self.out)?;
+            covered.note(&mut report);
+            tracing::info!("covered {} %, {} holes", covered.percent(), covered.gaps.len());
+        }
         report.more.insert("steps_total".to_owned(), steps.into());
         report.outcome = if finished { "done" } else { "interrupted" }.to_owned();
         report.wall_s = began.elapsed().as_secs_f64();

@@ -10,6 +10,7 @@ use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use models::camera::Pose;
 use models::cloud::GaussianCloud;
+use models::formats::flight_plan::{FlightPlan, Waypoint};
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms::pose_to_opengl;
 
@@ -107,6 +108,34 @@ fn the_reference_of_settings_needs_no_other_argument() {
     let text = String::from_utf8_lossy(&reference.stdout).into_owned();
     assert!(reference.status.success() && text.contains("heartbeat_timeout_s = 5.0"), "{text}");
     assert_eq!(dgtr(&["init"]).status.code(), Some(2), "an origin and a camera cannot be guessed");
+}
+
+/// The pictures land on a card, so that nothing needs to listen.
+#[test]
+fn a_plan_is_flown_by_the_simulator_with_a_picture_at_each_waypoint() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let origin = config::geodesy::Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
+    let mission = "name = \"m\"\norigin = { lat_deg = 46.0, lon_deg = 7.0, alt_m = 500.0 }\n\
+                   camera = { width = 32, height = 24, fx = 30.0, fy = 30.0, cx = 16.0, cy = 12.0 }\n\
+                   [[aircraft]]\nid = \"one\"\nlink = \"tcpin:1\"\ncamera = { folder = \"c\" }\n\
+                   region_enu = [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]\n";
+    std::fs::write(path("m.toml"), mission).unwrap();
+    let frame = config::geodesy::EnuFrame::new(origin);
+    let places = [DVec3::new(0.0, 0.0, 35.0), DVec3::new(30.0, 0.0, 35.0), DVec3::new(30.0, 25.0, 45.0)];
+    let waypoint = |p: &DVec3| Waypoint { position: frame.to_geodetic(*p), yaw_deg: None, picture: true };
+    let waypoints = places.iter().map(waypoint).collect();
+    let plan = FlightPlan { home: origin, speed_m_s: 5.0, pitch_deg: Some(-90.0), waypoints };
+    plan.write(&mut std::fs::File::create(path("again.plan")).unwrap()).unwrap();
+    let card = path("card");
+    let flown =
+        dgtr(&["sim", "--mission", &path("m.toml"), "--plan", &path("again.plan"), "--card", &card, "--perfect"]);
+    assert!(flown.status.success(), "{}", String::from_utf8_lossy(&flown.stderr));
+    let taken = models::formats::transforms::read(&dir.path().join("card/truth.json")).unwrap();
+    assert_eq!(taken.shots.len(), places.len());
+    for (shot, place) in taken.shots.iter().zip(places) {
+        assert!((shot.pose.center - place).length() < 0.5 && shot.pose.forward().z < -0.999, "{shot:?}");
+    }
 }
 
 #[test]
@@ -209,6 +238,7 @@ fn training_improves_on_naive_guesses_and_its_report_says_what_it_took() {
     assert_eq!((report.outcome.as_str(), report.steps, report.views), ("done", 150, 10));
     assert!(report.device_bytes_peak > 0 && report.device_bytes_peak <= report.device_bytes_planned);
     assert!(report.stage_ms.contains_key("train") && report.host_rss_peak > 0);
+    assert!(report.more["coverage"]["percent"].is_u64() && dir.path().join("out/coverage.geojson").is_file());
     let save = path("eval");
     let output = dgtr(&["eval", &path("out/model.dgtr"), &path("set"), "--json", "--baselines", "--save", &save]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -46,7 +46,13 @@ fn fly(at: &Path, during: impl FnOnce(&Path)) -> (String, Value) {
     let said = std::fs::read_to_string(&log).unwrap_or_default();
     assert_eq!(code, Some(0), "{said}");
     let run = std::fs::read(at.join("out/run.json")).expect("run.json");
-    (said, serde_json::from_slice(&run).expect("JSON"))
+    let run: Value = serde_json::from_slice(&run).expect("JSON");
+    let covered = std::fs::read(at.join("out/coverage.geojson")).expect("what the flight covered");
+    let covered: Value = serde_json::from_slice(&covered).expect("JSON");
+    assert!(run["coverage"]["percent"].is_u64() && covered["covered_share"].is_number(), "{run}");
+    let again = run["coverage"]["more_pictures"].as_u64().expect("a number") > 0;
+    assert_eq!(at.join("out/reflight.plan").is_file(), again, "a flight is written when one is needed");
+    (said, run)
 }
 
 /// A serial cable between the simulator's socket and a port called `alias`: pulled while `pulled` is set.

@@ -24,6 +24,8 @@ fn missing_and_wrong_files_are_named_in_one_line_with_exit_code_2() {
     refused(at, &["serve", "--mission", "nowhere.toml", "--out", "o"], 2, &["nowhere.toml"]);
     refused(at, &["replay", "empty", "--link", "pty"], 2, &["empty"]);
     refused(at, &["sim", "--mission", "mission.toml", "--link", "pty", "--height=-3"], 2, &["height"]);
+    std::fs::write(at.join("bad.plan"), "{ \"fileType\": \"Plan\" }").expect("write");
+    refused(at, &["sim", "--mission", "mission.toml", "--link", "pty", "--plan", "bad.plan"], 2, &["bad.plan"]);
 }
 
 #[test]

@@ -87,6 +87,7 @@ mod tests {
     use serde::de::{Deserialize, Deserializer, Visitor, value::Error};
 
     use super::*;
+    use crate::coverage::CoverageSettings;
     use crate::failsafe::FailsafeSettings;
     use crate::link::Signing;
     use crate::map::MapSettings;
@@ -151,7 +152,7 @@ mod tests {
         same!(MemorySettings, Preset, NetworkSettings, UploadSettings, TlsSettings, GroundSettings, InitSettings);
         same!(RefineSettings, TrainSettings, LossSettings, RateSettings, AdamSettings, DensitySettings, Strategy);
         same!(ShSettings, ResolutionSettings, ViewSettings, StopSettings, RegulariseSettings, SkipSettings);
-        same!(FaultSettings, FailsafeSettings, Aircraft);
+        same!(FaultSettings, FailsafeSettings, CoverageSettings, Aircraft);
     }
 
     /// All tables of the reference, as the structs that would be read from it.
@@ -174,6 +175,7 @@ mod tests {
         default!(network: NetworkSettings, upload: UploadSettings, ground: GroundSettings, init: InitSettings);
         default!(map: MapSettings);
         default!(refine: RefineSettings, training: TrainSettings, faults: FaultSettings, failsafe: FailsafeSettings);
+        default!(coverage: CoverageSettings);
         assert!(file.is_empty(), "compared with nothing: {file:?}");
         let given: toml::Table = "id = \"a\"\nlink = \"tcpin:1\"\ncamera = { folder = \"a\" }".parse().expect("TOML");
         let mut full = aircraft[0].as_table().expect("a table").clone();

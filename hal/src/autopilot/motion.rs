@@ -79,6 +79,7 @@ impl Autopilot {
         let cm_s = |v: i16| f64::from(v) * 0.01;
         let velocity = ned_to_enu(DVec3::new(cm_s(m.vx), cm_s(m.vy), cm_s(m.vz)));
         self.landing.on_motion(f64::from(m.relative_alt) * 1e-3, velocity.length(), now_ns);
+        self.state.home_alt_m = Some(position.alt_m - f64::from(m.relative_alt) * 1e-3);
         self.motion.global_heard_ns = Some(boot_ns);
         let sigma_m = self.motion.gps_sigma_m.unwrap_or(DVec3::splat(UNKNOWN_SIGMA_M));
         self.add_position(PositionSample { boot_ns, position, velocity, sigma_m })

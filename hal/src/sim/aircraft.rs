@@ -6,7 +6,7 @@ use glam::{DQuat, DVec2, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::survey::{SurveySettings, lines};
+use super::survey::{Line, Route};
 use super::track::{Sample, Track};
 use crate::frames::{euler_to_ned, ned_to_enu};
 
@@ -18,6 +18,12 @@ const HOVER: f64 = 3.0;
 const ACCELERATION: f64 = 2.5;
 /// Longest flight simulated, seconds.
 const LONGEST: f64 = 3600.0;
+/// A waypoint is reached this near to it, metres; ArduCopter slows down within its WPNAV_RADIUS of 2 m.
+const NEAR: f64 = 0.3;
+/// A route begins this far before its first waypoint, metres, so that a picture may be taken there.
+const RUN_UP: f64 = 5.0;
+/// A heading is taken when it is off by no more than this, radians.
+const TURNED: f64 = 0.03;
 /// Acceleration by gravity, m/s².
 const GRAVITY: f64 = 9.81;
 
@@ -139,20 +145,81 @@ fn normal3(random: &mut Pcg64Mcg) -> DVec3 {
     DVec3::new(normal(random), normal(random), normal(random))
 }
 
-/// Flies a survey of `region` (corners in metres east and north of `origin`); `None` when it has no area.
+/// One straight stretch, with the places along it where pictures are taken, metres from its start.
+#[derive(Clone, Debug)]
+pub struct Leg {
+    from: DVec3,
+    to: DVec3,
+    shots: Vec<f64>,
+    /// Heading that a picture waits for, radians clockwise from north; else the nose follows the leg.
+    yaw: Option<f64>,
+}
+
+impl Leg {
+    /// The legs of a survey alternate: a line with pictures, then the way to the next one.
+    pub fn of_lines(lines: &[Line], height_m: f64) -> Vec<Self> {
+        let leg = |from: DVec2, to: DVec2, shots: &[f64]| Self {
+            from: from.extend(height_m),
+            to: to.extend(height_m),
+            shots: shots.to_vec(),
+            yaw: None,
+        };
+        let mut legs = Vec::with_capacity(2 * lines.len());
+        for (k, line) in lines.iter().enumerate() {
+            if k > 0 {
+                legs.push(leg(lines[k - 1].to, line.from, &[]));
+            }
+            legs.push(leg(line.from, line.to, &line.exposures));
+        }
+        legs
+    }
+
+    /// The legs of a route; pictures are taken at their ends.
+    pub fn of_route(route: &Route) -> Vec<Self> {
+        let mut legs = Vec::with_capacity(route.waypoints.len());
+        let mut from = route.waypoints.first().map_or(DVec3::ZERO, |w| w.position - DVec3::Y * RUN_UP);
+        for waypoint in &route.waypoints {
+            let to = waypoint.position;
+            let shot = (to - from).length() - NEAR;
+            let shots = if waypoint.picture { vec![shot] } else { Vec::new() };
+            legs.push(Self { from, to, shots, yaw: waypoint.yaw_deg.map(f64::to_radians) });
+            from = to;
+        }
+        legs
+    }
+
+    fn direction(&self) -> Option<DVec3> {
+        let way = self.to - self.from;
+        (way.length() > 1e-6).then(|| way.normalize())
+    }
+
+    /// Where the nose points along it, radians clockwise from north; `None` when it goes straight up or nowhere.
+    fn heading(&self) -> Option<f64> {
+        self.direction().map(|d| d.truncate()).filter(|d| d.length() > 1e-6).map(|d| d.x.atan2(d.y))
+    }
+}
+
+/// How legs are flown.
+#[derive(Clone, Copy, Debug)]
+pub struct Manner {
+    /// Speed along them, m/s.
+    pub speed_ms: f64,
+    /// Pitch of the camera, degrees.
+    pub gimbal_pitch_deg: f64,
+}
+
+/// Flies `legs`, metres around `origin`; `None` when there are none.
 ///
-/// `footprint`: see [`lines`]. Pictures are called `{prefix}0001.jpg` and so on.
+/// Pictures are called `{prefix}0001.jpg` and so on.
 pub fn fly(
     origin: Geodetic,
-    region: &[DVec2],
-    footprint: DVec2,
-    survey: &SurveySettings,
+    legs: &[Leg],
+    manner: Manner,
     wrong: &Imperfections,
     prefix: &str,
     seed: u64,
 ) -> Option<Flight> {
-    let lines = lines(region, footprint, survey);
-    let first = lines.first()?;
+    let (first, last) = (legs.first()?, legs.last()?);
     let random = &mut Pcg64Mcg::seed_from_u64(seed);
     let mut gust = Wander::new(wrong.gust_ms, 2.0, random);
     let mut bias = Wander::new(wrong.gps_bias_m, 150.0, random);
@@ -161,40 +228,30 @@ pub fn fly(
     let mut stray = Wander::new(wrong.gimbal_stray_deg.to_radians(), 0.8, random);
     let yaw_bias = wrong.yaw_bias_deg.to_radians() * normal(random);
     let mean_wind = DVec3::new(wrong.wind_ms[0], wrong.wind_ms[1], 0.0);
-    let height = survey.height_m;
-    let pitch = survey.gimbal_pitch_deg.to_radians();
-
-    // The legs alternate: a line with pictures, then the way to the next one.
-    let mut legs: Vec<(DVec2, DVec2, &[f64])> = Vec::new();
-    for (k, line) in lines.iter().enumerate() {
-        if k > 0 {
-            legs.push((lines[k - 1].to, line.from, &[]));
-        }
-        legs.push((line.from, line.to, &line.exposures));
-    }
-    let toward = |a: DVec2, b: DVec2| if (b - a).length() > 1e-6 { Some((b - a).normalize()) } else { None };
-    let mut yaw = toward(first.from, first.to).map_or(0.0, |d| d.x.atan2(d.y));
+    let pitch = manner.gimbal_pitch_deg.to_radians();
+    let mut yaw = first.yaw.or(first.heading()).unwrap_or(0.0);
 
     let (mut truth, mut reported, mut exposures) = (Vec::new(), Vec::new(), Vec::new());
-    let mut position = first.from.extend(height);
+    let mut position = first.from;
     let mut velocity = DVec3::ZERO;
     let (mut leg, mut progress, mut pace, mut shot) = (0, 0.0, 0.0, 0);
     let mut after = 0.0;
     for k in 0.. {
         let time_s = k as f64 * STEP;
         // The point the autopilot follows, slowing down before each corner.
-        let (from, to, shots) = legs.get(leg).copied().unwrap_or((legs[legs.len() - 1].0, legs[legs.len() - 1].1, &[]));
-        let length = (to - from).length();
-        let direction = toward(from, to).unwrap_or(DVec2::Y);
+        let current = legs.get(leg).unwrap_or(last);
+        let shots = legs.get(leg).map_or(&[][..], |leg| &leg.shots);
+        let (from, length) = (current.from, (current.to - current.from).length());
+        let direction = current.direction().unwrap_or(DVec3::Y);
         if leg < legs.len() && time_s > HOVER {
             let limit = (2.0 * ACCELERATION * (length - progress).max(0.0)).sqrt() + 0.3;
-            pace = (pace + ACCELERATION * STEP).min(survey.speed_ms).min(limit);
+            pace = (pace + ACCELERATION * STEP).min(manner.speed_ms).min(limit);
             progress += pace * STEP;
         } else {
             pace = 0.0;
         }
-        let aim = (from + direction * progress.min(length)).extend(height);
-        let aim_velocity = (direction * pace).extend(0.0);
+        let aim = from + direction * progress.min(length);
+        let aim_velocity = direction * pace;
         // Position controller (critically damped at 1.6 rad/s) against drag from wind and gusts.
         let wind = mean_wind + gust.step(random);
         let drag = 0.12 * (wind - velocity);
@@ -204,7 +261,7 @@ pub fn fly(
         velocity += acceleration * STEP;
         position += velocity * STEP;
         // A multirotor leans the way its thrust must point; yaw follows the leg at 60°/s at most.
-        let heading = direction.x.atan2(direction.y);
+        let heading = current.yaw.or(current.heading()).unwrap_or(yaw);
         let turn = (heading - yaw + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
         yaw += turn.clamp(-1.05 * STEP, 1.05 * STEP);
         let attitude = lean(control + DVec3::Z * GRAVITY, yaw);
@@ -224,8 +281,9 @@ pub fn fly(
             gimbal: (error * gimbal).normalize(),
         });
 
-        // Triggered by distance along the line, as CAM_TRIGG_DIST does.
-        while shot < shots.len() && (position.truncate() - from).dot(direction) >= shots[shot] {
+        // Triggered by distance along the line, as CAM_TRIGG_DIST does; with a heading asked for, when it is there.
+        let turned = current.yaw.is_none() || turn.abs() < TURNED;
+        while turned && shot < shots.len() && (position - from).dot(direction) >= shots[shot] {
             let middle_s =
                 time_s + (wrong.shutter_delay_ms + wrong.shutter_jitter_ms * normal(random)).max(0.0) / 1000.0;
             let name = format!("{prefix}{:04}.jpg", exposures.len() + 1);

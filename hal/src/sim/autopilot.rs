@@ -4,6 +4,7 @@
 //! Every message is composed for the instant it is due, not for the instant the program got round to it, so that two
 //! runs of a seed say the same.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use config::faults::FaultSettings;
@@ -31,6 +32,8 @@ mod requests;
 
 pub use announce::Announcing;
 
+/// Lines for the ground control station kept; the oldest are dropped.
+pub(super) const TEXTS: usize = 32;
 /// No message's id: somebody else's heartbeat, when that fault acts.
 const FORGED_HEARTBEAT: u32 = u32::MAX;
 const STREAM_COUNT: usize = 10;
@@ -120,6 +123,7 @@ pub struct Autopilot<L: Link<Error = HalError> = Reconnecting> {
     gps_lost_since_s: Option<f64>,
     wrong_key: bool,
     heard: u64,
+    texts: VecDeque<String>,
     list_from: Option<usize>,
 }
 
@@ -153,6 +157,7 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
             gps_lost_since_s: None,
             wrong_key: false,
             heard: 0,
+            texts: VecDeque::with_capacity(TEXTS),
             list_from: None,
         }
     }
@@ -165,6 +170,11 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
     /// Frames of others understood so far; more than 0 means that somebody listens.
     pub fn heard(&self) -> u64 {
         self.heard
+    }
+
+    /// The newest lines meant for the ground control station, in order.
+    pub fn texts(&self) -> Vec<String> {
+        self.texts.iter().cloned().collect()
     }
 
     /// What happened on the line.

@@ -51,7 +51,7 @@ impl SessionSettings {
 }
 
 /// What happened in a flight.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct SessionReport {
     /// True when every exposure was announced and every picture delivered.
     pub completed: bool,
@@ -71,6 +71,8 @@ pub struct SessionReport {
     pub pictures: PictureCounters,
     /// Seconds of flight flown.
     pub flight_s: f64,
+    /// The newest lines that the companion said to the ground control station.
+    pub texts: Vec<String>,
 }
 
 /// Opens the simulator's end of a link and reports where the other end is (the path of a pseudo-terminal).
@@ -173,6 +175,7 @@ impl<L: Link<Error = HalError>> Session<L> {
             line: self.autopilot.line().done(),
             pictures,
             flight_s: self.flight_s.min(self.autopilot.flight().reported.end_s()),
+            texts: self.autopilot.texts(),
         })
     }
 }

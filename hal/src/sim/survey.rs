@@ -1,6 +1,6 @@
 //! A survey pattern: parallel lines over a region, spaced by the wanted overlap of the pictures' footprints.
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 
 /// How a region is flown.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,6 +47,28 @@ pub struct Line {
     pub to: DVec2,
     /// Where pictures are taken, metres from the start, ascending.
     pub exposures: Vec<f64>,
+}
+
+/// A flight from waypoint to waypoint instead of a survey.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Route {
+    /// In flying order; the first is where the flight begins.
+    pub waypoints: Vec<Waypoint>,
+    /// Speed between them, m/s.
+    pub speed_ms: f64,
+    /// Pitch of the camera, degrees; −90 looks straight down.
+    pub gimbal_pitch_deg: f64,
+}
+
+/// One of them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Waypoint {
+    /// Metres east, north, up.
+    pub position: DVec3,
+    /// Heading to be taken before a picture, degrees clockwise from north; `None` = as it flies.
+    pub yaw_deg: Option<f64>,
+    /// Whether a picture is taken there.
+    pub picture: bool,
 }
 
 /// The lines over `region` (corners in metres east and north), in flying order; empty when the region has no area.

@@ -25,6 +25,7 @@ pub(super) fn quick() -> SimSettings {
         lens: Lens { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 },
         region: vec![[-20.0, -15.0], [20.0, -15.0], [20.0, 15.0], [-20.0, 15.0]],
         survey: SurveySettings::default(),
+        route: None,
         imperfections: Imperfections::default(),
         autopilot: AutopilotSettings { unix_us: Some(1_790_000_000_000_000), ..AutopilotSettings::default() },
         session: SessionSettings { speed: 20.0, wait_for_peer_s: 10.0, settle_s: 0.0, linger_s: 0.0 },

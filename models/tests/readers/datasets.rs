@@ -1,8 +1,9 @@
-//! What describes pictures beside them, and networks: nerfstudio, OpenSfM, splits, telemetry, manifests.
+//! What describes pictures beside them, and networks: nerfstudio, OpenSfM, splits, telemetry, flight plans, manifests.
 
 use std::path::Path;
 
 use config::geodesy::Geodetic;
+use models::formats::flight_plan::{self, FlightPlan, Waypoint};
 use models::formats::reconstruction::Reconstruction;
 use models::formats::{opensfm, split, telemetry, transforms};
 use models::onnx::manifest::Manifest;
@@ -130,6 +131,46 @@ fn opensfm_references() {
                 std::fs::write(&reconstruction, &beside).expect("written");
             }
             line(opensfm::read(&reconstruction), |r| r.origin.is_some() && finite(&r))
+        }),
+    });
+}
+
+#[test]
+fn flight_plans() {
+    let home = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
+    let waypoint = |k: f64, yaw_deg, picture| Waypoint {
+        position: Geodetic { lat_deg: 47.4 + k * 1e-4, lon_deg: 8.5, alt_m: 470.0 },
+        yaw_deg,
+        picture,
+    };
+    let waypoints = vec![waypoint(0.0, None, true), waypoint(1.0, Some(90.0), true), waypoint(2.0, None, false)];
+    let plan = FlightPlan { home, speed_m_s: 5.0, pitch_deg: Some(-60.0), waypoints };
+    let mut whole = Vec::new();
+    plan.write(&mut whole).expect("memory");
+    let bare = r#"{
+"fileType": "Plan",
+"mission": {
+"hoverSpeed": 5,
+"plannedHomePosition": [-33, 151, 20],
+"items": [
+{"type": "SimpleItem", "command": 16, "frame": 0, "params": [0, 0, 0, null, -33.001, 151.001, 60]},
+{"type": "SimpleItem", "command": 2000, "frame": 2, "params": [0, 0, 1, null, null, null, null]}
+]
+}
+}
+"#;
+    survive(&Reader {
+        name: "plan",
+        seeds: vec![whole, bare.into()],
+        text: true,
+        shell: None,
+        memory: (64 << 10, 256),
+        read: Read::File("reflight.plan", &|path| {
+            line(flight_plan::read(path), |plan| {
+                let flown =
+                    plan.waypoints.iter().all(|w| w.position.is_valid() && w.yaw_deg.is_none_or(f64::is_finite));
+                flown && !plan.waypoints.is_empty() && plan.speed_m_s.is_finite() && plan.home.is_valid()
+            })
         }),
     });
 }

@@ -5,6 +5,7 @@
 //! the points its cameras look at.
 
 use glam::{DVec2, DVec3};
+use models::coverage::hull;
 
 use super::LocalModel;
 
@@ -115,34 +116,6 @@ fn look_at(center: DVec3, forward: DVec3, ground: f64) -> DVec2 {
     let reach = if forward.z < -1e-6 && height > 0.0 { height / -forward.z } else { 0.0 };
     let offset = forward.truncate() * reach;
     center.truncate() + offset.clamp_length_max(3.0 * height.max(0.0))
-}
-
-/// Convex hull (Andrew's monotone chain), counter-clockwise.
-fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
-    points.retain(|p| p.is_finite());
-    points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
-    points.dedup();
-    if points.len() < 3 {
-        return points;
-    }
-    let mut hull: Vec<DVec2> = Vec::with_capacity(2 * points.len());
-    let chain = |hull: &mut Vec<DVec2>, points: &mut dyn Iterator<Item = &DVec2>| {
-        let start = hull.len();
-        for &p in points {
-            while hull.len() >= start + 2 {
-                let (a, b) = (hull[hull.len() - 2], hull[hull.len() - 1]);
-                if (b - a).perp_dot(p - b) > 0.0 {
-                    break;
-                }
-                hull.pop();
-            }
-            hull.push(p);
-        }
-        hull.pop();
-    };
-    chain(&mut hull, &mut points.iter());
-    chain(&mut hull, &mut points.iter().rev());
-    hull
 }
 
 #[cfg(test)]

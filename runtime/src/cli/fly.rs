@@ -110,6 +110,9 @@ fn report(outcome: &FlyOutcome) -> RunReport {
     }
     let counters = serde_json::to_value(outcome.flight.hal).unwrap_or_default();
     r.more.insert("hal".into(), counters);
+    if let Some(coverage) = &outcome.flight.coverage {
+        coverage.note(&mut r);
+    }
     r.more.insert("ended".into(), format!("{:?}", outcome.ended).into());
     r.more.insert("delivered".into(), outcome.delivered.into());
     r.more.insert("pictures_decoded".into(), outcome.flight.decoded.into());

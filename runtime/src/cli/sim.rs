@@ -11,10 +11,12 @@ use hal::sim::reference::Lens;
 use hal::sim::survey::SurveySettings;
 use hal::sim::world::WorldSettings;
 use hal::sim::{SessionSettings, SimSettings};
+use models::formats::flight_plan;
 
 mod card;
 
 use super::CliError;
+use crate::coverage::route;
 use crate::interrupt::Interrupt;
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
@@ -39,6 +41,10 @@ pub struct Args {
     /// Instead of flying: write the survey's pictures here as a camera's card, with EXIF and XMP.
     #[arg(long, value_name = "DIR")]
     card: Option<PathBuf>,
+    /// Instead of a survey: fly this plan (QGroundControl's `.plan`, as `dgtr fly` writes it), with its heights, headings and
+    /// pictures.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["height", "forward_overlap", "side_overlap", "cross"])]
+    plan: Option<PathBuf>,
     /// Seconds of flight per second of wall clock.
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     speed: f64,
@@ -99,6 +105,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let address = args.link.parse()?;
     let number = mission.aircraft.iter().position(|a| a.id == aircraft.id).unwrap_or(0) as u64;
     let c = &mission.camera;
+    let plan = args.plan.as_deref().map(flight_plan::read).transpose()?;
     let settings = SimSettings {
         world_seed: mission.seed,
         seed: mission.seed.wrapping_mul(1000).wrapping_add(number),
@@ -113,6 +120,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             cy: c.cy.into(),
         },
         region: mission.region(aircraft),
+        route: plan.map(|plan| route(&plan, mission.origin, args.pitch)),
         survey: SurveySettings {
             height_m: args.height,
             forward_overlap: args.forward_overlap,

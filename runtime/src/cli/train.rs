@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use config::coverage::CoverageSettings;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
 use config::mission::{KeyframeSettings, NetworkSettings};
@@ -135,6 +136,7 @@ struct Settings {
     network: NetworkSettings,
     keyframes: KeyframeSettings,
     failsafe: FailsafeSettings,
+    coverage: CoverageSettings,
 }
 
 /// The presets as clap shows them, each with its budgets.
@@ -168,6 +170,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     settings.keyframes.check()?;
     settings.failsafe.check()?;
+    settings.coverage.check()?;
     if args.network.is_some() {
         settings.network.pair = args.network;
     }
@@ -213,6 +216,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         fresh: args.fresh,
         evaluate: !args.no_eval,
         training: settings.training,
+        coverage: settings.coverage,
         init_settings: settings.init,
         refine_settings: settings.refine,
     };

@@ -45,6 +45,7 @@ fn script(row: &Row) -> Script {
         lens: Lens { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 },
         region: vec![[-20.0, -15.0], [20.0, -15.0], [20.0, 15.0], [-20.0, 15.0]],
         survey: SurveySettings::default(),
+        route: None,
         imperfections: Imperfections::default(),
         autopilot: AutopilotSettings { unix_us: Some(1_790_000_000_000_000), faults, ..AutopilotSettings::default() },
         session: SessionSettings { linger_s: 15.0, ..SessionSettings::default() },
@@ -73,6 +74,7 @@ fn script(row: &Row) -> Script {
     };
     let end = EndOfFlight { silence: Duration::from_secs(20), patience: Some(Duration::from_secs(120)) };
     let mut script = Script {
+        ground: sim.region.clone(),
         sim,
         vehicle,
         end,

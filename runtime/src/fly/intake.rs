@@ -7,18 +7,23 @@ use std::collections::{HashSet, VecDeque};
 use std::sync::mpsc::TrySendError;
 use std::time::Duration;
 
+use config::coverage::CoverageSettings;
 use config::mission::KeyframeSettings;
+use glam::DVec2;
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::error::HalError;
+use hal::mavlink::dialect::MavSeverity;
 use hal::traits::{Camera, Clock, Link};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use models::coverage::{CoverageMap, Region};
 use models::picture;
 
 use super::geotags::Geotags;
 use super::handover::CaptureEnd;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
+use crate::coverage::Coverage;
 use crate::error::JobError;
 use crate::keyframe_store::KeyFrame;
 
@@ -68,6 +73,8 @@ pub struct FlightCounters {
     pub links_lost: u32,
     /// The HAL's own counters.
     pub hal: HalCounters,
+    /// The ground that the key frames see; `None` before the first of them, or for a region without an area.
+    pub coverage: Option<Coverage>,
 }
 
 /// What capture needs to know.
@@ -78,6 +85,10 @@ pub struct FlightPlan {
     pub intrinsics: Intrinsics,
     /// The key-frame rule.
     pub keyframes: KeyframeSettings,
+    /// When ground is covered.
+    pub coverage: CoverageSettings,
+    /// Which ground is to be: corners, metres east and north.
+    pub region: Vec<[f64; 2]>,
     /// Poses of earlier key frames.
     pub earlier: Vec<Pose>,
     /// Their names: no new one may take them.
@@ -178,6 +189,7 @@ where
             Phase::Closing(ended) => {
                 self.listen(Duration::ZERO)?;
                 if self.vehicle.is_finished() {
+                    self.tell_coverage();
                     self.phase = Phase::Emptying(ended);
                 }
             }
@@ -194,9 +206,47 @@ where
 
     /// What was counted, at the end.
     pub(super) fn finish(mut self) -> FlightCounters {
+        if self.counters.coverage.is_none() {
+            self.counters.coverage = self.survey();
+        }
         self.counters.keyframes = self.selector.counters();
         self.counters.hal = self.vehicle.counters();
         self.counters
+    }
+
+    /// Begins a map of the ground once its height is known: with the first picture the autopilot has said where home is.
+    fn look_at_ground(&mut self) {
+        if self.selector.has_ground() {
+            return;
+        }
+        let corners = self.plan.region.iter().map(|c| DVec2::from(*c)).collect();
+        let height_m = self.plan.coverage.ground_m.map(f64::from).or(self.vehicle.home_m()).unwrap_or(0.0);
+        match Region::new(corners).and_then(|region| CoverageMap::new(&region, height_m, self.plan.coverage)) {
+            Ok(map) => self.selector.over(map, self.plan.intrinsics),
+            Err(e) => tracing::debug!("no map of the ground: {e}"),
+        }
+    }
+
+    /// What the key frames cover, and how to get the rest.
+    fn survey(&mut self) -> Option<Coverage> {
+        let (map, flown) = self.selector.ground()?;
+        let home_m = self.vehicle.home_m().unwrap_or(map.base_m());
+        let found = Coverage::of(map.clone(), Some(self.plan.vehicle.origin));
+        Some(found.with_reflight(&flown, self.plan.keyframes.t_min_m.into(), home_m))
+    }
+
+    /// Says it to the ground control station: whoever has to fly again is still there.
+    fn tell_coverage(&mut self) {
+        self.counters.coverage = self.survey();
+        if let Some(coverage) = &self.counters.coverage {
+            let line = coverage.line();
+            tracing::info!("{line}");
+            let severity = match coverage.gaps.is_empty() {
+                true => MavSeverity::MAV_SEVERITY_INFO,
+                false => MavSeverity::MAV_SEVERITY_NOTICE,
+            };
+            self.vehicle.status_text(severity, &line);
+        }
     }
 
     fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
@@ -257,6 +307,7 @@ where
     /// A picture is looked at before it counts: one that shows nothing must not keep its place from the next.
     fn choose(&mut self, frame: PosedPicture) {
         let pose = Pose { rotation: frame.pose.rotation, center: frame.pose.position };
+        self.look_at_ground();
         let mut decision = self.selector.consider(&pose);
         let loaded = (decision == Decision::Key).then(|| self.vehicle.load(&frame));
         self.counters.decoded += u32::from(loaded.is_some());

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use config::coverage::CoverageSettings;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::geodesy::Geodetic;
@@ -174,6 +175,8 @@ pub(super) struct Script {
     pub(super) sim: SimSettings,
     pub(super) vehicle: VehicleSettings,
     pub(super) end: EndOfFlight,
+    /// What is to be covered.
+    pub(super) ground: Vec<[f64; 2]>,
     /// Names of key frames that an earlier run has stored.
     pub(super) earlier_names: Vec<String>,
     /// Somebody asks the program to end (Ctrl-C) at this time.
@@ -235,6 +238,8 @@ pub(super) fn rehearse_on(
         vehicle: script.vehicle.clone(),
         intrinsics: intrinsics(&script.vehicle.lens),
         keyframes: KeyframeSettings::default(),
+        coverage: CoverageSettings::default(),
+        region: script.ground.clone(),
         earlier: store.poses(),
         earlier_names: script.earlier_names.iter().cloned().collect(),
         end: script.end,

@@ -1,5 +1,6 @@
 //! Promises of the simulated flight.
 
+use super::super::survey::{SurveySettings, Waypoint, lines};
 use super::*;
 
 fn pitch_roll(q: DQuat) -> (f64, f64) {
@@ -9,9 +10,12 @@ fn pitch_roll(q: DQuat) -> (f64, f64) {
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 47.0, lon_deg: 8.0, alt_m: 400.0 };
 
+const STRAIGHT_DOWN: Manner = Manner { speed_ms: 5.0, gimbal_pitch_deg: -90.0 };
+
 fn flight(wrong: &Imperfections, seed: u64) -> Flight {
     let region = [DVec2::new(-30.0, -30.0), DVec2::new(30.0, -30.0), DVec2::new(30.0, 30.0), DVec2::new(-30.0, 30.0)];
-    fly(ORIGIN, &region, DVec2::new(50.0, 40.0), &SurveySettings::default(), wrong, "IMG_", seed).expect("a flight")
+    let legs = Leg::of_lines(&lines(&region, DVec2::new(50.0, 40.0), &SurveySettings::default()), 40.0);
+    fly(ORIGIN, &legs, STRAIGHT_DOWN, wrong, "IMG_", seed).expect("a flight")
 }
 
 #[test]
@@ -64,4 +68,33 @@ fn it_leans_into_the_wind_and_into_acceleration() {
     let windy = flight(&Imperfections { wind_ms: [0.0, 8.0], ..Imperfections::none() }, 1);
     let thrust = windy.truth.at(1.0).attitude * DVec3::NEG_Z; // NED
     assert!(thrust.x < -0.05, "wind towards north is met by leaning south: {thrust}");
+}
+
+#[test]
+fn a_route_is_flown_to_each_waypoint_with_its_height_and_heading_and_a_picture_where_one_is_asked_for() {
+    let waypoint = |x, y, z, yaw_deg, picture| Waypoint { position: DVec3::new(x, y, z), yaw_deg, picture };
+    let waypoints = vec![
+        waypoint(0.0, 0.0, 40.0, None, true),
+        waypoint(30.0, 0.0, 40.0, Some(0.0), true),
+        waypoint(30.0, 0.0, 55.0, None, false),
+        waypoint(30.0, 20.0, 50.0, Some(-90.0), true),
+        waypoint(30.0, 20.0, 50.0, Some(90.0), true),
+    ];
+    let asked: Vec<Waypoint> = waypoints.iter().filter(|w| w.picture).copied().collect();
+    let route = Route { waypoints, speed_ms: 5.0, gimbal_pitch_deg: -60.0 };
+    let manner = Manner { speed_ms: route.speed_ms, gimbal_pitch_deg: route.gimbal_pitch_deg };
+    for (wrong, off) in [(Imperfections::none(), 0.5), (Imperfections::default(), 2.0)] {
+        let flight = fly(ORIGIN, &Leg::of_route(&route), manner, &wrong, "IMG_", 3).expect("a flight");
+        assert_eq!(flight.exposures.len(), asked.len());
+        for (exposure, asked) in flight.exposures.iter().zip(&asked) {
+            let at = flight.truth.at(exposure.middle_s);
+            assert!((at.position - asked.position).length() < off, "{at:?} {asked:?}");
+            let (yaw, pitch, _) = at.gimbal.to_euler(glam::EulerRot::ZYX);
+            assert!((pitch.to_degrees() + 60.0).abs() < 2.0, "{pitch}");
+            if let Some(wanted) = asked.yaw_deg {
+                assert!((yaw.to_degrees() - wanted).abs() < 4.0, "{yaw} {asked:?}");
+            }
+        }
+    }
+    assert!(fly(ORIGIN, &[], manner, &Imperfections::none(), "IMG_", 3).is_none());
 }

@@ -1,10 +1,10 @@
 //! What others ask of the autopilot: time, parameters (the faults, live), messages and their rates.
 
-use super::Autopilot;
+use super::{Autopilot, TEXTS};
 use crate::error::HalError;
 use crate::mavlink::dialect::{
     COMMAND_ACK_DATA, COMMAND_LONG_DATA, MavCmd, MavParamType, MavResult, PARAM_REQUEST_LIST_DATA,
-    PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, PARAM_VALUE_DATA, TIMESYNC_DATA,
+    PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, PARAM_VALUE_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
 };
 use crate::traits::Link;
 use config::faults::FaultSettings;
@@ -16,6 +16,7 @@ enum Request {
     ReadParameter(PARAM_REQUEST_READ_DATA),
     ListParameters,
     Command(COMMAND_LONG_DATA),
+    Say(STATUSTEXT_DATA),
     Other,
 }
 
@@ -36,6 +37,8 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
                 if mine(m.target_system) { Request::ListParameters } else { Request::Other }
             } else if let Some(m) = frame.message::<COMMAND_LONG_DATA>() {
                 if mine(m.target_system) { Request::Command(m) } else { Request::Other }
+            } else if let Some(m) = frame.message::<STATUSTEXT_DATA>() {
+                Request::Say(m)
             } else {
                 Request::Other
             };
@@ -64,6 +67,12 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
                 }
                 Request::ListParameters => self.list_from = Some(0),
                 Request::Command(m) => self.command(&m, from, now_s())?,
+                Request::Say(m) => {
+                    if self.texts.len() >= TEXTS {
+                        self.texts.pop_front();
+                    }
+                    self.texts.extend(m.text.to_str().map(str::to_owned));
+                }
                 Request::Other => {}
             }
         }
