@@ -15,6 +15,7 @@ pub mod gaps;
 pub mod geojson;
 mod ground;
 mod outline;
+pub mod raster;
 pub mod reflight;
 mod region;
 mod sight;

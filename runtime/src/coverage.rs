@@ -7,7 +7,7 @@ use config::geodesy::{EnuFrame, Geodetic};
 use models::camera::View;
 use models::coverage::gaps::{self, Gap, GapKind};
 use models::coverage::reflight::{self, Reflight};
-use models::coverage::{CoverageMap, geojson};
+use models::coverage::{CoverageMap, geojson, raster};
 use models::formats::FormatError;
 use models::formats::flight_plan::{FlightPlan, Waypoint};
 
@@ -24,6 +24,8 @@ pub use route::route;
 
 /// The gaps, in the output folder.
 pub const GAPS: &str = "coverage.geojson";
+/// Every square with its figures, for a GIS.
+pub const RASTER: &str = "coverage.tif";
 /// The flight that closes them.
 pub const REFLIGHT: &str = "reflight.plan";
 /// Speed between two pictures of it, m/s: each is taken standing.
@@ -91,15 +93,22 @@ impl Coverage {
         let (missing, again) = (out.join(GAPS), out.join(REFLIGHT));
         disk.replace(&missing, |to| geojson::write(to, &self.map, &self.gaps, self.origin))
             .map_err(|e| FormatError::disk(&missing, e))?;
+        let squares = out.join(RASTER);
+        match raster::encode(&self.map, self.origin) {
+            Ok(bytes) => {
+                disk.replace(&squares, |to| to.write_all(&bytes)).map_err(|e| FormatError::disk(&squares, e))?
+            }
+            Err(e) => tracing::warn!("{}: not written: {e}", squares.display()),
+        }
         match self.flight_plan() {
             Some(plan) => {
                 disk.replace(&again, |to| plan.write(to)).map_err(|e| FormatError::disk(&again, e))?;
-                Ok(vec![missing, again])
+                Ok(vec![missing, squares, again])
             }
             None => {
                 let failed = |source| FormatError::Io { path: again.clone(), action: "removing", source };
                 disk.remove(&again).map_err(failed)?;
-                Ok(vec![missing])
+                Ok(vec![missing, squares])
             }
         }
     }

@@ -99,10 +99,15 @@ impl Map {
         let Some(mut gsd) = request.gsd.or(extent.gsd()) else {
             return Err(JobError::Request("the model keeps no views to take the pixel size from; give --gsd".into()));
         };
-        let bounds = match request.bounds {
-            Some([west, south, east, north]) => [DVec2::new(west, south), DVec2::new(east, north)],
-            None => bounds(&crs, &extent)?,
-        };
+        let covered = bounds(&crs, &extent)?;
+        let bounds = request.bounds.map_or(covered, |[w, s, e, n]| [DVec2::new(w, s), DVec2::new(e, n)]);
+        if bounds[0].cmpgt(covered[1]).any() || bounds[1].cmplt(covered[0]).any() {
+            let [low, high] = covered;
+            return Err(JobError::Request(format!(
+                "the bounds lie outside of the model's ground, which is {:.0},{:.0},{:.0},{:.0}",
+                low.x, low.y, high.x, high.y
+            )));
+        }
         if let Some(most) = request.most_pixels {
             let size = bounds[1] - bounds[0];
             gsd = gsd.max((size.x * size.y / f64::from(most.max(1))).sqrt());

@@ -5,8 +5,9 @@ use std::process::Command;
 
 use serde_json::Value;
 
-/// Licences that Apache-2.0 code may be linked with. MPL-2.0 covers its own files only.
-const LICENCES: [&str; 13] = [
+/// Licences that Apache-2.0 code may be linked with. MPL-2.0 covers its own files only; IJG (a JPEG encoder's tables, by way of the
+/// GeoTIFF writer) asks for the sentence that ends the README.
+const LICENCES: [&str; 14] = [
     "Apache-2.0",
     "MIT",
     "BSD-2-Clause",
@@ -20,6 +21,7 @@ const LICENCES: [&str; 13] = [
     "BSL-1.0",
     "MPL-2.0",
     "CDLA-Permissive-2.0",
+    "IJG",
 ];
 
 /// Crates that must not come in, not even by way of another, with the reason.

@@ -10,7 +10,7 @@ use config::disk::Disk;
 use config::geodesy::Geodetic;
 use geotiff_writer::{
     CogBuilder, CogTileWriter, Compression, ExtraSample, GeoTiffBuilder, NumericSample, PhotometricInterpretation,
-    Predictor, Resampling,
+    Predictor, RasterType, Resampling,
 };
 use ndarray::{ArrayView2, ArrayView3};
 use serde::Serialize;
@@ -78,15 +78,16 @@ impl<'a> MapFiles<'a> {
         let levels: Vec<u32> = (1..16).map(|k| 1 << k).take_while(|l| columns.max(rows) > BLOCK * l / 2).collect();
         let build = |bands: u32, predictor| {
             let [west, north] = grid.corner();
+            // Not sparse: only GDAL reads files whose empty tiles are not there.
             let builder = GeoTiffBuilder::new(columns, rows)
                 .bands(bands)
                 .pixel_scale(grid.gsd(), grid.gsd())
                 .origin(west, north)
+                .raster_type(RasterType::PixelIsArea)
                 .tile_size(BLOCK, BLOCK)
                 .compression(Compression::Deflate)
                 .deflate_level(DEFLATE)
-                .predictor(predictor)
-                .sparse(true);
+                .predictor(predictor);
             match grid.crs().epsg() {
                 Some(code) => builder.projected_epsg(code),
                 None => builder,
@@ -203,7 +204,7 @@ fn finish<T: NumericSample>(tiles: CogTileWriter<T, File>, disk: &Disk, path: &P
 }
 
 /// Writes a whole file.
-pub(super) fn replace(
+fn replace(
     disk: &Disk,
     path: &Path,
     fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,

@@ -2,13 +2,12 @@
 
 use std::path::Path;
 
+use config::disk::Disk;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 
-use super::files::replace;
 use super::grid::{Block, Grid};
 use crate::formats::FormatError;
-use config::disk::Disk;
 
 /// Longest side, pixels.
 const SIDE: u32 = 640;
@@ -83,6 +82,6 @@ impl Preview {
         PngEncoder::new(&mut encoded)
             .write_image(bytes, self.width, self.height, kind)
             .map_err(|e| FormatError::invalid(path, format!("cannot be encoded: {e}")))?;
-        replace(disk, path, |out| out.write_all(&encoded))
+        disk.replace(path, |out| out.write_all(&encoded)).map_err(|e| FormatError::disk(path, e))
     }
 }

@@ -29,8 +29,8 @@ pub struct Args {
     #[arg(long, value_name = "CM")]
     pub gsd: Option<f64>,
     /// West, south, east, north in metres of the reference system; default: what the pictures cover, inside the region.
-    #[arg(long, value_name = "W,S,E,N", value_delimiter = ',', num_args = 4, allow_hyphen_values = true)]
-    pub bounds: Option<Vec<f64>>,
+    #[arg(long, value_name = "W,S,E,N", value_parser = four, allow_hyphen_values = true)]
+    pub bounds: Option<[f64; 4]>,
     /// Another projected reference system in metres, by its EPSG code.
     #[arg(long, value_name = "CODE")]
     pub epsg: Option<u16>,
@@ -42,6 +42,12 @@ pub struct Args {
     pub device: Option<String>,
 }
 
+fn four(text: &str) -> Result<[f64; 4], String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    let numbers = numbers.ok().and_then(|n| n.try_into().ok());
+    numbers.ok_or_else(|| "four numbers with commas between them are needed: west, south, east, north".to_owned())
+}
+
 /// Runs `dgtr ortho`.
 ///
 /// # Errors
@@ -51,7 +57,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let request = MapRequest {
         gsd: args.gsd.map(|cm| cm / 100.0),
         epsg: args.epsg,
-        bounds: args.bounds.and_then(|b| b.try_into().ok()),
+        bounds: args.bounds,
         min_views: args.min_views,
         ..MapRequest::default()
     };

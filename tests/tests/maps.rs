@@ -1,0 +1,51 @@
+//! Maps from the command line: as true as the simulated survey lets them be, and refused in one line where there is none.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
+
+mod support;
+
+use serde_json::Value;
+use support::{refused, run};
+
+fn json(path: &std::path::Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).expect("readable")).expect("JSON")
+}
+
+#[test]
+fn the_map_of_a_simulated_survey_is_true_and_better_than_its_depth_maps() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let training = ["--steps", "120", "--max-gaussians", "40000", "--min-views", "4"];
+    let output = run(dir.path(), &[&["bench", "map", "--out", "survey", "--json", "map.json"][..], &training].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    println!("{}", String::from_utf8_lossy(&output.stdout));
+    let scores = json(&dir.path().join("map.json"));
+    let figure = |name: &str| scores[name].as_f64().expect(name);
+    let height = |from: &str, name: &str| scores[from][name].as_f64().expect(name);
+    assert!(figure("psnr") > 24.0 && figure("shift_px") < 0.5 && scores["squares"].as_u64() > Some(10), "{scores}");
+    assert!(figure("covered") > 0.97, "{scores}");
+    let gsd = figure("gsd_m");
+    assert!(height("heights", "median_abs_m") < gsd && height("heights", "bias_m").abs() < 1.5 * gsd, "{scores}");
+    assert!(height("heights", "median_abs_m") < height("fused_depth", "median_abs_m"), "{scores}");
+
+    // The same model by `dgtr ortho`, and by `dgtr eval` against points that lie on the plane z = 0 but for one.
+    let model = "survey/trained/model.dgtr";
+    let output = run(dir.path(), &["ortho", model, "--out", "map", "--gsd", "25", "--min-views", "4"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let georef = json(&dir.path().join("map/map.georef.json"));
+    assert_eq!((georef["crs"].as_str(), georef["gsd_m"].as_f64()), (Some("EPSG:32632"), Some(0.25)));
+    assert!(georef["covered_pixels"].as_u64() > Some(10_000), "{georef}");
+    std::fs::write(dir.path().join("points.csv"), "x,y,z\n0,0,0\n5,5,0\n5,5,0\n9000,0,0\n").expect("written");
+    let output = run(dir.path(), &["eval", model, "--heights", "points.csv", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let heights: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!((heights["points"].as_u64(), heights["missing"].as_u64()), (Some(2), Some(1)));
+
+    for (more, words) in [
+        (&["--gsd", "0"][..], "must be positive"),
+        (&["--epsg", "4326"], "EPSG:4326"),
+        (&["--bounds", "0,0,10,10"], "outside"),
+        (&["--gsd", "0.0001"], "larger pixels"),
+    ] {
+        refused(dir.path(), &[&["ortho", model, "--out", "none"], more].concat(), 2, &[words]);
+    }
+    refused(dir.path(), &["eval", model, "--heights", "missing.csv"], 2, &["missing.csv"]);
+}
