@@ -25,7 +25,7 @@ pub struct PlanRequest {
     pub max_gaussians: Option<usize>,
     /// Adam's moments of SH in 16 bits each.
     pub half_moments: bool,
-    /// Lanes that sort and emit: [`SORT_LANES_SOFTWARE`] or [`SORT_LANES_GPU`].
+    /// Lanes that sort and emit: [`SORT_LANES_SOFTWARE`] or [`SORT_LANES_GPU`](super::SORT_LANES_GPU).
     pub sort_lanes: u32,
 }
 
