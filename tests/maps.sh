@@ -2,7 +2,7 @@
 # What GDAL makes of a map (PyPI rasterio and rio-cogeo, in an environment of their own): reference system, bounds, overviews, nodata,
 # and whether both files are valid Cloud-Optimised GeoTIFF.
 #   tests/maps.sh FOLDER       a folder that `dgtr ortho` wrote
-#   tests/maps.sh --large      draws 20,000 x 20,000 pixels of a simulated survey under --limit-mib 448 first: more than ten minutes on lavapipe
+#   tests/maps.sh --large      draws 20,000 x 20,000 pixels of a simulated survey under --limit-mib 256 first: more than ten minutes on lavapipe
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 [ $# -eq 1 ] || { echo "usage: tests/maps.sh FOLDER | --large" >&2; exit 2; }
@@ -26,7 +26,7 @@ west, south = g["west"] + 5, g["north"] - 85
 print(f"{west:.3f},{south:.3f},{west + 80:.3f},{south + 80:.3f}")
 PY
 )
-    /usr/bin/env time -v "$dgtr" --quiet --limit-mib 448 ortho "$work/survey/trained/model.dgtr" --out "$folder" --gsd 0.4 --min-views 0 \
+    /usr/bin/env time -v "$dgtr" --quiet --limit-mib 256 ortho "$work/survey/trained/model.dgtr" --out "$folder" --gsd 0.4 --min-views 0 \
         --bounds "$west" 2> "$work/time" || { cat "$work/time" >&2; exit 1; }
     grep -E 'Elapsed|Maximum resident' "$work/time"
     ls -l "$folder"

@@ -32,6 +32,7 @@ mod first_gaussians;
 mod follow;
 pub mod host;
 mod map;
+mod rebuild;
 mod reconstruct;
 pub mod source;
 

@@ -27,9 +27,6 @@ mod shortage;
 
 #[cfg(test)]
 #[cfg(feature = "lab")]
-mod again;
-#[cfg(test)]
-#[cfg(feature = "lab")]
 mod fault_table;
 #[cfg(test)]
 #[cfg(feature = "lab")]
@@ -40,6 +37,9 @@ mod killed;
 #[cfg(test)]
 #[cfg(feature = "lab")]
 mod power_cut;
+#[cfg(test)]
+#[cfg(feature = "lab")]
+mod reflown;
 #[cfg(test)]
 #[cfg(feature = "lab")]
 mod rehearsal;

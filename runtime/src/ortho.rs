@@ -9,12 +9,12 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::ortho::OrthoError;
 use models::ortho::crs::Crs;
-use models::ortho::extent::{Extent, Seen};
+use models::ortho::extent::{Extent, ViewsAround};
 use models::ortho::files::{MapFiles, NO_HEIGHT, Written};
 use models::ortho::grid::{BLOCK, Block, BlockView, Grid};
 use vulkan::trainer::{Rendering, Trainer};
 
-use crate::engine::device::renderer;
+use crate::engine::device::map_renderer;
 use crate::error::JobError;
 
 /// Where less than this share of a pixel is covered, there is no ground.
@@ -64,7 +64,7 @@ pub fn keep_scratch_in(folder: &Path) {
 pub fn draw_file(model: &Path, device: Option<&str>, folder: &Path) -> Result<Written, JobError> {
     let (header, cloud) = model::read(model)?;
     let map = Map::of(&header, &cloud, &MapRequest::default())?;
-    let mut trainer = renderer(device, &cloud, BLOCK, BLOCK)?;
+    let mut trainer = map_renderer(device, &cloud)?;
     drop(cloud);
     let written = map.write(&mut trainer, &header, (&Disk::default(), folder), |_, _| true)?;
     written.ok_or_else(|| JobError::System("a map was not finished".into()))
@@ -160,7 +160,7 @@ impl Map {
         let half = DVec2::new(f64::from(block.width), f64::from(block.height)) / 2.0;
         let middle = self.grid.place(DVec2::new(f64::from(block.x), f64::from(block.y)) + half);
         let place = self.grid.crs().to_enu(middle.extend(0.0))?.truncate();
-        let seen = self.extent.seen_around(place, f64::from(BLOCK) * self.grid.gsd());
+        let seen = self.extent.views_around(place, f64::from(BLOCK) * self.grid.gsd());
         if self.extent.has_views() && seen.views() < self.min_views {
             return Ok(false);
         }
@@ -183,7 +183,14 @@ impl Map {
     }
 
     /// Whether enough pictures saw the middle of the square at `corner`.
-    fn is_seen(&self, seen: &Seen<'_>, look: &BlockView, rendering: &Rendering, corner: [u32; 2], ground: f64) -> bool {
+    fn is_seen(
+        &self,
+        seen: &ViewsAround<'_>,
+        look: &BlockView,
+        rendering: &Rendering,
+        corner: [u32; 2],
+        ground: f64,
+    ) -> bool {
         if !self.extent.has_views() || self.min_views == 0 {
             return true;
         }

@@ -19,7 +19,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 /// that took three quarters of it costs nothing.
 const SIGNS: u32 = 4;
 
-/// The service manager's ear. Says goodbye when it is dropped.
+/// The connection to the service manager. Says STOPPING=1 when it is dropped.
 #[derive(Debug, Default)]
 pub struct Supervisor {
     socket: Option<UnixDatagram>,

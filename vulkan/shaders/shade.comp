@@ -52,8 +52,8 @@ void main() {
         }
         float y[16];
         // An orthographic view looks along its axis everywhere.
-        vec3 sight = (frame.flags & FLAG_ORTHOGRAPHIC) != 0u ? frame.view_rows[2].xyz : p0.xyz - frame.camera_center;
-        harmonics(normalize(sight), min(frame.sh_degree, own), y);
+        vec3 view_direction = (frame.flags & FLAG_ORTHOGRAPHIC) != 0u ? frame.view_rows[2].xyz : p0.xyz - frame.camera_center;
+        harmonics(normalize(view_direction), min(frame.sh_degree, own), y);
         vec3 colour = vec3(0.5);
         [[unroll]] for (uint i = 0u; i < COEFFICIENTS; i++) {
             colour += y[i] * vec3(coefficient[i * 3u], coefficient[i * 3u + 1u], coefficient[i * 3u + 2u]);

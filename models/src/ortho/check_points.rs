@@ -6,7 +6,7 @@ use std::path::Path;
 use config::geodesy::{EnuFrame, Geodetic};
 use glam::DVec3;
 
-use super::crs::Survey;
+use super::crs::SurveyCrs;
 use crate::formats::{FormatError, read_bounded};
 
 /// Far more points than anybody surveys.
@@ -31,7 +31,7 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<Vec<DVec3>, FormatE
         || FormatError::invalid(path, "says where on Earth its points are, and the model has no origin there");
     let survey = match (&table, &frame) {
         (None, _) => {
-            let known = Survey::named(first);
+            let known = SurveyCrs::named(first);
             let unknown = || {
                 format!(
                     "line 1: {first:?} names neither columns (lat, lon, alt or x, y, z) nor a known reference system"

@@ -99,12 +99,12 @@ impl Crs {
 }
 
 /// A reference system that surveyed points are given in: any that the library knows, degrees included.
-pub struct Survey {
+pub struct SurveyCrs {
     geographic: Proj,
     source: Proj,
 }
 
-impl Survey {
+impl SurveyCrs {
     /// By what the first line of a `gcp_list.txt` says: a PROJ string, `EPSG:CODE`, `WGS84` or `WGS84 UTM 17N`.
     pub fn named(text: &str) -> Option<Self> {
         let words: Vec<&str> = text.split_whitespace().collect();

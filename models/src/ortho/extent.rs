@@ -19,7 +19,7 @@ const QUANTILE: f64 = 0.01;
 
 /// The ground of a model and its cameras.
 pub struct Extent {
-    views: Vec<Seer>,
+    views: Vec<Footprint>,
     low: DVec2,
     high: DVec2,
     /// Median height by cell, model metres.
@@ -27,8 +27,8 @@ pub struct Extent {
     gsd: Option<f64>,
 }
 
-/// A view and the ground it sees.
-struct Seer {
+/// A view and the box around the ground that its picture shows.
+struct Footprint {
     projector: Projector,
     view: View,
     low: DVec2,
@@ -44,7 +44,8 @@ impl Extent {
         let means: Vec<[f32; 3]> = (0..cloud.len()).step_by(every).filter(solid).map(|i| cloud.means[i]).collect();
         let mut heights: Vec<f32> = means.iter().map(|m| m[2]).collect();
         let ground = f64::from(median(&mut heights)?);
-        let views: Vec<Seer> = views.iter().filter(|v| v.is_usable()).filter_map(|v| Seer::of(v, ground)).collect();
+        let views: Vec<Footprint> =
+            views.iter().filter(|v| v.is_usable()).filter_map(|v| Footprint::of(v, ground)).collect();
         let inside = |(low, high): (DVec2, DVec2), [a, b]: [DVec2; 2]| (low.min(a), high.max(b));
         let nothing = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         let (mut low, mut high) = views.iter().map(|v| [v.low, v.high]).fold(nothing, inside);
@@ -90,9 +91,9 @@ impl Extent {
     /// Height, in model metres, of the plane that the ground at a place is looked at from.
     pub fn top(&self, place: DVec2) -> f64 {
         let ground = self.ground(place);
-        let above = |v: &&Seer| v.view.pose.center.z > ground;
-        let away = |v: &Seer| (v.view.pose.center.truncate() - place).length();
-        let near = |v: &&Seer| away(v) <= v.view.pose.center.z - ground;
+        let above = |v: &&Footprint| v.view.pose.center.z > ground;
+        let away = |v: &Footprint| (v.view.pose.center.truncate() - place).length();
+        let near = |v: &&Footprint| away(v) <= v.view.pose.center.z - ground;
         let over = self.views.iter().filter(above).filter(near).map(|v| v.view.pose.center.z).reduce(f64::min);
         let nearest = || self.views.iter().filter(above).min_by(|a, b| away(a).total_cmp(&away(b)));
         match over.or_else(|| nearest().map(|v| v.view.pose.center.z)) {
@@ -107,18 +108,18 @@ impl Extent {
         !self.views.is_empty()
     }
 
-    /// The views whose ground overlaps a square of half side `reach` around a place: those to ask with [`Seen::count`].
-    pub fn seen_around(&self, place: DVec2, reach: f64) -> Seen<'_> {
+    /// The views whose ground overlaps a square of half side `reach` around a place: those to ask with [`ViewsAround::count`].
+    pub fn views_around(&self, place: DVec2, reach: f64) -> ViewsAround<'_> {
         let (low, high) = (place - reach, place + reach);
-        let overlaps = |v: &&Seer| v.low.cmple(high).all() && v.high.cmpge(low).all();
-        Seen(self.views.iter().filter(overlaps).collect())
+        let overlaps = |v: &&Footprint| v.low.cmple(high).all() && v.high.cmpge(low).all();
+        ViewsAround(self.views.iter().filter(overlaps).collect())
     }
 }
 
 /// Views around a place.
-pub struct Seen<'a>(Vec<&'a Seer>);
+pub struct ViewsAround<'a>(Vec<&'a Footprint>);
 
-impl Seen<'_> {
+impl ViewsAround<'_> {
     /// How many views there are to ask.
     pub fn views(&self) -> usize {
         self.0.len()
@@ -127,7 +128,7 @@ impl Seen<'_> {
     /// How many pictures have a world point in them.
     pub fn count(&self, point: DVec3) -> usize {
         let p = point.as_vec3();
-        let sees = |v: &&&Seer| {
+        let sees = |v: &&&Footprint| {
             let k = &v.view.intrinsics;
             v.projector
                 .project(p)
@@ -137,7 +138,7 @@ impl Seen<'_> {
     }
 }
 
-impl Seer {
+impl Footprint {
     /// The box around where the picture's edge meets the ground; `None` for a camera that looks up or stands below it.
     fn of(view: &View, ground: f64) -> Option<Self> {
         let (camera, k) = (Pinhole::from(view), &view.intrinsics);
@@ -260,7 +261,7 @@ mod tests {
     fn who_saw_a_point_is_counted() {
         let views = [nadir(DVec3::new(0.0, 0.0, 58.0)), nadir(DVec3::new(20.0, 0.0, 58.0))];
         let extent = Extent::of(&cloud(), &views, &[]).unwrap();
-        let count = |x: f64| extent.seen_around(DVec2::new(x, 0.0), 5.0).count(DVec3::new(x, 0.0, 10.0));
+        let count = |x: f64| extent.views_around(DVec2::new(x, 0.0), 5.0).count(DVec3::new(x, 0.0, 10.0));
         assert_eq!([count(-30.0), count(5.0), count(50.0), count(80.0)], [1, 2, 1, 0]);
     }
 

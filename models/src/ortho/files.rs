@@ -22,7 +22,7 @@ use crate::formats::FormatError;
 
 /// Height where there is none.
 pub const NO_HEIGHT: f32 = -9999.0;
-/// Deflate's level: 1 to 9; higher ones take twice the time for 3 % of the bytes.
+/// Deflate's level, 1 to 9.
 const DEFLATE: u32 = 4;
 /// What a height is measured from.
 const VERTICAL: &str = "metres on the vertical scale of the origin's height, as the autopilot or the pictures gave it: \

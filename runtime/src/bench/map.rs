@@ -8,11 +8,11 @@ use hal::sim::world::{FromAbove, MapKind, World};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::ortho::files::NO_HEIGHT;
-use models::ortho::grid::{BLOCK, Block, Grid};
+use models::ortho::grid::{Block, Grid};
 use serde::Serialize;
 
 use super::{child, world};
-use crate::engine::device::renderer;
+use crate::engine::device::map_renderer;
 use crate::error::JobError;
 use crate::evaluate::heights::HeightScores;
 use crate::ortho::{DrawnBlock, Map, MapRequest};
@@ -116,7 +116,7 @@ fn seen_pixels(map: &Map, header: &ModelHeader, compared: &Compared) -> usize {
 }
 
 fn draw(map: &Map, cloud: &GaussianCloud, world: &World) -> Result<Compared, JobError> {
-    let mut trainer = renderer(None, cloud, BLOCK, BLOCK)?;
+    let mut trainer = map_renderer(None, cloud)?;
     let grid = map.grid();
     let [columns, rows] = grid.size().map(|n| n as usize);
     let n = columns * rows;

@@ -6,12 +6,11 @@ use std::path::{Path, PathBuf};
 
 use models::dataset::Dataset;
 use models::formats::model::{self, ModelHeader};
-use models::ortho::grid::BLOCK;
 use serde::Serialize;
 
 use super::CliError;
 use super::plan::largest;
-use crate::engine::device::renderer;
+use crate::engine::device::{map_renderer, renderer};
 use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, heights, open_metric};
 use crate::ortho::{Map, MapRequest};
 use crate::transfer::{PoseTransfer, stem};
@@ -129,7 +128,7 @@ fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
     let (header, cloud) = model::read(&args.model)?;
     let points = heights::reference(reference, &header)?;
     let map = Map::of(&header, &cloud, &MapRequest::default())?;
-    let mut trainer = renderer(args.device.as_deref(), &cloud, BLOCK, BLOCK)?;
+    let mut trainer = map_renderer(args.device.as_deref(), &cloud)?;
     let scores = heights::compare(&map, &mut trainer, &points)?;
     if args.json {
         println!("{}", serde_json::to_string(&scores).map_err(CliError::failed)?);

@@ -4,10 +4,9 @@ use std::path::PathBuf;
 
 use config::disk::Disk;
 use models::formats::model;
-use models::ortho::grid::BLOCK;
 
 use super::CliError;
-use crate::engine::device::renderer;
+use crate::engine::device::map_renderer;
 use crate::error::JobError;
 use crate::ortho::{Map, MapRequest, keep_scratch_in};
 use crate::{console, interrupt};
@@ -62,7 +61,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         ..MapRequest::default()
     };
     let map = Map::of(&header, &cloud, &request)?;
-    let mut trainer = renderer(args.device.as_deref(), &cloud, BLOCK, BLOCK)?;
+    let mut trainer = map_renderer(args.device.as_deref(), &cloud)?;
     drop(cloud);
     let stop = interrupt::Interrupt::install()?;
     let [columns, rows] = map.grid().size();

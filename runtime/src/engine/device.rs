@@ -9,6 +9,7 @@ use config::plan::{Plan, PlanError, PlanRequest};
 use config::training::{ShSettings, TrainSettings};
 use models::camera::Intrinsics;
 use models::cloud::GaussianCloud;
+use models::ortho::grid::BLOCK;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use vulkan::gpu::Gpu;
@@ -19,6 +20,8 @@ use crate::kernels;
 
 /// Gaussian–tile instances that a renderer holds at once, per pixel; pictures with more are rendered in bands.
 const INSTANCES_PER_PIXEL: usize = 8;
+/// The same of a map's block.
+const INSTANCES_PER_MAP_PIXEL: usize = 2;
 
 /// The lens of the pictures that a flight trains on.
 pub fn training_lens(mission: &Mission) -> Intrinsics {
@@ -118,6 +121,23 @@ fn scratch_file(folder: &Path, bytes: u64) -> std::io::Result<File> {
 /// # Errors
 /// No device, or not enough of its memory; an empty cloud.
 pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height: u32) -> Result<Trainer, JobError> {
+    renderer_of(device, cloud, (width, height), INSTANCES_PER_PIXEL)
+}
+
+/// The same for the blocks of a map, in less memory: where more Gaussians meet, a block is drawn in bands.
+///
+/// # Errors
+/// Those of [`renderer`].
+pub fn map_renderer(device: Option<&str>, cloud: &GaussianCloud) -> Result<Trainer, JobError> {
+    renderer_of(device, cloud, (BLOCK, BLOCK), INSTANCES_PER_MAP_PIXEL)
+}
+
+fn renderer_of(
+    device: Option<&str>,
+    cloud: &GaussianCloud,
+    (width, height): (u32, u32),
+    instances_per_pixel: usize,
+) -> Result<Trainer, JobError> {
     if cloud.is_empty() {
         let what = "the model holds no Gaussians; train it first (dgtr train continues it)";
         return Err(JobError::Request(what.into()));
@@ -137,7 +157,7 @@ pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height:
     };
     let request = request.plan_request(&settings.sh, gpu.info().sort_lanes());
     let pixels = width as usize * height as usize;
-    let plan = Plan::with_capacities(&request, cloud.len(), cloud.len() + INSTANCES_PER_PIXEL * pixels);
+    let plan = Plan::with_capacities(&request, cloud.len(), cloud.len() + instances_per_pixel * pixels);
     let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?;
     trainer.load(cloud)?;
     Ok(trainer)

@@ -152,7 +152,7 @@ mod tests {
         // On a software device, with a camera of 12 megapixels; the initialiser's plan as `dgtr fly` names it, and as many
         // pictures decoded ahead as it asks for, rounded up.
         let defaults = |r: &mut HostRequest<'_>| {
-            (r.shared, r.initialiser, r.camera_pixels, r.ahead) = (true, 909 << 20, 4056 * 3040, 20);
+            (r.shared, r.initialiser, r.camera_pixels, r.ahead) = (true, 909 << 20, 4056 * 3040, 24);
             r.map = config::map::MapSettings::default().host_bytes();
         };
         let bytes = total(&plan, defaults);

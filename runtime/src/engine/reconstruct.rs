@@ -5,14 +5,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use image::imageops::{FilterType, resize};
-use models::camera::{Pose, PosedImage, View};
+use models::camera::{Pose, PosedImage};
 use models::dataset::scaled;
 use models::formats::model;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
-use super::carry::carry_over;
-use super::first_gaussians::FirstGaussians;
-use super::follow::{Motion, follow};
 use super::{Reconstruction, model_path};
 use crate::error::JobError;
 
@@ -21,10 +18,6 @@ const FIRST_BUILD: usize = 3;
 /// A model is rebuilt when the key frames have grown by this share since the last build: often enough that new ground
 /// is trained on soon, seldom enough that building does not eat the time of training.
 const REBUILD_GROWTH: f64 = 0.34;
-/// Key frames that refinement moved less than this have not moved, pixels at the ground.
-const MOVED_PX: f64 = 0.05;
-/// Trained Gaussians are kept over a rebuild only where their key frames' motions agree to this, pixels.
-const CONTRADICTED_PX: f64 = 1.5;
 
 /// What makes a model out of key frames: the seam at which a rehearsal stands in for networks, device and disk.
 pub trait Reconstruct {
@@ -287,48 +280,11 @@ impl Reconstruct for Reconstruction {
     }
 }
 
-impl Reconstruction {
-    /// The cloud to train: what is trained already, and fresh Gaussians where it is not.
-    fn take_over(&mut self, fresh: &FirstGaussians) -> Result<(), JobError> {
-        if self.builds > 0 {
-            self.trainer.snapshot(&mut self.cloud)?;
-        }
-        let made = fresh.report.as_ref().filter(|_| self.settings.incremental);
-        match made {
-            _ if self.is_continued() => {}
-            Some(made) => {
-                self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
-                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().gaussians);
-            }
-            None => self.cloud.clone_from(&fresh.cloud),
-        }
-        Ok(())
-    }
-
-    /// Moves what is trained with the key frames that refinement moved since, at `depth_m`.
-    fn follow_key_frames(&mut self, depth_m: f32) {
-        let then = |(i, (name, now)): (usize, &(String, View))| {
-            let then = self.built.get(i).or_else(|| self.resumed.get(name))?;
-            Some(Motion { then: *then, now: *now })
-        };
-        let motions: Vec<Motion> = self.views.iter().enumerate().filter_map(then).collect();
-        let most_px = motions.iter().map(|m| m.pixels_at(depth_m.into())).fold(0.0, f64::max);
-        if most_px > MOVED_PX {
-            let dropped = follow(&mut self.cloud, &motions, CONTRADICTED_PX);
-            self.report.skip("gaussians_contradicted", dropped as u64);
-            tracing::info!(
-                "refinement moved earlier key frames by up to {most_px:.1} px: {} Gaussians follow, {dropped} are made anew",
-                self.cloud.len()
-            );
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use config::mission::NetworkSettings;
     use glam::{DQuat, DVec3};
-    use models::camera::{Intrinsics, PoseSigma};
+    use models::camera::{Intrinsics, PoseSigma, View};
     use models::formats::model::ModelHeader;
     use vulkan::gpu::Gpu;
 

@@ -39,7 +39,7 @@ impl Frame {
     /// Sets camera and picture size.
     pub fn look(&mut self, view: &View) {
         let lens = view.intrinsics;
-        self.stand(&view.pose);
+        self.place_camera(&view.pose);
         self.focal = [lens.fx, lens.fy];
         self.principal_point = [lens.cx, lens.cy];
         let (width, height) = (lens.width as f32, lens.height as f32);
@@ -52,9 +52,9 @@ impl Frame {
     }
 
     /// Sets an orthographic camera and its picture's size.
-    pub fn look_parallel(&mut self, view: &OrthographicView) {
+    pub fn look_orthographic(&mut self, view: &OrthographicView) {
         self.flags |= FLAG_ORTHOGRAPHIC;
-        self.stand(&view.pose);
+        self.place_camera(&view.pose);
         self.focal = view.pixels_per_metre.map(|f| f as f32);
         self.principal_point = [0.5 * view.width as f32, 0.5 * view.height as f32];
         (self.min_ratio, self.max_ratio) = ([0.0; 2], [0.0; 2]);
@@ -62,7 +62,7 @@ impl Frame {
         self.show(Window::whole(view.width, view.height));
     }
 
-    fn stand(&mut self, pose: &Pose) {
+    fn place_camera(&mut self, pose: &Pose) {
         let rotation = glam::DMat3::from_quat(pose.rotation.normalize()).transpose();
         let translation = -(rotation * pose.center);
         for (i, row) in self.view_rows.iter_mut().enumerate() {

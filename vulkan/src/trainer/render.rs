@@ -48,7 +48,7 @@ impl Trainer {
             let why = "size, scale and pose of the orthographic camera must be finite and positive".to_owned();
             return Err(TrainError::BadView { name: "rendering".into(), why });
         }
-        self.draw((view.width, view.height), into, |frame| frame.look_parallel(view))
+        self.draw((view.width, view.height), into, |frame| frame.look_orthographic(view))
     }
 
     fn draw(

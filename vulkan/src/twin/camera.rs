@@ -80,7 +80,7 @@ impl<R: Real> Camera<R> {
     }
 
     /// Where the Gaussian at `mean` is seen along, not normalised.
-    pub fn sight(&self, mean: Vec3<R>) -> Vec3<R> {
+    pub fn view_direction(&self, mean: Vec3<R>) -> Vec3<R> {
         match self.rays {
             Rays::Perspective => std::array::from_fn(|k| mean[k] - self.center[k]),
             Rays::Orthographic => self.rotation[2],

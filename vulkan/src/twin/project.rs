@@ -153,7 +153,7 @@ pub fn project<R: Real>(
     if opacity <= R::ZERO || opacity < R::of(limits.alpha_min) {
         return Err(Culled::Transparent);
     }
-    let v = camera.sight(g.mean);
+    let v = camera.view_direction(g.mean);
     let norm = super::real::dot(v, v).sqrt();
     let colour = shade(degree, v.map(|k| k / norm), &g.sh);
     let inverse_det = R::ONE / geo.det;

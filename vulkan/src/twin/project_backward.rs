@@ -91,7 +91,7 @@ pub fn project_backward<R: Real>(
     }
     dp[2] += upstream.depth;
 
-    let (sh, mut d_direction) = shade_backward(degree, camera.sight(g.mean), &g.sh, upstream.colour);
+    let (sh, mut d_direction) = shade_backward(degree, camera.view_direction(g.mean), &g.sh, upstream.colour);
     if !perspective {
         // The direction is the camera's axis: it turns with the camera and moves with nothing.
         dw[2] = std::array::from_fn(|k| dw[2][k] + d_direction[k]);

@@ -1,0 +1,51 @@
+//! What a rebuild keeps of what is trained already.
+
+use models::camera::View;
+
+use super::Reconstruction;
+use super::carry::carry_over;
+use super::first_gaussians::FirstGaussians;
+use super::follow::{Motion, follow};
+use crate::error::JobError;
+
+/// Key frames that refinement moved less than this have not moved, pixels at the ground.
+const MOVED_PX: f64 = 0.05;
+/// Trained Gaussians are kept over a rebuild only where their key frames' motions agree to this, pixels.
+const CONTRADICTED_PX: f64 = 1.5;
+
+impl Reconstruction {
+    /// The cloud to train: what is trained already, and fresh Gaussians where it is not.
+    pub(super) fn take_over(&mut self, fresh: &FirstGaussians) -> Result<(), JobError> {
+        if self.builds > 0 {
+            self.trainer.snapshot(&mut self.cloud)?;
+        }
+        let made = fresh.report.as_ref().filter(|_| self.settings.incremental);
+        match made {
+            _ if self.is_continued() => {}
+            Some(made) => {
+                self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
+                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().gaussians);
+            }
+            None => self.cloud.clone_from(&fresh.cloud),
+        }
+        Ok(())
+    }
+
+    /// Moves what is trained with the key frames that refinement moved since, at `depth_m`.
+    fn follow_key_frames(&mut self, depth_m: f32) {
+        let then = |(i, (name, now)): (usize, &(String, View))| {
+            let then = self.built.get(i).or_else(|| self.resumed.get(name))?;
+            Some(Motion { then: *then, now: *now })
+        };
+        let motions: Vec<Motion> = self.views.iter().enumerate().filter_map(then).collect();
+        let most_px = motions.iter().map(|m| m.pixels_at(depth_m.into())).fold(0.0, f64::max);
+        if most_px > MOVED_PX {
+            let dropped = follow(&mut self.cloud, &motions, CONTRADICTED_PX);
+            self.report.skip("gaussians_contradicted", dropped as u64);
+            tracing::info!(
+                "refinement moved earlier key frames by up to {most_px:.1} px: {} Gaussians follow, {dropped} are made anew",
+                self.cloud.len()
+            );
+        }
+    }
+}
