@@ -48,7 +48,9 @@ pub struct Plan {
     pub tiles: usize,
     /// Training views.
     pub views: usize,
-    /// Training views on the device at once; the others wait in a file.
+    /// Crops of larger pictures.
+    pub crops: usize,
+    /// Views and crops on the device at once; the others wait in a file.
     pub view_slots: usize,
     /// Highest SH degree.
     pub sh_degree: u8,
@@ -108,6 +110,11 @@ pub const fn view_bytes(pixels: u64) -> u64 {
     (4 * pixels + 4 * pixels.div_ceil(2)).next_multiple_of(SECTION_ALIGNMENT)
 }
 
+/// Bytes of one crop in the file of views: RGBA8.
+pub const fn crop_bytes(pixels: u64) -> u64 {
+    (4 * pixels).next_multiple_of(SECTION_ALIGNMENT)
+}
+
 fn within(what: &'static str, value: u64, low: u64, high: u64) -> Result<(), PlanError> {
     if (low..=high).contains(&value) { Ok(()) } else { Err(PlanError::OutOfRange { what, value, low, high }) }
 }
@@ -126,6 +133,7 @@ impl Plan {
         within("height", r.height.into(), 1, 1 << 15)?;
         within("pixels", u64::from(r.width) * u64::from(r.height), 1, BINDING_LIMIT / 48)?;
         within("views", r.views.into(), 0, 1 << 20)?;
+        within("crops", r.crops.into(), 0, 1 << 20)?;
         within("sh_degree", r.sh_degree.into(), 0, 3)?;
         within("sort_lanes", r.sort_lanes.into(), SORT_LANES_SOFTWARE.into(), SORT_LANES_GPU.into())?;
         within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, u64::from(u32::MAX) >> 4)?;
@@ -158,7 +166,7 @@ impl Plan {
     /// A plan with given capacities instead of a budget (tests, benchmarks). `instances` is raised to `gaussians`, so
     /// that one tile always fits. All views are on the device where the request does not say how many.
     pub fn with_capacities(request: &PlanRequest, gaussians: usize, instances: usize) -> Self {
-        let slots = if request.view_slots.is_some() { request.slots() } else { request.views };
+        let slots = if request.view_slots.is_some() { request.slots() } else { request.views + request.crops };
         Self::laid_out(request, slots, gaussians.max(1), instances)
     }
 
@@ -218,6 +226,7 @@ impl Plan {
             pixels: p as usize,
             tiles: tiles as usize,
             views: r.views as usize,
+            crops: r.crops as usize,
             view_slots: slots as usize,
             sh_degree: r.sh_degree,
             half_moments: r.half_moments,

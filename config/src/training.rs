@@ -4,11 +4,13 @@
 //! `--seconds S` squeezes the same recipe into whatever time there is. And every length is relative to the
 //! scene's [extent](scene_extent), so that one recipe serves a stuffed fox and a quarry.
 
+mod crops;
 mod density;
 mod rates;
 mod schedule;
 mod skips;
 
+pub use crops::CropSettings;
 pub use density::{DensitySettings, Strategy};
 pub use rates::{AdamSettings, RateSettings};
 pub use schedule::{ResolutionSettings, ShSettings, StopSettings, ViewSettings};
@@ -40,6 +42,8 @@ table! {
         pub resolution: ResolutionSettings = ResolutionSettings::default();
         /// Which view comes next.
         pub views: ViewSettings = ViewSettings::default();
+        /// Pictures larger than training pictures.
+        pub crops: CropSettings = CropSettings::default();
         /// When to end before the schedule does.
         pub stop: StopSettings = StopSettings::default();
         /// Regularisers that act on the parameters or on the rendering.

@@ -5,6 +5,7 @@
 //! picture at quarter size costs a few megabytes, no full-size picture ever exists, and nothing but Rust is needed to build
 //! it. (libjpeg-turbo is faster yet, but its crates want cmake and an assembler, which a board's two commands do not bring.)
 
+pub mod crops;
 pub(crate) mod tiff;
 
 use std::fs::File;

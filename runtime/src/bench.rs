@@ -2,6 +2,7 @@
 //! each figure of `tests/BENCHMARKS.md` has a command that makes it anew.
 
 pub mod child;
+pub mod detail;
 pub mod figures;
 pub mod front;
 pub mod map;

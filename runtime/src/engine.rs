@@ -27,6 +27,7 @@ use crate::error::JobError;
 use crate::run_json::RunReport;
 
 mod carry;
+mod crops;
 pub mod device;
 mod first_gaussians;
 mod follow;

@@ -13,6 +13,7 @@ use config::geodesy::Geodetic;
 use config::mission::CameraSettings;
 use hal::camera::Picture;
 use hal::error::HalError;
+use image::RgbImage;
 use models::camera::{Intrinsics, Pose, PosedImage, View};
 use models::formats::{FormatError, transforms};
 use models::picture;
@@ -205,6 +206,22 @@ impl KeyframeStore {
             view: View { intrinsics: self.lens, pose: entry.dgtr.pose },
             sigma: entry.dgtr.sigma(),
         })
+    }
+
+    /// Width and height of the pictures as the camera gives them.
+    pub fn camera_size(&self) -> (u32, u32) {
+        (self.camera.width, self.camera.height)
+    }
+
+    /// The picture of key frame `name` at `scale` of the camera's size; `None` when it is not kept.
+    ///
+    /// # Errors
+    /// A picture that is missing, damaged or of another size.
+    pub fn whole(&self, name: &str, scale: f64) -> Result<Option<RgbImage>, StoreError> {
+        let Some(entry) = self.list.frames.iter().find(|f| list::name(&f.file_path) == name) else { return Ok(None) };
+        let image = Picture::Path(self.folder.join(&entry.file_path)).load(&self.camera).map_err(StoreError::Camera)?;
+        let edge = |side: u32| ((f64::from(side) * scale).round() as u32).max(1);
+        Ok(Some(picture::resized(image, (edge(self.camera.width), edge(self.camera.height)))))
     }
 
     /// Key frame `i` if there is one. One whose picture cannot be read is set aside, named in a warning, and the next takes its

@@ -154,6 +154,7 @@ impl TrainJob {
             return Err(JobError::Request(format!("{}: split {:?} holds no pictures", set.root.display(), self.split)));
         }
         let size = largest(&set, &frames, picture_scale)?;
+        let crops = self.crops(&set, &frames, picture_scale)?;
         let metric = self.network.metric.as_deref().filter(|_| self.evaluate);
         let mut metric = evaluate::open_metric(metric, size)?;
         let settings = EngineSettings {
@@ -163,6 +164,7 @@ impl TrainJob {
                 device_mib: self.budget_mib,
                 size,
                 views: frames.len(),
+                crops,
                 view_slots: self.view_slots,
                 folder: Some(self.out.clone()),
                 max_gaussians: self.max_gaussians,
@@ -197,7 +199,8 @@ impl TrainJob {
             // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
             engine.checkpoint(&self.out, false)?;
         }
-        let ready = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
+        let built = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
+        let ready = built && engine.look_closer(&mut source, &go_on)?;
         let finished = ready && self.optimise(&mut engine, &stop)?;
         if finished && self.evaluate {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
@@ -243,6 +246,7 @@ impl TrainJob {
                 device_mib: self.budget_mib,
                 size: largest(set, &frames, scale)?,
                 views: frames.len(),
+                crops: 0,
                 view_slots: self.view_slots.or(Some(frames.len() as u32)),
                 folder: None,
                 max_gaussians: self.max_gaussians,
@@ -262,6 +266,17 @@ impl TrainJob {
         }
         // Not even the smallest fits: the plan itself says what is missing.
         Ok(1.0)
+    }
+
+    /// Crops that find use: all of all pictures, at the most as many as the settings say.
+    fn crops(&self, set: &Dataset, frames: &[usize], scale: f64) -> Result<usize, JobError> {
+        let settings = &self.training.crops;
+        let mut all = 0;
+        for &i in frames {
+            let (whole, small) = (&set.frames[i].view.intrinsics, scaled(&set.frames[i].view.intrinsics, scale)?);
+            all += settings.planned((whole.width, whole.height), (small.width, small.height));
+        }
+        Ok(all.min(settings.most) as usize)
     }
 
     /// Takes up the model in `out` when it is of the same pictures and holds Gaussians; a model of other pictures is an

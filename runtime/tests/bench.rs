@@ -83,7 +83,7 @@ fn time_against_error_leaves_figures_a_picture_and_a_page_and_keeps_what_it_meas
     }
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
-    write_data_set(&dir.path().join("world"), 2).unwrap();
+    write_data_set(&dir.path().join("world"), 2, 1.0).unwrap();
     let (set, out) = (path("world"), path("out"));
     let arguments = [
         "time-error",
@@ -133,4 +133,30 @@ fn every_skip_is_a_row_with_a_verdict() {
 fn the_twin_keeps_every_promise_without_a_device() {
     let text = held(&bench(&["stress", "--twin-only"]));
     assert!(text.contains("held") && !text.contains("BROKEN"), "{text}");
+}
+
+#[test]
+fn detail_that_training_pictures_cannot_show_is_learnt_from_crops_and_the_same_seed_gives_the_same_bytes() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    write_data_set(&dir.path().join("world"), 2, 1.0).unwrap();
+    let (set, figures) = (path("world"), path("figures.json"));
+    let run = |out: &str, crops: &str| {
+        let out = path(out);
+        let of_training = ["--scale", "0.25", "--steps", "150", "--max-gaussians", "4000", "--crops", crops];
+        held(&bench(&[&["detail", &set, "--out", &out, "--json", &figures][..], &of_training].concat()));
+        json(Path::new(&figures)).as_array().unwrap().clone()
+    };
+    let both = run("first", "0,512");
+    assert_eq!([0, 1].map(|i| both[i]["taken"].as_u64().unwrap()), [0, 21 * 16]);
+    let [whole, crops] = [0, 1].map(|i| both[i]["full"]["psnr"].as_f64().unwrap());
+    println!("{whole:.2} dB at full size from whole pictures, {crops:.2} dB with crops");
+    assert!(crops > whole + 0.3, "{whole} dB, {crops} dB");
+    // A third of the room: of each picture the five with the most detail.
+    assert_eq!(run("second", "105,512")[0]["taken"], 21 * 4, "all crops of half the size find room");
+    let model = |out: &str| std::fs::read(dir.path().join(out).join("crops-512/model.dgtr")).unwrap();
+    assert!(model("first") == model("second"), "another model from the same seed");
 }

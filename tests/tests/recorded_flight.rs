@@ -104,6 +104,10 @@ fn every_exposure_of_a_recorded_survey_becomes_a_picture_with_the_pose_it_was_ta
     assert!(mean_m <= 0.15 && mean_deg <= 1.0, "{mean_m} m, {mean_deg}°");
     let (header, cloud) = models::formats::model::read(&at.join("out/model.dgtr")).expect("a model");
     assert!(header.finished && cloud.len() > 1000);
+    // Trained at four tenths of the camera's size: after the landing every key frame gives nine crops that show all of it.
+    let run: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(at.join("out/run.json")).expect("run.json")).expect("JSON");
+    assert_eq!(run["crops"], 9 * header.views.len(), "{run}");
 }
 
 fn stem(name: &str) -> String {

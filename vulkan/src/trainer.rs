@@ -6,6 +6,7 @@
 mod bands;
 mod check;
 mod control;
+mod crops;
 mod deferred;
 mod degrees;
 mod density;
@@ -24,6 +25,7 @@ mod step;
 mod views;
 
 pub use check::{PlanFit, check_device, check_plan};
+pub use crops::CropPlace;
 pub use error::TrainError;
 pub use gradient::ViewGradients;
 pub use parameters::LoadReport;
@@ -69,8 +71,10 @@ pub struct Trainer {
     frame: Box<Frame>,
     deferred: deferred::Deferred,
     views: Vec<views::TrainingView>,
+    crops: Vec<crops::TrainingCrop>,
     slots: slots::Slots,
     sampler: sampler::Sampler,
+    crop_sampler: sampler::Sampler,
     density: density::Scratch,
     degrees: degrees::Degrees,
     bands: Vec<bands::Band>,
@@ -146,8 +150,10 @@ impl Trainer {
             frame: Box::new(Frame::zeroed()),
             deferred: deferred::Deferred::new(&settings.adam),
             views: Vec::with_capacity(plan.views),
+            crops: Vec::with_capacity(plan.crops),
             slots: slots::Slots::new(plan),
             sampler: sampler::Sampler::new(settings.seed, plan.views),
+            crop_sampler: sampler::Sampler::new(settings.seed, plan.crops),
             density: density::Scratch::new(plan.gaussians),
             degrees: degrees::Degrees::new(plan.gaussians),
             bands: Vec::with_capacity(plan.tiles),
@@ -174,6 +180,7 @@ impl Trainer {
         self.flushed = true;
         self.deferred.reset();
         self.sampler.reset();
+        self.crop_sampler.reset();
         self.strategy = self.settings.density.resolve(self.gaussians, self.plan.gaussians);
         self.counters = Counters::default();
         self.extent = 0.0;

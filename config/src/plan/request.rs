@@ -1,6 +1,6 @@
 //! What a job asks of the device, and which of its views find room there.
 
-use super::{BINDING_LIMIT, Plan, SORT_LANES_SOFTWARE, sh_columns, view_bytes};
+use super::{BINDING_LIMIT, Plan, SORT_LANES_SOFTWARE, crop_bytes, sh_columns, view_bytes};
 
 /// Views on the device at the least: the step's own, and the one that comes in.
 const LEAST_SLOTS: u32 = 2;
@@ -16,7 +16,9 @@ pub struct PlanRequest {
     pub height: u32,
     /// Training views.
     pub views: u32,
-    /// How many of them are on the device at once, the others waiting in a file; `None`: all where they take at most half of the
+    /// Crops of the pictures at a larger size than they are trained at, each of a training picture's pixels at most.
+    pub crops: u32,
+    /// How many views and crops are on the device at once, the others waiting in a file; `None`: all where they take at most half of the
     /// memory, else as many as an eighth of it holds, and never more than leave room for a plan.
     pub view_slots: Option<u32>,
     /// Highest SH degree, 0…3.
@@ -37,6 +39,7 @@ impl Default for PlanRequest {
             width: 640,
             height: 480,
             views: 64,
+            crops: 0,
             view_slots: None,
             sh_degree: 3,
             max_gaussians: None,
@@ -52,18 +55,24 @@ impl PlanRequest {
         (u64::from(self.width) * u64::from(self.height)).next_multiple_of(64)
     }
 
-    /// Training views on the device at once.
+    /// Views and crops, all of which are pictures of a step.
+    fn pictures(&self) -> u32 {
+        self.views.saturating_add(self.crops)
+    }
+
+    /// Views and crops on the device at once.
     pub fn slots(&self) -> u32 {
         let budget = u64::from(self.device_mib) << 20;
         let held_in = |bytes: u64| u32::try_from(bytes / view_bytes(self.padded_pixels())).unwrap_or(u32::MAX);
         let slots = match self.view_slots {
             Some(slots) => slots,
             None => {
-                let few = if held_in(budget / 2) >= self.views { self.views } else { held_in(budget / 8) };
+                let all = self.pictures();
+                let few = if held_in(budget / 2) >= all { all } else { held_in(budget / 8) };
                 few.min(held_in(budget.saturating_sub(Plan::smallest(self, 0).total_bytes)))
             }
         };
-        slots.max(LEAST_SLOTS).min(self.views)
+        slots.max(LEAST_SLOTS).min(self.pictures())
     }
 
     /// Gaussians that bindings and request allow.
@@ -74,9 +83,11 @@ impl PlanRequest {
         self.max_gaussians.unwrap_or(most).min(most)
     }
 
-    /// Bytes of the file that holds the views when not all of them are on the device; 0 when all are.
+    /// Bytes of the file that holds views and crops when not all of them are on the device; 0 when all are.
     pub fn view_file_bytes(&self) -> u64 {
-        if self.slots() < self.views { u64::from(self.views) * view_bytes(self.padded_pixels()) } else { 0 }
+        let pixels = self.padded_pixels();
+        let all = u64::from(self.views) * view_bytes(pixels) + u64::from(self.crops) * crop_bytes(pixels);
+        if self.slots() < self.pictures() { all } else { 0 }
     }
 }
 
@@ -97,6 +108,10 @@ mod tests {
         assert_eq!(PlanRequest { view_slots: Some(0), ..many }.slots(), 2, "one in use, one coming in");
         assert_eq!(PlanRequest { view_slots: Some(2000), ..many }.slots(), 1000);
         assert_eq!(of(0, 640, 480).slots(), 0);
+        // Crops wait as views do, without room for a depth prior.
+        let cropped = PlanRequest { crops: 300, ..few };
+        assert_eq!((cropped.slots(), cropped.view_file_bytes()), (36, 640 * 480 * (50 * 6 + 300 * 4)));
+        assert_eq!(PlanRequest { crops: 3, ..few }.slots(), 53);
         // Where pictures are large for the memory, fewer of them stay rather than that no plan can be made.
         let tight = PlanRequest { device_mib: 215, ..of(50, 1280, 960) };
         assert!(tight.slots() == 2 && Plan::new(&tight).is_ok(), "{}", tight.slots());

@@ -125,6 +125,7 @@ pub fn distil(
         device_mib: settings.device_mib,
         size: (side(|k| k.width), side(|k| k.height)),
         views: lessons.len(),
+        crops: 0,
         // Their targets are in the host's memory anyway.
         view_slots: Some(lessons.len() as u32),
         folder: None,

@@ -69,7 +69,7 @@ struct Compared {
 /// The training fails, or the folder cannot be written to.
 pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> Result<MapScores, JobError> {
     let (data, world) = (out.join("data"), world::world(seed));
-    world::write_data_set(&data, seed)?;
+    world::write_data_set(&data, seed, 1.0)?;
     let train = |name: &str, more: &[String]| {
         let mut arguments = vec!["train".to_owned(), data.display().to_string(), "--seed".into(), seed.to_string()];
         arguments.extend_from_slice(more);

@@ -143,6 +143,7 @@ pub fn measure(
         device_mib: MOST_MIB,
         size: (width, height),
         views: scene.pictures.len(),
+        crops: 0,
         view_slots: Some(scene.pictures.len() as u32),
         folder: None,
         max_gaussians: Some(scene.cloud.len()),

@@ -27,14 +27,15 @@ pub fn world(seed: u64) -> World {
     World::new(seed, &WorldSettings { half_extent_m: 60.0, ..WorldSettings::default() })
 }
 
-/// Writes `GRID` nadir pictures with their true poses to `root`; every 8th is held out, as in any data set without
-/// `split.json`.
+/// Writes `GRID` nadir pictures, `larger` times as wide and high as `SIZE`, with their true poses to `root`; every 8th is held out,
+/// as in any data set without `split.json`.
 ///
 /// # Errors
 /// The folder cannot be written to.
-pub fn write_data_set(root: &Path, seed: u64) -> Result<(), JobError> {
+pub fn write_data_set(root: &Path, seed: u64, larger: f64) -> Result<(), JobError> {
     let world = world(seed);
-    let (cx, cy) = (f64::from(SIZE[0]) / 2.0, f64::from(SIZE[1]) / 2.0);
+    let [width, height] = SIZE.map(|side| (f64::from(side) * larger).round() as u32);
+    let (focal, cx, cy) = (FOCAL * larger, f64::from(width) / 2.0, f64::from(height) / 2.0);
     // Camera axes right, down, forward; the picture's top is north.
     let rotation = DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0);
     let mut frames = Vec::new();
@@ -42,15 +43,14 @@ pub fn write_data_set(root: &Path, seed: u64) -> Result<(), JobError> {
         let (column, row) = ((i % GRID[0]) as f64, (i / GRID[0]) as f64);
         let place = |at: f64, of: usize| (at - 0.5 * (of - 1) as f64) * SPACING_M;
         let center = DVec3::new(place(column, GRID[0]), place(row, GRID[1]), HEIGHT_M);
-        let view =
-            PinholeView { width: SIZE[0], height: SIZE[1], fx: FOCAL, fy: FOCAL, cx, cy, position: center, rotation };
+        let view = PinholeView { width, height, fx: focal, fy: focal, cx, cy, position: center, rotation };
         let file = format!("images/{i:02}.png");
         save_png(&world.render(&view).0, &root.join(&file))?;
         let matrix = pose_to_opengl(&Pose { rotation, center });
         frames.push(serde_json::json!({ "file_path": file, "transform_matrix": matrix }));
     }
     let description = serde_json::json!({
-        "fl_x": FOCAL, "fl_y": FOCAL, "cx": cx, "cy": cy, "w": SIZE[0], "h": SIZE[1],
+        "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "w": width, "h": height,
         "enu_origin_wgs84": { "lat": 47.3977, "lon": 8.5456, "alt": 488.0 },
         "frames": frames,
     });
@@ -64,7 +64,7 @@ mod tests {
     #[test]
     fn the_data_set_opens_and_its_pictures_overlap() {
         let dir = tempfile::tempdir().unwrap();
-        write_data_set(dir.path(), 3).unwrap();
+        write_data_set(dir.path(), 3, 1.0).unwrap();
         let set = models::dataset::Dataset::open(dir.path()).unwrap();
         assert_eq!(set.frames.len(), 24);
         assert_eq!((set.select("test", None).unwrap().len(), set.select("train", None).unwrap().len()), (3, 21));

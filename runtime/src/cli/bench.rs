@@ -1,5 +1,6 @@
 //! `dgtr bench …`: one subcommand per question; results as Markdown on standard output, JSON and CSV on request.
 
+mod detail;
 mod map;
 mod memory;
 mod skips;
@@ -24,6 +25,8 @@ enum Command {
     Stages(stages::Args),
     /// Orthophoto and heights of a simulated survey against the exact ones.
     Map(map::Args),
+    /// What crops of pictures larger than the plan holds are worth at their full size.
+    Detail(detail::Args),
     /// Planned against measured bytes, and quality, across memory budgets.
     Memory(memory::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
@@ -56,6 +59,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     match args.command {
         Command::Stages(args) => stages::run(args),
         Command::Map(args) => map::run(args),
+        Command::Detail(args) => detail::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),

@@ -7,7 +7,7 @@ use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
-use config::training::ShSettings;
+use config::training::{CropSettings, ShSettings};
 use models::dataset::{Dataset, scaled};
 use vulkan::gpu::{Gpu, GpuInfo};
 
@@ -177,11 +177,14 @@ impl Job {
         };
         let memory = MemorySettings { image_scale: args.scale.map(|s| s as f32), ..MemorySettings::default() };
         memory.check().map_err(|e| CliError::input(format!("--scale: {e}")))?;
+        let (size, settings) = (memory.training_size(picture), CropSettings::default());
+        let crops = u64::from(settings.planned(picture, size)) * views as u64;
         let device = DeviceRequest {
             device: None,
             device_mib: args.budget_mib,
-            size: memory.training_size(picture),
+            size,
             views,
+            crops: crops.min(settings.most.into()) as usize,
             view_slots: args.view_slots,
             folder: None,
             max_gaussians: args.max_gaussians,

@@ -31,6 +31,13 @@ pub fn training_lens(mission: &Mission) -> Intrinsics {
     full.resized(width, height)
 }
 
+/// Crops that a flight with as many key frames as it may have takes.
+fn crops_of_flight(mission: &Mission) -> u32 {
+    let (camera, lens, settings) = (&mission.camera, training_lens(mission), &mission.training.crops);
+    let each = settings.planned((camera.width, camera.height), (lens.width, lens.height));
+    mission.keyframes.max.saturating_mul(each).min(settings.most)
+}
+
 /// What a job wants of which device.
 #[derive(Clone, Debug)]
 pub struct DeviceRequest {
@@ -42,7 +49,9 @@ pub struct DeviceRequest {
     pub size: (u32, u32),
     /// Training views.
     pub views: usize,
-    /// How many of them are on the device at once; `None`: as [`PlanRequest::slots`] says.
+    /// Crops of larger pictures at the most.
+    pub crops: usize,
+    /// How many of both are on the device at once; `None`: as [`PlanRequest::slots`] says.
     pub view_slots: Option<u32>,
     /// Where the file of the others lies; absent: the system's temporary folder.
     pub folder: Option<PathBuf>,
@@ -58,6 +67,7 @@ impl DeviceRequest {
             width: self.size.0,
             height: self.size.1,
             views: self.views as u32,
+            crops: self.crops as u32,
             view_slots: self.view_slots,
             sh_degree: sh.degree,
             max_gaussians: self.max_gaussians,
@@ -74,6 +84,7 @@ impl DeviceRequest {
             device_mib: memory.device_mib,
             size: (lens.width, lens.height),
             views: mission.keyframes.max as usize,
+            crops: crops_of_flight(mission) as usize,
             view_slots: memory.view_slots,
             folder,
             max_gaussians: memory.max_gaussians.map(|n| n as usize),
@@ -151,6 +162,7 @@ fn renderer_of(
         device_mib: u32::MAX,
         size: (width, height),
         views: 0,
+        crops: 0,
         view_slots: None,
         folder: None,
         max_gaussians,

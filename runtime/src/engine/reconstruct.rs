@@ -10,7 +10,7 @@ use models::dataset::scaled;
 use models::formats::model;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
-use super::{Reconstruction, model_path};
+use super::{PictureSource, Reconstruction, model_path};
 use crate::error::JobError;
 
 /// Fewer key frames than this say too little about the ground.
@@ -39,6 +39,14 @@ pub trait Reconstruct {
     /// # Errors
     /// The network or the device fails; the pictures give no depth.
     fn build(&mut self, go_on: &dyn Fn() -> bool) -> Result<bool, JobError>;
+    /// Has what training pictures are too small to show cut out of the key frames, once no more of them come; false when `go_on` said
+    /// no before it was.
+    ///
+    /// # Errors
+    /// A picture that was there cannot be read any more; the file of the views cannot be written.
+    fn look_closer(&mut self, _source: &mut dyn PictureSource, _go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
+        Ok(true)
+    }
     /// Whether the schedule of `budget` is over.
     fn is_done(&self, budget: &RunBudget) -> bool;
     /// Trains until the budget, the schedule, or `each` says stop.
@@ -196,6 +204,10 @@ impl Reconstruct for Reconstruction {
         Ok(true)
     }
 
+    fn look_closer(&mut self, source: &mut dyn PictureSource, go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
+        self.cut_crops(source, go_on)
+    }
+
     fn is_done(&self, budget: &RunBudget) -> bool {
         let (steps, seconds) = self.trainer.spent();
         let by_steps = budget.steps.is_some_and(|s| steps >= s);
@@ -319,6 +331,7 @@ mod tests {
                 device_mib: 64,
                 size: (32, 24),
                 views: 3,
+                crops: 0,
                 view_slots: None,
                 folder: None,
                 max_gaussians: Some(300),

@@ -1,9 +1,10 @@
-//! Where pictures come from: an aircraft in flight, a folder. The engine asks for the next one and never for an earlier one
-//! again: what it needs of a picture it keeps.
+//! Where pictures come from: an aircraft in flight, a folder. The engine asks for the next one; what it needs of a picture it
+//! keeps, but for the detail that training pictures are too small to show: that it has cut out of an earlier one.
 
 use std::time::Duration;
 
 use config::mission::KeyframeSettings;
+use image::RgbImage;
 use models::camera::PosedImage;
 use models::dataset::{Dataset, PoseSource};
 
@@ -23,6 +24,15 @@ pub trait PictureSource {
 
     /// Whether pictures may come that are not waiting yet.
     fn is_open(&self) -> bool;
+
+    /// Width and height of an earlier picture as the camera took it, where it is still there.
+    fn size_of(&self, name: &str) -> Option<(u32, u32)>;
+
+    /// An earlier picture decoded again, at `scale` of the camera's size; `None` where it is not there any more.
+    ///
+    /// # Errors
+    /// It is there and cannot be read.
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<RgbImage>, JobError>;
 }
 
 /// The pictures of a data set, each decoded once.
@@ -73,6 +83,10 @@ impl<'a> Folder<'a> {
         self.keyframes
     }
 
+    fn index_of(&self, name: &str) -> Option<usize> {
+        self.set.frames.iter().position(|frame| frame.name == name)
+    }
+
     /// Pictures decoded so far.
     pub fn decoded(&self) -> u64 {
         self.decoded
@@ -92,5 +106,15 @@ impl PictureSource for Folder<'_> {
 
     fn is_open(&self) -> bool {
         false
+    }
+
+    fn size_of(&self, name: &str) -> Option<(u32, u32)> {
+        let lens = &self.set.frames[self.index_of(name)?].view.intrinsics;
+        Some((lens.width, lens.height))
+    }
+
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<RgbImage>, JobError> {
+        let Some(i) = self.index_of(name) else { return Ok(None) };
+        Ok(Some(self.set.load_posed(i, scale, self.poses)?.image))
     }
 }

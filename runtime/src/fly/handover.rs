@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use hal::failsafe::Flags;
 use hal::mavlink::dialect::MavSeverity;
+use image::RgbImage;
 use models::camera::{Pose, PosedImage};
 
 use crate::engine::PictureSource;
@@ -167,6 +168,19 @@ impl PictureSource for Handover {
 
     fn waiting(&self) -> usize {
         self.earlier_left() + self.shared.waiting.load(Ordering::Acquire)
+    }
+
+    fn size_of(&self, _name: &str) -> Option<(u32, u32)> {
+        self.store.as_ref().map(|(store, _)| store.camera_size())
+    }
+
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<RgbImage>, JobError> {
+        let Some((store, _)) = &self.store else { return Ok(None) };
+        // What is damaged is set aside at the next start.
+        Ok(store.whole(name, scale).unwrap_or_else(|e| {
+            tracing::warn!("{e}; no crops of it");
+            None
+        }))
     }
 
     fn is_open(&self) -> bool {

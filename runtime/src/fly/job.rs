@@ -281,6 +281,14 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         if !self.reconstruction.has_model() {
             return Ok(());
         }
+        if !interrupt.requested() && !self.failsafe.state().forbids_training() {
+            let supervisor = &self.supervisor;
+            let go_on = || {
+                supervisor.alive();
+                !interrupt.requested()
+            };
+            self.reconstruction.look_closer(capture, &go_on)?;
+        }
         // What the autopilot said last of its battery holds; the rest of what the HAL saw ended with the flight, and there
         // is no flight's time any more that training could be behind.
         let seen = Flags { battery_low: capture.flags().battery_low, ..Flags::default() };

@@ -68,6 +68,7 @@ fn two_buffers(bytes: u64) -> Plan {
         pixels: 0,
         tiles: 0,
         views: 0,
+        crops: 0,
         view_slots: 0,
         sh_degree: 0,
         half_moments: false,

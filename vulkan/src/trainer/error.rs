@@ -28,6 +28,12 @@ pub enum TrainError {
         /// Views in the plan.
         planned: usize,
     },
+    /// More crops than planned.
+    #[error("the memory plan holds {planned} crops; plan for more (PlanRequest::crops)")]
+    TooManyCrops {
+        /// Crops in the plan.
+        planned: usize,
+    },
     /// The file of the views that are not on the device.
     #[error("the file of the views that are not on the device: {0}")]
     ViewFile(String),

@@ -1,6 +1,7 @@
 //! Gradients for inspection: what a step would follow, for every parameter, the camera and the exposure. The gradient
 //! checks compare them with the CPU twins and with central differences.
 
+use super::slots::Picture;
 use super::{TrainError, Trainer};
 use models::cloud::GaussianCloud;
 
@@ -32,10 +33,10 @@ impl Trainer {
         self.measure_extent();
         self.open_degrees();
         self.forget_all();
-        self.prepare_frame(index, 1.0);
+        self.prepare_frame(Picture::View(index), 1.0);
         (self.frame.background, self.frame.drop_share) = ([0.0; 3], 0.0);
         self.write_frame();
-        self.forward_count(index)?;
+        self.forward_count(Picture::View(index))?;
         self.gradients_only = true;
         let done = self.forward_backward();
         self.gradients_only = false;

@@ -18,6 +18,8 @@ pub struct StepReport {
     pub step: u32,
     /// The view it looked at.
     pub view: usize,
+    /// The crop of its picture that it looked at; `None`: the whole picture at training size.
+    pub crop: Option<usize>,
     /// The whole loss.
     pub loss: f32,
     /// Mean absolute difference.

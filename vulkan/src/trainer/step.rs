@@ -2,6 +2,7 @@
 
 use super::bands::Counted;
 use super::frame::flags_of;
+use super::slots::Picture;
 use super::{StepReport, TrainError, Trainer};
 use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
 use crate::kernels::Kernel;
@@ -32,13 +33,12 @@ impl Trainer {
             self.open_degrees();
         }
         let progress = self.progress();
-        let views = &self.views;
-        let index = self.sampler.next(views.len(), self.settings.views.residual_share, |v| views[v].last_loss);
-        let divisor = self.prepare_frame(index, progress);
+        let picture = self.choose(progress);
+        let divisor = self.prepare_frame(picture, progress);
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
         self.commands.weigh(super::timed_weight(self.steps, self.timed_every));
-        let counted = self.forward_count(index)?;
+        let counted = self.forward_count(picture)?;
         self.read_ahead();
         self.forward_backward()?;
         self.commands.weigh(1.0);
@@ -46,7 +46,7 @@ impl Trainer {
         self.flushed = false;
         self.deferred.push(self.steps, self.frame.mean_rate, self.settings.rates.decay(progress));
         self.elapsed_s += start.elapsed().as_secs_f64();
-        let mut report = self.read_loss(index, counted, divisor, progress);
+        let mut report = self.read_loss(picture, counted, divisor, progress);
         self.control_density(progress)?;
         self.raise_degrees(progress)?;
         if !self.settings.skips.deferred_moments {
@@ -57,13 +57,17 @@ impl Trainer {
         Ok(report)
     }
 
-    /// Fills the frame for view `index`; returns the resolution divisor.
-    pub(super) fn prepare_frame(&mut self, index: usize, progress: f32) -> u32 {
+    /// Fills the frame for a picture; returns the resolution divisor.
+    pub(super) fn prepare_frame(&mut self, picture: Picture, progress: f32) -> u32 {
         let s = &self.settings;
-        let resident = &self.views[index];
-        let divisor = s.resolution.divisor_at(progress, resident.width, resident.height);
-        let (width, height) = ((resident.width / divisor).max(1), (resident.height / divisor).max(1));
-        let mut view = resident.view;
+        let resident = &self.views[self.view_of(picture)];
+        let (mut view, depth_at) = match picture {
+            Picture::View(_) => (resident.view, resident.depth_at),
+            Picture::Crop(index) => (self.crops[index].seen_from(&resident.view), 0),
+        };
+        let source_width = view.intrinsics.width;
+        let divisor = s.resolution.divisor_at(progress, source_width, view.intrinsics.height);
+        let (width, height) = ((source_width / divisor).max(1), (view.intrinsics.height / divisor).max(1));
         // Whole blocks of pixels: the lens is scaled by the divisor exactly, what does not fill a block is left out.
         let lens = &mut view.intrinsics;
         let d = divisor as f32;
@@ -72,7 +76,7 @@ impl Trainer {
         let f = &mut *self.frame;
         f.look(&view);
         let pixels = (width * height) as f32;
-        let has_depth = resident.depth_at != 0 && s.loss.depth > 0.0;
+        let has_depth = depth_at != 0 && s.loss.depth > 0.0;
         let mut flags = flags_of(&s.skips);
         if s.loss.freeze_shape {
             flags |= FLAG_FREEZE_SHAPE;
@@ -106,14 +110,14 @@ impl Trainer {
         (f.first_bias, f.second_bias) = (decay * bias(s.adam.beta1), bias(s.adam.beta2));
         (f.step, f.seed) = (t, (s.seed ^ (s.seed >> 32)) as u32);
         (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * pixels), s.loss.ssim / (3.0 * pixels));
-        (f.source_width, f.depth_offset) = (resident.width, resident.depth_at);
+        (f.source_width, f.depth_offset) = (source_width, depth_at);
         divisor
     }
 
     /// First submission: picture, projection, sort, counts.
-    pub(super) fn forward_count(&mut self, index: usize) -> Result<Counted, TrainError> {
+    pub(super) fn forward_count(&mut self, picture: Picture) -> Result<Counted, TrainError> {
         let _phase = tracing::trace_span!("project, sort, count").entered();
-        let slot = self.resident(index)?;
+        let slot = self.resident(picture)?;
         let commands = self.take_recording()?;
         commands.run_view(Kernel::Target, slot, self.frame.pixels());
         self.record_counting(&commands);
@@ -170,7 +174,7 @@ impl Trainer {
     }
 
     /// Sums the partial losses in a fixed order, moves pose and exposure, and makes the report.
-    fn read_loss(&mut self, index: usize, counted: Counted, divisor: u32, progress: f32) -> StepReport {
+    fn read_loss(&mut self, picture: Picture, counted: Counted, divisor: u32, progress: f32) -> StepReport {
         let sums = self.partial_sums();
         let Weighed { loss, l1, ssim, correlation } = self.weigh(&sums);
         let tiles = self.frame.tiles() as usize;
@@ -187,8 +191,12 @@ impl Trainer {
         c.sh_missing += missing;
 
         let s = &self.settings;
+        let index = self.view_of(picture);
         let view = &mut self.views[index];
-        view.last_loss = loss;
+        match picture {
+            Picture::View(_) => view.last_loss = loss,
+            Picture::Crop(crop) => self.crops[crop].last_loss = loss,
+        }
         if s.refine_poses {
             view.adjust.move_pose(&mut view.view.pose, sums.pose, &s.rates, self.extent, &s.adam);
         }
@@ -198,6 +206,7 @@ impl Trainer {
         StepReport {
             step: self.steps,
             view: index,
+            crop: if let Picture::Crop(crop) = picture { Some(crop) } else { None },
             loss,
             l1,
             ssim,

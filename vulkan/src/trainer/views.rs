@@ -1,5 +1,6 @@
 //! Training views: pixels in a slot of the device or in a file, pose and exposure on the host.
 
+use super::slots::Picture;
 use super::{TrainError, Trainer};
 use image::RgbImage;
 use models::camera::{DepthPrior, Pose, PosedImage, View};
@@ -39,12 +40,7 @@ impl Trainer {
         view.intrinsics = view.intrinsics.resized(width, height);
         let adjust = super::pose::Adjust::default();
         self.views.push(TrainingView { view, width, height, depth_at: 0, last_loss: f32::INFINITY, adjust });
-        let slot = self.slot_for_new(index);
-        let section = self.pixels_in(slot, index);
-        let words = self.arena.slice_mut::<u32>(section);
-        for (word, p) in words.iter_mut().zip(image.pixels()) {
-            *word = u32::from_le_bytes([p[0], p[1], p[2], 0]);
-        }
+        self.write_pixels(Picture::View(index), image);
         self.sampler.forget();
         if let Err(e) = self.set_prior(index, prior) {
             // A view without its pixels is none.
@@ -52,6 +48,16 @@ impl Trainer {
             return Err(e);
         }
         Ok(index)
+    }
+
+    /// Puts the pixels of a new picture into a slot; returns which.
+    pub(super) fn write_pixels(&mut self, picture: Picture, image: &RgbImage) -> usize {
+        let slot = self.slot_for_new(picture);
+        let section = self.pixels_in(slot, picture);
+        for (word, p) in self.arena.slice_mut::<u32>(section).iter_mut().zip(image.pixels()) {
+            *word = u32::from_le_bytes([p[0], p[1], p[2], 0]);
+        }
+        slot
     }
 
     /// Replaces the depth prior of view `index`, of any size; its pixels stay.
@@ -64,8 +70,8 @@ impl Trainer {
         if let Some(why) = prior.and_then(broken) {
             return Err(TrainError::BadView { name: format!("view {index}"), why: why.to_owned() });
         }
-        let slot = self.resident(index)?;
-        let section = self.pixels_in(slot, index);
+        let slot = self.resident(Picture::View(index))?;
+        let section = self.pixels_in(slot, Picture::View(index));
         let TrainingView { width, height, .. } = self.views[index];
         let pixels = width as usize * height as usize;
         let (colours, depths) = self.arena.slice_mut::<u32>(section).split_at_mut(pixels);
@@ -86,7 +92,7 @@ impl Trainer {
             }
             *colour = (*colour & 0x00ff_ffff) | u32::from(confidence) << 24;
         }
-        self.keep(slot, index)?;
+        self.keep(slot, Picture::View(index))?;
         self.views[index].depth_at = if range.is_some() { pixels as u32 } else { 0 };
         Ok(())
     }
@@ -114,9 +120,9 @@ impl Trainer {
     /// [`TrainError::BadView`] when there is no such view; [`TrainError::ViewFile`].
     pub fn view_image(&mut self, index: usize) -> Result<RgbImage, TrainError> {
         self.view_is_there(index)?;
-        let slot = self.resident(index)?;
+        let slot = self.resident(Picture::View(index))?;
         let TrainingView { width, height, .. } = self.views[index];
-        let words = self.arena.slice::<u32>(self.pixels_in(slot, index)).iter();
+        let words = self.arena.slice::<u32>(self.pixels_in(slot, Picture::View(index))).iter();
         // As many words as the image has pixels: what is behind them is the depth prior.
         let mut pixels = words.map(|w| w.to_le_bytes());
         Ok(RgbImage::from_fn(width, height, |_, _| {
@@ -125,7 +131,7 @@ impl Trainer {
         }))
     }
 
-    fn view_is_there(&self, index: usize) -> Result<(), TrainError> {
+    pub(super) fn view_is_there(&self, index: usize) -> Result<(), TrainError> {
         match index < self.views.len() {
             true => Ok(()),
             false => Err(TrainError::BadView { name: format!("view {index}"), why: "does not exist".to_owned() }),
@@ -133,7 +139,7 @@ impl Trainer {
     }
 
     /// The largest size of the same shape that the plan holds.
-    fn fitting(&self, width: u32, height: u32) -> (u32, u32) {
+    pub(super) fn fitting(&self, width: u32, height: u32) -> (u32, u32) {
         let fits = |w: u32, h: u32| {
             let tiles = super::frame::Window::whole(w, h).tiles() as usize;
             w as usize * h as usize <= self.plan.pixels && tiles <= self.plan.tiles

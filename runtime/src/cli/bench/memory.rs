@@ -62,7 +62,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Some(root) => root.clone(),
         None => {
             let root = temporary.path().join("world");
-            world::write_data_set(&root, args.seed)?;
+            world::write_data_set(&root, args.seed, 1.0)?;
             root
         }
     };

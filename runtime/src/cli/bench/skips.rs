@@ -72,7 +72,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Some(root) => root.clone(),
         None => {
             let root = temporary.path().join("world");
-            world::write_data_set(&root, 1)?;
+            world::write_data_set(&root, 1, 1.0)?;
             root
         }
     };
