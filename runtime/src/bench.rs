@@ -3,6 +3,7 @@
 
 pub mod child;
 pub mod detail;
+pub mod device;
 pub mod figures;
 pub mod front;
 pub mod map;

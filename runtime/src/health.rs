@@ -1,7 +1,7 @@
 //! The companion's own state as flags of the failsafe ladder, beside those of the HAL: temperature, supply, clock, memory, disk,
 //! and whether training keeps its time budget.
 
-mod board;
+pub(crate) mod board;
 
 use std::path::{Path, PathBuf};
 

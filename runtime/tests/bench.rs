@@ -160,3 +160,27 @@ fn detail_that_training_pictures_cannot_show_is_learnt_from_crops_and_the_same_s
     let model = |out: &str| std::fs::read(dir.path().join(out).join("crops-512/model.dgtr")).unwrap();
     assert!(model("first") == model("second"), "another model from the same seed");
 }
+
+#[test]
+fn a_device_s_report_says_who_it_is_and_that_it_computes_what_the_twin_does() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("device.json");
+    let path = file.to_string_lossy().into_owned();
+    let small = ["--calibration-seconds", "0", "--sizes", "1", "--steps", "10"];
+    let text = held(&bench(&[&["device", "--out", &path][..], &small].concat()));
+    let report = json(&file);
+    let name = report["device"]["name"].as_str().unwrap();
+    assert!(!name.is_empty() && text.contains(name), "{text}");
+    let [device, twin] = ["loss", "twin_loss"].map(|loss| report["twin"][loss].as_f64().unwrap());
+    assert!((device - twin).abs() < 2e-4, "{device} against {twin}");
+    assert_eq!(report["sizes"].as_array().unwrap().len(), 1);
+    assert_eq!(report["survey"]["steps"], 10);
+    assert!(report["survey"]["psnr"].as_f64().unwrap() > 10.0);
+    assert!(report["board"].as_array().unwrap().len() >= 4);
+    // Nothing that tells whose computer it is.
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    assert!(host.trim().len() < 4 || !report.to_string().contains(host.trim()));
+}

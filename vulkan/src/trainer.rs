@@ -24,7 +24,7 @@ mod state;
 mod step;
 mod views;
 
-pub use check::{PlanFit, check_device, check_plan};
+pub use check::{PlanFit, TrainingCheck, check_device, check_plan, check_training};
 pub use crops::CropPlace;
 pub use error::TrainError;
 pub use gradient::ViewGradients;

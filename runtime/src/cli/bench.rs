@@ -1,6 +1,7 @@
 //! `dgtr bench …`: one subcommand per question; results as Markdown on standard output, JSON and CSV on request.
 
 mod detail;
+mod device;
 mod map;
 mod memory;
 mod skips;
@@ -27,6 +28,8 @@ enum Command {
     Map(map::Args),
     /// What crops of pictures larger than the plan holds are worth at their full size.
     Detail(detail::Args),
+    /// All that a board or a card can tell in ten minutes, as a report to send in.
+    Device(device::Args),
     /// Planned against measured bytes, and quality, across memory budgets.
     Memory(memory::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
@@ -60,6 +63,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Stages(args) => stages::run(args),
         Command::Map(args) => map::run(args),
         Command::Detail(args) => detail::run(args),
+        Command::Device(args) => device::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),

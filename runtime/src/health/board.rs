@@ -13,31 +13,35 @@ const FIRMWARE_THROTTLED: i64 = 1 << 1 | 1 << 2 | 1 << 3;
 
 /// Where the sensors are.
 #[derive(Debug, Default)]
-pub(super) struct Board {
+pub(crate) struct Board {
     zones: Vec<PathBuf>,
     /// The Raspberry Pi's `get_throttled`, hexadecimal.
     firmware: Vec<PathBuf>,
     supply_alarms: Vec<PathBuf>,
     current_alarms: Vec<PathBuf>,
+    /// Power monitors, microwatts.
+    powers: Vec<PathBuf>,
     /// The clock's limit of each processor group, and what it was at the start.
     clocks: Vec<(PathBuf, i64)>,
 }
 
 /// What they say.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct BoardState {
-    pub(super) hottest_c: Option<f32>,
-    pub(super) under_voltage: bool,
-    pub(super) throttled: bool,
+pub(crate) struct BoardState {
+    pub(crate) hottest_c: Option<f32>,
+    pub(crate) under_voltage: bool,
+    pub(crate) throttled: bool,
+    /// Of the rail that takes most: where there are several, one feeds the others.
+    pub(crate) watts: Option<f32>,
 }
 
 impl Board {
     /// Looks for sensors below `sys`.
-    pub(super) fn find(sys: &Path) -> Self {
+    pub(crate) fn find(sys: &Path) -> Self {
         let platform = files(&sys.join("devices/platform"), |name| name.starts_with("soc"));
         let firmware = platform.iter().flat_map(|soc| files(soc, |name| name.ends_with(":firmware")));
         let hwmon: Vec<PathBuf> = files(&sys.join("class/hwmon"), |name| name.starts_with("hwmon"));
-        let alarms = |kind: &'static str, ends: &'static [&'static str]| {
+        let files_of = |kind: &'static str, ends: &'static [&'static str]| {
             let fits = move |name: &str| name.starts_with(kind) && ends.iter().any(|end| name.ends_with(end));
             hwmon.iter().flat_map(|monitor| files(monitor, fits)).take(MAX_SENSORS).collect()
         };
@@ -50,13 +54,14 @@ impl Board {
                 .collect(),
             firmware: firmware.map(|f| f.join("get_throttled")).take(MAX_SENSORS).collect(),
             // rpi_volt, ina2xx and ina3221: low supply; over-current makes a Jetson throttle.
-            supply_alarms: alarms("in", &["_lcrit_alarm", "_min_alarm"]),
-            current_alarms: alarms("curr", &["_crit_alarm"]),
+            supply_alarms: files_of("in", &["_lcrit_alarm", "_min_alarm"]),
+            current_alarms: files_of("curr", &["_crit_alarm"]),
+            powers: files_of("power", &["_input", "_average"]),
             clocks: clocks.filter_map(|path| number(&path, 10).map(|khz| (path, khz))).collect(),
         }
     }
 
-    pub(super) fn read(&self) -> BoardState {
+    pub(crate) fn read(&self) -> BoardState {
         let any = |paths: &[PathBuf]| paths.iter().any(|p| number(p, 10).is_some_and(|v| v != 0));
         let firmware = self.firmware.iter().filter_map(|p| number(p, 16)).fold(0, |a, b| a | b);
         let slowed = self.clocks.iter().any(|(path, first)| number(path, 10).is_some_and(|khz| khz < *first));
@@ -65,6 +70,7 @@ impl Board {
             hottest_c: self.zones.iter().filter_map(|z| number(z, 10)).max().map(|t| t as f32 / 1000.0),
             under_voltage: firmware & FIRMWARE_UNDER_VOLTAGE != 0 || any(&self.supply_alarms),
             throttled: firmware & FIRMWARE_THROTTLED != 0 || any(&self.current_alarms) || slowed,
+            watts: self.powers.iter().filter_map(|p| number(p, 10)).max().map(|microwatts| microwatts as f32 * 1e-6),
         }
     }
 }
@@ -142,6 +148,17 @@ mod tests {
         set(sys.path(), low, "0\n");
         set(sys.path(), over, "1\n");
         assert!(board.read().throttled && !board.read().under_voltage);
+    }
+
+    #[test]
+    fn the_rail_that_takes_most_power_counts() {
+        let sys = sysfs(&[
+            ("class/hwmon/hwmon1/power1_input", "4250000\n"),
+            ("class/hwmon/hwmon1/power2_average", "1100000\n"),
+            ("class/hwmon/hwmon1/power1_max", "90000000\n"),
+        ]);
+        assert_eq!(Board::find(sys.path()).read().watts, Some(4.25));
+        assert_eq!(Board::find(Path::new("/nonexistent")).read().watts, None);
     }
 
     #[test]

@@ -8,11 +8,14 @@ use crate::kernels::{Kernel, SCAN_LANES};
 use crate::layout::Push;
 use crate::pipelines::Pipelines;
 use crate::shape::KernelShape;
-use crate::synthetic::{cloud, plain, view};
+use crate::synthetic::{cloud, photo, plain, posed, view};
 use crate::twin::camera::Camera;
 use crate::twin::gaussian::Gaussian;
+use crate::twin::loss::Target;
 use crate::twin::project::{Culled, Limits, project};
+use crate::twin::trainer::TwinTrainer;
 use config::plan::{Plan, PlanRequest};
+use config::training::scene_extent;
 
 /// Gaussians that the kernel is tried on.
 const TRIED: usize = 200;
@@ -63,6 +66,42 @@ pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
         0 => Ok(TRIED),
         _ => Err(GpuError::ComputesWrong { kernel: "project", differ, of: TRIED }.into()),
     }
+}
+
+/// Whole training steps on the device beside those of the twin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrainingCheck {
+    /// Steps.
+    pub steps: u32,
+    /// Loss of the last one on the device.
+    pub loss: f32,
+    /// The twin's, in f64.
+    pub twin_loss: f64,
+}
+
+/// Trains a small scene for so many steps with kernels of `shape`, and the same on the processor in f64.
+///
+/// # Errors
+/// What the driver says, as [`TrainError::Gpu`].
+pub fn check_training(gpu: &Gpu, shape: KernelShape, steps: u32) -> Result<TrainingCheck, TrainError> {
+    let (v, c, settings) = (view(64, 48), cloud(5, TRIED, 3), plain());
+    let photo = photo(5, &v);
+    let sort_lanes = gpu.info().sort_lanes();
+    let request = PlanRequest { width: 64, height: 48, views: 1, sort_lanes, ..Default::default() };
+    let plan = Plan::with_capacities(&request, TRIED, 64 * TRIED);
+    let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
+    trainer.load(&c)?;
+    trainer.add_view(&posed(&v, &photo), None)?;
+    let extent = scene_extent(&c.means, &[v.pose.center.to_array()]);
+    let mut twin = TwinTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
+    let (camera, rgb) = (Camera::<f64>::of(&v), photo.iter().map(|p| p.map(f64::from)).collect::<Vec<_>>());
+    let mut check = TrainingCheck { steps, loss: f32::NAN, twin_loss: f64::NAN };
+    for step in 0..steps {
+        let target = Target { width: 64, rgb: &rgb, depth: None, background: [0.0; 3] };
+        check.loss = trainer.step()?.loss;
+        check.twin_loss = twin.step(&camera, &target, settings.progress(step, 0.0)).loss.total;
+    }
+    Ok(check)
 }
 
 /// How a plan fits a device.
