@@ -100,8 +100,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     println!(
-        "{} views of {} x {}, {} of them on the device at once, SH degree {}, {} MiB allowed",
-        plan.views, request.width, request.height, plan.view_slots, plan.sh_degree, request.device_mib
+        "{} views and {} crops of {} x {}, {} of them on the device at once, SH degree {}, {} MiB allowed",
+        plan.views, plan.crops, request.width, request.height, plan.view_slots, plan.sh_degree, request.device_mib
     );
     println!(
         "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n  sort lanes{:>10}\n",
