@@ -1,4 +1,4 @@
-//! PlayCanvas' SOG, version 2: a zip of lossless WebP pictures with a Gaussian per pixel, a fifteenth of the PLY. For viewers
+//! PlayCanvas' SOG, version 2: a zip of lossless WebP pictures with a Gaussian per pixel, a tenth of the PLY. For viewers
 //! in a browser; it rounds, so a model to go on with is exchanged as `.dgtr` or PLY.
 //!
 //! Positions are 16 bits of sign · ln(1 + |x|) between the scene's bounds, so that they are finest around zero: the cloud is
@@ -110,7 +110,7 @@ pub fn encode(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
         ));
     }
     // In whole metres, so that nobody reads meaning into digits.
-    let shift = cloud.middle().map(f32::round);
+    let shift = cloud.middle().map(|v| v.round() + 0.0);
     let order = morton_order(cloud);
     let size = picture_size(order.len());
     if size.0.max(size.1) > MAX_SIDE {

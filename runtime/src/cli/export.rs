@@ -25,7 +25,7 @@ pub enum Format {
     Ply,
     /// Niantic's SPZ, version 3: a tenth of the size, rounded.
     Spz,
-    /// PlayCanvas' SOG: a fifteenth of the size, rounded; for viewers in a browser.
+    /// PlayCanvas' SOG: a tenth of the size, rounded less than SPZ; for viewers in a browser.
     Sog,
     /// Binary glTF (.glb) with KHR_gaussian_splatting.
     Gltf,

@@ -11,10 +11,10 @@ pub(super) const OVERVIEW_FOV_DEG: f64 = 60.0;
 /// Share of the Gaussians that the first view has in sight; those far away are sky and mistakes.
 const IN_SIGHT: f64 = 0.8;
 /// How steeply the first view looks down: distance to the south and height, in radii of what is in sight.
-const OVERVIEW: [f64; 2] = [1.1, 0.9];
+const OVERVIEW: [f64; 2] = [1.6, 1.3];
 /// Looking straight down has no heading. Below this share of level the look is tipped by as much towards the picture's upper edge,
 /// which then is where the viewer's screen has it.
-const TIP: f64 = 0.01;
+const TIP: f64 = 1e-3;
 
 /// Where a camera stands.
 #[derive(Debug, Serialize)]
@@ -81,7 +81,7 @@ mod tests {
         let stand = stand(&View { intrinsics, pose }, &cloud());
         let look = DVec3::from_array(stand.target) - DVec3::from_array(stand.position);
         assert!((look.length() - 50.0).abs() < 0.1 && look.y < -49.0, "down: {look}");
-        assert!(look.x > 0.1 && look.z.abs() < 1e-6, "to the east: {look}");
+        assert!(look.x > 0.01 && look.z.abs() < 1e-6, "to the east: {look}");
         assert!((stand.fov - 90.0).abs() < 1e-4, "across the longer edge: {}", stand.fov);
     }
 

@@ -102,10 +102,13 @@ byId('dgtr-measure').addEventListener('click', () => measure(!measuring));
 window.addEventListener('keydown', (event) => event.key === 'Escape' && measuring && measure(false));
 let pressed = null;
 canvas.addEventListener('pointerdown', (event) => (pressed = [event.offsetX, event.offsetY]));
-canvas.addEventListener('pointerup', (event) => {
+// For the viewer a click is the wish to turn around that place, or to go there; not while it measures.
+const moves = ['pick', 'orbitTarget:set', 'navigateTo'];
+const fire = viewer.events.fire.bind(viewer.events);
+viewer.events.fire = (name, ...values) => (measuring && moves.includes(name) ? viewer.events : fire(name, ...values));
+canvas.addEventListener('click', (event) => {
     // A drag turns the view.
-    const still = pressed && Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) < 4;
-    if (!measuring || !still || event.button !== 0) return;
+    if (!measuring || !pressed || Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) >= 4) return;
     const place = pick(event.offsetX, event.offsetY);
     if (place) points = points.length === 2 ? [place] : [...points, place];
     report();
