@@ -39,13 +39,13 @@ have_vulkan_driver() {
 
 have_viewer() { (cd "$viewer" 2>/dev/null && sed -n 's/^sha256 \([^ ]*\) /\1  /p' "$pin" | sha256sum --check --status); }
 
-# The package as npm has it, compared with the pinned hash before anything of it is unpacked.
+# No second tries: without a network every start would wait for them. The package as npm has it, compared with the pinned hash before anything of it is unpacked.
 fetch_viewer() {
     read -r name version <"$pin"
     say "fetching $name $version into $viewer"
     package=$(mktemp -d)
     (
-        cd "$package" && npm pack --silent "$name@$version" >/dev/null && mv ./*.tgz viewer.tgz &&
+        cd "$package" && npm pack --silent --fetch-retries=0 --fetch-timeout=60000 "$name@$version" >/dev/null && mv ./*.tgz viewer.tgz &&
             echo "$(sed -n 's/^sha512 //p' "$pin")  viewer.tgz" | sha512sum --check --status && tar -xzf viewer.tgz
     ) && mkdir -p "$viewer.part/public" && (
         cd "$package/package" && cp public/index.js public/index.css "$viewer.part/public/" && cp LICENSE "$viewer.part/"

@@ -80,7 +80,7 @@ async function step(what) {
     if ('camera' in what) {
         const before = await evaluate(rests);
         await clickOn(`#dgtr-cameras button:nth-child(${what.camera + 1})`);
-        await until(`${rests} > ${before}`, 60);
+        await until(`${rests} > ${before}`, 180);
         await pause(500);
     }
     if (what.measure) await clickOn('#dgtr-measure');

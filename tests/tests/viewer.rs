@@ -67,13 +67,15 @@ fn pixel(shot: &Path, [x, y]: [u32; 2]) -> [u8; 3] {
 
 fn number(text: &str, after: &str) -> f64 {
     let rest = text.split(after).nth(1).unwrap_or_else(|| panic!("{after:?} is not in {text:?}"));
-    let digits: String = rest.trim_start().replace('−', "-").replace('+', "").chars().take_while(|c| !c.is_whitespace()).collect();
+    let digits: String =
+        rest.trim_start().replace('−', "-").replace('+', "").chars().take_while(|c| !c.is_whitespace()).collect();
     digits.parse().unwrap_or_else(|_| panic!("{digits:?} in {text:?}"))
 }
 
 #[test]
 fn the_page_opens_offline_without_webgpu_north_is_north_and_measures_are_right() {
-    let (Some(chromium), Some(node)) = (program(&["chromium", "chromium-browser", "google-chrome"]), program(&["node"]))
+    let (Some(chromium), Some(node)) =
+        (program(&["chromium", "chromium-browser", "google-chrome"]), program(&["node"]))
     else {
         println!("skipped: chromium and node are needed (apt-get install chromium nodejs)");
         return;
@@ -115,15 +117,14 @@ fn the_page_opens_offline_without_webgpu_north_is_north_and_measures_are_right()
     println!("pictures of the screen: {}; {seen:#}", out.display());
     assert!(seen["failed"].is_null(), "{}", seen["failed"]);
     assert_eq!((&seen["errors"], &seen["webgpu"]), (&json!([]), &json!(false)), "no errors, no WebGPU");
-    let local = |url: &Value| url.as_str().is_some_and(|u| ["file:", "data:", "blob:"].iter().any(|s| u.starts_with(s)));
+    let local =
+        |url: &Value| url.as_str().is_some_and(|u| ["file:", "data:", "blob:"].iter().any(|s| u.starts_with(s)));
     assert!(seen["requests"].as_array().is_some_and(|r| r.iter().all(local)), "nothing from a network: {seen}");
 
     let note = |i: usize| &seen["notes"][i];
     assert_eq!(note(0)["cameras"], 3);
     // Straight down: the compass is the map's, its arrows 38 pixels long.
-    let near = |v: &Value, to: [f64; 2]| {
-        (0..2).all(|k| v[k].as_f64().is_some_and(|v| (v - to[k]).abs() < 1.0))
-    };
+    let near = |v: &Value, to: [f64; 2]| (0..2).all(|k| v[k].as_f64().is_some_and(|v| (v - to[k]).abs() < 1.0));
     assert!(near(&note(1)["north"], [0.0, -38.0]) && near(&note(1)["east"], [38.0, 0.0]), "{}", note(1));
     assert!(near(&note(6)["east"], [0.0, -38.0]) && near(&note(6)["north"], [-38.0, 0.0]), "{}", note(6));
     assert!(near(&note(7)["up"], [0.0, -38.0]) && near(&note(7)["east"], [38.0, 0.0]), "{}", note(7));

@@ -125,6 +125,8 @@ function drawCompass(view) {
         arrow.querySelector('line').setAttribute('y2', tip[1]);
         arrow.querySelector('text').setAttribute('x', 1.2 * tip[0]);
         arrow.querySelector('text').setAttribute('y', 1.2 * tip[1]);
+        // Pointing at the reader, its name would lie on the others.
+        arrow.querySelector('text').setAttribute('visibility', Math.hypot(...tip) < 10 ? 'hidden' : 'visible');
     }
 }
 
