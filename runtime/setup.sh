@@ -2,11 +2,15 @@
 # Installs what dgtr needs beside git, a C compiler and Rust, and only what is missing:
 #   - the Vulkan loader and, where no GPU driver is installed, Mesa's software driver (Debian/Ubuntu packages, needs root);
 #   - ONNX Runtime's shared library, out of its published Python package, into ~/.local/share/dgtr/lib.
+#   - where npm is, the viewer that `dgtr export --to html` puts into its pages, at the version and with the hashes of viewer.pin,
+#     into ~/.local/share/dgtr/viewer. Nothing else needs it; `setup.sh --viewer` brings npm, too, and does nothing else.
 # Ends with 0 when everything is there, with 3 and one line that says what to install when it cannot be.
 # `setup.sh --tests` also brings what only the tests need (a C++ compiler for the shader check, Vulkan's validation layer).
 set -eu
 
 lib="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/lib"
+viewer="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/viewer"
+pin="$(cd "$(dirname "$0")" && pwd)/viewer.pin"
 
 say() { echo "dgtr setup: $*" >&2; }
 give_up() { say "$*"; exit 3; }
@@ -33,6 +37,31 @@ have_vulkan_driver() {
     return 1
 }
 
+have_viewer() { (cd "$viewer" 2>/dev/null && sed -n 's/^sha256 \([^ ]*\) /\1  /p' "$pin" | sha256sum --check --status); }
+
+# No second tries: without a network every start would wait for them. The package as npm has it, compared with the pinned hash before anything of it is unpacked.
+fetch_viewer() {
+    read -r name version <"$pin"
+    say "fetching $name $version into $viewer"
+    package=$(mktemp -d)
+    (
+        cd "$package" && npm pack --silent --fetch-retries=0 --fetch-timeout=60000 "$name@$version" >/dev/null && mv ./*.tgz viewer.tgz &&
+            echo "$(sed -n 's/^sha512 //p' "$pin")  viewer.tgz" | sha512sum --check --status && tar -xzf viewer.tgz
+    ) && mkdir -p "$viewer.part/public" && (
+        cd "$package/package" && cp public/index.js public/index.css "$viewer.part/public/" && cp LICENSE "$viewer.part/"
+    ) && rm -rf "$viewer" && mv "$viewer.part" "$viewer"
+    status=$?
+    rm -rf "$package"
+    [ "$status" = 0 ] && have_viewer
+}
+
+if [ "${1:-}" = --viewer ]; then
+    have_viewer && exit 0
+    command -v npm >/dev/null || apt npm
+    fetch_viewer || give_up "npm could not fetch the viewer, or it is not what viewer.pin says; see npm's own message: npm pack $(head -n 1 "$pin" | tr ' ' @)"
+    exit 0
+fi
+
 have_library libvulkan.so.1 || apt libvulkan1
 have_vulkan_driver || apt mesa-vulkan-drivers
 
@@ -54,6 +83,10 @@ for member, target in ((name, "libonnxruntime.so"), ("onnxruntime/LICENSE", "LIC
         out.write(wheel.read(member))
     os.replace(path + ".part", path)
 PY
+fi
+
+if ! have_viewer && command -v npm >/dev/null; then
+    fetch_viewer || say "without its viewer dgtr export --to html does not work; try runtime/setup.sh --viewer later"
 fi
 
 if [ "${1:-}" = --tests ]; then

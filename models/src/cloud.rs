@@ -104,6 +104,15 @@ impl GaussianCloud {
             && self.sh[i * stride..(i + 1) * stride].iter().all(|v| v.is_finite())
     }
 
+    /// The median of each coordinate of the means; zeros for an empty cloud. A stray Gaussian far away does not move it.
+    pub fn middle(&self) -> [f32; 3] {
+        [0, 1, 2].map(|k| {
+            let mut column: Vec<f32> = self.means.iter().map(|m| m[k]).collect();
+            let half = column.len() / 2;
+            if column.is_empty() { 0.0 } else { *column.select_nth_unstable_by(half, f32::total_cmp).1 }
+        })
+    }
+
     /// Opacity-weighted area of the disc spanned by a Gaussian's two longest axes, m²: how much of the ground it covers.
     pub fn covered_m2(&self, index: usize) -> f64 {
         let mut s = self.log_scales[index].map(f64::from);
@@ -170,6 +179,19 @@ impl GaussianCloud {
         }
     }
 
+    /// Cuts the stored SH degree down; what a lower one cannot say is gone.
+    pub fn lower_sh_degree(&mut self, degree: u8) {
+        if degree >= self.sh_degree {
+            return;
+        }
+        let (from, to) = (self.sh_stride(), sh_coefficients(degree) * 3);
+        for i in 0..self.len() {
+            self.sh.copy_within(i * from..i * from + to, i * to);
+        }
+        self.sh.truncate(self.len() * to);
+        self.sh_degree = degree;
+    }
+
     /// Raises the stored SH degree; new coefficients are zero.
     pub fn raise_sh_degree(&mut self, degree: u8) {
         if degree <= self.sh_degree {
@@ -206,6 +228,18 @@ mod tests {
         assert_eq!(a.len(), 2);
         assert_eq!(&a.sh[..12], &[1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         assert_eq!(&a.sh[12..], &[2.0; 12]);
+    }
+
+    #[test]
+    fn a_lower_degree_is_the_head_of_every_row() {
+        let mut a = one(1.0, 2);
+        a.extend(&one(2.0, 2));
+        a.sh.iter_mut().enumerate().for_each(|(i, v)| *v = i as f32);
+        a.lower_sh_degree(1);
+        let head = |from: u32| (from..from + 12).map(|v| v as f32);
+        assert_eq!((a.sh_degree, &a.sh), (1, &head(0).chain(head(27)).collect::<Vec<_>>()));
+        a.lower_sh_degree(3);
+        assert_eq!(a.sh_degree, 1, "nothing is made up");
     }
 
     #[test]

@@ -14,6 +14,7 @@ pub mod dataset;
 pub mod formats;
 pub mod init;
 pub mod metrics;
+mod morton;
 pub mod onnx;
 pub mod ortho;
 pub mod picture;

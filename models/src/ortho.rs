@@ -6,6 +6,7 @@ pub mod crs;
 mod error;
 pub mod extent;
 pub mod files;
+pub mod georef;
 pub mod grid;
 mod preview;
 

@@ -31,3 +31,4 @@ pub mod session;
 pub mod train_job;
 pub mod transfer;
 pub mod upload;
+pub mod viewer;

@@ -10,7 +10,7 @@ use models::formats::{FormatError, write_atomic};
 pub mod chart;
 mod html;
 mod map;
-mod picture;
+pub(crate) mod picture;
 mod text;
 
 pub use text::{bytes, count, seconds};

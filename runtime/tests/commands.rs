@@ -21,6 +21,8 @@ mod keys;
 mod manual;
 #[path = "commands/supervised.rs"]
 mod supervised;
+#[path = "commands/viewing.rs"]
+mod viewing;
 
 /// `dgtr`, which measures no kernels and leaves the user's cache folder alone.
 fn program() -> Command {

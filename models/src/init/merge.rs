@@ -7,6 +7,8 @@
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
 
+use crate::morton::{BITS, morton, unmorton};
+
 mod cell;
 mod tree;
 
@@ -42,8 +44,6 @@ pub struct Merged {
 
 /// Octree levels above the finest; eight finest edges are the coarsest.
 const LEVELS: usize = 4;
-/// Bits per axis of a Morton key.
-const BITS: u32 = 21;
 /// Samples collected before they are sorted into the cells.
 const BUFFER: usize = 1 << 19;
 
@@ -184,33 +184,6 @@ impl VoxelMerge {
         let cut = levels.cut(budget);
         cut.into_par_iter().map(|(level, index)| levels.gaussian(level, index, spread)).collect()
     }
-}
-
-/// Interleaves three coordinates of [`BITS`] bits.
-fn morton(x: u32, y: u32, z: u32) -> u64 {
-    spread_bits(x) | spread_bits(y) << 1 | spread_bits(z) << 2
-}
-
-fn unmorton(key: u64) -> (u32, u32, u32) {
-    (gather_bits(key), gather_bits(key >> 1), gather_bits(key >> 2))
-}
-
-fn spread_bits(v: u32) -> u64 {
-    let mut x = u64::from(v) & 0x1f_ffff;
-    x = (x | x << 32) & 0x1f_0000_0000_ffff;
-    x = (x | x << 16) & 0x1f_0000_ff00_00ff;
-    x = (x | x << 8) & 0x100f_00f0_0f00_f00f;
-    x = (x | x << 4) & 0x10c3_0c30_c30c_30c3;
-    (x | x << 2) & 0x1249_2492_4924_9249
-}
-
-fn gather_bits(v: u64) -> u32 {
-    let mut x = v & 0x1249_2492_4924_9249;
-    x = (x | x >> 2) & 0x10c3_0c30_c30c_30c3;
-    x = (x | x >> 4) & 0x100f_00f0_0f00_f00f;
-    x = (x | x >> 8) & 0x1f_0000_ff00_00ff;
-    x = (x | x >> 16) & 0x1f_0000_0000_ffff;
-    ((x | x >> 32) & 0x1f_ffff) as u32
 }
 
 #[cfg(test)]

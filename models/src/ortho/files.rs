@@ -16,6 +16,7 @@ use ndarray::{ArrayView2, ArrayView3};
 use serde::Serialize;
 
 use super::OrthoError;
+use super::georef::VERTICAL;
 use super::grid::{BLOCK, Block, Grid};
 use super::preview::Preview;
 use crate::formats::FormatError;
@@ -24,10 +25,6 @@ use crate::formats::FormatError;
 pub const NO_HEIGHT: f32 = -9999.0;
 /// Deflate's level, 1 to 9.
 const DEFLATE: u32 = 4;
-/// What a height is measured from.
-const VERTICAL: &str = "metres on the vertical scale of the origin's height, as the autopilot or the pictures gave it: \
-                        above mean sea level for most, above the WGS 84 ellipsoid for RTK receivers";
-
 /// A map that is being written.
 pub struct MapFiles<'a> {
     folder: PathBuf,

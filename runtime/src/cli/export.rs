@@ -1,27 +1,36 @@
-//! `dgtr export MODEL --to ply|spz|delivery|colmap|nerfstudio|opensfm`: the Gaussians for viewers, the poses for other programs.
+//! `dgtr export MODEL --to …`: the Gaussians for viewers, the poses for other programs.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use config::disk::Disk;
 use config::lens::Distortion;
+use glam::DVec3;
 use models::cloud::{GaussianCloud, SH_C0};
 use models::dataset::Dataset;
 use models::formats::colmap::Point;
 use models::formats::delivery::Rounding;
 use models::formats::model::ModelHeader;
 use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
-use models::formats::{colmap, model, opensfm, ply, spz, transforms};
+use models::formats::{colmap, gltf, model, opensfm, ply, sog, spz, transforms};
+use models::ortho::georef::{FROM_Y_UP, Georef, shifted};
 
 use super::CliError;
+use crate::viewer::{self, ViewerRequest};
 
 /// Formats that can be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Format {
     /// 3DGS point cloud: every viewer reads it; keeps the georeference as a comment.
     Ply,
-    /// Niantic's SPZ: a tenth of the size, rounded, without the georeference.
+    /// Niantic's SPZ, version 3: a tenth of the size, rounded.
     Spz,
+    /// PlayCanvas' SOG: a tenth of the size, rounded less than SPZ; for viewers in a browser.
+    Sog,
+    /// Binary glTF (.glb) with KHR_gaussian_splatting.
+    Gltf,
+    /// A page with the scene and its viewer inside: opens by double click, without a network.
+    Html,
     /// Rounded and entropy-coded .dgtr, about a thirtieth of the exact one: what an aircraft delivers.
     Delivery,
     /// Poses, lenses and Gaussians' centres as a COLMAP model, binary, in a folder.
@@ -30,6 +39,13 @@ pub enum Format {
     Nerfstudio,
     /// Poses and lenses as OpenSfM's and OpenDroneMap's reconstruction.json, in a folder.
     Opensfm,
+}
+
+impl Format {
+    /// Whether it is the Gaussians for others, who know nothing of origins.
+    fn is_scene(self) -> bool {
+        matches!(self, Self::Ply | Self::Spz | Self::Sog | Self::Gltf | Self::Html)
+    }
 }
 
 /// Arguments of `dgtr export`.
@@ -43,13 +59,53 @@ pub struct Args {
     /// Where to write; default: beside the model, with the format's extension or name.
     #[arg(long)]
     pub out: Option<PathBuf>,
+    /// With `--to ply|spz|sog|gltf|html`: leave out colours of a higher degree (0: the same colour from every side).
+    #[arg(long, value_name = "0-3", value_parser = clap::value_parser!(u8).range(0..=3))]
+    pub sh_degree: Option<u8>,
     /// With `--to delivery`: rounded more finely, for scenes seen from near; a third more bytes.
     #[arg(long)]
     pub fine: bool,
+    /// With `--to html`: so many of the cameras as small pictures to jump to, evenly chosen; 0 needs no Vulkan device.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=i64::from(viewer::MAX_THUMBNAILS)))]
+    pub thumbnails: Option<u16>,
+    /// With `--to html`: Vulkan device, for the small pictures, whose name contains this.
+    #[arg(long)]
+    pub device: Option<String>,
     /// Poses and lenses of this data set (the folder that a card was trained into holds its own) instead of the model's
     /// undistorted views.
     #[arg(long, value_name = "FOLDER")]
     pub cameras: Option<PathBuf>,
+}
+
+impl Args {
+    /// Options that the format does not know are mistakes.
+    fn check(&self) -> Result<(), CliError> {
+        let of_html = self.format == Format::Html;
+        let misplaced = [
+            (self.fine && self.format != Format::Delivery, "--fine", "delivery"),
+            (self.sh_degree.is_some() && !self.format.is_scene(), "--sh-degree", "ply, spz, sog, gltf and html"),
+            (self.thumbnails.is_some() && !of_html, "--thumbnails", "html"),
+            (self.device.is_some() && !of_html, "--device", "html"),
+        ];
+        match misplaced.iter().find(|row| row.0) {
+            Some((_, option, format)) => Err(CliError::input(format!("{option} is for --to {format}; leave it out"))),
+            None => Ok(()),
+        }
+    }
+
+    fn default_out(&self) -> PathBuf {
+        match self.format {
+            Format::Ply => self.model.with_extension("ply"),
+            Format::Spz => self.model.with_extension("spz"),
+            Format::Sog => self.model.with_extension("sog"),
+            Format::Gltf => self.model.with_extension("glb"),
+            Format::Html => self.model.with_extension("html"),
+            Format::Delivery => self.model.with_extension("delivery.dgtr"),
+            Format::Colmap => self.model.with_file_name("colmap"),
+            Format::Nerfstudio => self.model.with_file_name("cameras.json"),
+            Format::Opensfm => self.model.with_file_name("opensfm"),
+        }
+    }
 }
 
 /// Runs `dgtr export`.
@@ -57,31 +113,19 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    if args.fine && args.format != Format::Delivery {
-        return Err(CliError::input("--fine is for --to delivery; leave it out"));
-    }
-    let (header, cloud) = model::read(&args.model)?;
-    let out = args.out.unwrap_or_else(|| match args.format {
-        Format::Ply => args.model.with_extension("ply"),
-        Format::Spz => args.model.with_extension("spz"),
-        Format::Delivery => args.model.with_extension("delivery.dgtr"),
-        Format::Colmap => args.model.with_file_name("colmap"),
-        Format::Nerfstudio => args.model.with_file_name("cameras.json"),
-        Format::Opensfm => args.model.with_file_name("opensfm"),
-    });
+    args.check()?;
+    let (header, mut cloud) = model::read(&args.model)?;
+    let out = args.out.clone().unwrap_or_else(|| args.default_out());
     if out == args.model {
         return Err(CliError::input(format!("{}: would overwrite the model; give another --out", out.display())));
     }
-    let gaussians = match args.format {
-        Format::Ply => ply::write(&out, &cloud, header.origin).map(|()| Some(cloud.len()))?,
-        Format::Spz => spz::write(&out, &cloud).map(|()| Some(cloud.len()))?,
-        Format::Delivery => {
-            let rounding = if args.fine { Rounding::fine() } else { Rounding::default() };
-            Some(model::write_rounded(&Disk::default(), &out, &header, &cloud, &rounding)?)
-        }
-        Format::Colmap | Format::Nerfstudio | Format::Opensfm => None,
-    };
-    if let Some(n) = gaussians {
+    if args.format.is_scene() {
+        cloud.lower_sh_degree(args.sh_degree.unwrap_or(cloud.sh_degree));
+        return scene(&args, &out, &header, &cloud);
+    }
+    if args.format == Format::Delivery {
+        let rounding = if args.fine { Rounding::fine() } else { Rounding::default() };
+        let n = model::write_rounded(&Disk::default(), &out, &header, &cloud, &rounding)?;
         println!("{}: {n} Gaussians, SH degree {}", out.display(), cloud.sh_degree);
         return Ok(());
     }
@@ -98,6 +142,36 @@ pub fn run(args: Args) -> Result<(), CliError> {
         _ => opensfm::write(&out, &cameras)?,
     }
     println!("{}: {} poses", out.display(), cameras.shots.len());
+    Ok(())
+}
+
+/// The Gaussians for others, and beside them where on Earth they are.
+fn scene(args: &Args, out: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result<(), CliError> {
+    let middle = DVec3::from_array(cloud.middle().map(f64::from));
+    let georef = |to_enu| Georef::new(out, header.origin, to_enu, middle);
+    let as_they_are = shifted([0.0; 3]);
+    let georef = match args.format {
+        Format::Html => {
+            let request = ViewerRequest { thumbnails: args.thumbnails, device: args.device.as_deref() };
+            viewer::write(out, header, cloud, &request)?;
+            georef(FROM_Y_UP)?
+        }
+        Format::Gltf => {
+            gltf::write(out, cloud)?;
+            georef(FROM_Y_UP)?
+        }
+        Format::Sog => georef(shifted(sog::write(out, cloud)?.shift.map(f64::from)))?,
+        Format::Spz => {
+            spz::write(out, cloud)?;
+            georef(as_they_are)?
+        }
+        _ => {
+            ply::write(out, cloud, header.origin)?;
+            georef(as_they_are)?
+        }
+    };
+    georef.write(out)?;
+    println!("{}: {} Gaussians, SH degree {}", out.display(), cloud.len(), cloud.sh_degree);
     Ok(())
 }
 

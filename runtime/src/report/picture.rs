@@ -11,7 +11,7 @@ const PNG_PIXELS: u32 = 128 * 128;
 /// High enough that the codec's error stays far below the rendering's.
 const JPEG_QUALITY: u8 = 88;
 
-pub(super) fn data_uri(image: &RgbImage) -> Result<String, ImageError> {
+pub(crate) fn data_uri(image: &RgbImage) -> Result<String, ImageError> {
     let mut bytes = Vec::new();
     let (w, h) = image.dimensions();
     let kind = if w * h <= PNG_PIXELS {

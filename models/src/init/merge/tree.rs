@@ -3,8 +3,9 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
+use super::Merged;
 use super::cell::Cell;
-use super::{Merged, unmorton};
+use crate::morton::unmorton;
 
 /// Cells of doubled edge: runs of eight neighbours in Morton order.
 pub fn parents(fine: &[Cell], origin: Vec3, edge: f32) -> Vec<Cell> {
