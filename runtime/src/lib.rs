@@ -28,6 +28,8 @@ pub mod run_json;
 pub mod serve;
 pub mod service;
 pub mod session;
+pub mod trace;
 pub mod train_job;
 pub mod transfer;
 pub mod upload;
+pub mod watch;

@@ -18,6 +18,7 @@ use serde::Serialize;
 use super::OrthoError;
 use super::grid::{BLOCK, Block, Grid};
 use super::preview::Preview;
+pub use super::preview::preview_step;
 use crate::formats::FormatError;
 
 /// Height where there is none.

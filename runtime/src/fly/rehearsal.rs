@@ -36,6 +36,7 @@ use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
+use crate::watch::Watch;
 use crate::upload::{Offerer, Source};
 
 /// Time between two turns; one training step is taken in each.
@@ -244,6 +245,7 @@ pub(super) fn rehearse_on(
         earlier_names: script.earlier_names.iter().cloned().collect(),
         end: script.end,
         geotags: Geotags::open(disk, &out, script.vehicle.origin).expect("a file"),
+        watch: Watch::default(),
     };
     capture.keep_in(store, model_path(&out));
     let mut intake = Some(Intake::new(plan, vehicle, clock.clone(), end));

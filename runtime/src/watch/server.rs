@@ -1,0 +1,213 @@
+//! The thread that listens, and a short-lived one for each of a few connections. A slow or silent browser costs one of those for a
+//! bounded time, and the job nothing.
+
+use std::io::{self, Read};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::access::{Token, Verdict, address, judge};
+use super::request::{Refusal, parse};
+use super::respond::{answer, keep_token, refusal, status};
+use super::{HttpError, Watch};
+
+/// Connections at the same time: a browser opens six to one host, and somebody else looks, too.
+const CONNECTIONS: usize = 8;
+/// Of them may hear of changes: the others stay for the page, its parts and whoever comes next.
+const LISTENERS: usize = 5;
+/// Bytes of a request's head (what nginx and Apache allow).
+const HEAD_BYTES: usize = 8 << 10;
+/// A head is here within this, however it trickles in.
+const HEAD_WITHIN: Duration = Duration::from_secs(5);
+/// How long who is turned away may take to read it: nobody else is let in meanwhile.
+const TURNED_AWAY_WITHIN: Duration = Duration::from_millis(50);
+/// How soon the listening thread sees that the job is over.
+const STOP_WITHIN: Duration = Duration::from_millis(200);
+/// At its end the job waits so long for browsers to hear of it.
+const GOODBYE: Duration = Duration::from_millis(500);
+/// Stack of a connection's thread: head, headers and a piece of a file take 32 KiB, a picture's encoder as much again.
+const STACK: usize = 512 << 10;
+
+/// How many there are, and whether it is time to go.
+#[derive(Default)]
+pub(super) struct Room {
+    connections: AtomicUsize,
+    listeners: AtomicUsize,
+    pub(super) closing: AtomicBool,
+    bell: (Mutex<()>, Condvar),
+}
+
+/// Gives a listener's place back.
+pub(super) struct Place<'a>(&'a AtomicUsize);
+
+impl Drop for Place<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
+fn take(of: &AtomicUsize, most: usize) -> bool {
+    of.fetch_update(Ordering::AcqRel, Ordering::Acquire, |n| (n < most).then_some(n + 1)).is_ok()
+}
+
+/// A connection's place, which goes with it into its thread.
+struct Seat(Arc<Room>);
+
+impl Seat {
+    fn take(room: &Arc<Room>) -> Option<Self> {
+        take(&room.connections, CONNECTIONS).then(|| Self(room.clone()))
+    }
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        self.0.connections.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
+impl Room {
+    /// A place among those who hear of changes.
+    pub(super) fn listen(&self) -> Option<Place<'_>> {
+        take(&self.listeners, LISTENERS).then_some(Place(&self.listeners))
+    }
+
+    /// Waits, but not beyond the job's end.
+    pub(super) fn pause(&self, time: Duration) {
+        let guard = self.bell.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if !self.closing.load(Ordering::Relaxed) {
+            // Woken or not, the caller looks again.
+            drop(self.bell.1.wait_timeout(guard, time));
+        }
+    }
+
+    fn close(&self) {
+        let _guard = self.bell.0.lock().unwrap_or_else(PoisonError::into_inner);
+        self.closing.store(true, Ordering::Relaxed);
+        self.bell.1.notify_all();
+    }
+}
+
+/// Serves the page until it is dropped.
+#[derive(Debug)]
+pub struct Server {
+    address: SocketAddr,
+    room: Arc<Room>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl std::fmt::Debug for Room {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} connections", self.connections.load(Ordering::Relaxed))
+    }
+}
+
+impl Server {
+    /// Listens on `at` (`ADDRESS:PORT`, port 0 = any).
+    ///
+    /// # Errors
+    /// No address, one beyond this machine without a token, or one that cannot be listened on.
+    pub fn start(at: &str, token: Option<Token>, watch: Watch) -> Result<Self, HttpError> {
+        let wanted = address(at, token.as_ref())?;
+        let failed = |source| HttpError::Listen { address: wanted, source };
+        let listener = TcpListener::bind(wanted).map_err(failed)?;
+        // A connection may be gone between the poll and the accept.
+        listener.set_nonblocking(true).map_err(failed)?;
+        let address = listener.local_addr().map_err(failed)?;
+        let room = Arc::new(Room::default());
+        let inside = room.clone();
+        let thread = std::thread::Builder::new()
+            .name("http".into())
+            .stack_size(STACK)
+            .spawn(move || serve(&listener, token.map(Arc::new), &watch, &inside))
+            .map_err(failed)?;
+        Ok(Self { address, room, thread: Some(thread) })
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.room.close();
+        if let Some(thread) = self.thread.take() {
+            // It holds nothing that could be left half done.
+            let _ = thread.join();
+        }
+        let until = Instant::now() + GOODBYE;
+        while self.room.connections.load(Ordering::Acquire) > 0 && Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+fn serve(listener: &TcpListener, token: Option<Arc<Token>>, watch: &Watch, room: &Arc<Room>) {
+    let patience = Timespec { tv_sec: 0, tv_nsec: STOP_WITHIN.subsec_nanos().into() };
+    while !room.closing.load(Ordering::Relaxed) {
+        let mut waiting = [PollFd::new(listener, PollFlags::IN)];
+        let came = poll(&mut waiting, Some(&patience));
+        let Ok((stream, _)) = listener.accept() else {
+            // Out of descriptors, it would come again at once.
+            if came.is_ok_and(|n| n > 0) {
+                room.pause(STOP_WITHIN);
+            }
+            continue;
+        };
+        let Some(seat) = Seat::take(room) else {
+            turn_away(&stream);
+            continue;
+        };
+        let (watch, token) = (watch.clone(), token.clone());
+        // Without a thread the connection is closed. Whoever has gone is not missed.
+        let _ = std::thread::Builder::new().name("http".into()).stack_size(STACK).spawn(move || {
+            let _ = connection(&stream, token.as_deref(), &watch, &seat.0);
+        });
+    }
+}
+
+/// Says so, and reads what came so that the answer is not thrown away with it.
+fn turn_away(mut stream: &TcpStream) {
+    let _ = stream.set_nonblocking(false);
+    let _ = stream.set_read_timeout(Some(TURNED_AWAY_WITHIN));
+    let _ = stream.read(&mut [0; HEAD_BYTES]);
+    let _ = status(stream, "503 Service Unavailable", "Retry-After: 5\r\n");
+}
+
+fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, room: &Room) -> io::Result<()> {
+    stream.set_nonblocking(false)?;
+    stream.set_nodelay(true)?;
+    let mut bytes = [0; HEAD_BYTES];
+    let (mut n, until) = (0, Instant::now() + HEAD_WITHIN);
+    let asked = loop {
+        let left = until.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            return status(stream, "408 Request Timeout", "");
+        }
+        stream.set_read_timeout(Some(left))?;
+        let mut from = stream;
+        match from.read(&mut bytes[n..]) {
+            Ok(0) => return Ok(()),
+            Ok(more) => n += more,
+            Err(e) if matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => continue,
+            Err(e) => return Err(e),
+        }
+        match parse(&bytes[..n]) {
+            Ok(Some(asked)) => break asked,
+            Ok(None) if n == HEAD_BYTES => return refusal(stream, Refusal::TooLarge),
+            Ok(None) => {}
+            Err(why) => return refusal(stream, why),
+        }
+    };
+    match (judge(&asked, token), token) {
+        (Verdict::Welcome, _) => answer(stream, asked.route, watch, room),
+        (Verdict::Keep, Some(token)) => keep_token(stream, token),
+        (Verdict::Keep | Verdict::Stranger, _) => status(stream, "401 Unauthorized", "WWW-Authenticate: Bearer\r\n"),
+        (Verdict::Rebound, _) => status(stream, "403 Forbidden", ""),
+    }
+}
