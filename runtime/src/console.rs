@@ -100,7 +100,8 @@ static KEPT_WARNINGS: Mutex<VecDeque<(String, u32)>> = Mutex::new(VecDeque::new(
 /// The log's last warnings and errors, for the page.
 pub fn warnings() -> Vec<String> {
     let kept = KEPT_WARNINGS.lock().unwrap_or_else(PoisonError::into_inner);
-    let line = |(text, times): &(String, u32)| if *times > 1 { format!("{text} ({times} times)") } else { text.clone() };
+    let line =
+        |(text, times): &(String, u32)| if *times > 1 { format!("{text} ({times} times)") } else { text.clone() };
     kept.iter().map(line).collect()
 }
 

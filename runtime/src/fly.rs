@@ -206,7 +206,13 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
 }
 
 /// Waits for the ground to have the finished model, then says what became of everything.
-fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, interrupt: &Interrupt, watch: &Watch) -> FlyOutcome {
+fn outcome(
+    ended: Ended,
+    flight: FlightCounters,
+    end: JobEnd<Reconstruction>,
+    interrupt: &Interrupt,
+    watch: &Watch,
+) -> FlyOutcome {
     let JobEnd { mut reconstruction, offerer, supervisor, model, gaussians, finished } = end;
     supervisor.status(&format!("{gaussians} Gaussians of {} key frames; delivering", reconstruction.keyframes()));
     let go_on = || {

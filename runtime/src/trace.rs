@@ -64,7 +64,8 @@ impl Sheet {
         let written = if bytes + LAST_WORDS > self.left {
             self.ended = Some("the file is as large as it may be".into());
             let at = self.started.elapsed().as_micros();
-            let words = format!("{{\"ph\":\"i\",\"s\":\"g\",\"pid\":1,\"tid\":0,\"ts\":{at},\"name\":\"trace is full\"}}\n]\n");
+            let words =
+                format!("{{\"ph\":\"i\",\"s\":\"g\",\"pid\":1,\"tid\":0,\"ts\":{at},\"name\":\"trace is full\"}}\n]\n");
             file.write_all(words.as_bytes()).and_then(|()| file.flush())
         } else {
             self.left -= bytes;

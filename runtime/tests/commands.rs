@@ -19,6 +19,8 @@ mod keys;
 #[path = "commands/manual.rs"]
 #[cfg(feature = "lab")]
 mod manual;
+#[path = "commands/observed.rs"]
+mod observed;
 #[path = "commands/supervised.rs"]
 mod supervised;
 

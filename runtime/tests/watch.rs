@@ -112,7 +112,9 @@ fn all_parts_of_the_page_are_there_and_nothing_else_is() {
         assert!(head.contains(&format!("Content-Length: {}", body.len())), "{path}: {head}");
         assert!(head.contains("default-src 'none'") && !head.contains("unsafe"), "{path}: {head}");
     }
-    for path in ["/model.dgtr", "/../model.dgtr", "/map/../model.dgtr", "/map/ortho.tif", "/thumbnail?of=1", "/thumbnail?of=9"] {
+    for path in
+        ["/model.dgtr", "/../model.dgtr", "/map/../model.dgtr", "/map/ortho.tif", "/thumbnail?of=1", "/thumbnail?of=9"]
+    {
         let (status, _, body) = get(at, path);
         assert!(status.contains("404") && !body.windows(6).any(|w| w == b"secret"), "{path}: {status}");
     }

@@ -83,7 +83,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mut report = report(&outcome);
     report.wall_s = started.elapsed().as_secs_f64();
     let path = report.write(&args.out)?;
-    page(watch.freeze(), &report, &outcome, &path).write(&args.out.join(REPORT))?;
+    if let Err(e) = page(watch.freeze(), &report, &outcome, &path).write(&args.out.join(REPORT)) {
+        // Nothing that counts is missing.
+        tracing::warn!("{e}; there is no page of this flight");
+    }
     println!(
         "{}: {} Gaussians from {} key frames after {} steps; {}",
         outcome.model.display(),
@@ -111,9 +114,8 @@ fn page(mut page: ReportData, run: &RunReport, outcome: &FlyOutcome, run_json: &
         ("total".into(), seconds(run.wall_s)),
     ];
     let stages = run.stage_ms.iter().filter(|(name, _)| !name.starts_with("device_"));
-    page.timings = stages
-        .map(|(name, ms)| Timing { name: name.clone(), of: String::new(), seconds: ms * 1e-3 })
-        .collect();
+    page.timings =
+        stages.map(|(name, ms)| Timing { name: name.clone(), of: String::new(), seconds: ms * 1e-3 }).collect();
     let skipped = run.skipped.iter().filter(|s| *s.1 > 0);
     page.skipped = skipped.map(|(what, n)| (what.replace('_', " "), *n)).collect();
     page.files = vec![("model".into(), outcome.model.clone()), ("figures".into(), run_json.to_owned())];

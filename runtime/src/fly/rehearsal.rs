@@ -36,8 +36,8 @@ use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
-use crate::watch::Watch;
 use crate::upload::{Offerer, Source};
+use crate::watch::Watch;
 
 /// Time between two turns; one training step is taken in each.
 const TURN_NS: u64 = 20_000_000;

@@ -100,14 +100,15 @@ impl Ground {
         });
         let (grid, squares) = (map.grid(), &mut self.squares[at]);
         (squares.corner, squares.side_m, squares.columns) = (grid.corner.to_array(), grid.side_m, grid.columns);
-        let letters = (0..grid.rows).flat_map(|row| (0..grid.columns).map(move |column| (column, row))).map(|(c, r)| {
-            match map.cell(c, r).map(|cell| cell.state) {
-                None => b'.',
-                Some(State::Unseen) => b'0',
-                Some(State::Thin) => b'1',
-                Some(State::Covered) => b'2',
-            }
-        });
+        let letters =
+            (0..grid.rows).flat_map(|row| (0..grid.columns).map(move |column| (column, row))).map(|(c, r)| {
+                match map.cell(c, r).map(|cell| cell.state) {
+                    None => b'.',
+                    Some(State::Unseen) => b'0',
+                    Some(State::Thin) => b'1',
+                    Some(State::Covered) => b'2',
+                }
+            });
         squares.states.clear();
         squares.states.extend(letters);
         self.surveys += 1;

@@ -48,7 +48,7 @@
     const top = head.map((h) => (h === "" ? html("td", {}) : html("th", { scope: "col" }, h)));
     const whole = html("table", {}, [html("thead", {}, html("tr", {}, top)), html("tbody", {}, body)]);
     // It may be wider than the screen: then it is moved with the keyboard, too.
-    return html("div", { class: "card", tabindex: "0", role: "region", "aria-label": label, id }, whole);
+    return html("div", { class: "card", tabindex: "0", role: "region", "aria-label": "table: " + label, id }, whole);
   }
 
   function curve(craft) {

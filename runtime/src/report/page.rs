@@ -51,9 +51,7 @@ fn embedded(value: &impl serde::Serialize) -> String {
 /// The page with its state inside.
 pub(super) fn frozen(data: &ReportData) -> Result<String, ReportError> {
     let state = embedded(&state(data, true)?);
-    let head = format!(
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"{POLICY}\"><style>{STYLE}</style>"
-    );
+    let head = format!("<meta http-equiv=\"Content-Security-Policy\" content=\"{POLICY}\"><style>{STYLE}</style>");
     let ground = embedded(&data.ground);
     let inside = |id: &str, json: &str| format!("<script type=\"application/json\" id=\"{id}\">{json}</script>\n");
     let foot = [inside("state", &state), inside("ground", &ground), format!("<script>{SCRIPT}</script>")].concat();
@@ -74,13 +72,14 @@ pub(super) fn state(data: &ReportData, frozen: bool) -> Result<Value, ReportErro
     let finite = |points: &[[f64; 2]]| -> Vec<[f64; 2]> {
         points.iter().filter(|p| p[0].is_finite() && p[1].is_finite()).copied().collect()
     };
-    let regions = data.map.iter().map(|r| {
-        json!({ "name": r.name, "corners": finite(&r.corners), "cameras": finite(&r.cameras) })
-    });
-    let charts = data.charts.iter().filter_map(|c| {
-        Some(json!({ "title": c.title, "src": picture::svg_uri(&c.svg(true)?) }))
-    });
-    let tables = data.tables.iter().map(|t| json!({ "title": t.title, "note": t.note, "head": t.head, "rows": t.rows }));
+    let regions = data
+        .map
+        .iter()
+        .map(|r| json!({ "name": r.name, "corners": finite(&r.corners), "cameras": finite(&r.cameras) }));
+    let charts =
+        data.charts.iter().filter_map(|c| Some(json!({ "title": c.title, "src": picture::svg_uri(&c.svg(true)?) })));
+    let tables =
+        data.tables.iter().map(|t| json!({ "title": t.title, "note": t.note, "head": t.head, "rows": t.rows }));
     let skipped: Vec<_> = data.skipped.iter().map(|(what, n)| [what.clone(), count(*n)]).collect();
     let files: Vec<_> = data.files.iter().map(|(what, path)| [what.clone(), path.display().to_string()]).collect();
     Ok(json!({
@@ -126,8 +125,6 @@ fn models(models: &[ModelRow]) -> Value {
 fn timings(data: &ReportData) -> Vec<Value> {
     let known = || data.timings.iter().filter(|t| t.seconds.is_finite());
     let longest = known().map(|t| t.seconds).fold(0.0, f64::max);
-    let bar = |t: &super::Timing| {
-        json!({ "name": t.name, "of": t.of, "share": (t.seconds / longest).clamp(0.0, 1.0), "text": seconds(t.seconds) })
-    };
+    let bar = |t: &super::Timing| json!({ "name": t.name, "of": t.of, "share": (t.seconds / longest).clamp(0.0, 1.0), "text": seconds(t.seconds) });
     known().filter(|_| longest > 0.0).map(bar).collect()
 }

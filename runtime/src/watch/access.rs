@@ -109,7 +109,8 @@ mod tests {
         for name in ["localhost", "LOCALHOST:80", "127.0.0.1:8080", "127.8.9.1", "[::1]:8080", "[::1]"] {
             assert!(is_this_machine(name), "{name}");
         }
-        for name in ["", "evil.example", "localhost.evil.example:80", "127.0.0.1.evil.example", "10.0.0.2:80", "[::2]"] {
+        for name in ["", "evil.example", "localhost.evil.example:80", "127.0.0.1.evil.example", "10.0.0.2:80", "[::2]"]
+        {
             assert!(!is_this_machine(name), "{name}");
         }
     }
@@ -139,7 +140,8 @@ mod tests {
         assert!(token.is("0123456789abcdef") && !token.is("0123456789abcdeF") && !token.is(""));
         assert!(address("0.0.0.0:80", Some(&token)).is_ok());
         assert_eq!(format!("{token:?}"), "Token");
-        for bad in [&b"short"[..], b"0123456789abcde;", b"0123456789 abcdef", &[b'a'; 257], &[0xff; 20], &[b'a'; 2000]] {
+        for bad in [&b"short"[..], b"0123456789abcde;", b"0123456789 abcdef", &[b'a'; 257], &[0xff; 20], &[b'a'; 2000]]
+        {
             assert!(matches!(read(bad), Err(HttpError::Token { .. })));
         }
     }

@@ -121,7 +121,9 @@ mod tests {
 
     #[test]
     fn no_path_leads_out_of_the_list() {
-        for path in ["/../etc/passwd", "/map/../../x", "//", "/map/ortho.tif", "/thumbnail", "/thumbnail?of=-1", "/%2e%2e/"] {
+        for path in
+            ["/../etc/passwd", "/map/../../x", "//", "/map/ortho.tif", "/thumbnail", "/thumbnail?of=-1", "/%2e%2e/"]
+        {
             assert_eq!(asked(&format!("GET {path} HTTP/1.1\r\n\r\n")).route, None, "{path}");
         }
     }
