@@ -55,9 +55,10 @@ struct Cli {
     /// Bound on the memory this process may write to, MiB (RLIMIT_DATA).
     #[arg(long, global = true, value_name = "MIB")]
     limit_mib: Option<u64>,
-    /// How log lines and errors are written: text for people, json one object a line.
-    #[arg(long, global = true, value_name = "FORMAT", value_enum, default_value_t = console::Format::Text)]
-    log: console::Format,
+    // Not global: `train --log` is a flight's log.
+    /// How log lines and errors are written: text for people, json one object a line. Given before the command.
+    #[arg(long = "log", value_name = "FORMAT", value_enum, default_value_t = console::Format::Text)]
+    log_format: console::Format,
     /// Write what takes how long, the device's own times on a track of theirs, as a trace for ui.perfetto.dev; every step is timed
     /// for it.
     #[arg(long, global = true, value_name = "FILE")]
@@ -143,11 +144,11 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let trace = match cli.trace.as_deref().map(Trace::create).transpose() {
         Ok(trace) => trace,
         Err(e) => {
-            console::install(cli.verbose, cli.quiet, cli.log, None);
+            console::install(cli.verbose, cli.quiet, cli.log_format, None);
             return failed(&e.into());
         }
     };
-    console::install(cli.verbose, cli.quiet, cli.log, trace.clone());
+    console::install(cli.verbose, cli.quiet, cli.log_format, trace.clone());
     if let Some(mib) = cli.limit_mib
         && let Err(e) = crate::resources::limit_data(mib)
     {

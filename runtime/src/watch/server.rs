@@ -2,7 +2,7 @@
 //! bounded time, and the job nothing.
 
 use std::io::{self, Read};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -23,8 +23,8 @@ const LISTENERS: usize = 5;
 const HEAD_BYTES: usize = 8 << 10;
 /// A head is here within this, however it trickles in.
 const HEAD_WITHIN: Duration = Duration::from_secs(5);
-/// How long who is turned away may take to read it: nobody else is let in meanwhile.
-const TURNED_AWAY_WITHIN: Duration = Duration::from_millis(50);
+/// How long what is refused is still read: nobody else is let in meanwhile where there was no room.
+const SEEN_OFF_WITHIN: Duration = Duration::from_millis(50);
 /// How soon the listening thread sees that the job is over.
 const STOP_WITHIN: Duration = Duration::from_millis(200);
 /// At its end the job waits so long for browsers to hear of it.
@@ -171,12 +171,34 @@ fn serve(listener: &TcpListener, token: Option<Arc<Token>>, watch: &Watch, room:
     }
 }
 
-/// Says so, and reads what came so that the answer is not thrown away with it.
-fn turn_away(mut stream: &TcpStream) {
+/// Says that there is no room.
+fn turn_away(stream: &TcpStream) {
     let _ = stream.set_nonblocking(false);
-    let _ = stream.set_read_timeout(Some(TURNED_AWAY_WITHIN));
-    let _ = stream.read(&mut [0; HEAD_BYTES]);
     let _ = status(stream, "503 Service Unavailable", "Retry-After: 5\r\n");
+    see_off(stream);
+}
+
+/// Reads what is still on its way: a connection that is closed before takes the answer with it.
+fn see_off(mut stream: &TcpStream) {
+    let _ = stream.shutdown(Shutdown::Write);
+    let until = Instant::now() + SEEN_OFF_WITHIN;
+    loop {
+        let left = until.saturating_duration_since(Instant::now());
+        if left.is_zero() || stream.set_read_timeout(Some(left)).is_err() {
+            return;
+        }
+        match stream.read(&mut [0; HEAD_BYTES]) {
+            Ok(1..) => {}
+            _ => return,
+        }
+    }
+}
+
+/// A request that is not understood.
+fn refuse(stream: &TcpStream, why: Refusal) -> io::Result<()> {
+    refusal(stream, why)?;
+    see_off(stream);
+    Ok(())
 }
 
 fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, room: &Room) -> io::Result<()> {
@@ -199,9 +221,9 @@ fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, room: &R
         }
         match parse(&bytes[..n]) {
             Ok(Some(asked)) => break asked,
-            Ok(None) if n == HEAD_BYTES => return refusal(stream, Refusal::TooLarge),
+            Ok(None) if n == HEAD_BYTES => return refuse(stream, Refusal::TooLarge),
             Ok(None) => {}
-            Err(why) => return refusal(stream, why),
+            Err(why) => return refuse(stream, why),
         }
     };
     match (judge(&asked, token), token) {
