@@ -8,14 +8,15 @@ use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use tracing::field::{Field, Visit};
-use tracing::level_filters::LevelFilter;
+use tracing::Level;
+use tracing_subscriber::filter::filter_fn;
 use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 use tracing_subscriber::layer::{Context, SubscriberExt};
 use tracing_subscriber::{EnvFilter, Layer};
 
-use crate::trace::Trace;
+use crate::trace::{Trace, is_ours};
 
 /// Between two plain progress lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -70,7 +71,7 @@ pub fn install(verbose: u8, quiet: bool, format: Format, trace: Option<Trace>) {
     };
     let subscriber = tracing_subscriber::registry()
         .with(lines.with_filter(filter))
-        .with(Warnings.with_filter(LevelFilter::WARN))
+        .with(Warnings.with_filter(filter_fn(|m| *m.level() <= Level::WARN && is_ours(m))))
         .with(trace.map(Trace::layer));
     let _ = tracing::subscriber::set_global_default(subscriber);
 }

@@ -80,6 +80,12 @@ impl Sheet {
     }
 }
 
+/// Whether our own crates say it: what libraries have on their minds is for the log.
+pub fn is_ours(what: &tracing::Metadata<'_>) -> bool {
+    let name = what.target().split("::").next().unwrap_or_default();
+    ["runtime", "vulkan", "models", "hal", "config"].contains(&name)
+}
+
 /// Number of a thread in the trace.
 fn thread_number() -> (u32, bool) {
     static THREADS: AtomicU32 = AtomicU32::new(DEVICE_TRACK + 1);
@@ -128,9 +134,8 @@ impl Trace {
 
     /// What listens: to our own spans, and to the device's times.
     pub fn layer<S: Subscriber + for<'a> LookupSpan<'a>>(self) -> impl Layer<S> {
-        let ours = ["runtime", "vulkan", "models", "hal", "config"];
-        self.with_filter(filter_fn(move |m| match m.is_span() {
-            true => ours.contains(&m.target().split("::").next().unwrap_or_default()),
+        self.with_filter(filter_fn(|m| match m.is_span() {
+            true => is_ours(m),
             false => m.target() == vulkan::stages::DEVICE_TIMES,
         }))
     }

@@ -190,6 +190,7 @@ where
                 let all_came = !self.vehicle.awaits_pictures() && quiet_ns >= LATE_PICTURES_NS;
                 if stop || self.vehicle.is_finished() || all_came || quiet_ns >= late_ns {
                     self.vehicle.finish();
+                    self.shown.over();
                     self.phase = Phase::Closing(ended);
                 }
             }

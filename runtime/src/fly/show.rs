@@ -49,6 +49,11 @@ impl ShownCapture {
         });
     }
 
+    /// Nothing more is expected of link and camera.
+    pub(super) fn over(&self) {
+        self.watch.craft(0, |craft| craft.link = "the flight is over");
+    }
+
     /// A key frame, and now and then what all of them cover.
     pub(super) fn key_frame(&mut self, pose: Pose, image: &RgbImage, map: Option<&CoverageMap>, now_ns: u64) {
         let is_due = self.surveyed_ns.is_none_or(|at| now_ns.saturating_sub(at) >= SURVEY_EVERY_NS);

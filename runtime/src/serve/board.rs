@@ -19,6 +19,8 @@ pub struct Board<'a> {
     mission: &'a Mission,
     watch: Watch,
     seen: Vec<Seen>,
+    /// When what is under way began to come, and how many of its chunks were here.
+    under_way: Vec<Option<(Instant, usize)>>,
     started: Instant,
     told: Option<(usize, usize)>,
 }
@@ -32,7 +34,7 @@ impl<'a> Board<'a> {
             page.title = format!("Mission {}: ground", mission.name);
             page.aircraft.iter_mut().for_each(|craft| craft.axes = ["seconds", "steps of the models that arrived"]);
         });
-        Self { mission, watch, seen: vec![None; ids.len()], started: Instant::now(), told: None }
+        Self { mission, watch, seen: vec![None; ids.len()], under_way: vec![None; ids.len()], started: Instant::now(), told: None }
     }
 
     /// What is shown.
@@ -54,8 +56,9 @@ impl<'a> Board<'a> {
         for (i, aircraft) in self.mission.aircraft.iter().enumerate() {
             let here = progress.received.iter().find(|r| r.aircraft == aircraft.id);
             let under_way = progress.transfers.iter().find(|t| t.0 == aircraft.id).map(|t| (t.1, t.2));
+            let left_s = self.left_s(i, under_way);
             self.watch.craft(i, |craft| {
-                craft.chunks = under_way;
+                (craft.chunks, craft.left_s) = (under_way, left_s);
                 craft.bytes = here.map(|r| r.size);
                 craft.progress = under_way.map(|(n, of)| n as f32 / of.max(1) as f32);
                 craft.link = if under_way.is_some() { "receiving" } else { "idle" };
@@ -70,6 +73,17 @@ impl<'a> Board<'a> {
                 self.look(i, received);
             }
         }
+    }
+
+    /// Seconds until a model is here, by the pace of its chunks so far.
+    fn left_s(&mut self, i: usize, under_way: Option<(usize, usize)>) -> Option<f64> {
+        let Some((here, of)) = under_way else {
+            self.under_way[i] = None;
+            return None;
+        };
+        let (since, before) = *self.under_way[i].get_or_insert((Instant::now(), here));
+        let came = here.saturating_sub(before);
+        (came > 0).then(|| since.elapsed().as_secs_f64() * of.saturating_sub(here) as f64 / came as f64)
     }
 
     /// Reads what a model says of itself, once.
