@@ -34,7 +34,14 @@ impl<'a> Board<'a> {
             page.title = format!("Mission {}: ground", mission.name);
             page.aircraft.iter_mut().for_each(|craft| craft.axes = ["seconds", "steps of the models that arrived"]);
         });
-        Self { mission, watch, seen: vec![None; ids.len()], under_way: vec![None; ids.len()], started: Instant::now(), told: None }
+        Self {
+            mission,
+            watch,
+            seen: vec![None; ids.len()],
+            under_way: vec![None; ids.len()],
+            started: Instant::now(),
+            told: None,
+        }
     }
 
     /// What is shown.
