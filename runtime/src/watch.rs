@@ -19,6 +19,7 @@ use crate::report::{Craft, MapRegion, ReportData, ReportError};
 mod access;
 mod request;
 mod respond;
+mod room;
 mod server;
 
 pub use access::Token;

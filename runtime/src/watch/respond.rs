@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use super::Watch;
 use super::access::Token;
 use super::request::{COOKIE, Refusal, Route};
-use super::server::Room;
+use super::room::Room;
 use crate::report::{self, SCRIPT, STYLE, picture};
 
 /// A document is sent within this: 1 MB over 100 kB/s three times over.

@@ -3,8 +3,8 @@
 
 use std::io::{self, Read};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -13,12 +13,9 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use super::access::{Token, Verdict, address, judge};
 use super::request::{Refusal, parse};
 use super::respond::{answer, keep_token, refusal, status};
+use super::room::{Room, Seat};
 use super::{HttpError, Watch};
 
-/// Connections at the same time: a browser opens six to one host, and somebody else looks, too.
-const CONNECTIONS: usize = 8;
-/// Of them may hear of changes: the others stay for the page, its parts and whoever comes next.
-const LISTENERS: usize = 5;
 /// Bytes of a request's head (what nginx and Apache allow).
 const HEAD_BYTES: usize = 8 << 10;
 /// A head is here within this, however it trickles in.
@@ -32,77 +29,12 @@ const GOODBYE: Duration = Duration::from_millis(500);
 /// Stack of a connection's thread: head, headers and a piece of a file take 32 KiB, a picture's encoder as much again.
 const STACK: usize = 512 << 10;
 
-/// How many there are, and whether it is time to go.
-#[derive(Default)]
-pub(super) struct Room {
-    connections: AtomicUsize,
-    listeners: AtomicUsize,
-    pub(super) closing: AtomicBool,
-    bell: (Mutex<()>, Condvar),
-}
-
-/// Gives a listener's place back.
-pub(super) struct Place<'a>(&'a AtomicUsize);
-
-impl Drop for Place<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::AcqRel);
-    }
-}
-
-fn take(of: &AtomicUsize, most: usize) -> bool {
-    of.fetch_update(Ordering::AcqRel, Ordering::Acquire, |n| (n < most).then_some(n + 1)).is_ok()
-}
-
-/// A connection's place, which goes with it into its thread.
-struct Seat(Arc<Room>);
-
-impl Seat {
-    fn take(room: &Arc<Room>) -> Option<Self> {
-        take(&room.connections, CONNECTIONS).then(|| Self(room.clone()))
-    }
-}
-
-impl Drop for Seat {
-    fn drop(&mut self) {
-        self.0.connections.fetch_sub(1, Ordering::AcqRel);
-    }
-}
-
-impl Room {
-    /// A place among those who hear of changes.
-    pub(super) fn listen(&self) -> Option<Place<'_>> {
-        take(&self.listeners, LISTENERS).then_some(Place(&self.listeners))
-    }
-
-    /// Waits, but not beyond the job's end.
-    pub(super) fn pause(&self, time: Duration) {
-        let guard = self.bell.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if !self.closing.load(Ordering::Relaxed) {
-            // Woken or not, the caller looks again.
-            drop(self.bell.1.wait_timeout(guard, time));
-        }
-    }
-
-    fn close(&self) {
-        let _guard = self.bell.0.lock().unwrap_or_else(PoisonError::into_inner);
-        self.closing.store(true, Ordering::Relaxed);
-        self.bell.1.notify_all();
-    }
-}
-
 /// Serves the page until it is dropped.
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
     room: Arc<Room>,
     thread: Option<JoinHandle<()>>,
-}
-
-impl std::fmt::Debug for Room {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} connections", self.connections.load(Ordering::Relaxed))
-    }
 }
 
 impl Server {
@@ -141,7 +73,7 @@ impl Drop for Server {
             let _ = thread.join();
         }
         let until = Instant::now() + GOODBYE;
-        while self.room.connections.load(Ordering::Acquire) > 0 && Instant::now() < until {
+        while !self.room.is_empty() && Instant::now() < until {
             std::thread::sleep(Duration::from_millis(10));
         }
     }
@@ -166,7 +98,7 @@ fn serve(listener: &TcpListener, token: Option<Arc<Token>>, watch: &Watch, room:
         let (watch, token) = (watch.clone(), token.clone());
         // Without a thread the connection is closed. Whoever has gone is not missed.
         let _ = std::thread::Builder::new().name("http".into()).stack_size(STACK).spawn(move || {
-            let _ = connection(&stream, token.as_deref(), &watch, &seat.0);
+            let _ = connection(&stream, token.as_deref(), &watch, seat.room());
         });
     }
 }
