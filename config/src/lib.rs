@@ -18,6 +18,8 @@ pub mod geodesy;
 #[cfg(feature = "std")]
 pub mod ground;
 #[cfg(feature = "std")]
+pub mod http;
+#[cfg(feature = "std")]
 pub mod init;
 #[cfg(feature = "std")]
 pub mod kernels;

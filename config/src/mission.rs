@@ -13,6 +13,7 @@ use crate::failsafe::FailsafeSettings;
 use crate::faults::FaultSettings;
 use crate::geodesy::{EnuFrame, Geodetic};
 use crate::ground::GroundSettings;
+use crate::http::HttpSettings;
 use crate::init::InitSettings;
 use crate::keys::PublicKey;
 use crate::link::LinkSettings;
@@ -90,6 +91,9 @@ record! {
         /// When orthophoto and heights are drawn.
         #[serde(default)]
         pub map: MapSettings = MapSettings::default();
+        /// Who may look at the live page.
+        #[serde(default)]
+        pub http: HttpSettings = HttpSettings::default();
         /// When a flight counts as in trouble.
         #[serde(default)]
         pub failsafe: FailsafeSettings = FailsafeSettings::default();
@@ -251,6 +255,9 @@ impl Mission {
             anchor(p);
         }
         anchor(&mut self.upload.keys);
+        if let Some(p) = &mut self.http.token_file {
+            anchor(p);
+        }
         if let Some(p) = &mut self.link.signing_key {
             anchor(p);
         }

@@ -93,6 +93,11 @@ impl KeyframeSelector {
         self.ground.is_some()
     }
 
+    /// The map as it is: the newest key frame may not be in it yet.
+    pub fn map(&self) -> Option<&CoverageMap> {
+        self.ground.as_ref().map(|ground| &ground.map)
+    }
+
     /// The map with all key frames noted, and their views; `None` without one.
     pub fn ground(&mut self) -> Option<(&CoverageMap, Vec<View>)> {
         let ground = self.ground.as_mut()?;

@@ -7,6 +7,7 @@ use clap::{Parser, Subcommand};
 use config::error::ErrorKind;
 
 use crate::console;
+use crate::trace::Trace;
 
 mod aggregate;
 #[cfg(feature = "lab")]
@@ -18,6 +19,7 @@ mod error;
 mod eval;
 mod export;
 mod fly;
+mod http;
 mod import;
 mod init;
 mod keys;
@@ -53,6 +55,14 @@ struct Cli {
     /// Bound on the memory this process may write to, MiB (RLIMIT_DATA).
     #[arg(long, global = true, value_name = "MIB")]
     limit_mib: Option<u64>,
+    // Not global: `train --log` is a flight's log.
+    /// How log lines and errors are written: text for people, json one object a line. Given before the command.
+    #[arg(long = "log", value_name = "FORMAT", value_enum, default_value_t = console::Format::Text)]
+    log_format: console::Format,
+    /// Write what takes how long, the device's own times on a track of theirs, as a trace for ui.perfetto.dev; every step is timed
+    /// for it.
+    #[arg(long, global = true, value_name = "FILE")]
+    trace: Option<std::path::PathBuf>,
     /// Warnings and errors only, no progress.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
@@ -131,7 +141,14 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
             return if asked { ExitCode::SUCCESS } else { exit_code(ErrorKind::Input) };
         }
     };
-    console::install(cli.verbose, cli.quiet);
+    let trace = match cli.trace.as_deref().map(Trace::create).transpose() {
+        Ok(trace) => trace,
+        Err(e) => {
+            console::install(cli.verbose, cli.quiet, cli.log_format, None);
+            return failed(&e.into());
+        }
+    };
+    console::install(cli.verbose, cli.quiet, cli.log_format, trace.clone());
     if let Some(mib) = cli.limit_mib
         && let Err(e) = crate::resources::limit_data(mib)
     {
@@ -168,11 +185,16 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
             manual::run(args, <Cli as clap::CommandFactory>::command(), Lab::has_subcommand)
         }
     };
+    if let Some(trace) = trace {
+        trace.finish();
+    }
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(e) => {
-            console::error(&e.to_string());
-            e.exit_code()
-        }
+        Err(e) => failed(&e),
     }
+}
+
+fn failed(e: &CliError) -> ExitCode {
+    console::error(&e.to_string());
+    e.exit_code()
 }

@@ -1,13 +1,22 @@
 //! What a person sees: log lines and progress on standard error — a live bar on a terminal, plain lines otherwise —
-//! so that standard output holds results only.
+//! so that standard output holds results only. Or one JSON object a line, for programs.
 
+use std::collections::VecDeque;
 use std::io::{IsTerminal, Write};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use tracing_subscriber::EnvFilter;
+use tracing::Level;
+use tracing::field::{Field, Visit};
+use tracing_subscriber::filter::filter_fn;
 use tracing_subscriber::fmt::MakeWriter;
+use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
+use tracing_subscriber::layer::{Context, SubscriberExt};
+use tracing_subscriber::{EnvFilter, Layer};
+
+use crate::trace::{Trace, is_ours};
 
 /// Between two plain progress lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -28,10 +37,23 @@ fn console() -> &'static Console {
 }
 
 static QUIET: OnceLock<bool> = OnceLock::new();
+static FORMAT: OnceLock<Format> = OnceLock::new();
 
-/// Sets up logging once per process; a second call changes nothing.
-pub fn install(verbose: u8, quiet: bool) {
-    let _ = QUIET.set(quiet);
+/// How log lines are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Format {
+    /// For people.
+    #[default]
+    Text,
+    /// One object a line.
+    Json,
+}
+
+/// Sets up logging once per process, and the trace if there is to be one; a second call changes nothing.
+pub fn install(verbose: u8, quiet: bool, format: Format, trace: Option<Trace>) {
+    // Bars are for people.
+    let _ = QUIET.set(quiet || format == Format::Json);
+    let _ = FORMAT.set(format);
     let level = match (quiet, verbose) {
         (true, _) => "warn",
         (_, 0) => "warn,runtime=info,models=info,vulkan=info,hal=info",
@@ -39,19 +61,81 @@ pub fn install(verbose: u8, quiet: bool) {
         _ => "debug",
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
-    let subscriber = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_target(verbose > 0)
-        .without_time()
-        .with_writer(AroundBars)
-        .finish();
+    let lines = tracing_subscriber::fmt::layer().with_writer(AroundBars);
+    let lines = match format {
+        Format::Text => {
+            let ansi = std::io::stderr().is_terminal();
+            lines.with_ansi(ansi).with_target(verbose > 0).without_time().boxed()
+        }
+        Format::Json => lines.json().flatten_event(true).with_current_span(true).with_span_list(false).boxed(),
+    };
+    let subscriber = tracing_subscriber::registry()
+        .with(lines.with_filter(filter))
+        .with(Warnings.with_filter(filter_fn(|m| *m.level() <= Level::WARN && is_ours(m))))
+        .with(trace.map(Trace::layer));
     let _ = tracing::subscriber::set_global_default(subscriber);
 }
 
 /// One error line on standard error, above any bar.
 pub fn error(line: &str) {
-    console().bars.suspend(|| eprintln!("dgtr: {line}"));
+    let line = match FORMAT.get() {
+        Some(Format::Json) => {
+            let mut time = String::new();
+            // Without a clock the line is still worth having.
+            let _ = SystemTime.format_time(&mut Writer::new(&mut time));
+            let fields = serde_json::json!({ "timestamp": time, "level": "ERROR", "message": line, "target": "dgtr" });
+            fields.to_string()
+        }
+        _ => format!("dgtr: {line}"),
+    };
+    console().bars.suspend(|| eprintln!("{line}"));
+}
+
+/// Warnings that are kept for the page, and characters of each.
+const KEPT: usize = 24;
+const CHARACTERS: usize = 240;
+
+/// The last warnings, oldest first, with how often each was said in a row.
+static KEPT_WARNINGS: Mutex<VecDeque<(String, u32)>> = Mutex::new(VecDeque::new());
+
+/// The log's last warnings and errors, for the page.
+pub fn warnings() -> Vec<String> {
+    let kept = KEPT_WARNINGS.lock().unwrap_or_else(PoisonError::into_inner);
+    let line =
+        |(text, times): &(String, u32)| if *times > 1 { format!("{text} ({times} times)") } else { text.clone() };
+    kept.iter().map(line).collect()
+}
+
+fn keep(text: String) {
+    let mut kept = KEPT_WARNINGS.lock().unwrap_or_else(PoisonError::into_inner);
+    match kept.back_mut().filter(|last| last.0 == text) {
+        Some(last) => last.1 = last.1.saturating_add(1),
+        None => {
+            if kept.len() == KEPT {
+                kept.pop_front();
+            }
+            kept.push_back((text, 1));
+        }
+    }
+}
+
+/// Keeps warnings and errors of the log.
+struct Warnings;
+
+impl<S: tracing::Subscriber> Layer<S> for Warnings {
+    fn on_event(&self, event: &tracing::Event<'_>, _: Context<'_, S>) {
+        struct Message(String);
+        impl Visit for Message {
+            fn record_debug(&mut self, field: &Field, value: &dyn std::fmt::Debug) {
+                if field.name() == "message" {
+                    self.0 = format!("{value:?}").chars().take(CHARACTERS).collect();
+                }
+            }
+        }
+        let mut message = Message(String::new());
+        event.record(&mut message);
+        keep(message.0);
+    }
 }
 
 /// Writes to standard error without tearing a live bar.
@@ -141,5 +225,19 @@ impl Drop for Progress {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_warnings_are_kept_and_repeated_ones_are_counted() {
+        (0..3 * KEPT).for_each(|i| keep(format!("{i}")));
+        (0..3).for_each(|_| keep("again".into()));
+        let kept = warnings();
+        assert_eq!((kept.len(), kept[KEPT - 1].as_str()), (KEPT, "again (3 times)"));
+        assert_eq!(kept[KEPT - 2], format!("{}", 3 * KEPT - 1));
     }
 }

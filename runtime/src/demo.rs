@@ -2,6 +2,7 @@
 //! own pseudo-terminal and a camera over a ray-cast world; two onboard jobs; one ground station. Every part is a process
 //! of its own, under a memory limit, exactly as it would run in the field.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -34,6 +35,8 @@ pub struct DemoOptions {
     pub limit_mib: u64,
     /// Seconds of flight per second of wall clock.
     pub speed: f64,
+    /// Where the ground serves its live page; the aircraft serve theirs on the ports behind it (any free ones for port 0).
+    pub http: Option<SocketAddr>,
 }
 
 /// Why the demo failed.
@@ -120,11 +123,16 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
     let mission = mission.to_string_lossy().into_owned();
     let path = |a: &str, b: &str| out.join(a).join(b).to_string_lossy().into_owned();
 
-    let ground = spawn("ground", &["serve", "--mission", &mission, "--out", &path("ground", "out")])?;
+    let spawn_shown = |name: &str, arguments: &[&str], i: u16| {
+        let page = options.http.map(|at| SocketAddr::new(at.ip(), port_behind(at.port(), i)).to_string());
+        let page = page.as_deref().map_or(vec![], |at| vec!["--http", at]);
+        spawn(name, &[arguments, &page].concat())
+    };
+    let ground = spawn_shown("ground", &["serve", "--mission", &mission, "--out", &path("ground", "out")], 0)?;
     let mut simulators = Vec::new();
     let mut jobs = Vec::new();
     let speed = options.speed.to_string();
-    for a in AIRCRAFT {
+    for (i, a) in (1..).zip(AIRCRAFT) {
         let port = out.join(a).join("port");
         let link = format!("pty:{}", port.display());
         let (camera, truth) = (path(a, "camera"), path(a, "truth"));
@@ -153,9 +161,11 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
             ],
         )?);
         wait_for(&port, interrupt, &out)?;
-        jobs.push(spawn(
+        let out = path(a, "out");
+        jobs.push(spawn_shown(
             a,
-            &["fly", "--mission", &mission, "--aircraft", a, "--out", &path(a, "out"), "--silence", "10"],
+            &["fly", "--mission", &mission, "--aircraft", a, "--out", &out, "--silence", "10"],
+            i,
         )?);
     }
     let mut processes: Vec<Process> = jobs.into_iter().chain(simulators).chain([ground]).collect();
@@ -165,6 +175,11 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
     let figures = evaluate::all(&out, options, interrupt)?;
     let summary = summary::write(&out, options, &figures, &processes, flown_s, started)?;
     Ok(summary)
+}
+
+/// The port `i` behind `port`; any free one for 0.
+fn port_behind(port: u16, i: u16) -> u16 {
+    if port == 0 { 0 } else { port.saturating_add(i) }
 }
 
 fn wait_for(port: &Path, interrupt: &Interrupt, out: &Path) -> Result<(), DemoError> {

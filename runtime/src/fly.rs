@@ -24,6 +24,7 @@ mod handover;
 mod intake;
 mod job;
 mod shortage;
+mod show;
 
 #[cfg(test)]
 #[cfg(feature = "lab")]
@@ -58,6 +59,7 @@ use crate::resources;
 use crate::run_json::RunReport;
 use crate::service::Supervisor;
 use crate::upload::{Offerer, Source, UploadError};
+use crate::watch::Watch;
 use flight::Flight;
 use geotags::Geotags;
 use intake::{DECODED_AHEAD, FlightPlan};
@@ -73,6 +75,8 @@ pub struct FlyOptions {
     pub out: PathBuf,
     /// When capture is over.
     pub end: EndOfFlight,
+    /// The live page; this is its aircraft 0.
+    pub watch: Watch,
 }
 
 /// How the job ended.
@@ -131,16 +135,18 @@ pub fn fly(
         end: options.end,
         geotags: Geotags::open(&disk, &options.out, mission.origin)
             .map_err(JobError::io(&options.out.join(geotags::FILE)))?,
+        watch: options.watch.clone(),
     })?;
     flight.handover().keep_in(store, model_path(&options.out));
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
     supervisor.ready();
     supervisor.status(&format!("listening on {}", aircraft.link));
+    options.watch.craft(0, |craft| craft.state = "listening");
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };
     let health = Health::new(mission.failsafe, mission.memory.host_mib, &options.out);
     let failsafe = Failsafe::new(health, &mission.failsafe);
     let job = Job::new(reconstruction, offerer, &options.out, budget, failsafe, MonotonicClock::default());
-    let mut job = job.supervised(supervisor);
+    let mut job = job.supervised(supervisor, options.watch.clone());
     while job.turn(flight.handover(), interrupt)? {}
     let (mut capture, ended, counters) = flight.finish()?;
     tracing::info!("capture is over ({ended:?}): {} key frames", job.keyframes());
@@ -152,7 +158,7 @@ pub fn fly(
     }
     let mut end = job.land(&mut capture, &counters, interrupt)?;
     end.reconstruction.report.skip("key_frames_without_room_on_disk", capture.without_room());
-    Ok(outcome(ended, counters, end, interrupt))
+    Ok(outcome(ended, counters, end, interrupt, &options.watch))
 }
 
 /// Most bytes of a Gaussian as it is delivered; 0: models are sent as they are.
@@ -200,14 +206,31 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
 }
 
 /// Waits for the ground to have the finished model, then says what became of everything.
-fn outcome(ended: Ended, flight: FlightCounters, end: JobEnd<Reconstruction>, interrupt: &Interrupt) -> FlyOutcome {
+fn outcome(
+    ended: Ended,
+    flight: FlightCounters,
+    end: JobEnd<Reconstruction>,
+    interrupt: &Interrupt,
+    watch: &Watch,
+) -> FlyOutcome {
     let JobEnd { mut reconstruction, offerer, supervisor, model, gaussians, finished } = end;
     supervisor.status(&format!("{gaussians} Gaussians of {} key frames; delivering", reconstruction.keyframes()));
     let go_on = || {
         supervisor.alive();
         !interrupt.requested()
     };
+    if finished {
+        watch.craft(0, |craft| (craft.state, craft.left_s) = ("delivering the model", None));
+    }
     let delivered = finished && offerer.wait_delivered(DELIVERY, go_on);
+    watch.craft(0, |craft| {
+        craft.state = match (finished, delivered) {
+            (true, true) => "done, the ground has the model",
+            (true, false) => "done, the model is on board",
+            _ => "stopped with a checkpoint",
+        };
+        craft.bytes = Some(offerer.status().sent);
+    });
     reconstruction.report.more.insert("bytes_sent".into(), offerer.status().sent.into());
     offerer.shutdown();
     let keyframes = reconstruction.keyframes();

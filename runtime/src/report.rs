@@ -1,5 +1,6 @@
-//! One self-contained HTML file that shows what a mission, a demo or a benchmark came to: map, figures, pictures,
-//! times, what was skipped, what went wrong. No scripts, no network; it opens from a USB stick.
+//! The page: what a job does, or what a mission, a demo or a benchmark came to. Map, aircraft, figures, pictures, times, what was
+//! skipped, what went wrong. Live, a browser fetches it from the job (`watch`) and hears of changes; as `report.html` the same page
+//! holds the same state inside, needs no network and opens from a USB stick.
 
 use std::path::{Path, PathBuf};
 
@@ -8,12 +9,20 @@ use image::RgbImage;
 use models::formats::{FormatError, write_atomic};
 
 pub mod chart;
-mod html;
-mod map;
-pub(crate) mod picture;
+pub mod craft;
+mod curve;
+pub mod ground;
+mod page;
+pub mod picture;
 mod text;
 
+pub use craft::Craft;
+use ground::Ground;
+pub use page::{SCRIPT, STYLE, live as live_page};
 pub use text::{bytes, count, seconds};
+
+/// The page's file in an output folder.
+pub const REPORT: &str = "report.html";
 
 /// Everything a report can show; empty parts leave no trace on the page.
 #[derive(Clone, Debug, Default)]
@@ -26,6 +35,10 @@ pub struct ReportData {
     pub headline: Vec<(String, String)>,
     /// Regions and camera positions.
     pub map: Vec<MapRegion>,
+    /// The aircraft as they are now, or were at the end.
+    pub aircraft: Vec<Craft>,
+    /// What else the map shows. Aircraft are counted as in `aircraft`, or in `map` where there are none.
+    pub ground: Ground,
     /// One row per local model, then the global one.
     pub models: Vec<ModelRow>,
     /// Pictures side by side.
@@ -138,13 +151,28 @@ impl Error for ReportError {
     }
 }
 
+impl ReportError {
+    /// For `map_err` on encoders.
+    fn picture(name: &str) -> impl FnOnce(image::ImageError) -> Self + '_ {
+        move |source| Self::Picture { name: name.to_owned(), source }
+    }
+}
+
 impl ReportData {
-    /// The page as text.
+    /// The page as text, with everything inside.
     ///
     /// # Errors
     /// A picture that cannot be encoded (no pixels).
     pub fn to_html(&self) -> Result<String, ReportError> {
-        html::page(self)
+        page::frozen(self)
+    }
+
+    /// What the live page is told, without the ground and without pictures side by side.
+    ///
+    /// # Errors
+    /// None at present: a live state holds no picture.
+    pub fn live_json(&self) -> Result<serde_json::Value, ReportError> {
+        page::state(self, false)
     }
 
     /// Writes the page, atomically.
@@ -155,11 +183,6 @@ impl ReportData {
         let page = self.to_html()?;
         write_atomic(path, |out| out.write_all(page.as_bytes()))?;
         Ok(())
-    }
-
-    /// Which colour a name has everywhere on the page.
-    fn colour(&self, name: &str) -> usize {
-        self.map.iter().position(|r| r.name == name).map_or(html::NEUTRAL, |i| i % html::COLOURS)
     }
 }
 

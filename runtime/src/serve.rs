@@ -17,6 +17,9 @@ use crate::upload::admission::{Admission, ModelRefusal, Refusals};
 use crate::upload::receive::{ReceiveCounters, Received, Receiver};
 
 pub mod admit;
+mod board;
+
+pub use board::Board;
 
 /// After the last model is here, the aircraft have so long to take their receipts.
 const RECEIPTS: Duration = Duration::from_secs(10);
@@ -56,6 +59,8 @@ pub struct Progress {
     pub transfers: Vec<(String, usize, usize)>,
     /// Bytes received by this run.
     pub bytes: u64,
+    /// The complete models.
+    pub received: Vec<Received>,
 }
 
 /// What came in.
@@ -97,6 +102,7 @@ pub fn receive(
             aircraft: ids.len(),
             transfers: receiver.progress().into_iter().filter(|p| p.2 > 0).collect(),
             bytes: receiver.counters.bytes,
+            received,
         });
         if receiver.all_finished() {
             let since = complete.get_or_insert_with(Instant::now);

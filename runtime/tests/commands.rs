@@ -19,6 +19,8 @@ mod keys;
 #[path = "commands/manual.rs"]
 #[cfg(feature = "lab")]
 mod manual;
+#[path = "commands/observed.rs"]
+mod observed;
 #[path = "commands/supervised.rs"]
 mod supervised;
 #[path = "commands/viewing.rs"]
@@ -94,7 +96,9 @@ fn a_mission_written_by_init_is_accepted_by_plan_and_fly() {
     let plan = dgtr(&["plan", "--mission", path]);
     let (said, error) = (String::from_utf8_lossy(&plan.stdout), String::from_utf8_lossy(&plan.stderr));
     assert!(
-        said.contains("48 views and 0 crops of 320 x 240, 48 of them on the device at once, SH degree 3, 96 MiB allowed"),
+        said.contains(
+            "48 views and 0 crops of 320 x 240, 48 of them on the device at once, SH degree 3, 96 MiB allowed"
+        ),
         "{said}{error}"
     );
     // The mission is accepted; what is refused is the link.

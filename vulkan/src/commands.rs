@@ -6,7 +6,7 @@ use crate::gpu::{Gpu, GpuError};
 use crate::kernels::{GROUPS, Group, KERNELS, Kernel};
 use crate::layout::Push;
 use crate::pipelines::Pipelines;
-use crate::stages::{STAGE_NAMES, Stage};
+use crate::stages::{DEVICE_TIMES, STAGE_NAMES, Stage};
 use ash::vk;
 use std::cell::Cell;
 
@@ -107,7 +107,7 @@ impl Commands {
     /// The device fails.
     pub fn begin<'a>(&'a self, pipelines: &'a Pipelines) -> Result<Recording<'a>, GpuError> {
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
-        let timed = self.gpu.timestamp_ns() > 0.0 && self.weight.get() > 0.0;
+        let timed = self.gpu.timestamp_ns() > 0.0 && (self.weight.get() > 0.0 || is_traced());
         // SAFETY: the buffer is not pending: `submit` waits.
         unsafe {
             let device = self.gpu.device();
@@ -138,6 +138,9 @@ impl Commands {
             )
         };
         if read.is_ok() {
+            if is_traced() {
+                self.tell_times(&ticks[..stamps]);
+            }
             let (mut all, mut groups) = (self.stage_ms.get(), self.group_ms.get());
             for i in 1..stamps {
                 let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns() * self.weight.get();
@@ -148,6 +151,24 @@ impl Commands {
             }
             self.stage_ms.set(all);
             self.group_ms.set(groups);
+        }
+    }
+}
+
+/// Whether somebody wants to know when every kernel ran.
+fn is_traced() -> bool {
+    tracing::enabled!(target: DEVICE_TIMES, tracing::Level::TRACE)
+}
+
+impl Commands {
+    /// Tells of every stage in `ticks`. The two clocks are set by the end of the submission, which the host has just seen: its own
+    /// way back, some microseconds, is taken for the device's.
+    fn tell_times(&self, ticks: &[u64]) {
+        let Some(last) = ticks.last() else { return };
+        let ns = |ticks: u64| (ticks as f64 * self.gpu.timestamp_ns()) as u64;
+        for (i, pair) in ticks.windows(2).enumerate() {
+            let (stage, took_ns) = (self.stages[i + 1].get() as u64, ns(pair[1].saturating_sub(pair[0])));
+            tracing::trace!(target: DEVICE_TIMES, stage, ago_ns = ns(last.saturating_sub(pair[0])), took_ns);
         }
     }
 }

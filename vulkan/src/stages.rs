@@ -2,6 +2,10 @@
 
 pub mod work;
 
+/// Target of the events that tell a stage's time by the device's clock: `stage` (its number), `ago_ns` before the event it began, and
+/// `took_ns`. While somebody listens to them at level TRACE, every submission is timed.
+pub const DEVICE_TIMES: &str = "device_times";
+
 /// A stage of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {

@@ -89,6 +89,7 @@ mod tests {
     use super::*;
     use crate::coverage::CoverageSettings;
     use crate::failsafe::FailsafeSettings;
+    use crate::http::HttpSettings;
     use crate::link::Signing;
     use crate::map::MapSettings;
     use crate::mission::*;
@@ -152,7 +153,7 @@ mod tests {
         same!(MemorySettings, Preset, NetworkSettings, UploadSettings, TlsSettings, GroundSettings, InitSettings);
         same!(RefineSettings, TrainSettings, LossSettings, RateSettings, AdamSettings, DensitySettings, Strategy);
         same!(ShSettings, ResolutionSettings, ViewSettings, StopSettings, RegulariseSettings, SkipSettings);
-        same!(FaultSettings, FailsafeSettings, CoverageSettings, Aircraft);
+        same!(FaultSettings, FailsafeSettings, CoverageSettings, HttpSettings, Aircraft);
     }
 
     /// All tables of the reference, as the structs that would be read from it.
@@ -173,7 +174,7 @@ mod tests {
         }
         default!(seed: u64, mount: MountSettings, link: LinkSettings, keyframes: KeyframeSettings, memory: MemorySettings);
         default!(network: NetworkSettings, upload: UploadSettings, ground: GroundSettings, init: InitSettings);
-        default!(map: MapSettings);
+        default!(map: MapSettings, http: HttpSettings);
         default!(refine: RefineSettings, training: TrainSettings, faults: FaultSettings, failsafe: FailsafeSettings);
         default!(coverage: CoverageSettings);
         assert!(file.is_empty(), "compared with nothing: {file:?}");

@@ -19,6 +19,7 @@ use super::OrthoError;
 use super::georef::VERTICAL;
 use super::grid::{BLOCK, Block, Grid};
 use super::preview::Preview;
+pub use super::preview::preview_step;
 use crate::formats::FormatError;
 
 /// Height where there is none.

@@ -16,6 +16,11 @@ const LIGHT: [f32; 3] = [-0.5, 0.5, std::f32::consts::FRAC_1_SQRT_2];
 /// Brightness of level ground in the relief.
 const LEVEL: f32 = 0.75;
 
+/// Pixels of a map of so many columns and rows along a side of one of its small picture.
+pub fn preview_step([columns, rows]: [u32; 2]) -> u32 {
+    columns.max(rows).div_ceil(SIDE).max(1)
+}
+
 /// Means over squares of the map's pixels.
 pub(super) struct Preview {
     step: u32,
@@ -29,7 +34,7 @@ pub(super) struct Preview {
 impl Preview {
     pub fn of(grid: &Grid) -> Self {
         let [columns, rows] = grid.size();
-        let step = columns.max(rows).div_ceil(SIDE);
+        let step = preview_step([columns, rows]);
         let (width, height) = (columns.div_ceil(step), rows.div_ceil(step));
         let metres = (f64::from(step) * grid.gsd()) as f32;
         Self { step, width, height, metres, sums: vec![[0.0; 5]; width as usize * height as usize] }

@@ -10,7 +10,7 @@ use models::dataset::Dataset;
 use crate::aggregate::compare::{add_to, compare, perceptual};
 use crate::aggregate::{self, LocalModel, Outcome, summary};
 use crate::interrupt::Interrupt;
-use crate::report::ReportData;
+use crate::report::{REPORT, ReportData};
 use crate::run_json::RunReport;
 
 use super::CliError;
@@ -144,7 +144,7 @@ pub(super) fn finish(
     mut data: ReportData,
     outcome: Outcome,
 ) -> Result<(), CliError> {
-    let page = out.join("report.html");
+    let page = out.join(REPORT);
     data.files.push(("figures".into(), run.write(out)?));
     data.write(&page)?;
     for warning in &data.warnings {

@@ -24,6 +24,9 @@ pub struct Args {
     /// Seconds of flight per second of wall clock.
     #[arg(long, value_name = "X", default_value_t = 4.0)]
     speed: f64,
+    /// Serve the ground's live page there, as 127.0.0.1:8080, and those of the aircraft on the two ports behind it.
+    #[arg(long, value_name = "ADDR")]
+    http: Option<std::net::SocketAddr>,
 }
 
 /// Runs the command.
@@ -31,9 +34,9 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let Args { out, seconds, seed, process_mib: limit_mib, speed } = args;
+    let Args { out, seconds, seed, process_mib: limit_mib, speed, http } = args;
     let interrupt = Interrupt::install()?;
-    let summary = run_demo(&DemoOptions { out, seconds, seed, limit_mib, speed }, &interrupt)?;
+    let summary = run_demo(&DemoOptions { out, seconds, seed, limit_mib, speed, http }, &interrupt)?;
     print!("{summary}");
     Ok(())
 }

@@ -1,19 +1,22 @@
 //! `dgtr fly`: the onboard job.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use config::disk::Disk;
 use config::mission::Mission;
 
 use super::CliError;
+use super::http::HttpArgs;
 use crate::engine::device::training_lens;
 use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly};
 use crate::interrupt::Interrupt;
 use crate::ortho::keep_scratch_in;
+use crate::report::{REPORT, ReportData, Timing, count, seconds};
 use crate::run_json::RunReport;
 use crate::service::Supervisor;
 use crate::session::{Owner, Session};
+use crate::watch::Watch;
 
 /// Reads pose and triggers from the autopilot and pictures from the camera, and builds the model while flying.
 #[derive(Debug, clap::Args)]
@@ -37,6 +40,9 @@ pub struct Args {
     /// Give up when nothing was ever heard for this many seconds; 0 waits for ever.
     #[arg(long, value_name = "S", default_value_t = 0.0)]
     patience: f64,
+    /// The live page.
+    #[command(flatten)]
+    http: HttpArgs,
 }
 
 /// Runs the command.
@@ -59,6 +65,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let end =
         EndOfFlight { silence: seconds(silence, "silence")?, patience: (!patience.is_zero()).then_some(patience) };
     let interrupt = Interrupt::install()?;
+    let watch = Watch::of(&mission, &[&aircraft.id], "opening the device and the networks", &args.out);
+    watch.update(|page| page.title = format!("Aircraft {}, mission {}", aircraft.id, mission.name));
+    let _server = args.http.serve(&mission.http, &watch)?;
     let lens = training_lens(&mission);
     let owner = Owner {
         command: "fly".into(),
@@ -69,11 +78,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
     keep_scratch_in(&args.out);
-    let options = FlyOptions { out: args.out.clone(), end };
+    let options = FlyOptions { out: args.out.clone(), end, watch: watch.clone() };
     let outcome = fly(&mission, &aircraft, &options, &interrupt, Supervisor::from_environment())?;
     let mut report = report(&outcome);
     report.wall_s = started.elapsed().as_secs_f64();
     let path = report.write(&args.out)?;
+    if let Err(e) = page(watch.freeze(), &report, &outcome, &path).write(&args.out.join(REPORT)) {
+        // Nothing that counts is missing.
+        tracing::warn!("{e}; there is no page of this flight");
+    }
     println!(
         "{}: {} Gaussians from {} key frames after {} steps; {}",
         outcome.model.display(),
@@ -89,6 +102,24 @@ pub fn run(args: Args) -> Result<(), CliError> {
         ))),
         (true, _) => Ok(()),
     }
+}
+
+/// The page as it was at the end, with what only the end knows.
+fn page(mut page: ReportData, run: &RunReport, outcome: &FlyOutcome, run_json: &Path) -> ReportData {
+    page.subtitle = run.device.clone();
+    page.headline = vec![
+        ("key frames".into(), count(run.views)),
+        ("Gaussians".into(), count(run.gaussians)),
+        ("steps".into(), count(run.steps)),
+        ("total".into(), seconds(run.wall_s)),
+    ];
+    let stages = run.stage_ms.iter().filter(|(name, _)| !name.starts_with("device_"));
+    page.timings =
+        stages.map(|(name, ms)| Timing { name: name.clone(), of: String::new(), seconds: ms * 1e-3 }).collect();
+    let skipped = run.skipped.iter().filter(|s| *s.1 > 0);
+    page.skipped = skipped.map(|(what, n)| (what.replace('_', " "), *n)).collect();
+    page.files = vec![("model".into(), outcome.model.clone()), ("figures".into(), run_json.to_owned())];
+    page
 }
 
 fn report(outcome: &FlyOutcome) -> RunReport {

@@ -12,12 +12,13 @@ use crate::console::Progress;
 use crate::interrupt::Interrupt;
 use crate::ortho::{draw_file, keep_scratch_in};
 use crate::report::{ReportData, Timing, bytes};
-use crate::serve::{self, Reception, ServeError};
+use crate::serve::{self, Board, Reception, ServeError};
 use crate::service::Supervisor;
 use crate::session::{Owner, Session};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};
+use super::http::HttpArgs;
 
 /// Arguments of `dgtr serve`.
 #[derive(Debug, clap::Args)]
@@ -34,6 +35,9 @@ pub struct Args {
     /// How to merge, over `[ground]` of the mission.
     #[command(flatten)]
     pub settings: Settings,
+    /// The live page.
+    #[command(flatten)]
+    pub http: HttpArgs,
 }
 
 /// Runs `dgtr serve`.
@@ -48,6 +52,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         None => None,
     };
     let interrupt = Interrupt::install()?;
+    let mut board = Board::new(&mission, &args.out);
+    let _server = args.http.serve(&mission.http, board.watch())?;
     let owner = Owner {
         command: "serve".into(),
         mission: mission.name.clone(),
@@ -65,6 +71,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         stop.store(interrupt.requested(), Ordering::Relaxed);
         supervisor.ready();
         supervisor.alive();
+        board.round(p);
         if told.replace(p.finished) != Some(p.finished) {
             supervisor.status(&format!("{} of {} final models", p.finished, p.aircraft));
         }
@@ -81,6 +88,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     ));
     // A first Ctrl-C ends the reception; what is here is merged all the same, and a second one ends at once.
     supervisor.status(&format!("merging {} models", reception.received.len()));
+    board.say("merging and distilling");
     let at_work = || {
         supervisor.alive();
         true
@@ -104,12 +112,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     if mission.map.ground {
         let from = Instant::now();
+        board.say("drawing the map");
         match draw_file(&outcome.path, mission.ground.device.as_deref(), &args.out.join("map")) {
             Ok(map) => data.files.extend(["orthophoto", "heights"].map(str::to_owned).into_iter().zip(map.files)),
             Err(e) => data.warnings.push(format!("There is no new map: {e}.")),
         }
         run.stage("map", from);
     }
+    let seen = board.watch().freeze();
+    (data.aircraft, data.ground) = (seen.aircraft, seen.ground);
     let missing = reception.missing;
     if !missing.is_empty() {
         run.outcome = "interrupted".into();

@@ -4,10 +4,13 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use models::formats::model;
+
 use super::evaluate::Figures;
 use super::processes::Process;
 use super::{AIRCRAFT, DemoError, DemoOptions};
-use crate::report::{Comparison, MapRegion, ModelRow, ReportData, Table, Timing, bytes};
+use crate::report::ground::{Ortho, Shot};
+use crate::report::{Comparison, MapRegion, ModelRow, REPORT, ReportData, Table, Timing, bytes};
 use crate::run_json::RunReport;
 use crate::transfer::stem;
 
@@ -133,7 +136,11 @@ pub fn write(
         for (what, count) in &run.skipped {
             data.skipped.push((format!("{}: {}", row.name, what.replace('_', " ")), *count));
         }
-        data.map.push(map_region(figure.name, &model).map_err(|e| report(&e))?);
+        let (header, _) = model::read_header(&model).map_err(|e| report(&e))?;
+        let of = data.map.len();
+        header.views.iter().for_each(|(_, view)| data.ground.add(Shot::of(of, view, 0.0)));
+        let cameras = header.views.iter().map(|(_, v)| [v.pose.center.x, v.pose.center.y]).collect();
+        data.map.push(MapRegion { name: figure.name.into(), corners: header.region, cameras });
         data.comparisons.extend(comparisons(figure));
         rows.push(row);
     }
@@ -164,13 +171,15 @@ pub fn write(
             })
             .collect(),
     });
+    let drawn = model::read_header(&out.join("ground/out/global.dgtr")).map_err(|e| report(&e))?;
+    data.ground.ortho = Ortho::read(&out.join("ground/out/map"), drawn.0.origin, None);
     data.headline = vec![
         ("global model, held out".into(), format!("{:.2} dB", mean(|r| r.global[0]))),
         ("aircraft".into(), AIRCRAFT.len().to_string()),
         ("from take-off to global model".into(), format!("{flown_s:.0} s")),
         ("largest process".into(), bytes(peak_bytes)),
     ];
-    let html = out.join("report.html");
+    let html = out.join(REPORT);
     let mut files: Vec<(String, PathBuf)> = vec![("report".into(), html.clone())];
     files.push(("global model".into(), out.join("ground/out/global.dgtr")));
     files.extend(AIRCRAFT.map(|a| (format!("{a}'s model"), out.join(a).join("out/model.dgtr"))));
@@ -179,12 +188,6 @@ pub fn write(
     data.write(&html).map_err(|e| report(&e))?;
     let (seconds, limit_mib) = (started.elapsed().as_secs_f64(), options.limit_mib);
     Ok(Summary { rows, files, seconds, limit_mib, peak_bytes })
-}
-
-fn map_region(name: &str, model: &Path) -> Result<MapRegion, models::formats::FormatError> {
-    let (header, _) = models::formats::model::read_header(model)?;
-    let cameras = header.views.iter().map(|(_, v)| [v.pose.center.x, v.pose.center.y]).collect();
-    Ok(MapRegion { name: name.into(), corners: header.region, cameras })
 }
 
 /// Truth, own model and global model, for the best and the worst view.

@@ -22,10 +22,12 @@ use models::picture;
 
 use super::geotags::Geotags;
 use super::handover::CaptureEnd;
+use super::show::ShownCapture;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::coverage::Coverage;
 use crate::error::JobError;
 use crate::keyframe_store::KeyFrame;
+use crate::watch::Watch;
 
 /// After the aircraft has landed, pictures that nobody announced may still be on their way from the camera for this long.
 const LATE_PICTURES_NS: u64 = 2_000_000_000;
@@ -97,6 +99,8 @@ pub struct FlightPlan {
     pub end: EndOfFlight,
     /// Where every matched picture is noted.
     pub geotags: Geotags,
+    /// The live page; this is its aircraft 0.
+    pub watch: Watch,
 }
 
 /// A key frame that the job has not taken yet.
@@ -133,6 +137,7 @@ pub(super) struct Intake<L: Link, C, K> {
     /// Names of all key frames, those of earlier runs too.
     names: HashSet<String>,
     counters: FlightCounters,
+    shown: ShownCapture,
 }
 
 impl<L, C, K> Intake<L, C, K>
@@ -145,6 +150,7 @@ where
     pub(super) fn new(mut plan: FlightPlan, vehicle: Vehicle<L, C, K>, clock: K, end: CaptureEnd) -> Self {
         let mut selector = KeyframeSelector::new(plan.keyframes);
         plan.earlier.iter().for_each(|pose| selector.restore(*pose));
+        let shown = ShownCapture::new(plan.watch.clone(), plan.intrinsics, &plan.earlier);
         Self {
             pending: VecDeque::with_capacity(plan.keyframes.max as usize),
             names: std::mem::take(&mut plan.earlier_names),
@@ -158,6 +164,7 @@ where
             phase: Phase::Flying,
             heard_ns: None,
             counters: FlightCounters::default(),
+            shown,
         }
     }
 
@@ -183,6 +190,7 @@ where
                 let all_came = !self.vehicle.awaits_pictures() && quiet_ns >= LATE_PICTURES_NS;
                 if stop || self.vehicle.is_finished() || all_came || quiet_ns >= late_ns {
                     self.vehicle.finish();
+                    self.shown.over();
                     self.phase = Phase::Closing(ended);
                 }
             }
@@ -239,6 +247,7 @@ where
     fn tell_coverage(&mut self) {
         self.counters.coverage = self.survey();
         if let Some(coverage) = &self.counters.coverage {
+            self.shown.coverage(coverage);
             let line = coverage.line();
             tracing::info!("{line}");
             let severity = match coverage.gaps.is_empty() {
@@ -259,6 +268,8 @@ where
             self.heard_ns = Some(now_ns);
         }
         self.end.set_flags(self.vehicle.flags());
+        let (autopilot, lost) = (self.vehicle.autopilot(), self.vehicle.is_link_lost());
+        self.shown.aircraft(&autopilot, lost, self.vehicle.pictures());
         if self.vehicle.autopilot().landed {
             return Ok(Some(Ended::Landed));
         }
@@ -291,7 +302,8 @@ where
                     tracing::warn!("link to the autopilot lost; waiting for it to come back");
                 }
                 Event::LinkBack => tracing::info!("link to the autopilot is back"),
-                Event::Pose(_) | Event::Trigger(_) => {}
+                Event::Pose(report) => self.shown.at = Some(report.position.to_array()),
+                Event::Trigger(_) => {}
             }
         }
         let pictures = self.vehicle.pictures();
@@ -319,6 +331,7 @@ where
         tracing::debug!("picture {}: {decision:?}", frame.sequence);
         self.plan.geotags.note(&frame, decision);
         if let Some(Ok(image)) = loaded {
+            self.shown.key_frame(pose, &image, self.selector.map(), self.clock.now_ns());
             self.end.count(true);
             let decoded = self.pending.iter().filter(|w| matches!(w, Waiting::Decoded(_))).count();
             let waiting = match decoded < DECODED_AHEAD {

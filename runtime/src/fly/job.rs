@@ -13,6 +13,7 @@ use vulkan::trainer::{RunBudget, StepReport, StopReason};
 use super::handover::Handover;
 use super::intake::FlightCounters;
 use super::shortage::likely_cause;
+use super::show::ShownJob;
 use crate::engine::{PictureSource, Reconstruct, model_path};
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
@@ -20,6 +21,7 @@ use crate::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
 use crate::service::Supervisor;
 use crate::upload::Offerer;
+use crate::watch::Watch;
 
 /// Between two checkpoints: what a power cut may cost.
 const CHECKPOINT_EVERY_NS: u64 = 15_000_000_000;
@@ -39,6 +41,7 @@ pub(super) struct Job<R, K> {
     clock: K,
     failsafe: Failsafe,
     supervisor: Supervisor,
+    shown: ShownJob,
     /// The device failed; the last checkpoint is what there is.
     training_failed: bool,
     saved_ns: u64,
@@ -76,6 +79,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             clock,
             failsafe,
             supervisor: Supervisor::default(),
+            shown: ShownJob::default(),
             training_failed: false,
             said_ns: None,
             for_a_frame: FOR_A_FRAME,
@@ -83,9 +87,13 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
     }
 
-    /// A service manager hears of every turn and every step.
-    pub(super) fn supervised(self, supervisor: Supervisor) -> Self {
-        Self { supervisor, ..self }
+    /// A service manager hears of every turn and every step, and so does whoever looks at the page.
+    pub(super) fn supervised(self, supervisor: Supervisor, watch: Watch) -> Self {
+        Self { supervisor, shown: ShownJob::new(watch), ..self }
+    }
+
+    fn show(&self, state: &'static str) {
+        self.shown.state(state, self.reconstruction.keyframes(), self.reconstruction.gaussians());
     }
 
     /// Key frames taken so far.
@@ -141,6 +149,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let Some(frame) = capture.next(patience)? else { return Ok(false) };
         tracing::info!("key frame {}: {}", self.reconstruction.keyframes() + 1, frame.name);
         self.reconstruction.add(frame, capture.waiting() > 0)?;
+        self.show("taking key frames");
         Ok(true)
     }
 
@@ -156,6 +165,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     fn act(&mut self, capture: &mut Handover) -> Result<(), JobError> {
         let Some(rung) = self.failsafe.act(&mut self.reconstruction)? else { return Ok(()) };
         let line = format!("dgtr: {rung}");
+        self.shown.rung(&self.failsafe.state());
         tracing::warn!("{line}");
         self.supervisor.status(&line);
         let severity = if rung.is_worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
@@ -168,6 +178,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     fn build(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+        self.show("building a model");
         let supervisor = &self.supervisor;
         let at_work = || {
             supervisor.alive();
@@ -198,11 +209,14 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
         let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
         let mut last = None;
+        self.show("training in flight");
         let (clock, failsafe, supervisor, budget) = (&self.clock, &mut self.failsafe, &self.supervisor, self.budget);
+        let shown = &mut self.shown;
         let views = self.reconstruction.keyframes();
         self.reconstruction.train(&budget, &mut |report: &StepReport| {
             last = Some(*report);
             supervisor.alive();
+            shown.step(report);
             let now_ns = clock.now_ns();
             let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
             let alarmed = failsafe.glance(now_ns, capture.flags(), &budget, views);
@@ -265,6 +279,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
                 other => other?,
             }
         };
+        self.show(if finished { "trained" } else { "stopped with a checkpoint" });
         if finished {
             self.offerer.offer_final(&model);
         } else {
@@ -299,9 +314,12 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             && !self.failsafe.state().forbids_training()
         {
             let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
+            self.show("training after the flight");
             let (clock, failsafe, supervisor) = (&self.clock, &mut self.failsafe, &self.supervisor);
+            let shown = &mut self.shown;
             let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
                 supervisor.alive();
+                shown.step(r);
                 progress.set((r.progress * 100.0) as u64, || {
                     format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
                 });
@@ -357,6 +375,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             return;
         }
         self.said_ns = Some(now_ns);
+        self.shown.sent(self.offerer.status().sent);
         let line = format!(
             "dgtr: {} views {}k gauss step {} loss {:.3}",
             self.reconstruction.keyframes(),

@@ -23,6 +23,13 @@ fn a_region_half_flown_is_told_to_the_ground_and_completed_by_the_flight_that_is
     let before = first.counters.coverage.expect("a map");
     assert!((30..90).contains(&before.percent()) && !before.gaps.is_empty(), "{}", before.line());
     assert!(first.happened.texts.contains(&before.line()), "{:?}", first.happened.texts);
+    // Whoever looked at the page has seen as much.
+    let (craft, ground) = (&first.page.aircraft[0], &first.page.ground);
+    assert_eq!((craft.state, craft.link), ("trained", "the flight is over"));
+    assert_eq!((craft.covered, craft.key_frames), (Some(before.percent()), Some(first.names.len() as u64)));
+    assert_eq!((ground.shots.len(), craft.thumbnail.serial as usize), (first.names.len(), first.names.len()));
+    assert!(craft.at.is_some_and(|p| p[0].abs() < 60.0 && p[1].abs() < 40.0), "near the region: {:?}", craft.at);
+    assert!(craft.steps > Some(0) && craft.curve.points().len() as u64 <= craft.steps.unwrap_or(0));
     before.write(&Disk::default(), &out).expect("written");
     let plan = flight_plan::read(&out.join(REFLIGHT)).expect("a plan");
     assert!((plan.home.alt_m - ORIGIN.alt_m).abs() < 1.0, "home is where the autopilot says");

@@ -36,7 +36,10 @@ use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
+use crate::report::{Craft, ReportData};
+use crate::service::Supervisor;
 use crate::upload::{Offerer, Source};
+use crate::watch::Watch;
 
 /// Time between two turns; one training step is taken in each.
 const TURN_NS: u64 = 20_000_000;
@@ -200,6 +203,8 @@ pub(super) struct Rehearsed {
     pub(super) model: Result<(usize, bool), (usize, String)>,
     /// Names of the model's views.
     pub(super) names: Vec<String>,
+    /// The page as it was at the end.
+    pub(super) page: ReportData,
 }
 
 /// Flies `script`, with its files in `folder`.
@@ -234,6 +239,8 @@ pub(super) fn rehearse_on(
     let (mut capture, end) = handover();
     let (mut ledger, store) = Ledger::open(disk, &script.vehicle.lens, script.vehicle.origin, &out).expect("opens");
     ledger.promised = promised;
+    let page = ReportData { aircraft: vec![Craft::new("one", "listening")], ..ReportData::default() };
+    let watch = Watch::new(page, &out, script.vehicle.origin);
     let plan = FlightPlan {
         vehicle: script.vehicle.clone(),
         intrinsics: intrinsics(&script.vehicle.lens),
@@ -244,6 +251,7 @@ pub(super) fn rehearse_on(
         earlier_names: script.earlier_names.iter().cloned().collect(),
         end: script.end,
         geotags: Geotags::open(disk, &out, script.vehicle.origin).expect("a file"),
+        watch: watch.clone(),
     };
     capture.keep_in(store, model_path(&out));
     let mut intake = Some(Intake::new(plan, vehicle, clock.clone(), end));
@@ -253,6 +261,7 @@ pub(super) fn rehearse_on(
     let health = Health::with_sensors(Path::new("/nonexistent"), limits, 1 << 20, &out);
     let mut job =
         Job::new(ledger, offerer, &out, budget, Failsafe::new(health, &limits), clock.clone()).without_waiting();
+    job = job.supervised(Supervisor::default(), watch.clone());
     let interrupt = Interrupt::default();
     let (mut flying, mut over, mut rungs) = (true, None, Vec::new());
     for turn in 1..=MOST_TURNS {
@@ -299,5 +308,14 @@ pub(super) fn rehearse_on(
         Err(e) => panic!("the job failed: {e}"),
     };
     let without_room = capture.without_room();
-    Rehearsed { happened: aircraft.finish().expect("a report"), ended, counters, without_room, rungs, model, names }
+    Rehearsed {
+        happened: aircraft.finish().expect("a report"),
+        ended,
+        counters,
+        without_room,
+        rungs,
+        model,
+        names,
+        page: watch.freeze(),
+    }
 }

@@ -1,4 +1,4 @@
-//! Pictures inside the page, as data URIs.
+//! Pictures of the page, as bytes and as data URIs.
 
 use base64::Engine;
 use image::codecs::jpeg::JpegEncoder;
@@ -11,12 +11,16 @@ const PNG_PIXELS: u32 = 128 * 128;
 /// High enough that the codec's error stays far below the rendering's.
 const JPEG_QUALITY: u8 = 88;
 
-pub(crate) fn data_uri(image: &RgbImage) -> Result<String, ImageError> {
+/// A picture's bytes and what kind they are.
+///
+/// # Errors
+/// It has no pixels.
+pub fn encode(image: &RgbImage) -> Result<(&'static str, Vec<u8>), ImageError> {
     let mut bytes = Vec::new();
     let (w, h) = image.dimensions();
     let kind = if w * h <= PNG_PIXELS {
         PngEncoder::new(&mut bytes).write_image(image.as_raw(), w, h, ExtendedColorType::Rgb8)?;
-        "png"
+        "image/png"
     } else {
         JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY).write_image(
             image.as_raw(),
@@ -24,7 +28,29 @@ pub(crate) fn data_uri(image: &RgbImage) -> Result<String, ImageError> {
             h,
             ExtendedColorType::Rgb8,
         )?;
-        "jpeg"
+        "image/jpeg"
     };
-    Ok(format!("data:image/{kind};base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
+    Ok((kind, bytes))
+}
+
+/// A picture inside a page.
+///
+/// # Errors
+/// It has no pixels.
+pub fn data_uri(image: &RgbImage) -> Result<String, ImageError> {
+    encode(image).map(|(kind, bytes)| uri(kind, &bytes))
+}
+
+/// A file of that format inside a page.
+pub(super) fn png_uri(bytes: &[u8]) -> String {
+    uri("image/png", bytes)
+}
+
+/// A drawing inside a page.
+pub(super) fn svg_uri(svg: &str) -> String {
+    uri("image/svg+xml", svg.as_bytes())
+}
+
+fn uri(kind: &str, bytes: &[u8]) -> String {
+    format!("data:{kind};base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes))
 }

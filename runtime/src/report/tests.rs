@@ -50,20 +50,35 @@ fn sample() -> ReportData {
         ],
         skipped: vec![("views without a seam, not distilled".into(), 31), ("pictures without a pose".into(), 1)],
         warnings: vec!["east's link was lost for 12 s; <3 pictures> & nothing else are missing".into()],
+        aircraft: vec![],
+        ground: Ground::default(),
         charts: vec![],
         tables: vec![],
         files: vec![("global model".into(), "/tmp/out/global.dgtr".into())],
     }
 }
 
+/// What is embedded under `id`.
+fn embedded(html: &str, id: &str) -> serde_json::Value {
+    let from = html.split_once(&format!("id=\"{id}\">")).expect(id).1;
+    serde_json::from_str(from.split_once("</script>").expect("its end").0).expect("JSON")
+}
+
 #[test]
-fn a_page_is_self_contained_and_escaped() {
-    let html = sample().to_html().expect("page");
-    assert!(html.contains("&lt;3 pictures&gt; &amp; nothing"));
-    assert!(!html.contains("<script") && !html.contains("http:") && !html.contains("https:"));
+fn a_page_needs_no_network_and_what_it_shows_cannot_become_markup() {
+    let mut data = sample();
+    data.title = "</script><b>{foot}{head}".into();
+    data.warnings.push("</script><script>alert(1)</script>".into());
+    let html = data.to_html().expect("page");
+    assert!(!html.contains("http:") && !html.contains("https:") && !html.contains("<b>"));
+    assert!(html.contains("<h1 id=\"title\">&lt;/script&gt;&lt;b&gt;{foot}{head}</h1>"));
+    assert!(html.contains("default-src 'none'"), "a report asks nobody for anything");
+    // State, ground and the script itself: nothing else begins or ends one.
+    assert_eq!((html.matches("<script").count(), html.matches("</script").count()), (3, 3));
     assert_eq!(html.matches("data:image/jpeg;base64,").count(), 5);
-    for tag in ["div", "table", "figure", "svg", "main", "dl", "ul", "span"] {
-        assert_eq!(html.matches(&format!("<{tag}")).count(), html.matches(&format!("</{tag}>")).count(), "{tag}");
+    for tag in ["div", "section", "svg", "main", "dl", "ul", "label", "fieldset"] {
+        let body = html.split_once("<body>").expect("a body").1.split_once("<script").expect("a script").0;
+        assert_eq!(body.matches(&format!("<{tag}")).count(), body.matches(&format!("</{tag}>")).count(), "{tag}");
     }
     if let Some(path) = std::env::var_os("DGTR_REPORT_SAMPLE") {
         sample().write(Path::new(&path)).expect("write");
@@ -71,9 +86,36 @@ fn a_page_is_self_contained_and_escaped() {
 }
 
 #[test]
-fn an_empty_report_is_a_page_with_a_title_only() {
+fn every_part_of_a_report_is_in_the_state_that_the_page_draws() {
+    let mut data = sample();
+    data.aircraft.push(Craft { key_frames: Some(25), ..Craft::new("west", "done") });
+    data.tables.push(Table { title: "Merging".into(), rows: vec![vec!["a".into()]], ..Table::default() });
+    let state = embedded(&data.to_html().expect("page"), "state");
+    assert_eq!(state["headline"][0], serde_json::json!(["held-out PSNR", "22.41 dB"]));
+    assert_eq!(state["models"]["head"].as_array().map(Vec::len), Some(9));
+    assert_eq!(state["models"]["rows"][2][0], "global");
+    assert_eq!(state["models"]["rows"][0][5], "22.41");
+    assert_eq!(state["comparisons"][1]["panels"].as_array().map(Vec::len), Some(2));
+    assert_eq!((&state["timings"][1]["share"], &state["timings"][1]["text"]), (&1.0.into(), &"83 s".into()));
+    assert_eq!(state["skipped"][0][1], "31");
+    assert_eq!(state["files"][0][1], "/tmp/out/global.dgtr");
+    assert!(state["warnings"][0].as_str().is_some_and(|w| w.contains("<3 pictures> & nothing")));
+    assert_eq!(state["regions"][1]["cameras"].as_array().map(Vec::len), Some(25));
+    assert_eq!(state["aircraft"][0]["facts"][0], serde_json::json!(["key frames", "25"]));
+    assert_eq!(state["tables"][0]["title"], "Merging");
+}
+
+#[test]
+fn every_part_of_the_state_is_drawn_by_the_script_into_a_part_of_the_page() {
     let html = ReportData { title: "t".into(), ..Default::default() }.to_html().expect("page");
-    assert!(!html.contains("<h2>") && html.contains("<h1>t</h1>"));
+    let state = embedded(&html, "state");
+    for name in state.as_object().expect("an object").keys() {
+        assert!(SCRIPT.contains(&format!("state.{name}")), "{name} is drawn nowhere");
+    }
+    for id in SCRIPT.split("byId(\"").skip(1).filter_map(|s| s.split('"').next()).filter(|id| !id.ends_with('-')) {
+        assert!(html.contains(&format!("id=\"{id}\"")), "the page has no {id}");
+    }
+    assert!(html.contains("<h1 id=\"title\">t</h1>"));
 }
 
 #[test]
@@ -82,8 +124,9 @@ fn strange_numbers_do_not_break_the_page() {
     data.map[0].cameras.push([f64::NAN, f64::INFINITY]);
     data.timings[0].seconds = f64::NAN;
     data.models[0].psnr = Some(f64::INFINITY);
-    let html = data.to_html().expect("page");
-    assert!(!html.contains("NaN%") && !html.contains(">NaN") && !html.contains(">inf") && !html.contains("\"NaN"));
+    data.aircraft.push(Craft { at: Some([f64::NAN; 3]), left_s: Some(f64::INFINITY), ..Craft::new("west", "done") });
+    let state = embedded(&data.to_html().expect("page"), "state").to_string();
+    assert!(!state.contains("NaN") && !state.contains("inf\""), "{state}");
     data.comparisons[0].panels[0].1 = RgbImage::new(0, 0);
     assert!(data.to_html().is_err());
 }

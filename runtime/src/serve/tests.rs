@@ -43,8 +43,19 @@ fn all_aircraft_arrive_and_each_keeps_its_own_region() {
     fly(&mission, dir.path(), "east");
     let mut told = 0;
     let stop = AtomicBool::new(false);
-    let reception = receive(&mission, &out, None, &stop, &mut |p| told = p.finished).expect("received");
+    let mut board = Board::new(&mission, &out);
+    let mut tell = |p: &Progress| {
+        told = p.finished;
+        board.round(p);
+    };
+    let reception = receive(&mission, &out, None, &stop, &mut tell).expect("received");
     assert!(told == 2 && reception.missing.is_empty());
+    let page = board.watch().freeze();
+    for (craft, id) in page.aircraft.iter().zip(["west", "east"]) {
+        assert_eq!((craft.name.as_str(), craft.state, craft.gaussians), (id, "final model is here", Some(3200)));
+        assert!(craft.bytes > Some(0) && craft.chunks.is_none(), "{craft:?}");
+    }
+    assert_eq!(page.subtitle, "2 of 2 final models are here");
     let (outcome, unreadable) = merge(&mission, &reception, &out, &|| true).expect("merged");
     assert!(unreadable.is_empty() && outcome.path == out.join("global.dgtr"));
     // The models themselves name no region: the mission's were used.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::{dgtr, has_device, program};
 
 /// An onboard job and a ground that have nothing to do.
-fn mission(dir: &Path) -> String {
+pub(super) fn mission(dir: &Path) -> String {
     let path = dir.join("mission.toml");
     let text = r#"
 name = "supervised"
