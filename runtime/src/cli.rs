@@ -26,6 +26,7 @@ mod keys;
 #[cfg(feature = "lab")]
 mod manual;
 mod ortho;
+mod output;
 mod plan;
 mod render;
 #[cfg(feature = "lab")]
@@ -188,7 +189,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     if let Some(trace) = trace {
         trace.finish();
     }
-    match result {
+    match result.and_then(|()| output::arrived()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => failed(&e),
     }

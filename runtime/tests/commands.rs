@@ -97,7 +97,7 @@ fn a_mission_written_by_init_is_accepted_by_plan_and_fly() {
     let (said, error) = (String::from_utf8_lossy(&plan.stdout), String::from_utf8_lossy(&plan.stderr));
     assert!(
         said.contains(
-            "48 views and 0 crops of 320 x 240, 48 of them on the device at once, SH degree 3, 96 MiB allowed"
+            "48 views and 512 crops of 320 x 240, 49 of them on the device at once, SH degree 3, 96 MiB allowed"
         ),
         "{said}{error}"
     );

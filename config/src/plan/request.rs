@@ -19,7 +19,7 @@ pub struct PlanRequest {
     /// Crops of the pictures at a larger size than they are trained at, each of a training picture's pixels at most.
     pub crops: u32,
     /// How many views and crops are on the device at once, the others waiting in a file; `None`: all where they take at most half of the
-    /// memory, else as many as an eighth of it holds, and never more than leave room for a plan.
+    /// memory, else the views and one crop where those do, else as many as an eighth of it holds; never more than leave room for a plan.
     pub view_slots: Option<u32>,
     /// Highest SH degree, 0…3.
     pub sh_degree: u8,
@@ -67,8 +67,12 @@ impl PlanRequest {
         let slots = match self.view_slots {
             Some(slots) => slots,
             None => {
-                let all = self.pictures();
-                let few = if held_in(budget / 2) >= all { all } else { held_in(budget / 8) };
+                let few = match held_in(budget / 2) {
+                    held if held >= self.pictures() => self.pictures(),
+                    // Views come again sooner than crops.
+                    held if held > self.views => self.views + 1,
+                    _ => held_in(budget / 8),
+                };
                 few.min(held_in(budget.saturating_sub(Plan::smallest(self, 0).total_bytes)))
             }
         };
@@ -110,7 +114,7 @@ mod tests {
         assert_eq!(of(0, 640, 480).slots(), 0);
         // Crops wait as views do, without room for a depth prior.
         let cropped = PlanRequest { crops: 300, ..few };
-        assert_eq!((cropped.slots(), cropped.view_file_bytes()), (36, 640 * 480 * (50 * 6 + 300 * 4)));
+        assert_eq!((cropped.slots(), cropped.view_file_bytes()), (51, 640 * 480 * (50 * 6 + 300 * 4)));
         assert_eq!(PlanRequest { crops: 3, ..few }.slots(), 53);
         // Where pictures are large for the memory, fewer of them stay rather than that no plan can be made.
         let tight = PlanRequest { device_mib: 215, ..of(50, 1280, 960) };

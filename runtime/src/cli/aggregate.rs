@@ -9,6 +9,7 @@ use models::dataset::Dataset;
 
 use crate::aggregate::compare::{add_to, compare, perceptual};
 use crate::aggregate::{self, LocalModel, Outcome, summary};
+use crate::cli::output::outln;
 use crate::interrupt::Interrupt;
 use crate::report::{REPORT, ReportData};
 use crate::run_json::RunReport;
@@ -150,8 +151,8 @@ pub(super) fn finish(
     for warning in &data.warnings {
         tracing::warn!("{warning}");
     }
-    println!("{}: {} Gaussians out of {} models", outcome.path.display(), outcome.gaussians, outcome.models.len());
-    println!("{}", page.display());
+    outln!("{}: {} Gaussians out of {} models", outcome.path.display(), outcome.gaussians, outcome.models.len());
+    outln!("{}", page.display());
     if let Some(e) = outcome.not_distilled {
         // The input made a model, so what went wrong since is not the input's fault.
         let kind = if e.kind() == ErrorKind::Input { ErrorKind::Failed } else { e.kind() };

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::CliError;
+use crate::cli::output::out;
 use crate::demo::{DemoOptions, run as run_demo};
 use crate::interrupt::Interrupt;
 
@@ -37,6 +38,6 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let Args { out, seconds, seed, process_mib: limit_mib, speed, http } = args;
     let interrupt = Interrupt::install()?;
     let summary = run_demo(&DemoOptions { out, seconds, seed, limit_mib, speed, http }, &interrupt)?;
-    print!("{summary}");
+    out!("{summary}");
     Ok(())
 }

@@ -12,6 +12,7 @@ use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
 use super::CliError;
+use crate::cli::output::outln;
 use crate::kernels::{self, Source};
 use crate::resources;
 
@@ -56,7 +57,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 ("missing", t)
             }
         };
-        println!("{state:<8} {what:<16} {}", text.split_whitespace().collect::<Vec<_>>().join(" "));
+        outln!("{state:<8} {what:<16} {}", text.split_whitespace().collect::<Vec<_>>().join(" "));
     };
     match Gpu::list() {
         Err(e) => tell("vulkan", Finding::Missing(e.to_string())),

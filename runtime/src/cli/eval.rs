@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use super::CliError;
 use super::plan::largest;
+use crate::cli::output::outln;
 use crate::engine::device::{map_renderer, renderer};
 use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, heights, open_metric};
 use crate::ortho::{Map, MapRequest};
@@ -101,7 +102,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             poses_transferred: !transfer.is_identity(),
             baselines: naive.as_ref(),
         };
-        println!("{}", serde_json::to_string(&answer).map_err(CliError::failed)?);
+        outln!("{}", serde_json::to_string(&answer).map_err(CliError::failed)?);
         return Ok(());
     }
     for v in &scores.views {
@@ -109,18 +110,18 @@ pub fn run(args: Args) -> Result<(), CliError> {
             (Some(m), Some(d)) => format!("  {} {d:.4}", m.name()),
             _ => String::new(),
         };
-        println!("{:<28} {:>7.3} dB  SSIM {:.4}{distance}", v.name, v.psnr, v.ssim);
+        outln!("{:<28} {:>7.3} dB  SSIM {:.4}{distance}", v.name, v.psnr, v.ssim);
     }
-    let row = |what: &str, s: &Scores| println!("{what:<28} {:>7.3} dB  SSIM {:.4}", s.psnr, s.ssim);
+    let row = |what: &str, s: &Scores| outln!("{what:<28} {:>7.3} dB  SSIM {:.4}", s.psnr, s.ssim);
     row(&format!("mean of {} views", scores.views.len()), &scores);
     if let Some(p) = &scores.perceptual {
-        println!("{:<28} {:>7.4}", format!("mean {}", p.name), p.mean);
+        outln!("{:<28} {:>7.4}", format!("mean {}", p.name), p.mean);
     }
     if let Some(naive) = &naive {
         row("ground-plane warp", &naive.ground_warp);
         row("mean colour", &naive.mean_color);
     }
-    println!("{} Gaussians after {} steps", cloud.len(), header.steps);
+    outln!("{} Gaussians after {} steps", cloud.len(), header.steps);
     Ok(())
 }
 
@@ -131,13 +132,16 @@ fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
     let mut trainer = map_renderer(args.device.as_deref(), &cloud)?;
     let scores = heights::compare(&map, &mut trainer, &points)?;
     if args.json {
-        println!("{}", serde_json::to_string(&scores).map_err(CliError::failed)?);
+        outln!("{}", serde_json::to_string(&scores).map_err(CliError::failed)?);
         return Ok(());
     }
-    println!("{} points ({} beside the map or where it has no height)", scores.points, scores.missing);
-    println!(
+    outln!("{} points ({} beside the map or where it has no height)", scores.points, scores.missing);
+    outln!(
         "bias {:+.3} m  RMSE {:.3} m  median {:.3} m  LE90 {:.3} m",
-        scores.bias_m, scores.rmse_m, scores.median_abs_m, scores.le90_m
+        scores.bias_m,
+        scores.rmse_m,
+        scores.median_abs_m,
+        scores.le90_m
     );
     Ok(())
 }

@@ -16,6 +16,7 @@ use models::formats::{colmap, gltf, model, opensfm, ply, sog, spz, transforms};
 use models::ortho::georef::{FROM_Y_UP, Georef, shifted};
 
 use super::CliError;
+use crate::cli::output::outln;
 use crate::viewer::{self, ViewerRequest};
 
 /// Formats that can be written.
@@ -126,7 +127,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if args.format == Format::Delivery {
         let rounding = if args.fine { Rounding::fine() } else { Rounding::default() };
         let n = model::write_rounded(&Disk::default(), &out, &header, &cloud, &rounding)?;
-        println!("{}: {n} Gaussians, SH degree {}", out.display(), cloud.sh_degree);
+        outln!("{}: {n} Gaussians, SH degree {}", out.display(), cloud.sh_degree);
         return Ok(());
     }
     let cameras = match &args.cameras {
@@ -141,7 +142,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Format::Nerfstudio => transforms::write(&out, &cameras)?,
         _ => opensfm::write(&out, &cameras)?,
     }
-    println!("{}: {} poses", out.display(), cameras.shots.len());
+    outln!("{}: {} poses", out.display(), cameras.shots.len());
     Ok(())
 }
 
@@ -171,7 +172,7 @@ fn scene(args: &Args, out: &Path, header: &ModelHeader, cloud: &GaussianCloud) -
         }
     };
     georef.write(out)?;
-    println!("{}: {} Gaussians, SH degree {}", out.display(), cloud.len(), cloud.sh_degree);
+    outln!("{}: {} Gaussians, SH degree {}", out.display(), cloud.len(), cloud.sh_degree);
     Ok(())
 }
 

@@ -8,6 +8,7 @@ use config::mission::Mission;
 
 use super::CliError;
 use super::http::HttpArgs;
+use crate::cli::output::outln;
 use crate::engine::device::training_lens;
 use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly};
 use crate::interrupt::Interrupt;
@@ -87,7 +88,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         // Nothing that counts is missing.
         tracing::warn!("{e}; there is no page of this flight");
     }
-    println!(
+    outln!(
         "{}: {} Gaussians from {} key frames after {} steps; {}",
         outcome.model.display(),
         outcome.gaussians,

@@ -6,6 +6,7 @@ use models::formats::model::{self, ModelHeader};
 use models::formats::{ply, spz};
 
 use super::CliError;
+use crate::cli::output::outln;
 
 /// Arguments of `dgtr import`.
 #[derive(Debug, clap::Args)]
@@ -39,6 +40,6 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let header = ModelHeader { origin, finished: true, ..Default::default() };
     model::write(&out, &header, &cloud)?;
-    println!("{}: {} Gaussians, {} unusable ones left out", out.display(), cloud.len(), dropped);
+    outln!("{}: {} Gaussians, {} unusable ones left out", out.display(), cloud.len(), dropped);
     Ok(())
 }

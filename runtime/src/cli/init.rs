@@ -7,6 +7,7 @@ use config::mission::{Draft, Mission, reference};
 use config::preset::Preset;
 
 use super::{CliError, train::presets};
+use crate::cli::output::{out, outln};
 
 /// Writes a mission file to start from; the reference of all settings with --reference.
 #[derive(Debug, clap::Args)]
@@ -67,7 +68,7 @@ fn aircraft(text: &str) -> Result<(String, String), String> {
 pub fn run(args: Args) -> Result<(), CliError> {
     let (Some([lat_deg, lon_deg, alt_m]), Some(picture), Some(fov_deg)) = (args.origin, args.picture, args.fov_deg)
     else {
-        print!("{}", reference());
+        out!("{}", reference());
         return Ok(());
     };
     let origin = Geodetic { lat_deg, lon_deg, alt_m };
@@ -76,7 +77,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     Mission::parse(&text, Path::new(".")).map_err(CliError::input)?;
     write_new(&out, &text)
         .map_err(|e| CliError::input(format!("{}: {e}; choose another file with --out", out.display())))?;
-    println!("{}: calibrate [camera], say how the camera is mounted ([mount]) and draw the regions", out.display());
+    outln!("{}: calibrate [camera], say how the camera is mounted ([mount]) and draw the regions", out.display());
     Ok(())
 }
 

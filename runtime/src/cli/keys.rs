@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use config::mission::Mission;
 
 use super::CliError;
+use crate::cli::output::outln;
 use crate::keys::{self, GROUND};
 
 /// Arguments of `dgtr keys`.
@@ -34,7 +35,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         let path = keys::private_path(&mission.upload.keys, id);
         let table = if id == GROUND { "[ground]".to_owned() } else { format!("the [[aircraft]] table of {id}") };
         let made = if new { "new" } else { "was there" };
-        println!("# into {table}; private key in {} ({made})\npublic_key = \"{key}\"\n", path.display());
+        outln!("# into {table}; private key in {} ({made})\npublic_key = \"{key}\"\n", path.display());
         if known.is_some_and(|known| known != key) {
             tracing::warn!("the mission has another public_key for {id}; replace it in the files of all");
         }

@@ -12,6 +12,7 @@ use models::dataset::{Dataset, scaled};
 use vulkan::gpu::{Gpu, GpuInfo};
 
 use super::CliError;
+use crate::cli::output::{out, outln};
 use crate::engine::device::DeviceRequest;
 use crate::engine::scratch_bytes;
 use crate::fly::delivered_bytes;
@@ -91,26 +92,35 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let plan = Plan::new(&request)?;
     if args.systemd {
         let processors = std::thread::available_parallelism().map_or(1, usize::from);
-        print!("{}", ServiceLimits::of_flight(&job.memory, lies, processors));
+        out!("{}", ServiceLimits::of_flight(&job.memory, lies, processors));
         return Ok(());
     }
     if args.json {
-        println!("{}", serde_json::to_string(&plan).map_err(CliError::failed)?);
+        outln!("{}", serde_json::to_string(&plan).map_err(CliError::failed)?);
         return Ok(());
     }
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
-    println!(
+    outln!(
         "{} views and {} crops of {} x {}, {} of them on the device at once, SH degree {}, {} MiB allowed",
-        plan.views, plan.crops, request.width, request.height, plan.view_slots, plan.sh_degree, request.device_mib
+        plan.views,
+        plan.crops,
+        request.width,
+        request.height,
+        plan.view_slots,
+        plan.sh_degree,
+        request.device_mib
     );
-    println!(
+    outln!(
         "  Gaussians {:>10}\n  instances {:>10}\n  tiles     {:>10}\n  sort lanes{:>10}\n",
-        plan.gaussians, plan.instances, plan.tiles, plan.sort_lanes
+        plan.gaussians,
+        plan.instances,
+        plan.tiles,
+        plan.sort_lanes
     );
     for (name, bytes) in &plan.sections {
-        println!("  {name:<18} {:>9.2} MiB", mib(*bytes));
+        outln!("  {name:<18} {:>9.2} MiB", mib(*bytes));
     }
-    println!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
+    outln!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
     let disk = DiskPlan::new(&DiskRequest {
         width: job.picture.0,
         height: job.picture.1,
@@ -121,11 +131,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
         delivered: job.delivered,
         map: job.map.disk_bytes(),
     });
-    println!("\n  on disk, for a flight:");
+    outln!("\n  on disk, for a flight:");
     for (name, bytes) in &disk.sections {
-        println!("  {name:<18} {:>9.2} MiB", mib(*bytes));
+        outln!("  {name:<18} {:>9.2} MiB", mib(*bytes));
     }
-    println!("  {:<18} {:>9.2} MiB at most, {:.2} MiB to begin", "total", mib(disk.total_bytes), mib(disk.min_bytes));
+    outln!("  {:<18} {:>9.2} MiB at most, {:.2} MiB to begin", "total", mib(disk.total_bytes), mib(disk.min_bytes));
     Ok(())
 }
 

@@ -12,6 +12,7 @@ use models::dataset::{Dataset, DatasetFrame, PoseSource};
 
 use super::CliError;
 use super::sim::stop_flag;
+use crate::cli::output::outln;
 
 /// Plays a folder of posed photographs, or a .tlog, as an autopilot and a camera.
 #[derive(Debug, clap::Args)]
@@ -79,7 +80,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let stop = stop_flag()?;
     let mut ready = |pty: Option<&Path>| {
         if let Some(path) = pty {
-            println!("{}", path.display());
+            outln!("{}", path.display());
         }
     };
     if let Some(folder) = &args.camera_dir {

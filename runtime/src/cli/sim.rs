@@ -16,6 +16,7 @@ use models::formats::flight_plan;
 mod card;
 
 use super::CliError;
+use crate::cli::output::outln;
 use crate::coverage::route;
 use crate::interrupt::Interrupt;
 
@@ -142,13 +143,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let stop = stop_flag()?;
     if let Some(folder) = &args.card {
         let written = card::write(&settings, folder, &stop)?;
-        println!("{}: {written} pictures", folder.display());
+        outln!("{}: {written} pictures", folder.display());
         return Ok(());
     }
     let camera_dir = camera_dir(args.camera_dir.clone(), &aircraft.camera)?;
     let report = hal::sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut |pty| {
         if let Some(path) = pty {
-            println!("{}", path.display());
+            outln!("{}", path.display());
         }
     })?;
     tracing::info!(

@@ -17,6 +17,7 @@ use models::formats::{FormatError, read_bounded};
 use serde::Deserialize;
 
 use super::CliError;
+use crate::cli::output::outln;
 use crate::engine::InitKind;
 use crate::train_job::{TrainJob, log};
 
@@ -231,7 +232,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let report = ended.report;
     let quality = report.psnr.map_or(String::new(), |p| format!(", held-out PSNR {p:.2} dB"));
-    println!(
+    outln!(
         "{}: {} Gaussians after {} steps, {:.1} s{quality}",
         model.display(),
         report.gaussians,

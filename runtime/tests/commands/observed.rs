@@ -1,6 +1,8 @@
-//! What programs and people who look on are told: log lines as JSON, a trace, and who may see the live page.
+//! What programs and people who look on are told: results, log lines as JSON, a trace, and who may see the live page.
 
-use super::{data_set, dgtr, error_line, has_device, supervised};
+use std::process::Stdio;
+
+use super::{data_set, dgtr, error_line, has_device, program, supervised};
 
 #[test]
 fn with_log_json_every_line_is_an_object_the_error_included() {
@@ -61,4 +63,19 @@ fn a_live_page_that_others_could_see_is_refused_before_anything_begins() {
         assert!(refused(&["--http", "0.0.0.0:0", "--http-token-file", &token]).contains("16 to 256"));
         assert!(refused(&["--http", "0.0.0.0:0", "--http-token-file", "/nonexistent"]).contains("/nonexistent"));
     }
+}
+
+#[test]
+fn whoever_reads_the_results_may_stop_reading() {
+    let mut child =
+        program().args(["plan", "--views", "4"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let ended = child.wait_with_output().unwrap();
+    assert_eq!(ended.status.code(), Some(0), "{}", String::from_utf8_lossy(&ended.stderr));
+    assert!(ended.stderr.is_empty(), "{}", String::from_utf8_lossy(&ended.stderr));
+    // A disk without room is another matter.
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let ended = program().args(["plan", "--views", "4"]).stdout(full).stderr(Stdio::piped()).output().unwrap();
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert!(ended.status.code() == Some(1) && said.contains("standard output") && said.lines().count() == 1, "{said}");
 }

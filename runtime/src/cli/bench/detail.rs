@@ -8,6 +8,7 @@ use crate::bench::detail::measure;
 use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::world;
 use crate::cli::CliError;
+use crate::cli::output::outln;
 use crate::report::Table;
 
 /// How much larger than the survey of the other benchmarks the pictures of this one are: 2,400 × 1,800 pixels.
@@ -87,7 +88,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             .to_vec(),
         rows: rows.collect(),
     };
-    println!("{}", markdown(&table));
+    outln!("{}", markdown(&table));
     if let Some(path) = &args.json {
         write_json(path, &all)?;
     }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use crate::bench::device::{Extent, SIZES, measure};
 use crate::bench::figures::{markdown, write_json};
 use crate::cli::CliError;
+use crate::cli::output::outln;
 use crate::report::Table;
 
 /// Arguments of `dgtr bench device`.
@@ -48,7 +49,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         head: head.map(str::to_owned).to_vec(),
         rows: vec![report.row()],
     };
-    println!("{}", markdown(&table));
-    report.left_out.iter().for_each(|line| println!("left out: {line}"));
+    outln!("{}", markdown(&table));
+    report.left_out.iter().for_each(|line| outln!("left out: {line}"));
     Ok(())
 }

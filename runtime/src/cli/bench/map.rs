@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::map::measure;
 use crate::cli::CliError;
+use crate::cli::output::outln;
 use crate::evaluate::heights::HeightScores;
 use crate::ortho::MapRequest;
 use crate::report::Table;
@@ -62,7 +63,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             .to_vec(),
         rows: vec![row("the trained model", &scores.heights), row("the fused depth maps", &scores.fused_depth)],
     };
-    println!("{}", markdown(&table));
+    outln!("{}", markdown(&table));
     if let Some(path) = &args.json {
         write_json(path, &scores)?;
     }

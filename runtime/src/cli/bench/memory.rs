@@ -9,6 +9,7 @@ use crate::bench::figures::{csv, markdown, write_json, write_text};
 use crate::bench::memory::{Recipe, measure, table};
 use crate::bench::world;
 use crate::cli::CliError;
+use crate::cli::output::outln;
 
 /// Arguments of `dgtr bench memory`.
 #[derive(Debug, clap::Args)]
@@ -86,7 +87,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         figures.push(one);
     }
     let table = table(&figures, gpu.info().is_cpu);
-    println!("{}\n\n{}", gpu.info().name, markdown(&table));
+    outln!("{}\n\n{}", gpu.info().name, markdown(&table));
     if let Some(path) = &args.csv {
         write_text(path, &csv(&table))?;
     }

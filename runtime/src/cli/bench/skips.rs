@@ -10,6 +10,7 @@ use crate::bench::figures::{csv, markdown, write_json, write_text};
 use crate::bench::skips::{NOT_SWITCHED, Run, SKIPS, captured, fastest, mean, table, train};
 use crate::bench::world;
 use crate::cli::CliError;
+use crate::cli::output::outln;
 
 /// Arguments of `dgtr bench skips`.
 #[derive(Debug, clap::Args)]
@@ -111,13 +112,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     runs.push(measured("all together", &|_| true)?);
     let table = table(&none, &runs);
-    println!("{}", markdown(&table));
+    outln!("{}", markdown(&table));
     let set = Dataset::open(&dataset)?;
     let poses: Vec<_> = set.frames.iter().map(|f| f.view.pose).collect();
     let [with, without] = captured(&poses);
-    println!("Covered places not captured again: {with} key frames of {} pictures instead of {without}.", poses.len());
+    outln!("Covered places not captured again: {with} key frames of {} pictures instead of {without}.", poses.len());
     for (name, why) in NOT_SWITCHED {
-        println!("Not switched here: {name}: {why}.");
+        outln!("Not switched here: {name}: {why}.");
     }
     if let Some(path) = &args.csv {
         write_text(path, &csv(&table))?;

@@ -8,6 +8,7 @@ use vulkan::gpu::Gpu;
 use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::stages::{Scene, SizeFigures, growth, growth_table, measure, overview_table, size_table};
 use crate::cli::CliError;
+use crate::cli::output::outln;
 use crate::kernels;
 use crate::report::Table;
 
@@ -62,7 +63,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
     let shape = kernels::shape_of(&gpu);
     let ceiling = ceiling::measure(&gpu)?;
-    println!(
+    outln!(
         "{}: copies {} GB/s by a kernel and {} GB/s by command (read + written), computes {} G operations/s; kernels {}x{}\n",
         gpu.info().name,
         short(ceiling.kernel_bytes_per_s * 1e-9),
@@ -74,7 +75,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mut sizes = Vec::new();
     let mut add = |scene: &Scene| -> Result<(), CliError> {
         let figures = measure(&gpu, shape, &ceiling, scene, args.steps)?;
-        println!("{}", markdown(&size_table(&figures)));
+        outln!("{}", markdown(&size_table(&figures)));
         sizes.push(figures);
         Ok(())
     };
@@ -89,10 +90,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
         }
     }
     let grown = growth(&sizes);
-    println!("{}", markdown(&overview_table(&sizes)));
+    outln!("{}", markdown(&overview_table(&sizes)));
     // One size has no slope.
     if sizes.len() > 1 {
-        println!("{}", markdown(&growth_table(&grown)));
+        outln!("{}", markdown(&growth_table(&grown)));
     }
     if let Some(path) = &args.csv {
         write_text(path, &csv(&flat(&sizes)))?;

@@ -7,6 +7,7 @@ use vulkan::gpu::Gpu;
 use crate::bench::figures::{csv, markdown, write_json, write_text};
 use crate::bench::stress::{elsewhere, run as try_all, table};
 use crate::cli::CliError;
+use crate::cli::output::outln;
 
 /// Arguments of `dgtr bench stress`.
 #[derive(Debug, clap::Args)]
@@ -43,8 +44,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         }
     });
     let table = table(&all);
-    println!("{}\n\n{}", gpu.as_ref().map_or("CPU twin", |g| &g.info().name), markdown(&table));
-    println!("{}", markdown(&elsewhere()));
+    outln!("{}\n\n{}", gpu.as_ref().map_or("CPU twin", |g| &g.info().name), markdown(&table));
+    outln!("{}", markdown(&elsewhere()));
     if let Some(path) = &args.csv {
         write_text(path, &csv(&table))?;
     }

@@ -6,6 +6,7 @@ use super::Init;
 use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::time_error::{Request, chart, groups, measure, points_table, speedups, table};
 use crate::cli::CliError;
+use crate::cli::output::outln;
 use crate::report::{ReportData, Table};
 
 /// Arguments of `dgtr bench time-error`.
@@ -104,7 +105,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             })
             .collect(),
     };
-    println!("{}", markdown(&curves));
+    outln!("{}", markdown(&curves));
     write_text(&args.out.join("points.csv"), &csv(&points_table(&points)))?;
     let all = serde_json::json!({ "points": points, "groups": groups, "speedups": speedups });
     write_json(&args.out.join("result.json"), &all)?;
@@ -122,11 +123,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     page.tables.push(curves);
     if !speedups.is_empty() {
-        println!("{}", markdown(&compared));
+        outln!("{}", markdown(&compared));
         page.tables.push(compared);
     }
     let path = args.out.join("report.html");
     page.write(&path)?;
-    println!("{}", path.display());
+    outln!("{}", path.display());
     Ok(())
 }
