@@ -79,7 +79,7 @@ impl Reader {
                 self.clock.push((time_s, self.boot_s));
             }
             if m.lat != 0 || m.lon != 0 {
-                let alt_m = f64::from(m.alt - m.relative_alt) / 1000.0;
+                let alt_m = (f64::from(m.alt) - f64::from(m.relative_alt)) / 1000.0;
                 self.home.get_or_insert(Geodetic { lat_deg: degrees(m.lat), lon_deg: degrees(m.lon), alt_m });
             }
         } else if let Some(m) = frame.message::<SYSTEM_TIME_DATA>() {
@@ -187,5 +187,28 @@ impl Recording {
     /// Length on the recorder's clock, seconds.
     pub fn length_s(&self) -> f64 {
         self.records.last().map_or(0.0, |r| r.time_s)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mavlink::Encoder;
+
+    #[test]
+    fn heights_at_the_ends_of_their_numbers_are_no_overflow() {
+        let mut encoder = Encoder::new(1, 1);
+        let beat = encoder.encode(&HEARTBEAT_DATA::default(), None).to_vec();
+        let far = GLOBAL_POSITION_INT_DATA { lat: 1, alt: i32::MAX, relative_alt: i32::MIN, ..Default::default() };
+        let mut log = Vec::new();
+        for (us, frame) in [beat, encoder.encode(&far, None).to_vec()].into_iter().enumerate() {
+            log.extend(1_700_000_000_000_000_u64.wrapping_add(us as u64).to_be_bytes());
+            log.extend(frame);
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("far.tlog");
+        std::fs::write(&path, log).expect("written");
+        let home = Recording::read(&path).expect("two messages").home;
+        assert_eq!(home.alt_m, (f64::from(i32::MAX) - f64::from(i32::MIN)) / 1000.0);
     }
 }
