@@ -66,7 +66,7 @@ pub fn measure(gpu: &Gpu) -> Option<(KernelShape, Source)> {
     measured(gpu, cache::path(), None)
 }
 
-fn choice() -> KernelChoice {
+pub(crate) fn choice() -> KernelChoice {
     KernelChoice::from_environment().unwrap_or_else(|e| {
         tracing::warn!("{e}; the default is used");
         KernelChoice::Standard

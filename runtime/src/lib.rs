@@ -9,6 +9,7 @@ pub mod console;
 pub mod coverage;
 #[cfg(feature = "lab")]
 pub mod demo;
+pub mod devices;
 pub mod engine;
 pub mod error;
 pub mod evaluate;

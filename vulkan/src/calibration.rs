@@ -88,6 +88,23 @@ pub fn calibrate(gpu: &Gpu, limit: Option<Duration>) -> Result<Calibration, Trai
     Ok(Calibration { shape, trials, refused, seconds: start.elapsed().as_secs_f64() })
 }
 
+/// Milliseconds of wall clock that the device takes for one small training step with its standard shape: what devices of one
+/// computer are compared by.
+///
+/// # Errors
+/// [`TrainError::Gpu`]: the device, its driver or its memory.
+pub fn step_ms(gpu: &Gpu) -> Result<f64, TrainError> {
+    let mut trainer = trainer(gpu, KernelShape::standard(gpu.info()))?;
+    // The first one compiles.
+    trainer.step()?;
+    let mut least = f64::INFINITY;
+    for _ in 0..REPEATS {
+        let [ms, ..] = step(&mut trainer, false)?;
+        least = least.min(ms);
+    }
+    Ok(least)
+}
+
 /// What to try, by kind of kernel.
 struct Candidates {
     wide: Vec<u32>,

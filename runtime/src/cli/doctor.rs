@@ -13,6 +13,7 @@ use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
 use super::CliError;
 use crate::cli::output::outln;
+use crate::devices;
 use crate::kernels::{self, Source};
 use crate::resources;
 
@@ -61,8 +62,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     match Gpu::list() {
         Err(e) => tell("vulkan", Finding::Missing(e.to_string())),
-        Ok(devices) => {
-            for d in devices {
+        Ok(found) => {
+            if found.len() > 1 {
+                tell("training", trains(&found, args.calibrate));
+            }
+            for d in found {
                 let kind = if d.is_cpu { "software" } else { "hardware" };
                 let mib = d.heap_bytes >> 20;
                 let (major, minor) = d.version;
@@ -168,6 +172,20 @@ fn takes_a_plan(info: &GpuInfo) -> Finding {
         }
         Err(e) => Finding::Missing(format!("{what}: {e}")),
     }
+}
+
+/// Which of several devices trains, and why.
+fn trains(found: &[GpuInfo], calibrate: bool) -> Finding {
+    let steps: Vec<Option<f64>> =
+        found.iter().map(if calibrate { devices::measured } else { devices::known }).collect();
+    let chosen = &found[devices::fastest(found, &steps)].name;
+    if steps.contains(&None) {
+        return Finding::Note(format!(
+            "on {chosen} until the first job, or dgtr doctor --calibrate, measures a step of each"
+        ));
+    }
+    let each = found.iter().zip(&steps).map(|(d, ms)| format!("{} {:.1} ms", d.name, ms.unwrap_or(f64::INFINITY)));
+    Finding::Ok(format!("on {chosen} (a step: {}; --device names another)", each.collect::<Vec<_>>().join(", ")))
 }
 
 /// Which shape of the kernels is in use on a device, and why.

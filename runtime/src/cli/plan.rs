@@ -9,10 +9,11 @@ use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
 use config::training::{CropSettings, ShSettings};
 use models::dataset::{Dataset, scaled};
-use vulkan::gpu::{Gpu, GpuInfo};
+use vulkan::gpu::GpuInfo;
 
 use super::CliError;
 use crate::cli::output::{out, outln};
+use crate::devices;
 use crate::engine::device::DeviceRequest;
 use crate::engine::scratch_bytes;
 use crate::fly::delivered_bytes;
@@ -82,7 +83,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         None => Job::of_arguments(&args)?,
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
-    let (sort_lanes, lies) = match (Gpu::open(args.device.as_deref()), &args.device) {
+    let (sort_lanes, lies) = match (devices::open_known(args.device.as_deref()), &args.device) {
         (Ok(gpu), _) => (gpu.info().sort_lanes(), device_memory(gpu.info())),
         // A bound that is too large ends no flight.
         (Err(_), None) => (SORT_LANES_SOFTWARE, DeviceMemory::Shared),

@@ -12,11 +12,10 @@ use models::cloud::GaussianCloud;
 use models::ortho::grid::BLOCK;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
-use vulkan::gpu::Gpu;
 use vulkan::trainer::{TrainError, Trainer};
 
 use crate::error::JobError;
-use crate::kernels;
+use crate::{devices, kernels};
 
 /// Gaussian–tile instances that a renderer holds at once, per pixel; pictures with more are rendered in bands.
 const INSTANCES_PER_PIXEL: usize = 8;
@@ -97,7 +96,7 @@ impl DeviceRequest {
     /// # Errors
     /// No device, or a plan that does not fit into it or into `device_mib`.
     pub fn open<E: From<PlanError> + From<TrainError>>(&self, training: &TrainSettings) -> Result<Trainer, E> {
-        let gpu = Gpu::open(self.device.as_deref()).map_err(TrainError::from)?;
+        let gpu = devices::open(self.device.as_deref()).map_err(TrainError::from)?;
         let request = self.plan_request(&training.sh, gpu.info().sort_lanes());
         let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
         if request.view_file_bytes() > 0 {
@@ -153,7 +152,7 @@ fn renderer_of(
         let what = "the model holds no Gaussians; train it first (dgtr train continues it)";
         return Err(JobError::Request(what.into()));
     }
-    let gpu = Gpu::open(device)?;
+    let gpu = devices::open_known(device)?;
     let mut settings = TrainSettings::default();
     settings.sh.degree = cloud.sh_degree;
     let max_gaussians = Some(cloud.len());

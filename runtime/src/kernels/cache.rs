@@ -1,5 +1,5 @@
 //! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the shape that was
-//! measured. It is only a cache: it may be deleted, be damaged or be somebody's handiwork at any time.
+//! measured, and the small step that devices are compared by. It is only a cache: it may be deleted, be damaged or be somebody's handiwork at any time.
 
 use std::path::{Path, PathBuf};
 
@@ -19,6 +19,32 @@ struct Kept {
     /// The one measured last comes last.
     #[serde(default)]
     device: Vec<Entry>,
+    /// The same.
+    #[serde(default)]
+    step: Vec<Step>,
+}
+
+/// A device's small step.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+struct Step {
+    name: String,
+    vendor_id: u32,
+    device_id: u32,
+    driver_version: u32,
+    kernels: String,
+    ms: f64,
+}
+
+impl Step {
+    fn of(info: &GpuInfo, ms: f64) -> Self {
+        let Entry { name, vendor_id, device_id, driver_version, kernels, .. } =
+            Entry::of(info, KernelShape::standard(info));
+        Self { name, vendor_id, device_id, driver_version, kernels, ms }
+    }
+
+    fn is_device(&self, other: &Self) -> bool {
+        (&self.name, self.vendor_id, self.device_id) == (&other.name, other.vendor_id, other.device_id)
+    }
 }
 
 /// One device.
@@ -66,7 +92,7 @@ impl Entry {
 }
 
 /// Where the file lies; none without a home.
-pub(super) fn path() -> Option<PathBuf> {
+pub fn path() -> Option<PathBuf> {
     let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|p| p.is_absolute());
     let cache = folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))?;
     Some(cache.join("dgtr/kernels.toml"))
@@ -100,9 +126,37 @@ pub fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), Form
     kept.device.push(entry);
     let over = kept.device.len().saturating_sub(MOST_DEVICES);
     kept.device.drain(..over);
-    let text = toml::to_string(&kept).map_err(|e| FormatError::Invalid { path: path.into(), what: e.to_string() })?;
+    save(path, &kept)
+}
+
+/// Milliseconds of the small step on this very device, with this driver and these kernels; `None` when it was not measured.
+///
+/// # Errors
+/// A file that is there and cannot be used.
+pub fn read_step(path: &Path, info: &GpuInfo) -> Result<Option<f64>, FormatError> {
+    let kept = load(path)?;
+    let found = kept.step.iter().rev().find(|s| **s == Step::of(info, s.ms));
+    Ok(found.map(|s| s.ms).filter(|ms| *ms > 0.0))
+}
+
+/// Remembers it, in place of what was remembered of the device. A damaged file is begun anew.
+///
+/// # Errors
+/// A file or folder that cannot be written.
+pub fn write_step(path: &Path, info: &GpuInfo, ms: f64) -> Result<(), FormatError> {
+    let mut kept = load(path).unwrap_or_default();
+    let step = Step::of(info, ms);
+    kept.step.retain(|s| !s.is_device(&step));
+    kept.step.push(step);
+    let over = kept.step.len().saturating_sub(MOST_DEVICES);
+    kept.step.drain(..over);
+    save(path, &kept)
+}
+
+fn save(path: &Path, kept: &Kept) -> Result<(), FormatError> {
+    let text = toml::to_string(kept).map_err(|e| FormatError::Invalid { path: path.into(), what: e.to_string() })?;
     write_atomic(path, |out| {
-        writeln!(out, "# Shapes of kernels measured by dgtr (`dgtr doctor --calibrate`); may be deleted.")?;
+        writeln!(out, "# Shapes of kernels and steps measured by dgtr (`dgtr doctor --calibrate`); may be deleted.")?;
         out.write_all(text.as_bytes())
     })
 }
@@ -152,6 +206,28 @@ mod tests {
         write(&path, &b, OTHER).unwrap();
         assert_eq!(read(&path, &a).unwrap(), Some(SHAPE));
         assert_eq!(read(&path, &b).unwrap(), Some(OTHER));
+    }
+
+    #[test]
+    fn the_step_of_a_device_is_kept_beside_its_shape_until_its_driver_changes() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("kernels.toml");
+        let (a, b) = (device("V3D"), device("llvmpipe"));
+        write(&path, &a, SHAPE).unwrap();
+        write_step(&path, &a, 12.5).unwrap();
+        write_step(&path, &b, 3.25).unwrap();
+        write_step(&path, &b, 3.5).unwrap();
+        assert_eq!([&a, &b].map(|info| read_step(&path, info).unwrap()), [Some(12.5), Some(3.5)]);
+        assert_eq!(read(&path, &a).unwrap(), Some(SHAPE));
+        assert_eq!(read_step(&path, &GpuInfo { driver_version: 8, ..a.clone() }).unwrap(), None);
+        // What nobody could have measured is not believed.
+        for ms in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            write_step(&path, &a, ms).unwrap();
+            assert!(read_step(&path, &a).unwrap().is_none_or(|ms| ms > 0.0), "{ms}");
+        }
+        let endless = (0..2 * MOST_DEVICES).map(|i| device(&format!("device {i}")));
+        endless.for_each(|info| write_step(&path, &info, 1.0).unwrap());
+        assert!(std::fs::metadata(&path).unwrap().len() < LIMIT);
     }
 
     #[test]
