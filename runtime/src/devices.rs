@@ -10,7 +10,8 @@ use vulkan::gpu::{Gpu, GpuError, GpuInfo};
 
 use crate::kernels::{cache, choice};
 
-/// The processor must be faster than a GPU by this: its cores are wanted for matching pictures and for networks, too.
+/// The processor must be faster than a GPU by this: its cores are wanted for matching pictures and for networks, too. Chosen, not
+/// measured: no board was at hand.
 const PROCESSOR_HANDICAP: f64 = 1.25;
 
 /// Opens the device whose name contains `name`, or the one with the fastest step. Call it before anything that must not wait: devices
@@ -83,28 +84,12 @@ pub fn fastest(devices: &[GpuInfo], steps: &[Option<f64>]) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use vulkan::gpu::DeviceLimits;
-
     use super::*;
-
-    fn device(name: &str, is_cpu: bool) -> GpuInfo {
-        GpuInfo {
-            name: name.into(),
-            version: (1, 3),
-            is_cpu,
-            is_integrated: !is_cpu,
-            subgroup_size: 16,
-            shuffles: true,
-            heap_bytes: 1 << 30,
-            ids: (1, 2),
-            driver_version: 7,
-            limits: DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 },
-        }
-    }
+    use crate::kernels::cache::tests::device;
 
     #[test]
     fn the_faster_device_trains_whichever_kind_it_is() {
-        let board = [device("llvmpipe", true), device("V3D", false)];
+        let board = [GpuInfo { is_cpu: true, ..device("llvmpipe") }, device("V3D")];
         let ms = |a: f64, b: f64| fastest(&board, &[Some(a), Some(b)]);
         assert_eq!(ms(10.0, 90.0), 0, "the processor by nine times");
         assert_eq!(ms(90.0, 10.0), 1);

@@ -1,7 +1,7 @@
 //! The live page: what a job does, for whoever looks at it with a browser.
 //!
 //! The job writes into a state of fixed size ([`Watch::update`]) where it reports anyway; a thread of its own answers requests and
-//! turns the state into text. Nobody who looks holds up the job: the state is locked for as long as it takes to copy, never while
+//! turns the state into text. Nobody who looks holds up the job for longer than that takes: the state is locked meanwhile, never while
 //! something is sent.
 
 use std::path::{Path, PathBuf};

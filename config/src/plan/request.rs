@@ -18,8 +18,8 @@ pub struct PlanRequest {
     pub views: u32,
     /// Crops of the pictures at a larger size than they are trained at, each of a training picture's pixels at most.
     pub crops: u32,
-    /// How many views and crops are on the device at once, the others waiting in a file; `None`: all where they take at most half of the
-    /// memory, else the views and one crop where those do, else as many as an eighth of it holds; never more than leave room for a plan.
+    /// How many views and crops are on the device at once, the others waiting in a file; `None`: all views and one crop where they take
+    /// at most half of the memory, else as many as an eighth of it holds, and never more than leave room for a plan.
     pub view_slots: Option<u32>,
     /// Highest SH degree, 0…3.
     pub sh_degree: u8,
@@ -67,12 +67,9 @@ impl PlanRequest {
         let slots = match self.view_slots {
             Some(slots) => slots,
             None => {
-                let few = match held_in(budget / 2) {
-                    held if held >= self.pictures() => self.pictures(),
-                    // Views come again sooner than crops.
-                    held if held > self.views => self.views + 1,
-                    _ => held_in(budget / 8),
-                };
+                // A crop is read for its step: kept here, crops would take the room of Gaussians.
+                let wanted = self.views.saturating_add(self.crops.min(1));
+                let few = if held_in(budget / 2) >= wanted { wanted } else { held_in(budget / 8) };
                 few.min(held_in(budget.saturating_sub(Plan::smallest(self, 0).total_bytes)))
             }
         };
@@ -115,7 +112,7 @@ mod tests {
         // Crops wait as views do, without room for a depth prior.
         let cropped = PlanRequest { crops: 300, ..few };
         assert_eq!((cropped.slots(), cropped.view_file_bytes()), (51, 640 * 480 * (50 * 6 + 300 * 4)));
-        assert_eq!(PlanRequest { crops: 3, ..few }.slots(), 53);
+        assert_eq!(PlanRequest { crops: 3, ..few }.slots(), 51, "crops take no room of Gaussians");
         // Where pictures are large for the memory, fewer of them stay rather than that no plan can be made.
         let tight = PlanRequest { device_mib: 215, ..of(50, 1280, 960) };
         assert!(tight.slots() == 2 && Plan::new(&tight).is_ok(), "{}", tight.slots());

@@ -5,14 +5,12 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hal::failsafe::{Action, Cause, Flags};
+use hal::failsafe::Action;
 use hal::mavlink::dialect::MavSeverity;
 use hal::traits::Clock;
-use vulkan::trainer::{RunBudget, StepReport, StopReason};
+use vulkan::trainer::{RunBudget, StepReport};
 
 use super::handover::Handover;
-use super::intake::FlightCounters;
-use super::shortage::likely_cause;
 use super::show::ShownJob;
 use crate::engine::{PictureSource, Reconstruct, model_path};
 use crate::error::JobError;
@@ -22,6 +20,8 @@ use crate::keyframe_store::Relief;
 use crate::service::Supervisor;
 use crate::upload::Offerer;
 use crate::watch::Watch;
+
+mod landing;
 
 /// Between two checkpoints: what a power cut may cost.
 const CHECKPOINT_EVERY_NS: u64 = 15_000_000_000;
@@ -227,117 +227,6 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             self.say(capture, &report);
         }
         if self.clock.now_ns() >= due_ns { self.save(capture) } else { Ok(()) }
-    }
-
-    /// After capture, which counted `flight`: the last build, the rest of the schedule, and the model that remains.
-    ///
-    /// # Errors
-    /// The device fails before there was a checkpoint; there are too few key frames for a model.
-    pub(super) fn land(
-        mut self,
-        capture: &mut Handover,
-        flight: &FlightCounters,
-        interrupt: &Interrupt,
-    ) -> Result<JobEnd<R>, JobError> {
-        if !self.training_failed {
-            let finished = self.finish_schedule(capture, interrupt);
-            self.survive(finished)?;
-        }
-        let before = (model_path(&self.out), self.reconstruction.gaussians());
-        if !self.reconstruction.has_model() && interrupt.requested() && before.0.is_file() {
-            // Stopped before everything was taken up again: the checkpoint stays as it is.
-            let (reconstruction, offerer, (model, gaussians)) = (self.reconstruction, self.offerer, before);
-            return Ok(JobEnd {
-                reconstruction,
-                offerer,
-                supervisor: self.supervisor,
-                model,
-                gaussians,
-                finished: false,
-            });
-        }
-        if !self.reconstruction.has_model() {
-            let keyframes = self.reconstruction.keyframes();
-            return Err(JobError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
-        }
-        let state = self.failsafe.state();
-        let spared = state.forbids_training();
-        if spared {
-            let cause = state.cause().map_or("", Cause::name);
-            tracing::warn!("{cause}: the rest of the training is left; the same command continues it later");
-        }
-        let mut finished = !interrupt.requested() && !self.training_failed && !spared;
-        let (model, gaussians) = if self.training_failed {
-            before
-        } else {
-            match self.checkpoint(capture, finished) {
-                Err(e) if e.may_pass() && before.0.is_file() => {
-                    tracing::error!("{e}; the last checkpoint is kept, make room and give the same command again");
-                    finished = false;
-                    before
-                }
-                other => other?,
-            }
-        };
-        self.show(if finished { "trained" } else { "stopped with a checkpoint" });
-        if finished {
-            self.offerer.offer_final(&model);
-        } else {
-            self.offerer.offer(&model);
-        }
-        let Self { reconstruction, offerer, supervisor, .. } = self;
-        Ok(JobEnd { reconstruction, offerer, supervisor, model, gaussians, finished })
-    }
-
-    fn finish_schedule(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
-        if self.reconstruction.wants_build(true) && !interrupt.requested() {
-            self.build(capture)?;
-        }
-        if !self.reconstruction.has_model() {
-            return Ok(());
-        }
-        if !interrupt.requested() && !self.failsafe.state().forbids_training() {
-            let supervisor = &self.supervisor;
-            let go_on = || {
-                supervisor.alive();
-                !interrupt.requested()
-            };
-            self.reconstruction.look_closer(capture, &go_on)?;
-        }
-        // What the autopilot said last of its battery holds; the rest of what the HAL saw ended with the flight, and there
-        // is no flight's time any more that training could be behind.
-        let seen = Flags { battery_low: capture.flags().battery_low, ..Flags::default() };
-        let (at_leisure, views) = (RunBudget { seconds: None, ..self.budget }, self.reconstruction.keyframes());
-        let mut progress = crate::console::Progress::new("training", 100);
-        while !self.reconstruction.is_done(&self.budget)
-            && !interrupt.requested()
-            && !self.failsafe.state().forbids_training()
-        {
-            let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
-            self.show("training after the flight");
-            let (clock, failsafe, supervisor) = (&self.clock, &mut self.failsafe, &self.supervisor);
-            let shown = &mut self.shown;
-            let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
-                supervisor.alive();
-                shown.step(r);
-                progress.set((r.progress * 100.0) as u64, || {
-                    format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
-                });
-                let now_ns = clock.now_ns();
-                let alarmed = failsafe.glance(now_ns, seen, &at_leisure, views);
-                // Only where saving leaves no trace, as in any training.
-                let go_on = !interrupt.requested() && !alarmed && (now_ns < due_ns || !r.settled);
-                if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-            })?;
-            self.act(capture)?;
-            if reason != StopReason::Caller || interrupt.requested() {
-                break;
-            }
-            if self.clock.now_ns() >= due_ns {
-                self.save(capture)?;
-            }
-        }
-        Ok(())
     }
 
     fn save(&mut self, capture: &mut Handover) -> Result<(), JobError> {

@@ -1,5 +1,6 @@
 //! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the shape that was
-//! measured, and the small step that devices are compared by. It is only a cache: it may be deleted, be damaged or be somebody's handiwork at any time.
+//! measured, and the small step that devices are compared by. It is only a cache: it may be deleted, be damaged or be
+//! somebody's handiwork at any time.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +11,7 @@ use vulkan::shape::{KernelShape, kernels_fingerprint};
 
 /// Bound on the file; an entry takes some 200 bytes.
 const LIMIT: u64 = 64 << 10;
-/// Devices that are remembered; the one measured longest ago makes room.
+/// Devices that are remembered.
 const MOST_DEVICES: usize = 64;
 
 /// The file.
@@ -24,38 +25,47 @@ struct Kept {
     step: Vec<Step>,
 }
 
-/// A device's small step.
-#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
-struct Step {
-    name: String,
-    vendor_id: u32,
-    device_id: u32,
-    driver_version: u32,
-    kernels: String,
-    ms: f64,
-}
-
-impl Step {
-    fn of(info: &GpuInfo, ms: f64) -> Self {
-        let Entry { name, vendor_id, device_id, driver_version, kernels, .. } =
-            Entry::of(info, KernelShape::standard(info));
-        Self { name, vendor_id, device_id, driver_version, kernels, ms }
-    }
-
-    fn is_device(&self, other: &Self) -> bool {
-        (&self.name, self.vendor_id, self.device_id) == (&other.name, other.vendor_id, other.device_id)
-    }
-}
-
-/// One device.
+/// Which device, with which driver, ran which kernels.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
-struct Entry {
+struct Id {
     name: String,
     vendor_id: u32,
     device_id: u32,
     driver_version: u32,
     /// Fingerprint of the kernels, hexadecimal.
     kernels: String,
+}
+
+impl Id {
+    fn of(info: &GpuInfo) -> Self {
+        Self {
+            name: info.name.clone(),
+            vendor_id: info.ids.0,
+            device_id: info.ids.1,
+            driver_version: info.driver_version,
+            kernels: format!("{:016x}", kernels_fingerprint()),
+        }
+    }
+
+    /// Whatever its driver and the kernels were.
+    fn is_device(&self, other: &Self) -> bool {
+        (&self.name, self.vendor_id, self.device_id) == (&other.name, other.vendor_id, other.device_id)
+    }
+}
+
+/// A device's small step.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+struct Step {
+    #[serde(flatten)]
+    id: Id,
+    ms: f64,
+}
+
+/// A device's shape.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
+struct Entry {
+    #[serde(flatten)]
+    id: Id,
     wide: u32,
     narrow: u32,
     share_lanes: u32,
@@ -66,29 +76,22 @@ struct Entry {
 
 impl Entry {
     fn of(info: &GpuInfo, shape: KernelShape) -> Self {
-        Self {
-            name: info.name.clone(),
-            vendor_id: info.ids.0,
-            device_id: info.ids.1,
-            driver_version: info.driver_version,
-            kernels: format!("{:016x}", kernels_fingerprint()),
-            wide: shape.wide,
-            narrow: shape.narrow,
-            share_lanes: shape.share_lanes,
-            tiles: shape.tiles,
-            tile_lanes: shape.tile_lanes,
-            fetched: shape.fetched,
-        }
+        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched } = shape;
+        Self { id: Id::of(info), wide, narrow, share_lanes, tiles, tile_lanes, fetched }
     }
 
     fn shape(&self) -> KernelShape {
         let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, .. } = *self;
         KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }
     }
+}
 
-    fn is_device(&self, other: &Self) -> bool {
-        (&self.name, self.vendor_id, self.device_id) == (&other.name, other.vendor_id, other.device_id)
-    }
+/// Puts `new` last, in place of what was kept of its device; the one measured longest ago makes room.
+fn remember<T>(kept: &mut Vec<T>, new: T, id: fn(&T) -> &Id) {
+    kept.retain(|old| !id(old).is_device(id(&new)));
+    kept.push(new);
+    let over = kept.len().saturating_sub(MOST_DEVICES);
+    kept.drain(..over);
 }
 
 /// Where the file lies; none without a home.
@@ -104,8 +107,9 @@ pub fn path() -> Option<PathBuf> {
 /// A file that is there and cannot be used.
 pub fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatError> {
     let kept = load(path)?;
-    // An entry equals the one that would be written for its own shape, or it is another driver's or other kernels'.
-    let found = kept.device.iter().rev().find(|e| **e == Entry::of(info, e.shape()));
+    // Another driver's, or other kernels', says nothing.
+    let id = Id::of(info);
+    let found = kept.device.iter().rev().find(|e| e.id == id);
     match found.map(Entry::shape) {
         Some(shape) if !shape.fits(info) => {
             let what = format!("{}: {shape} is no shape this device can run", info.name);
@@ -121,11 +125,7 @@ pub fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatEr
 /// A file or folder that cannot be written.
 pub fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
-    let entry = Entry::of(info, shape);
-    kept.device.retain(|e| !e.is_device(&entry));
-    kept.device.push(entry);
-    let over = kept.device.len().saturating_sub(MOST_DEVICES);
-    kept.device.drain(..over);
+    remember(&mut kept.device, Entry::of(info, shape), |e| &e.id);
     save(path, &kept)
 }
 
@@ -134,8 +134,8 @@ pub fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), Form
 /// # Errors
 /// A file that is there and cannot be used.
 pub fn read_step(path: &Path, info: &GpuInfo) -> Result<Option<f64>, FormatError> {
-    let kept = load(path)?;
-    let found = kept.step.iter().rev().find(|s| **s == Step::of(info, s.ms));
+    let (kept, id) = (load(path)?, Id::of(info));
+    let found = kept.step.iter().rev().find(|s| s.id == id);
     Ok(found.map(|s| s.ms).filter(|ms| *ms > 0.0))
 }
 
@@ -145,11 +145,7 @@ pub fn read_step(path: &Path, info: &GpuInfo) -> Result<Option<f64>, FormatError
 /// A file or folder that cannot be written.
 pub fn write_step(path: &Path, info: &GpuInfo, ms: f64) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
-    let step = Step::of(info, ms);
-    kept.step.retain(|s| !s.is_device(&step));
-    kept.step.push(step);
-    let over = kept.step.len().saturating_sub(MOST_DEVICES);
-    kept.step.drain(..over);
+    remember(&mut kept.step, Step { id: Id::of(info), ms }, |s| &s.id);
     save(path, &kept)
 }
 
@@ -172,7 +168,7 @@ fn load(path: &Path) -> Result<Kept, FormatError> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use vulkan::gpu::DeviceLimits;
 
@@ -181,7 +177,8 @@ mod tests {
     const OTHER: KernelShape =
         KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
 
-    fn device(name: &str) -> GpuInfo {
+    /// A board's GPU.
+    pub(crate) fn device(name: &str) -> GpuInfo {
         GpuInfo {
             name: name.into(),
             version: (1, 3),
