@@ -72,7 +72,7 @@ async function live(browser, port) {
       await accessible(ground.page, "the ground's live page, light");
     }
     const over = await ground.page.evaluate(() => /ended|lost/.test(document.getElementById("status").textContent));
-    if (over || (/ended|lost/.test(now.status) && seen.arrived && seen.ortho)) break;
+    if (over) break;
     await sleep(0.5);
   }
   promise(states.west.size > 5, `the aircraft's page changed ${states.west.size} times`);
