@@ -6,8 +6,10 @@
 use serde::Serialize;
 
 mod request;
+mod scene;
 
 pub use request::PlanRequest;
+pub use scene::BLOCK_GAUSSIANS;
 
 /// Lanes that sort and emit on a processor; each owns one histogram. How many there are says nothing about the result.
 ///
@@ -38,8 +40,10 @@ pub const TILE_SIDE: u64 = 4;
 /// Capacities and the size of every section.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Plan {
-    /// N, Gaussians.
+    /// N, Gaussians on the device.
     pub gaussians: usize,
+    /// Gaussians of the whole scene; those beyond N wait in a file.
+    pub scene: usize,
     /// M, Gaussian–tile instances held at once; more are rendered in several bands.
     pub instances: usize,
     /// P, pixels rendered at once; larger renderings are done in several windows.
@@ -136,7 +140,9 @@ impl Plan {
         within("crops", r.crops.into(), 0, 1 << 20)?;
         within("sh_degree", r.sh_degree.into(), 0, 3)?;
         within("sort_lanes", r.sort_lanes.into(), SORT_LANES_SOFTWARE.into(), SORT_LANES_GPU.into())?;
-        within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, u64::from(u32::MAX) >> 4)?;
+        let most_gaussians = u64::from(u32::MAX) >> 4;
+        within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, most_gaussians)?;
+        within("scene_gaussians", r.scene_gaussians.unwrap_or(1) as u64, 1, most_gaussians)?;
         let (budget, slots, most) = (u64::from(r.device_mib) << 20, r.slots(), r.most_gaussians());
         let least = most.min(Self::LEAST_GAUSSIANS);
         let pixels = r.width as usize * r.height as usize;
@@ -222,6 +228,7 @@ impl Plan {
         let total: u64 = sections.iter().map(|s| s.1).sum();
         Self {
             gaussians,
+            scene: r.scene_gaussians.unwrap_or(gaussians).max(gaussians),
             instances,
             pixels: p as usize,
             tiles: tiles as usize,

@@ -89,6 +89,7 @@ mod tests {
                 views: 48,
                 sh_degree: 3,
                 max_gaussians: Some(v.max_gaussians as usize),
+                scene_gaussians: None,
                 // The more of the two.
                 sort_lanes: SORT_LANES_GPU,
                 ..Default::default()

@@ -4,12 +4,14 @@
 //! `--seconds S` squeezes the same recipe into whatever time there is. And every length is relative to the
 //! scene's [extent](scene_extent), so that one recipe serves a stuffed fox and a quarry.
 
+mod cells;
 mod crops;
 mod density;
 mod rates;
 mod schedule;
 mod skips;
 
+pub use cells::CellSettings;
 pub use crops::CropSettings;
 pub use density::{DensitySettings, Strategy};
 pub use rates::{AdamSettings, RateSettings};
@@ -44,6 +46,8 @@ table! {
         pub views: ViewSettings = ViewSettings::default();
         /// Pictures larger than training pictures.
         pub crops: CropSettings = CropSettings::default();
+        /// Scenes of more Gaussians than the device holds.
+        pub cells: CellSettings = CellSettings::default();
         /// When to end before the schedule does.
         pub stop: StopSettings = StopSettings::default();
         /// Regularisers that act on the parameters or on the rendering.

@@ -69,6 +69,7 @@ fn usable(mission: &Mission) -> bool {
         height: camera.height,
         views: mission.keyframes.max,
         max_gaussians: memory.max_gaussians.map(|n| n as usize),
+        scene_gaussians: memory.scene_gaussians.map(|n| n as usize),
         ..PlanRequest::default()
     });
     let disk = DiskPlan::new(&DiskRequest {

@@ -47,11 +47,11 @@ pub use source::PictureSource;
 /// Pictures and depths that wait for the initialiser in memory, bytes; more of them wait in a file.
 const FRAMES_IN_MEMORY: u64 = 256 << 20;
 
-/// Bytes of the scratch files of a job: views that find no room on the device, and what waits for the initialiser.
+/// Bytes of the scratch files of a job: views and cells that find no room on the device, and what waits for the initialiser.
 pub fn scratch_bytes(request: &PlanRequest, init: &InitSettings, network: &NetworkSettings) -> u64 {
     let each = most_frame_bytes(init, (request.width, request.height), network.pair.is_some());
     let waiting = u64::from(request.views) * each;
-    request.view_file_bytes() + if waiting > FRAMES_IN_MEMORY { waiting } else { 0 }
+    request.view_file_bytes() + request.scene_file_bytes() + if waiting > FRAMES_IN_MEMORY { waiting } else { 0 }
 }
 
 /// What the engine needs to know before the first picture.
@@ -161,7 +161,7 @@ impl Reconstruction {
             shared: trainer.gpu().info().is_cpu,
             initialiser: initialiser
                 .as_ref()
-                .map_or(0, |i| i.planned_bytes_at(settings.device.size, views, trainer.plan().gaussians)),
+                .map_or(0, |i| i.planned_bytes_at(settings.device.size, views, trainer.plan().scene)),
             refine: settings.refine.as_ref(),
             camera_pixels: settings.camera_pixels,
             ahead: settings.ahead as u64,
@@ -178,7 +178,7 @@ impl Reconstruction {
             refiner: refiner.transpose()?,
             initialiser,
             depth,
-            cloud: GaussianCloud::with_capacity(settings.training.sh.degree, trainer.plan().gaussians),
+            cloud: GaussianCloud::with_capacity(settings.training.sh.degree, trainer.plan().scene),
             trainer,
             views: Vec::with_capacity(views),
             initialised: 0,
@@ -298,7 +298,7 @@ impl Reconstruction {
     /// Gaussians and depth priors of all key frames; `None` when `go_on` said no.
     fn initialise(&mut self, go_on: &dyn Fn() -> bool) -> Result<Option<FirstGaussians>, JobError> {
         let _span = tracing::info_span!("initialise").entered();
-        let capacity = self.trainer.plan().gaussians;
+        let capacity = self.trainer.plan().scene;
         if let Some(refiner) = &self.refiner {
             self.points = refiner.sparse_points().iter().map(|p| (p.position, p.color)).collect();
         }

@@ -172,7 +172,8 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
     // At least this much of the device's memory goes with every Gaussian: its floats, their two moments and gradient.
     let each = 16 * (11 + 3 * (u64::from(sh_degree) + 1).pow(2));
     let held = (u64::from(memory.device_mib) << 20) / each;
-    let gaussians = memory.max_gaussians.map_or(held, u64::from).min(held) as usize;
+    let on_device = memory.max_gaussians.map_or(held, u64::from).min(held);
+    let gaussians = memory.scene_gaussians.map_or(on_device, |n| on_device.max(n.into())) as usize;
     let CameraSettings { width, height, .. } = mission.camera;
     // How many lanes sort matters little; more of them leave less room.
     let request = DeviceRequest::of_flight(mission, None).plan_request(&mission.training.sh, SORT_LANES_GPU);

@@ -69,6 +69,8 @@ pub struct TrainJob {
     pub budget_mib: u32,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
+    /// Gaussians of the whole scene; `None`: those on the device.
+    pub scene_gaussians: Option<usize>,
     /// Views on the device at once; `None`: as [`config::plan::PlanRequest::slots`] says.
     pub view_slots: Option<u32>,
     /// Image scale; `None`: as large as the plan holds.
@@ -168,6 +170,7 @@ impl TrainJob {
                 view_slots: self.view_slots,
                 folder: Some(self.out.clone()),
                 max_gaussians: self.max_gaussians,
+                scene_gaussians: self.scene_gaussians,
             },
             host_mib: None,
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
@@ -250,6 +253,7 @@ impl TrainJob {
                 view_slots: self.view_slots.or(Some(frames.len() as u32)),
                 folder: None,
                 max_gaussians: self.max_gaussians,
+                scene_gaussians: None,
             };
             let some_in_file = DeviceRequest { view_slots: self.view_slots, ..all_on_device.clone() };
             let holds = |request: &DeviceRequest| {

@@ -22,6 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         views: train.len() as u32,
         sh_degree: 3,
         max_gaussians: Some(capacity),
+        scene_gaussians: None,
         ..Default::default()
     };
     let plan = Plan::new(&request)?;

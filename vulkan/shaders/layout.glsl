@@ -160,7 +160,7 @@ layout(std140, set = 0, binding = 0) uniform Frame {
 } frame;
 
 layout(push_constant) uniform Push {
-    // First tile of the band.
+    // First tile of the band, or first pixel of a part of a picture.
     uint first;
     // One past its last tile.
     uint last;

@@ -1,6 +1,6 @@
 #version 450
 // The step's picture at working size: blocks of divisor x divisor pixels averaged; alpha is the depth prior's
-// confidence, which weighs the depth. One lane per pixel.
+// confidence, which weighs the depth. Of a part of a picture, from its pixel `push.first` on. One lane per pixel.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 
@@ -16,7 +16,7 @@ void main() {
     float depth = 0.0;
     for (uint y = 0u; y < divisor; y++) {
         for (uint x = 0u; x < divisor; x++) {
-            uint at = (corner.y + y) * width + corner.x + x;
+            uint at = push.first + (corner.y + y) * width + corner.x + x;
             vec4 c = unpackUnorm4x8(view[at]);
             sum += c;
             if (depth_at != 0u && c.w > 0.0) {

@@ -201,6 +201,7 @@ fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
         views: 1,
         sh_degree: 3,
         max_gaussians: Some(GAUSSIANS),
+        scene_gaussians: None,
         sort_lanes: gpu.info().sort_lanes(),
         ..Default::default()
     };

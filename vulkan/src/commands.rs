@@ -195,8 +195,8 @@ impl Recording<'_> {
     }
 
     /// As [`Self::run`], with the descriptor set of view slot `slot`.
-    pub fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize) {
-        self.dispatch(kernel, self.pipelines.view_set(slot), lanes, Push::default());
+    pub fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize, push: Push) {
+        self.dispatch(kernel, self.pipelines.view_set(slot), lanes, push);
         self.stamp_kernel(kernel);
     }
 

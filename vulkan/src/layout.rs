@@ -162,7 +162,7 @@ layout! {
 
     /// What a kernel is told besides the frame.
     Push {
-        /// First tile of the band.
+        /// First tile of the band, or first pixel of a part of a picture.
         first: u32,
         /// One past its last tile.
         last: u32,

@@ -19,6 +19,7 @@ mod pose;
 mod render;
 mod run;
 mod sampler;
+mod scene;
 mod slots;
 mod state;
 mod step;
@@ -42,6 +43,7 @@ use crate::shape::KernelShape;
 use crate::stages::STAGE_NAMES;
 use bytemuck::Zeroable;
 use config::plan::{LOOP_LANES, Plan};
+use config::settings::SettingError;
 use config::training::{Strategy, TrainSettings, scene_extent};
 use std::ops::ControlFlow;
 use std::time::Instant;
@@ -73,6 +75,9 @@ pub struct Trainer {
     views: Vec<views::TrainingView>,
     crops: Vec<crops::TrainingCrop>,
     slots: slots::Slots,
+    scene: scene::Scene,
+    /// One Gaussian on its way to the host.
+    record: Vec<u8>,
     sampler: sampler::Sampler,
     crop_sampler: sampler::Sampler,
     density: density::Scratch,
@@ -81,6 +86,7 @@ pub struct Trainer {
     /// Dispatches that counting and emitting are spread over.
     walk_rounds: u32,
     strategy: Strategy,
+    /// Those on the device.
     gaussians: usize,
     extent: f32,
     /// Steps taken since `load`.
@@ -136,6 +142,10 @@ impl Trainer {
         kernels: &[Kernel],
     ) -> Result<Self, TrainError> {
         settings.check()?;
+        if plan.is_paged() && settings.sh.raise_share < 1.0 {
+            let wanted = "1 where the scene has more Gaussians than the device: degrees are ranked among all of them";
+            return Err(SettingError::new("sh.raise_share", &settings.sh.raise_share, wanted).into());
+        }
         let arena = Arena::new(gpu, plan)?;
         let pipelines = Pipelines::new(gpu, plan, &arena, shape, settings.sh.raise_share < 1.0, kernels)?;
         let commands = Commands::new(gpu)?;
@@ -152,6 +162,8 @@ impl Trainer {
             views: Vec::with_capacity(plan.views),
             crops: Vec::with_capacity(plan.crops),
             slots: slots::Slots::new(plan),
+            scene: scene::Scene::new(plan),
+            record: vec![0; plan.record_bytes()],
             sampler: sampler::Sampler::new(settings.seed, plan.views),
             crop_sampler: sampler::Sampler::new(settings.seed, plan.crops),
             density: density::Scratch::new(plan.gaussians),
@@ -181,7 +193,7 @@ impl Trainer {
         self.deferred.reset();
         self.sampler.reset();
         self.crop_sampler.reset();
-        self.strategy = self.settings.density.resolve(self.gaussians, self.plan.gaussians);
+        self.strategy = self.settings.density.resolve(self.gaussians(), self.plan.scene);
         self.counters = Counters::default();
         self.extent = 0.0;
         self.density.last = 0;
@@ -227,7 +239,7 @@ impl Trainer {
             steps: self.steps - start.1,
             seconds: start.0.elapsed().as_secs_f64(),
             reason,
-            gaussians: self.gaussians,
+            gaussians: self.gaussians(),
             last,
             counters: self.counters,
         })
@@ -255,9 +267,9 @@ impl Trainer {
         self.elapsed_s
     }
 
-    /// Number of Gaussians.
+    /// Number of Gaussians, those that are not on the device included.
     pub fn gaussians(&self) -> usize {
-        self.gaussians
+        self.gaussians + self.scene.away
     }
 
     /// Steps taken since the last [`Trainer::load`].
@@ -302,9 +314,13 @@ impl Trainer {
         if self.extent > 0.0 {
             return;
         }
+        let centres: Vec<[f64; 3]> = self.views.iter().map(|v| v.view.pose.center.to_array()).collect();
+        if self.scene.is_paged() {
+            self.extent = scene_extent(self.scene.means(), &centres);
+            return;
+        }
         let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
         let means: Vec<[f32; 3]> = geometry.iter().map(|g| g.mean).collect();
-        let centres: Vec<[f64; 3]> = self.views.iter().map(|v| v.view.pose.center.to_array()).collect();
         self.extent = scene_extent(&means, &centres);
     }
 

@@ -23,6 +23,7 @@ fn train(gpu: &Gpu, instances: usize) -> (Rendering, GaussianCloud, usize) {
         views: 2,
         sh_degree: 2,
         max_gaussians: None,
+        scene_gaussians: None,
         ..Default::default()
     };
     let plan = Plan::with_capacities(&request, 300, instances);

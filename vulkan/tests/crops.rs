@@ -31,6 +31,7 @@ fn trainer(crops: CropSettings, slots: u32) -> Option<Trainer> {
         crops: 4,
         view_slots: Some(slots),
         max_gaussians: Some(300),
+        scene_gaussians: None,
         ..Default::default()
     };
     let mut settings = plain();

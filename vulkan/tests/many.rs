@@ -37,6 +37,7 @@ fn a_view_of_a_hundred_and_twenty_thousand_gaussians_has_no_holes() {
         views: 0,
         sh_degree: 0,
         max_gaussians: Some(cloud.len()),
+        scene_gaussians: None,
         ..Default::default()
     };
     let mut settings = TrainSettings::default();

@@ -51,6 +51,7 @@ fn work() {
         views: 2,
         sh_degree: 3,
         max_gaussians: None,
+        scene_gaussians: None,
         ..Default::default()
     };
     let standard = KernelShape::standard(gpu.info());

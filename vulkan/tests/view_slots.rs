@@ -30,6 +30,7 @@ fn trainer(view: &View, slots: u32) -> Option<Trainer> {
         views: VIEWS,
         view_slots: Some(slots),
         max_gaussians: Some(300),
+        scene_gaussians: None,
         ..Default::default()
     };
     let mut settings = plain();

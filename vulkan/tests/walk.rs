@@ -31,6 +31,7 @@ fn every_tile_of_every_giant_is_counted_and_emitted() {
         views: 1,
         sh_degree: 0,
         max_gaussians: None,
+        scene_gaussians: None,
         ..Default::default()
     };
     let mut pictures = Vec::new();

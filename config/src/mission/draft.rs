@@ -165,6 +165,7 @@ mod tests {
                 height,
                 views: mission.keyframes.max,
                 max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
+                scene_gaussians: mission.memory.scene_gaussians.map(|n| n as usize),
                 sort_lanes: SORT_LANES_GPU,
                 ..PlanRequest::default()
             };

@@ -22,6 +22,9 @@ table! {
         pub view_slots: Option<u32> = None, in Limits::within(2.0, 4096.0);
         /// Cap on the number of Gaussians below what the budget would hold; absent = what it holds.
         pub max_gaussians: Option<u32> = None;
+        /// Gaussians of the whole scene: more than the device holds wait in a file in the output folder, by cells of ground; absent =
+        /// all are on the device.
+        pub scene_gaussians: Option<u32> = None;
         /// Bound on what an aircraft's output folder takes of the disk, MiB; absent = what is free.
         pub disk_mib: Option<u32> = None;
         /// Pictures are trained at this fraction of their size; absent = whole, or at 640 pixels of the longer side where that is
@@ -49,6 +52,7 @@ struct Given {
     host_mib: Option<u32>,
     view_slots: Option<u32>,
     max_gaussians: Option<u32>,
+    scene_gaussians: Option<u32>,
     disk_mib: Option<u32>,
     image_scale: Option<f32>,
 }
@@ -65,6 +69,7 @@ impl From<Given> for MemorySettings {
         all.host_mib = given.host_mib.unwrap_or(all.host_mib);
         all.view_slots = given.view_slots;
         all.max_gaussians = given.max_gaussians.or(all.max_gaussians);
+        all.scene_gaussians = given.scene_gaussians;
         all.disk_mib = given.disk_mib;
         all.image_scale = given.image_scale.or(all.image_scale);
         all

@@ -25,6 +25,9 @@ pub struct PlanRequest {
     pub sh_degree: u8,
     /// Upper bound on Gaussians; `None` takes what the memory allows.
     pub max_gaussians: Option<usize>,
+    /// Gaussians of the whole scene, in cells of ground of which those that the views at work see are on the device and the others
+    /// wait in a file; `None`: all Gaussians are on the device.
+    pub scene_gaussians: Option<usize>,
     /// Adam's moments of SH in 16 bits each.
     pub half_moments: bool,
     /// Lanes that sort and emit: [`SORT_LANES_SOFTWARE`] or [`SORT_LANES_GPU`](super::SORT_LANES_GPU).
@@ -43,6 +46,7 @@ impl Default for PlanRequest {
             view_slots: None,
             sh_degree: 3,
             max_gaussians: None,
+            scene_gaussians: None,
             half_moments: false,
             sort_lanes: SORT_LANES_SOFTWARE,
         }
@@ -82,6 +86,11 @@ impl PlanRequest {
         let widest = 144.max(16 * sh_columns(self.sh_degree));
         let most = (BINDING_LIMIT / widest) as usize;
         self.max_gaussians.unwrap_or(most).min(most)
+    }
+
+    /// Bytes of the file of the cells that are not on the device; 0 when all are, or no plan can be made.
+    pub fn scene_file_bytes(&self) -> u64 {
+        Plan::new(self).map_or(0, |plan| plan.scene_file_bytes())
     }
 
     /// Bytes of the file that holds views and crops when not all of them are on the device; 0 when all are.

@@ -130,6 +130,7 @@ pub fn distil(
         view_slots: Some(lessons.len() as u32),
         folder: None,
         max_gaussians: Some(largest),
+        scene_gaussians: None,
     };
     let steps = settings.epochs.saturating_mul(lessons.len() as u32);
     let mut trainer: Trainer = request.open::<AggregateError>(&recipe(settings, merged.cloud.sh_degree, steps))?;

@@ -147,6 +147,7 @@ pub fn measure(
         view_slots: Some(scene.pictures.len() as u32),
         folder: None,
         max_gaussians: Some(scene.cloud.len()),
+        scene_gaussians: None,
     };
     let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().sort_lanes()))?;
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;

@@ -24,7 +24,7 @@ use crate::service::limits::{DeviceMemory, ServiceLimits};
 pub struct Args {
     /// The plan of an aircraft of this mission, instead of the numbers below.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "scale", "budget_mib", "width", "height", "views",
-        "view_slots", "sh_degree", "max_gaussians", "half_moments"])]
+        "view_slots", "sh_degree", "max_gaussians", "scene_gaussians", "half_moments"])]
     pub mission: Option<PathBuf>,
     /// Take picture size and number of views from this data set instead of --width, --height and --views.
     #[arg(long)]
@@ -59,6 +59,9 @@ pub struct Args {
     /// Most Gaussians wanted.
     #[arg(long)]
     pub max_gaussians: Option<usize>,
+    /// Gaussians of the whole scene; those that the device does not hold wait in a file.
+    #[arg(long)]
+    pub scene_gaussians: Option<usize>,
     /// Adam's moments of SH in 16 bits each (`training.sh.half_moments`).
     #[arg(long)]
     pub half_moments: bool,
@@ -118,6 +121,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
         plan.tiles,
         plan.sort_lanes
     );
+    if plan.is_paged() {
+        outln!(
+            "  of a scene of {} in up to {} cells; the others wait in a file of {:.2} MiB\n",
+            plan.scene,
+            plan.cells(),
+            mib(plan.scene_file_bytes())
+        );
+    }
     for (name, bytes) in &plan.sections {
         outln!("  {name:<18} {:>9.2} MiB", mib(*bytes));
     }
@@ -127,7 +138,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         height: job.picture.1,
         key_frames: request.views,
         scratch: scratch_bytes(&request, &job.init, &job.network),
-        gaussians: plan.gaussians,
+        gaussians: plan.scene,
         sh_degree: plan.sh_degree,
         delivered: job.delivered,
         map: job.map.disk_bytes(),
@@ -199,6 +210,7 @@ impl Job {
             view_slots: args.view_slots,
             folder: None,
             max_gaussians: args.max_gaussians,
+            scene_gaussians: args.scene_gaussians,
         };
         let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
         let (init, network) = (InitSettings::default(), NetworkSettings::default());

@@ -94,9 +94,12 @@ pub struct Args {
     /// Device memory, MiB, allocated once [default: 512].
     #[arg(long)]
     budget_mib: Option<u32>,
-    /// Most Gaussians; default: what the budget holds.
+    /// Most Gaussians on the device; default: what the budget holds.
     #[arg(long)]
     max_gaussians: Option<usize>,
+    /// Gaussians of the whole scene, when they are more than those on the device; the others wait in a file in --out.
+    #[arg(long, value_name = "N")]
+    scene_gaussians: Option<usize>,
     /// Pictures on the device at once, the others waiting in a file in --out [default: all while they leave half of the budget].
     #[arg(long, value_name = "N")]
     view_slots: Option<u32>,
@@ -209,6 +212,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         seconds,
         budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)).unwrap_or(512),
         max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
+        scene_gaussians: args.scene_gaussians,
         view_slots: args.view_slots,
         scale: args.scale.or(preset.map(|p| p.image_scale.into())),
         device: args.device,

@@ -56,6 +56,8 @@ pub struct DeviceRequest {
     pub folder: Option<PathBuf>,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
+    /// Gaussians of the whole scene; `None`: those on the device.
+    pub scene_gaussians: Option<usize>,
 }
 
 impl DeviceRequest {
@@ -70,6 +72,7 @@ impl DeviceRequest {
             view_slots: self.view_slots,
             sh_degree: sh.degree,
             max_gaussians: self.max_gaussians,
+            scene_gaussians: self.scene_gaussians,
             half_moments: sh.half_moments,
             sort_lanes,
         }
@@ -87,6 +90,7 @@ impl DeviceRequest {
             view_slots: memory.view_slots,
             folder,
             max_gaussians: memory.max_gaussians.map(|n| n as usize),
+            scene_gaussians: memory.scene_gaussians.map(|n| n as usize),
         }
     }
 
@@ -101,6 +105,9 @@ impl DeviceRequest {
         let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
         if request.view_file_bytes() > 0 {
             trainer.keep_views_in(self.scratch(request.view_file_bytes())?);
+        }
+        if trainer.plan().is_paged() {
+            trainer.keep_scene_in(self.scratch(trainer.plan().scene_file_bytes())?);
         }
         Ok(trainer)
     }
@@ -165,6 +172,7 @@ fn renderer_of(
         view_slots: None,
         folder: None,
         max_gaussians,
+        scene_gaussians: None,
     };
     let request = request.plan_request(&settings.sh, gpu.info().sort_lanes());
     let pixels = width as usize * height as usize;

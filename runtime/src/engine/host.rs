@@ -1,10 +1,10 @@
 //! Host memory of a job, planned like the device's: what it will hold at most, by a formula, before the first picture.
 //!
 //! ```text
-//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·N + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
+//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·R (+ 36·N + 8·R + cells) + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
 //! ```
 //!
-//! V views, N Gaussians, D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
+//! V views, N Gaussians of the scene, R on the device (where N > R), D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
 
 use config::plan::Plan;
 use config::refine::RefineSettings;
@@ -18,6 +18,8 @@ const PROGRAM_BYTES: u64 = 96 << 20;
 const FEATURES_BYTES: u64 = 2 * (32 << 20);
 /// The trainer's own lists per Gaussian: density control and SH degrees.
 const LISTS_BYTES: u64 = 20;
+/// Per Gaussian of a scene in cells while it is divided into them: its index, its cell, and the cells once more.
+const DIVIDED_BYTES: u64 = 36;
 
 /// What a job will hold.
 #[derive(Clone, Copy, Debug)]
@@ -52,7 +54,7 @@ pub struct HostPlan {
 impl HostPlan {
     /// The formula above.
     pub fn new(r: &HostRequest<'_>) -> Self {
-        let (n, v, p) = (r.plan.gaussians as u64, r.plan.views as u64, r.plan.pixels as u64);
+        let (n, v, p) = (r.plan.scene as u64, r.plan.views as u64, r.plan.pixels as u64);
         let coefficients = (u64::from(r.plan.sh_degree) + 1).pow(2);
         let matching = r.refine.map_or(0, |s| {
             let side = u64::from(s.feature_side);
@@ -67,7 +69,8 @@ impl HostPlan {
             ("initialisation", r.initialiser),
             ("matching", matching),
             ("cloud and checkpoint", 2 * 4 * n * (11 + 3 * coefficients)),
-            ("density control", LISTS_BYTES * n),
+            ("density control", LISTS_BYTES * r.plan.gaussians as u64),
+            ("cells", r.plan.scene_lists_bytes() + if r.plan.is_paged() { DIVIDED_BYTES * n } else { 0 }),
             ("pictures ahead", r.ahead * 3 * (p + if r.ahead_in_memory { r.camera_pixels } else { 0 })),
             ("picture at hand", 2 * 3 * r.camera_pixels),
             (

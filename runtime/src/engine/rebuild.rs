@@ -24,7 +24,7 @@ impl Reconstruction {
             _ if self.is_continued() => {}
             Some(made) => {
                 self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
-                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().gaussians);
+                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().scene);
             }
             None => self.cloud.clone_from(&fresh.cloud),
         }

@@ -239,6 +239,10 @@ impl Reconstruct for Reconstruction {
         }
         let work = serde_json::json!({ "instances": c.instances, "evaluations": c.evaluations });
         self.report.more.insert("work".into(), work);
+        if let (cells @ 1.., _) = self.trainer.cells() {
+            let windows = serde_json::json!({ "cells": cells, "windows": c.windows, "paged_bytes": c.paged_bytes });
+            self.report.more.insert("cells".into(), windows);
+        }
         self.report.more.insert("views_read_back".into(), self.trainer.views_read_back().into());
         if let Some(last) = summary.last.filter(|last| last.loss.is_finite()) {
             self.report.more.insert("loss".into(), f64::from(last.loss).into());
@@ -335,6 +339,7 @@ mod tests {
                 view_slots: None,
                 folder: None,
                 max_gaussians: Some(300),
+                scene_gaussians: None,
             },
             host_mib: None,
             camera_pixels: 32 * 24,

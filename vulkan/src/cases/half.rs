@@ -22,6 +22,7 @@ pub fn request(half_moments: bool) -> PlanRequest {
         views: 2,
         sh_degree: 3,
         max_gaussians: Some(512),
+        scene_gaussians: None,
         half_moments,
         ..Default::default()
     }

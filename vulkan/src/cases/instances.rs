@@ -71,6 +71,7 @@ fn loaded(gpu: &Gpu, c: &GaussianCloud, v: &View, instances: usize) -> Result<Tr
         views: 1,
         sh_degree: c.sh_degree,
         max_gaussians: None,
+        scene_gaussians: None,
         ..Default::default()
     };
     let mut t = Trainer::new(gpu, &Plan::with_capacities(&request, c.len(), instances), &plain())?;
@@ -240,6 +241,7 @@ pub fn a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient(gp
         views: 1,
         sh_degree: 0,
         max_gaussians: None,
+        scene_gaussians: None,
         ..Default::default()
     };
     let mut t = Trainer::new(gpu, &Plan::with_capacities(&request, 1, 1 << 17), &plain())?;

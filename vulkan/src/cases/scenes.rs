@@ -112,6 +112,7 @@ pub fn empty_trainer(
         views: 2,
         sh_degree,
         max_gaussians: Some(capacity),
+        scene_gaussians: None,
         ..Default::default()
     };
     Ok(Trainer::new(gpu, &Plan::new(&request)?, settings)?)

@@ -63,6 +63,7 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 /// An allocation of two equal sections and nothing else.
 fn two_buffers(bytes: u64) -> Plan {
     Plan {
+        scene: 0,
         gaussians: 0,
         instances: 0,
         pixels: 0,

@@ -62,6 +62,7 @@ mod tests {
             views: 1,
             sh_degree: 3,
             max_gaussians: Some(10_000),
+            scene_gaussians: None,
             ..Default::default()
         };
         let plan = Plan::new(&request).unwrap();

@@ -90,7 +90,11 @@ impl Trainer {
         } else {
             self.settings.steps
         };
-        let due = self.steps - self.density.last >= d.interval(expected);
+        let interval = d.interval(expected);
+        let due = match self.scene.is_paged() {
+            true => self.window_ends(),
+            false => self.steps - self.density.last >= interval,
+        };
         if self.strategy == Strategy::None || progress >= d.until || !due {
             if since_flush >= FLUSH_EVERY {
                 self.flush()?;
@@ -101,17 +105,18 @@ impl Trainer {
         self.flush()?;
         self.density.last_flush = self.steps;
         self.density.last = self.steps;
-        self.decay_opacities(progress);
+        let share = if self.scene.is_paged() { self.window_share(interval) } else { 1.0 };
+        self.decay_opacities(progress, share);
         self.drop_non_finite();
         match self.strategy {
             Strategy::Prune => self.prune(),
-            _ => self.relocate_and_grow(),
+            _ => self.relocate_and_grow(share)?,
         }
         Ok(())
     }
 
-    fn decay_opacities(&mut self, progress: f32) {
-        let amount = f64::from(self.settings.regularise.opacity_decay * (1.0 - progress));
+    fn decay_opacities(&mut self, progress: f32, share: f32) {
+        let amount = f64::from(self.settings.regularise.opacity_decay * (1.0 - progress) * share);
         if amount <= 0.0 {
             return;
         }
@@ -141,14 +146,22 @@ impl Trainer {
             self.gaussians -= 1;
             if index != self.gaussians {
                 self.parameters.shift(&mut self.arena, self.gaussians, index);
+                self.scene.place(self.gaussians, index);
             }
             self.counters.pruned += 1;
         }
+        self.scene.truncate(self.gaussians);
     }
 
-    fn relocate_and_grow(&mut self) {
+    /// Grows by `share` of what a densification may add.
+    fn relocate_and_grow(&mut self, share: f32) -> Result<(), TrainError> {
         let n = self.gaussians;
+        let grown = (n as f32 * self.settings.density.growth * share) as usize;
+        if self.plan.is_paged() && !self.scene.is_paged() && n + grown > self.plan.gaussians {
+            return self.enter_cells();
+        }
         let limit = f64::from(self.settings.density.dead_opacity);
+        let free = grown.min(self.plan.gaussians - n).min(self.plan.scene - self.gaussians());
         let s = &mut self.density;
         s.dead.clear();
         s.cumulative.clear();
@@ -165,10 +178,8 @@ impl Trainer {
         }
         // All dead: nothing worth copying; training or pruning must go on from what there is.
         if sum <= 0.0 {
-            return;
+            return Ok(());
         }
-        let grown = (n as f32 * self.settings.density.growth) as usize;
-        let free = grown.min(self.plan.gaussians - n);
         s.copies[..n].fill(0);
         let rng = self.sampler.rng();
         let (dead, room) = (s.dead.len(), s.dead.len() + free);
@@ -183,6 +194,7 @@ impl Trainer {
             s.moves.push([source as u32, to]);
         }
         self.apply_copies(n);
+        Ok(())
     }
 
     fn apply_copies(&mut self, n: usize) {
@@ -205,6 +217,7 @@ impl Trainer {
                 to
             };
             parameters.copy(&mut self.arena, from, to);
+            self.scene.place(from, to);
             self.displace(to);
         }
     }

@@ -37,6 +37,23 @@ pub enum TrainError {
     /// The file of the views that are not on the device.
     #[error("the file of the views that are not on the device: {0}")]
     ViewFile(String),
+    /// The file of the cells that are not on the device.
+    #[error("the file of the cells that are not on the device: {0}")]
+    SceneFile(String),
+    /// No picture shows anything of the scene.
+    #[error("no Gaussian is in view of any picture; check the poses and the initialisation")]
+    NothingInView,
+    /// Not even a small part of any picture can be drawn with what the device holds.
+    #[error(
+        "the least part of a picture shows {needed} Gaussians and the device holds {gaussians} at once; \
+         raise device_mib (or max_gaussians), or lower scene_gaussians"
+    )]
+    TooCrowded {
+        /// Gaussians that may show in it.
+        needed: usize,
+        /// Gaussians that the plan holds.
+        gaussians: usize,
+    },
     /// A picture, pose, lens or depth prior that cannot be used.
     #[error("picture '{name}' cannot be used: {why}")]
     BadView {
@@ -59,7 +76,7 @@ impl Error for TrainError {
     fn kind(&self) -> ErrorKind {
         match self {
             Self::Gpu(e) => e.kind(),
-            Self::ViewFile(_) => ErrorKind::Failed,
+            Self::ViewFile(_) | Self::SceneFile(_) => ErrorKind::Failed,
             _ => ErrorKind::Input,
         }
     }

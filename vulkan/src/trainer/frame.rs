@@ -33,6 +33,20 @@ impl Window {
     pub fn tiles(&self) -> u32 {
         self.columns * self.rows
     }
+
+    /// The window cut across its longer side; `None` of a single tile.
+    pub fn halves(&self) -> Option<[Self; 2]> {
+        let (columns, rows) = (self.columns / 2, self.rows / 2);
+        if self.tiles() <= 1 {
+            None
+        } else if self.columns > self.rows {
+            let right = Self { column: self.column + columns, columns: self.columns - columns, ..*self };
+            Some([Self { columns, ..*self }, right])
+        } else {
+            let below = Self { row: self.row + rows, rows: self.rows - rows, ..*self };
+            Some([Self { rows, ..*self }, below])
+        }
+    }
 }
 
 impl Frame {

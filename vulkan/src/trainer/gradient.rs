@@ -1,6 +1,7 @@
 //! Gradients for inspection: what a step would follow, for every parameter, the camera and the exposure. The gradient
 //! checks compare them with the CPU twins and with central differences.
 
+use super::scene::Blocks;
 use super::slots::Picture;
 use super::{TrainError, Trainer};
 use models::cloud::GaussianCloud;
@@ -33,10 +34,10 @@ impl Trainer {
         self.measure_extent();
         self.open_degrees();
         self.forget_all();
-        self.prepare_frame(Picture::View(index), 1.0);
+        let (_, first_pixel) = self.prepare_frame(Picture::View(index), Blocks::WHOLE, 1.0);
         (self.frame.background, self.frame.drop_share) = ([0.0; 3], 0.0);
         self.write_frame();
-        self.forward_count(Picture::View(index))?;
+        self.forward_count(Picture::View(index), first_pixel)?;
         self.gradients_only = true;
         let done = self.forward_backward();
         self.gradients_only = false;

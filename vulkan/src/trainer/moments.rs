@@ -7,7 +7,7 @@ use crate::arena::{Arena, Section};
 /// Where one of the two lies, and in how many bits.
 #[derive(Clone, Copy)]
 pub(crate) struct ShMoments {
-    section: Section,
+    pub section: Section,
     /// vec4 per Gaussian.
     columns: usize,
     half: bool,
@@ -18,7 +18,7 @@ impl ShMoments {
         Self { section, columns, half }
     }
 
-    fn bytes_each(&self) -> usize {
+    pub fn bytes_each(&self) -> usize {
         self.columns * if self.half { 8 } else { 16 }
     }
 

@@ -33,10 +33,18 @@ impl Geometry {
     }
 }
 
+/// Where a Gaussian is.
+pub(crate) enum Held<'a> {
+    /// Its place on the device.
+    OnDevice(usize),
+    /// Its record.
+    InFile(&'a [u8]),
+}
+
 /// What became of a cloud's Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LoadReport {
-    /// Gaussians now on the device.
+    /// Gaussians now trained.
     pub loaded: usize,
     /// Those with numbers that are not finite or a quaternion that cannot be normalised.
     pub dropped_non_finite: usize,
@@ -106,6 +114,35 @@ impl Parameters {
         }
     }
 
+    /// Columns of one Gaussian besides the geometry: where they lie in the arena, and how many bytes each is.
+    fn columns_of(&self, index: usize) -> [(Section, std::ops::Range<usize>); 3] {
+        let of = |section: Section, bytes: usize| (section, index * bytes..(index + 1) * bytes);
+        let moments = |m: ShMoments| of(m.section, m.bytes_each());
+        [of(self.sh, 16 * self.columns), moments(self.sh_first), moments(self.sh_second)]
+    }
+
+    /// Copies Gaussian `index` with its moments out of the arena, as a record of [`Plan::record_bytes`].
+    pub fn read_record(&self, arena: &Arena, index: usize, record: &mut [u8]) {
+        let (geometry, mut rest) = record.split_at_mut(size_of::<Geometry>());
+        geometry.copy_from_slice(bytemuck::bytes_of(&self.geometry(arena)[index]));
+        for (section, range) in self.columns_of(index) {
+            let (column, after) = rest.split_at_mut(range.len());
+            column.copy_from_slice(&arena.slice::<u8>(section)[range]);
+            rest = after;
+        }
+    }
+
+    /// Copies a record to place `index` of the arena.
+    pub fn write_record(&self, arena: &mut Arena, index: usize, record: &[u8]) {
+        let (geometry, mut rest) = record.split_at(size_of::<Geometry>());
+        self.geometry_mut(arena)[index] = bytemuck::pod_read_unaligned(geometry);
+        for (section, range) in self.columns_of(index) {
+            let (column, after) = rest.split_at(range.len());
+            arena.slice_mut::<u8>(section)[range].copy_from_slice(column);
+            rest = after;
+        }
+    }
+
     /// Forgets the moments of Gaussian `index`.
     pub fn forget(&self, arena: &mut Arena, index: usize) {
         self.geometry_mut(arena)[index].forget();
@@ -129,11 +166,11 @@ impl Trainer {
     /// important ones beyond the plan's capacity.
     ///
     /// # Errors
-    /// [`TrainError::Empty`] when nothing remains.
+    /// [`TrainError::Empty`] when nothing remains; [`TrainError::SceneFile`] where they are more than the device holds.
     pub fn load(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
         let mut keep: Vec<usize> = (0..cloud.len()).filter(|i| cloud.is_valid(*i)).collect();
         let mut report = LoadReport { dropped_non_finite: cloud.len() - keep.len(), ..LoadReport::default() };
-        let capacity = self.plan.gaussians;
+        let capacity = self.plan.scene;
         if keep.len() > capacity {
             report.dropped_over_capacity = keep.len() - capacity;
             let weight = |i: &usize| {
@@ -149,24 +186,20 @@ impl Trainer {
         if keep.is_empty() {
             return Err(TrainError::Empty { non_finite: report.dropped_non_finite });
         }
-        let parameters = self.parameters;
-        let stride = cloud.sh_stride();
         let coefficients = sh_coefficients(self.plan.sh_degree.min(cloud.sh_degree)) * 3;
-        for (to, &from) in keep.iter().enumerate() {
-            let coefficients = &cloud.sh[from * stride..from * stride + coefficients];
-            let geometry = &mut parameters.geometry_mut(&mut self.arena)[to];
-            geometry.mean = cloud.means[from];
-            geometry.opacity_logit = cloud.opacity_logits[from];
-            geometry.log_scale = cloud.log_scales[from];
-            geometry.state = state::state(state::degree_in_use(coefficients));
-            geometry.rotation = cloud.rotations[from];
-            let width = parameters.columns * 4;
-            let sh = &mut self.arena.slice_mut::<f32>(parameters.sh)[to * width..(to + 1) * width];
-            sh.fill(0.0);
-            sh[..coefficients.len()].copy_from_slice(coefficients);
-            parameters.forget(&mut self.arena, to);
+        let fill = |from: usize, record: &mut [u8]| record_of(cloud, from, coefficients, record);
+        if keep.len() > self.plan.gaussians {
+            self.scene.fill(&self.plan, &self.settings, cloud, &keep, fill)?;
+            self.gaussians = 0;
+        } else {
+            self.scene.close();
+            let mut record = vec![0; self.plan.record_bytes()];
+            for (to, &from) in keep.iter().enumerate() {
+                fill(from, &mut record);
+                self.parameters.write_record(&mut self.arena, to, &record);
+            }
+            self.gaussians = keep.len();
         }
-        self.gaussians = keep.len();
         self.restart();
         Ok(report)
     }
@@ -174,20 +207,51 @@ impl Trainer {
     /// Writes the present parameters to `cloud`, reusing its memory.
     ///
     /// # Errors
-    /// [`TrainError::Gpu`].
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
     pub fn snapshot(&mut self, cloud: &mut GaussianCloud) -> Result<(), TrainError> {
         self.flush()?;
         clear(cloud, self.plan.sh_degree);
-        let stride = cloud.sh_stride();
-        let parameters = self.parameters;
-        for g in &parameters.geometry(&self.arena)[..self.gaussians] {
-            cloud.means.push(g.mean);
-            cloud.opacity_logits.push(g.opacity_logit);
-            cloud.log_scales.push(g.log_scale);
-            cloud.rotations.push(g.rotation);
-        }
-        let sh = self.arena.slice::<f32>(parameters.sh).chunks_exact(parameters.columns * 4);
-        sh.take(self.gaussians).for_each(|sh| cloud.sh.extend_from_slice(&sh[..stride]));
-        Ok(())
+        let (parameters, arena, plan) = (self.parameters, &self.arena, &self.plan);
+        let mut record = std::mem::take(&mut self.record);
+        let done = self.scene.each_record(self.gaussians, |from| match from {
+            Held::OnDevice(index) => {
+                parameters.read_record(arena, index, &mut record);
+                push_record(cloud, plan, &record);
+            }
+            Held::InFile(record) => push_record(cloud, plan, record),
+        });
+        self.record = record;
+        done
     }
+}
+
+/// A record of Gaussian `from` with its first `coefficients` numbers of SH, without moments.
+fn record_of(cloud: &GaussianCloud, from: usize, coefficients: usize, record: &mut [u8]) {
+    let stride = cloud.sh_stride();
+    let coefficients = &cloud.sh[from * stride..from * stride + coefficients];
+    let geometry = Geometry {
+        mean: cloud.means[from],
+        opacity_logit: cloud.opacity_logits[from],
+        log_scale: cloud.log_scales[from],
+        state: state::state(state::degree_in_use(coefficients)),
+        rotation: cloud.rotations[from],
+        ..bytemuck::Zeroable::zeroed()
+    };
+    let (head, rest) = record.split_at_mut(size_of::<Geometry>());
+    head.copy_from_slice(bytemuck::bytes_of(&geometry));
+    let (sh, zero) = rest.split_at_mut(4 * coefficients.len());
+    sh.copy_from_slice(bytemuck::cast_slice(coefficients));
+    zero.fill(0);
+}
+
+/// Adds what a record holds to a cloud of the plan's degree.
+fn push_record(cloud: &mut GaussianCloud, plan: &Plan, record: &[u8]) {
+    let (geometry, rest) = record.split_at(size_of::<Geometry>());
+    let g: Geometry = bytemuck::pod_read_unaligned(geometry);
+    cloud.means.push(g.mean);
+    cloud.opacity_logits.push(g.opacity_logit);
+    cloud.log_scales.push(g.log_scale);
+    cloud.rotations.push(g.rotation);
+    let numbers = 3 * sh_coefficients(plan.sh_degree);
+    cloud.sh.extend(rest.chunks_exact(4).take(numbers).map(bytemuck::pod_read_unaligned::<f32>));
 }

@@ -74,12 +74,25 @@ impl Trainer {
         let mut row = 0;
         while row < whole.rows {
             let window = Window { row, rows: rows.min(whole.rows - row), ..whole };
-            self.frame.show(window);
-            self.write_frame();
-            self.render_window()?;
-            self.copy_out(into);
+            self.draw_window(window, into)?;
             row += window.rows;
         }
+        Ok(())
+    }
+
+    /// Draws a window whose cells the device holds at once, or one half of it after the other.
+    fn draw_window(&mut self, window: Window, into: &mut Rendering) -> Result<(), TrainError> {
+        self.frame.show(window);
+        if self.scene.is_paged()
+            && let Some(needed) = self.hold_region()?
+        {
+            let too_crowded = TrainError::TooCrowded { needed, gaussians: self.plan.gaussians };
+            return window.halves().ok_or(too_crowded)?.into_iter().try_for_each(|half| self.draw_window(half, into));
+        }
+        self.frame.gaussians = self.gaussians as u32;
+        self.write_frame();
+        self.render_window()?;
+        self.copy_out(into);
         Ok(())
     }
 
@@ -113,14 +126,17 @@ impl Trainer {
     }
 
     fn copy_out(&self, into: &mut Rendering) {
-        let ([_, y], [width, height]) = (self.frame.region_origin, self.frame.region);
-        let (first, pixels) = (y as usize * into.width as usize, width as usize * height as usize);
+        let ([x, y], [width, height]) = (self.frame.region_origin, self.frame.region.map(|side| side as usize));
+        let pixels = width * height;
         let image = &self.arena.slice::<[f32; 4]>(self.arena.section("image"))[..pixels];
         let left = &self.arena.slice::<f32>(self.arena.section("transmittance"))[..pixels];
-        for (i, p) in image.iter().enumerate() {
-            into.rgb[3 * (first + i)..3 * (first + i) + 3].copy_from_slice(&p[..3]);
-            into.depth[first + i] = p[3];
+        for (row, (image, left)) in image.chunks_exact(width).zip(left.chunks_exact(width)).enumerate() {
+            let first = (y as usize + row) * into.width as usize + x as usize;
+            for (i, p) in image.iter().enumerate() {
+                into.rgb[3 * (first + i)..3 * (first + i) + 3].copy_from_slice(&p[..3]);
+                into.depth[first + i] = p[3];
+            }
+            into.transmittance[first..first + width].copy_from_slice(left);
         }
-        into.transmittance[first..first + pixels].copy_from_slice(left);
     }
 }

@@ -28,7 +28,7 @@ pub struct StepReport {
     pub ssim: f32,
     /// Pearson's correlation with the depth prior, when the view has one that says something.
     pub depth_correlation: Option<f32>,
-    /// Gaussians on the device after the step.
+    /// Gaussians after the step, those that are not on the device included.
     pub gaussians: usize,
     /// Gaussians in view.
     pub visible: usize,
@@ -78,6 +78,10 @@ pub struct Counters {
     pub added: u64,
     /// Gaussians removed.
     pub pruned: u64,
+    /// Windows of cells that were trained.
+    pub windows: u64,
+    /// Bytes of cells written to their file and read from it.
+    pub paged_bytes: u64,
     /// Times a Gaussian's own SH degree was raised because the residual asked for it.
     pub sh_raised: u64,
     /// SH coefficients that were not there to be evaluated and stepped, summed over Gaussians and steps (as of the last

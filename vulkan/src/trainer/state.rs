@@ -4,6 +4,8 @@ use models::cloud::sh_coefficients;
 
 const DEGREE_SHIFT: u32 = 26;
 const ORDINARY: u32 = 1 << 29;
+/// Bits of the steps that the geometry was last moved in; those of SH lie above them.
+const STATE_STEPS: u32 = 0x1FFF;
 
 /// The state word, as the float it travels as, of a Gaussian of `degree` that was never stepped.
 pub(super) fn state(degree: u8) -> f32 {
@@ -16,6 +18,12 @@ pub(super) fn degree_of(state: f32) -> u8 {
 
 pub(super) fn with_degree(state: f32, degree: u8) -> f32 {
     f32::from_bits(state.to_bits() & !(3 << DEGREE_SHIFT) | u32::from(degree & 3) << DEGREE_SHIFT)
+}
+
+/// The state word of a Gaussian that missed nothing up to step `step`.
+pub(super) fn up_to(state: f32, step: u32) -> f32 {
+    let step = step & STATE_STEPS;
+    f32::from_bits(state.to_bits() & !(STATE_STEPS | STATE_STEPS << 13) | step | step << 13)
 }
 
 /// Degree of the highest coefficient (r, g, b each) that is not zero.
@@ -37,6 +45,9 @@ mod tests {
                 assert_eq!(degree_of(word), degree);
                 assert_eq!(degree_of(with_degree(word, 1)), 1);
                 assert_eq!(with_degree(word, 2).to_bits() & steps, steps);
+                let renewed = up_to(word, 0x2003);
+                assert_eq!((renewed.to_bits() & 0x03FF_FFFF, degree_of(renewed)), (3 | 3 << 13, degree));
+                assert!(renewed.is_normal());
             }
         }
     }

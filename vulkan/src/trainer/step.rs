@@ -2,6 +2,7 @@
 
 use super::bands::Counted;
 use super::frame::flags_of;
+use super::scene::Blocks;
 use super::slots::Picture;
 use super::{StepReport, TrainError, Trainer};
 use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
@@ -23,7 +24,7 @@ impl Trainer {
         if self.views.is_empty() {
             return Err(TrainError::NoViews);
         }
-        if self.gaussians == 0 {
+        if self.gaussians() == 0 {
             return Err(TrainError::Empty { non_finite: 0 });
         }
         let _step = tracing::trace_span!("step", step = self.steps + 1).entered();
@@ -33,12 +34,17 @@ impl Trainer {
             self.open_degrees();
         }
         let progress = self.progress();
-        let picture = self.choose(progress);
-        let divisor = self.prepare_frame(picture, progress);
+        let (picture, part) = if self.scene.is_paged() {
+            self.hold_window()?;
+            self.choose_part(progress)
+        } else {
+            (self.choose(progress), Blocks::WHOLE)
+        };
+        let (divisor, first_pixel) = self.prepare_frame(picture, part, progress);
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
         self.commands.weigh(super::timed_weight(self.steps, self.timed_every));
-        let counted = self.forward_count(picture)?;
+        let counted = self.forward_count(picture, first_pixel)?;
         self.read_ahead();
         self.forward_backward()?;
         self.commands.weigh(1.0);
@@ -52,13 +58,13 @@ impl Trainer {
         if !self.settings.skips.deferred_moments {
             self.flush()?;
         }
-        report.gaussians = self.gaussians;
+        report.gaussians = self.gaussians();
         report.settled = self.flushed;
         Ok(report)
     }
 
-    /// Fills the frame for a picture; returns the resolution divisor.
-    pub(super) fn prepare_frame(&mut self, picture: Picture, progress: f32) -> u32 {
+    /// Fills the frame for a part of a picture; returns the resolution divisor and where in the picture it begins.
+    pub(super) fn prepare_frame(&mut self, picture: Picture, part: Blocks, progress: f32) -> (u32, u32) {
         let s = &self.settings;
         let resident = &self.views[self.view_of(picture)];
         let (mut view, depth_at) = match picture {
@@ -73,6 +79,8 @@ impl Trainer {
         let d = divisor as f32;
         (lens.width, lens.height) = (width, height);
         (lens.fx, lens.fy, lens.cx, lens.cy) = (lens.fx / d, lens.fy / d, lens.cx / d, lens.cy / d);
+        let ((x, width), (y, height)) = (Blocks::pixels(part.x, width), Blocks::pixels(part.y, height));
+        (lens.cx, lens.cy, lens.width, lens.height) = (lens.cx - x as f32, lens.cy - y as f32, width, height);
         let f = &mut *self.frame;
         f.look(&view);
         let pixels = (width * height) as f32;
@@ -111,15 +119,16 @@ impl Trainer {
         (f.step, f.seed) = (t, (s.seed ^ (s.seed >> 32)) as u32);
         (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * pixels), s.loss.ssim / (3.0 * pixels));
         (f.source_width, f.depth_offset) = (source_width, depth_at);
-        divisor
+        (divisor, (y * source_width + x) * divisor)
     }
 
     /// First submission: picture, projection, sort, counts.
-    pub(super) fn forward_count(&mut self, picture: Picture) -> Result<Counted, TrainError> {
+    pub(super) fn forward_count(&mut self, picture: Picture, first_pixel: u32) -> Result<Counted, TrainError> {
         let _phase = tracing::trace_span!("project, sort, count").entered();
         let slot = self.resident(picture)?;
         let commands = self.take_recording()?;
-        commands.run_view(Kernel::Target, slot, self.frame.pixels());
+        let push = Push { first: first_pixel, ..Push::default() };
+        commands.run_view(Kernel::Target, slot, self.frame.pixels(), push);
         self.record_counting(&commands);
         commands.submit()?;
         self.cut_bands()
@@ -211,7 +220,7 @@ impl Trainer {
             l1,
             ssim,
             depth_correlation: correlation,
-            gaussians: self.gaussians,
+            gaussians: self.gaussians(),
             visible: counted.visible,
             instances: counted.instances,
             bands: self.bands.len(),

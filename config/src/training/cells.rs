@@ -1,0 +1,14 @@
+//! A scene of more Gaussians than the device holds is trained in windows of cells.
+
+use crate::settings::{Limits, table};
+
+table! {
+    /// Cells of ground, of which the device holds a window at a time with the views that see it.
+    #[derive(Copy)]
+    pub struct CellSettings {
+        /// Steps for which the same cells stay on the device.
+        pub steps: u32 = 16, in Limits::within(1.0, 65_536.0), unit "steps";
+        /// Cells that are made of what the device holds: more of them fit the views better, fewer cost less to keep.
+        pub per_window: u32 = 64, in Limits::within(4.0, 4096.0);
+    }
+}

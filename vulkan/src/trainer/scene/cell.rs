@@ -1,0 +1,236 @@
+//! Cells of ground: which one a Gaussian belongs to, and where in a picture a cell may show.
+
+use glam::{Vec2, Vec3};
+
+use crate::constants::{ALPHA_MIN, LOW_PASS};
+use crate::layout::{FLAG_ORTHOGRAPHIC, Frame};
+use crate::trainer::parameters::Geometry;
+
+/// Cells of the coarsest level are 2^12 times as wide as those of the finest.
+const MOST_LEVEL: u8 = 12;
+/// Most that a Gaussian reaches beyond its cell, in sides of it: what is added around every cell wherever it may show.
+const MOST_REACH: f32 = 0.25;
+/// Rounding of the bounds below: a hundredth of a pixel, as `project` adds, and as much again.
+const ROUNDING_PX: f32 = 0.02;
+
+/// A square of ground: side · 2^level metres wide, the x-th to the east and the y-th to the north.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct CellKey {
+    pub level: u8,
+    pub y: i32,
+    pub x: i32,
+}
+
+/// How far from its mean a Gaussian is blended at most, metres: where its alpha falls below [`ALPHA_MIN`], were it opaque.
+pub(crate) fn reach_of(g: &Geometry) -> f32 {
+    let widest = g.log_scale.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    // What `project` would clamp by depth, too, stays finite here.
+    standard_deviations() * widest.min(80.0).exp()
+}
+
+fn standard_deviations() -> f32 {
+    (-2.0 * ALPHA_MIN.ln()).sqrt()
+}
+
+/// The squares of a scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Grid {
+    /// Metres of a cell of level 0.
+    pub side: f32,
+}
+
+impl Grid {
+    /// The cell under a mean, of the finest level that is wide enough for the Gaussian's reach: what is large does not make its
+    /// neighbours show in pictures that do not see them.
+    pub fn key(&self, mean: [f32; 3], reach: f32) -> CellKey {
+        let level = (0..MOST_LEVEL).find(|l| reach <= MOST_REACH * self.side_at(*l)).unwrap_or(MOST_LEVEL);
+        // Casts saturate: what lies beyond 2³¹ cells shares the last.
+        let index = |v: f32| (v / self.side_at(level)).floor() as i32;
+        CellKey { level, y: index(mean[1]), x: index(mean[0]) }
+    }
+
+    fn side_at(&self, level: u8) -> f32 {
+        self.side * f32::from(1u16 << level)
+    }
+
+    /// Whether a Gaussian still counts to `key`: within half a cell around it and not twice as large as it should be, so that
+    /// those on the border stay where they are.
+    pub fn holds(&self, key: CellKey, mean: [f32; 3], reach: f32) -> bool {
+        let side = self.side_at(key.level);
+        let within = |v: f32, index: i32| {
+            let from = index as f32 * side;
+            v >= from - 0.5 * side && v < from + 1.5 * side
+        };
+        within(mean[0], key.x)
+            && within(mean[1], key.y)
+            && (reach <= 2.0 * MOST_REACH * side || key.level == MOST_LEVEL)
+    }
+}
+
+/// Box around the means of a cell's Gaussians, and how far the widest reaches beyond.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Bounds {
+    pub low: Vec3,
+    pub high: Vec3,
+    pub reach: f32,
+}
+
+impl Bounds {
+    pub const EMPTY: Self = Self { low: Vec3::INFINITY, high: Vec3::NEG_INFINITY, reach: 0.0 };
+
+    pub fn add(&mut self, g: &Geometry) {
+        let mean = Vec3::from(g.mean);
+        // What is not finite shows nowhere.
+        if !mean.is_finite() {
+            return;
+        }
+        (self.low, self.high) = (self.low.min(mean), self.high.max(mean));
+        self.reach = self.reach.max(reach_of(g));
+    }
+
+    pub fn centre(&self) -> Vec2 {
+        0.5 * (self.low + self.high).truncate()
+    }
+
+    /// The largest value of direction · p in the box.
+    fn most(&self, direction: Vec3) -> f32 {
+        (direction * self.low).max(direction * self.high).element_sum()
+    }
+}
+
+/// Blocks along each side of a picture: the grain in which parts of pictures are trained.
+pub(crate) const SIDE: u8 = 8;
+
+/// A rectangle of a picture's 8 × 8 blocks: [first, one past the last].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Blocks {
+    pub x: [u8; 2],
+    pub y: [u8; 2],
+}
+
+impl Blocks {
+    pub const WHOLE: Self = Self { x: [0, SIDE], y: [0, SIDE] };
+
+    pub fn count(&self) -> u32 {
+        u32::from(self.x[1] - self.x[0]) * u32::from(self.y[1] - self.y[0])
+    }
+
+    /// One bit per block, row by row.
+    pub fn mask(&self) -> u64 {
+        let row = ((1u64 << (self.x[1] - self.x[0])) - 1) << self.x[0];
+        (self.y[0]..self.y[1]).fold(0, |mask, y| mask | row << (SIDE * y))
+    }
+
+    /// First pixel and pixels of [first, last) blocks along a side of `pixels`.
+    pub fn pixels([first, last]: [u8; 2], pixels: u32) -> (u32, u32) {
+        let at = |block: u8| (u64::from(block) * u64::from(pixels) / u64::from(SIDE)) as u32;
+        (at(first), at(last) - at(first))
+    }
+}
+
+/// A camera as it decides which blocks of its picture a cell may show in: exact where it says no.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sight {
+    axes: [Vec3; 3],
+    shift: Vec3,
+    perspective: bool,
+    near: f32,
+    /// Boundaries between blocks: x/z and y/z, or metres where rays are parallel.
+    edges: [[f32; SIDE as usize + 1]; 2],
+    /// Factor of a cell's reach along x and y.
+    slant: [f32; 2],
+    /// What the low-pass adds around every Gaussian, in the unit of the edges.
+    blur: [f32; 2],
+}
+
+impl Sight {
+    /// Of the picture that `frame` looks at: its window of so many pixels from `origin` on.
+    pub fn new(frame: &Frame, origin: [u32; 2], size: [u32; 2]) -> Self {
+        let row = |i: usize| Vec3::from_slice(&frame.view_rows[i][..3]);
+        let perspective = !frame.has(FLAG_ORTHOGRAPHIC);
+        let edge = |axis: usize, block: usize| {
+            let pixel = origin[axis] as f32 + size[axis] as f32 * block as f32 / f32::from(SIDE);
+            (pixel - frame.principal_point[axis]) / frame.focal[axis]
+        };
+        let blur = standard_deviations() * LOW_PASS.sqrt() + ROUNDING_PX;
+        Self {
+            axes: [row(0), row(1), row(2)],
+            shift: Vec3::new(frame.view_rows[0][3], frame.view_rows[1][3], frame.view_rows[2][3]),
+            perspective,
+            near: frame.near,
+            edges: [0, 1].map(|axis| std::array::from_fn(|block| edge(axis, block))),
+            // |a| = f/z · |(1, -ratio) · axes| ≤ f/z · scale · √(1 + ratio²), with the ratio clamped (`projection.glsl`).
+            slant: [0, 1].map(|axis| {
+                let ratio = frame.max_ratio[axis].abs().max(frame.min_ratio[axis].abs());
+                if perspective { (1.0 + ratio * ratio).sqrt() } else { 1.0 }
+            }),
+            blur: [0, 1].map(|axis| blur / frame.focal[axis]),
+        }
+    }
+
+    /// The blocks in which Gaussians of a cell may show; `None` when none of them can.
+    pub fn blocks(&self, bounds: &Bounds) -> Option<Blocks> {
+        let [x, y] = [0, 1].map(|axis| self.along(axis, bounds));
+        let in_front = bounds.most(self.axes[2]) + self.shift.z >= self.near;
+        match (x, y) {
+            (Some(x), Some(y)) if in_front => Some(Blocks { x, y }),
+            _ => None,
+        }
+    }
+
+    /// First block and one past the last along an axis.
+    fn along(&self, axis: usize, bounds: &Bounds) -> Option<[u8; 2]> {
+        let reach = bounds.reach * self.slant[axis];
+        let edges = &self.edges[axis];
+        // Of the planes through the camera and a boundary, on which sides something of the cell lies.
+        let beyond = |side: f32, edge: f32| {
+            let (per_depth, constant) = if self.perspective {
+                (self.blur[axis] - side * edge, 0.0)
+            } else {
+                (0.0, self.blur[axis] - side * edge)
+            };
+            let direction = side * self.axes[axis] + per_depth * self.axes[2];
+            let shift = side * self.shift[axis] + per_depth * self.shift.z;
+            // Sums of large numbers lose bits: a millionth of them is given away.
+            let lost = 1e-6 * (shift.abs() + bounds.low.abs().max(bounds.high.abs()).max_element() + reach);
+            bounds.most(direction) + shift + constant + reach + lost > 0.0
+        };
+        if !beyond(-1.0, edges[usize::from(SIDE)]) || !beyond(1.0, edges[0]) {
+            return None;
+        }
+        let first = (0..SIDE).find(|b| beyond(-1.0, edges[usize::from(*b) + 1]))?;
+        let last = (0..SIDE).rev().find(|b| beyond(1.0, edges[usize::from(*b)]))?;
+        (first <= last).then_some([first, last + 1])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gaussian(mean: [f32; 3], log_scale: f32) -> Geometry {
+        let mut g: Geometry = bytemuck::Zeroable::zeroed();
+        (g.mean, g.log_scale) = (mean, [log_scale, log_scale - 1.0, -9.0]);
+        g
+    }
+
+    #[test]
+    fn a_gaussian_belongs_to_the_cell_under_it_and_a_large_one_to_a_coarser_cell() {
+        let grid = Grid { side: 10.0 };
+        let of = |mean: [f32; 3], log_scale| grid.key(mean, reach_of(&gaussian(mean, log_scale)));
+        assert_eq!(of([-0.1, 25.0, 3.0], -1.0), CellKey { level: 0, y: 2, x: -1 });
+        assert_eq!(of([-0.1, 25.0, 3.0], 1.0), CellKey { level: 2, y: 0, x: -1 });
+        assert_eq!(of([5e9, 0.0, 0.0], 40.0).level, MOST_LEVEL);
+        let home = CellKey { level: 0, y: 2, x: -1 };
+        assert!(grid.holds(home, [4.9, 15.1, 0.0], 5.0) && !grid.holds(home, [5.1, 25.0, 0.0], 1.0));
+        assert!(!grid.holds(home, [f32::NAN, 25.0, 0.0], 1.0) && !grid.holds(home, [0.0, 25.0, 0.0], 5.1));
+    }
+
+    #[test]
+    fn a_rectangle_of_blocks_has_its_bits_and_its_pixels() {
+        let part = Blocks { x: [1, 3], y: [0, 2] };
+        assert_eq!((part.count(), part.mask()), (4, 0x0606));
+        assert_eq!(Blocks::WHOLE.mask(), u64::MAX);
+        assert_eq!([Blocks::pixels([0, 8], 101), Blocks::pixels([3, 5], 101)], [(0, 101), (37, 26)]);
+    }
+}

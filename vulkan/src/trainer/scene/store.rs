@@ -1,0 +1,206 @@
+//! The file of the cells that are not on the device: blocks of records, each a Gaussian with its moments as the arena holds it.
+//! It lives as long as the job: what survives a job is its model.
+
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+
+use config::plan::{BLOCK_GAUSSIANS, Plan};
+
+use crate::trainer::TrainError;
+
+/// No block.
+const NONE: u32 = u32::MAX;
+
+/// The blocks of one cell.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Chain {
+    first: u32,
+    last: u32,
+    /// Gaussians.
+    pub count: u32,
+}
+
+impl Chain {
+    pub const EMPTY: Self = Self { first: NONE, last: NONE, count: 0 };
+}
+
+/// Blocks in a file, and a buffer of one.
+pub(crate) struct Store {
+    file: Option<File>,
+    record: usize,
+    /// The block behind each block.
+    next: Vec<u32>,
+    free: u32,
+    buffer: Vec<u8>,
+    /// Bytes read and written since it was cleared.
+    pub moved: u64,
+}
+
+impl Store {
+    pub fn new(plan: &Plan) -> Self {
+        let mut store = Self {
+            file: None,
+            record: plan.record_bytes(),
+            next: vec![NONE; plan.scene_blocks()],
+            free: NONE,
+            buffer: vec![0; if plan.is_paged() { BLOCK_GAUSSIANS * plan.record_bytes() } else { 0 }],
+            moved: 0,
+        };
+        store.clear();
+        store
+    }
+
+    pub fn keep_in(&mut self, file: File) {
+        self.file = Some(file);
+    }
+
+    /// All blocks are free.
+    pub fn clear(&mut self) {
+        let blocks = self.next.len() as u32;
+        self.next.iter_mut().zip(1..).for_each(|(next, after)| *next = if after < blocks { after } else { NONE });
+        (self.free, self.moved) = (if blocks > 0 { 0 } else { NONE }, 0);
+    }
+
+    /// Gives the cell's blocks back; it is empty then.
+    pub fn forget(&mut self, chain: &mut Chain) {
+        if chain.last != NONE {
+            self.next[chain.last as usize] = self.free;
+            self.free = chain.first;
+        }
+        *chain = Chain::EMPTY;
+    }
+
+    /// Puts records behind those of the cell; `fill(i, record)` writes the i-th of `count`.
+    ///
+    /// # Errors
+    /// [`TrainError::SceneFile`]: no file, no block left, or the disk.
+    pub fn append(
+        &mut self,
+        chain: &mut Chain,
+        count: usize,
+        mut fill: impl FnMut(usize, &mut [u8]),
+    ) -> Result<(), TrainError> {
+        let mut done = 0;
+        while done < count {
+            let within = chain.count as usize % BLOCK_GAUSSIANS;
+            if within == 0 {
+                self.add_block(chain)?;
+            }
+            let records = (BLOCK_GAUSSIANS - within).min(count - done);
+            let bytes = &mut self.buffer[..records * self.record];
+            bytes.chunks_exact_mut(self.record).enumerate().for_each(|(i, record)| fill(done + i, record));
+            let at = self.offset(chain.last, within);
+            let bytes = &self.buffer[..records * self.record];
+            let file = self.file.as_ref().ok_or_else(no_file)?;
+            file.write_all_at(bytes, at).map_err(|e| failed("writing", &e))?;
+            self.moved += bytes.len() as u64;
+            chain.count += records as u32;
+            done += records;
+        }
+        Ok(())
+    }
+
+    fn add_block(&mut self, chain: &mut Chain) -> Result<(), TrainError> {
+        let block = self.free;
+        if block == NONE {
+            return Err(TrainError::SceneFile("it has no block left".into()));
+        }
+        self.free = std::mem::replace(&mut self.next[block as usize], NONE);
+        match chain.last {
+            NONE => chain.first = block,
+            last => self.next[last as usize] = block,
+        }
+        chain.last = block;
+        Ok(())
+    }
+
+    /// The cell's records in order.
+    ///
+    /// # Errors
+    /// [`TrainError::SceneFile`].
+    pub fn read(&mut self, chain: &Chain, mut take: impl FnMut(usize, &[u8])) -> Result<(), TrainError> {
+        let (mut block, mut done, count) = (chain.first, 0, chain.count as usize);
+        while done < count && block != NONE {
+            let records = BLOCK_GAUSSIANS.min(count - done);
+            let at = self.offset(block, 0);
+            let bytes = &mut self.buffer[..records * self.record];
+            let file = self.file.as_ref().ok_or_else(no_file)?;
+            file.read_exact_at(bytes, at).map_err(|e| failed("reading", &e))?;
+            self.moved += bytes.len() as u64;
+            bytes.chunks_exact(self.record).enumerate().for_each(|(i, record)| take(done + i, record));
+            done += records;
+            block = self.next[block as usize];
+        }
+        Ok(())
+    }
+
+    fn offset(&self, block: u32, record: usize) -> u64 {
+        (block as u64 * BLOCK_GAUSSIANS as u64 + record as u64) * self.record as u64
+    }
+}
+
+fn no_file() -> TrainError {
+    TrainError::SceneFile("none was given; call Trainer::keep_scene_in".into())
+}
+
+fn failed(what: &str, e: &std::io::Error) -> TrainError {
+    TrainError::SceneFile(format!("{what} it: {e}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use config::plan::PlanRequest;
+
+    use super::*;
+
+    fn store() -> Store {
+        let request = PlanRequest { max_gaussians: Some(256), scene_gaussians: Some(1000), ..PlanRequest::default() };
+        let mut store = Store::new(&Plan::new(&request).unwrap());
+        store.keep_in(tempfile::tempfile().unwrap());
+        store
+    }
+
+    fn read(store: &mut Store, chain: &Chain) -> Vec<u8> {
+        let mut all = Vec::new();
+        store.read(chain, |_, record| all.push(record[0])).unwrap();
+        all
+    }
+
+    #[test]
+    fn cells_come_back_as_they_were_written_however_their_blocks_lie() {
+        let mut store = store();
+        let (mut a, mut b) = (Chain::EMPTY, Chain::EMPTY);
+        for round in 0..3u8 {
+            store.append(&mut a, 50, |i, r| r.fill(round * 50 + i as u8)).unwrap();
+            store.append(&mut b, 1, |_, r| r.fill(200 + round)).unwrap();
+        }
+        assert_eq!(read(&mut store, &a), (0..150).collect::<Vec<u8>>());
+        assert_eq!(read(&mut store, &b), [200, 201, 202]);
+        store.forget(&mut a);
+        assert_eq!((a.count, read(&mut store, &a)), (0, vec![]));
+        store.append(&mut a, 100, |i, r| r.fill(i as u8)).unwrap();
+        assert_eq!((read(&mut store, &a), read(&mut store, &b)), ((0..100).collect(), vec![200, 201, 202]));
+    }
+
+    #[test]
+    fn every_block_is_used_before_the_file_is_full_and_all_come_back() {
+        let mut store = store();
+        for _ in 0..2 {
+            let mut chains = vec![Chain::EMPTY; store.next.len()];
+            chains.iter_mut().for_each(|c| store.append(c, 64, |_, r| r.fill(1)).unwrap());
+            let error = store.append(&mut { Chain::EMPTY }, 1, |_, _| {}).unwrap_err();
+            assert!(error.to_string().contains("no block left"), "{error}");
+            chains.iter_mut().for_each(|c| store.forget(c));
+        }
+        store.clear();
+        assert!(store.append(&mut { Chain::EMPTY }, 64 * store.next.len(), |_, _| {}).is_ok());
+    }
+
+    #[test]
+    fn without_a_file_the_error_says_what_to_call() {
+        let request = PlanRequest { max_gaussians: Some(256), scene_gaussians: Some(1000), ..PlanRequest::default() };
+        let mut store = Store::new(&Plan::new(&request).unwrap());
+        let error = store.append(&mut { Chain::EMPTY }, 1, |_, _| {}).unwrap_err();
+        assert!(error.to_string().contains("keep_scene_in"), "{error}");
+    }
+}
