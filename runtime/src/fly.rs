@@ -12,6 +12,7 @@ use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
 use config::plan::SORT_LANES_GPU;
 use config::upload::Encoding;
+use hal::mavlink_camera::Activity;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
 use models::formats::delivery::ENCODED_BYTES;
@@ -128,6 +129,7 @@ pub fn fly(
         },
         intrinsics,
         keyframes: mission.keyframes,
+        training_seconds: mission.training.seconds,
         coverage: mission.coverage,
         region: mission.region(aircraft),
         earlier: store.poses(),
@@ -141,7 +143,7 @@ pub fn fly(
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
     supervisor.ready();
     supervisor.status(&format!("listening on {}", aircraft.link));
-    options.watch.craft(0, |craft| craft.state = "listening");
+    options.watch.craft(0, |craft| craft.state = Activity::Listening.name());
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };
     let health = Health::new(mission.failsafe, mission.memory.host_mib, &options.out);
     let failsafe = Failsafe::new(health, &mission.failsafe);

@@ -9,15 +9,12 @@ use std::time::Duration;
 
 use config::coverage::CoverageSettings;
 use config::mission::KeyframeSettings;
-use glam::DVec2;
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::error::HalError;
-use hal::mavlink::dialect::MavSeverity;
 use hal::traits::{Camera, Clock, Link};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
-use models::coverage::{CoverageMap, Region};
 use models::picture;
 
 use super::geotags::Geotags;
@@ -28,6 +25,9 @@ use crate::coverage::Coverage;
 use crate::error::JobError;
 use crate::keyframe_store::KeyFrame;
 use crate::watch::Watch;
+
+mod ground;
+mod station;
 
 /// After the aircraft has landed, pictures that nobody announced may still be on their way from the camera for this long.
 const LATE_PICTURES_NS: u64 = 2_000_000_000;
@@ -87,6 +87,8 @@ pub struct FlightPlan {
     pub intrinsics: Intrinsics,
     /// The key-frame rule.
     pub keyframes: KeyframeSettings,
+    /// Longest training, seconds; what the ground station is shown and may change.
+    pub training_seconds: Option<f64>,
     /// When ground is covered.
     pub coverage: CoverageSettings,
     /// Which ground is to be: corners, metres east and north.
@@ -138,6 +140,8 @@ pub(super) struct Intake<L: Link, C, K> {
     names: HashSet<String>,
     counters: FlightCounters,
     shown: ShownCapture,
+    /// When the ground station was last shown how things stand.
+    stationed_ns: Option<u64>,
 }
 
 impl<L, C, K> Intake<L, C, K>
@@ -165,6 +169,7 @@ where
             heard_ns: None,
             counters: FlightCounters::default(),
             shown,
+            stationed_ns: None,
         }
     }
 
@@ -174,6 +179,7 @@ where
     /// A link or camera that will not come back.
     pub(super) fn turn(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         let stop = self.end.stop_asked();
+        self.show_station();
         match self.phase {
             Phase::Flying => {
                 if stop {
@@ -222,42 +228,6 @@ where
         self.counters
     }
 
-    /// Begins a map of the ground once its height is known: with the first picture the autopilot has said where home is.
-    fn look_at_ground(&mut self) {
-        if self.selector.has_ground() {
-            return;
-        }
-        let corners = self.plan.region.iter().map(|c| DVec2::from(*c)).collect();
-        let height_m = self.plan.coverage.ground_m.map(f64::from).or(self.vehicle.home_m()).unwrap_or(0.0);
-        match Region::new(corners).and_then(|region| CoverageMap::new(&region, height_m, self.plan.coverage)) {
-            Ok(map) => self.selector.over(map, self.plan.intrinsics),
-            Err(e) => tracing::debug!("no map of the ground: {e}"),
-        }
-    }
-
-    /// What the key frames cover, and how to get the rest.
-    fn survey(&mut self) -> Option<Coverage> {
-        let (map, flown) = self.selector.ground()?;
-        let home_m = self.vehicle.home_m().unwrap_or(map.base_m());
-        let found = Coverage::of(map.clone(), Some(self.plan.vehicle.origin));
-        Some(found.with_reflight(&flown, self.plan.keyframes.t_min_m.into(), home_m))
-    }
-
-    /// Says it to the ground control station: whoever has to fly again is still there.
-    fn tell_coverage(&mut self) {
-        self.counters.coverage = self.survey();
-        if let Some(coverage) = &self.counters.coverage {
-            self.shown.coverage(coverage);
-            let line = coverage.line();
-            tracing::info!("{line}");
-            let severity = match coverage.gaps.is_empty() {
-                true => MavSeverity::MAV_SEVERITY_INFO,
-                false => MavSeverity::MAV_SEVERITY_NOTICE,
-            };
-            self.vehicle.status_text(severity, &line);
-        }
-    }
-
     fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         while let Ok((severity, text)) = self.end.words.try_recv() {
             self.vehicle.status_text(severity, &text);
@@ -303,6 +273,7 @@ where
                 }
                 Event::LinkBack => tracing::info!("link to the autopilot is back"),
                 Event::Pose(report) => self.shown.at = Some(report.position.to_array()),
+                Event::Asked { parameter, value } => self.set(parameter, value),
                 Event::Trigger(_) => {}
             }
         }

@@ -131,6 +131,8 @@ impl Reconstruct for Ledger {
         Ok(true)
     }
 
+    fn set_seconds(&mut self, _seconds: Option<f64>) {}
+
     fn is_done(&self, budget: &RunBudget) -> bool {
         budget.steps.is_some_and(|s| self.steps >= s)
     }
@@ -245,6 +247,7 @@ pub(super) fn rehearse_on(
         vehicle: script.vehicle.clone(),
         intrinsics: intrinsics(&script.vehicle.lens),
         keyframes: KeyframeSettings::default(),
+        training_seconds: None,
         coverage: CoverageSettings::default(),
         region: script.ground.clone(),
         earlier: store.poses(),
