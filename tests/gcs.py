@@ -1,4 +1,5 @@
 """A ground station beside a simulated aircraft and its onboard job: see gcs.sh."""
+import json
 import os
 import shutil
 import signal
@@ -19,9 +20,9 @@ name = "gcs"
 seed = 3
 origin = { lat_deg = 46.0, lon_deg = 7.0, alt_m = 500.0 }
 camera = { width = 128, height = 96, fx = 100.0, fy = 100.0, cx = 64.0, cy = 48.0, exposure_delay_ms = 60.0 }
-keyframes = { t_min_m = 6.0, max = 24 }
+keyframes = { t_min_m = 500.0, r_max_deg = 180.0, max = 24 }
 memory = { device_mib = 96, host_mib = 1024, max_gaussians = 4000 }
-training = { seconds = 60.0 }
+training = { seconds = 600.0 }
 upload = { folder = "upload" }
 [[aircraft]]
 id = "one"
@@ -166,11 +167,11 @@ def main(program, out):
     environment = dict(os.environ, DGTR_KERNELS="default")
     log = open(os.path.join(out, "fly.log"), "w")
     sim = subprocess.Popen(
-        [program, "sim", "--mission", "mission.toml", "--link", "udpout:127.0.0.1:%d" % PORTS[0], "--linger", "0"],
+        [program, "sim", "--mission", "mission.toml", "--link", "udpout:127.0.0.1:%d" % PORTS[0], "--speed", "3", "--linger", "6"],
         cwd=out, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )
     fly = subprocess.Popen(
-        [program, "fly", "--mission", "mission.toml", "--out", "out", "--silence", "8"],
+        [program, "fly", "--mission", "mission.toml", "--out", "out", "--silence", "4"],
         cwd=out, env=environment, stdout=log, stderr=log,
     )
     try:
@@ -179,7 +180,7 @@ def main(program, out):
         station.mav.param_ext_request_list_send(1, 100)
         station.until("all parameters", lambda: set(station.values) >= set(rows), 10.0)
         assert set(station.values) == set(rows), station.values
-        assert (station.values["KF_DISTANCE"], station.values["TRAIN_SECONDS"]) == (6.0, 60.0), station.values
+        assert (station.values["KF_DISTANCE"], station.values["TRAIN_SECONDS"]) == (500.0, 600.0), station.values
         assert station.set("KF_DISTANCE", 4.5) == (ACCEPTED, 4.5)
         assert station.set("KF_DISTANCE", 4.5) == (ACCEPTED, 4.5), "repeated"
         assert station.set("TRAIN_SECONDS", 2.0) == (ACCEPTED, 2.0)
@@ -194,7 +195,7 @@ def main(program, out):
         station.until("Gaussians", lambda: station.values["GAUSSIANS"] > 100)
         station.until("covered ground", lambda: station.values["COVERED"] > 0)
         assert max(station.counts.values()) < 60, "told more often than anybody reads: %r" % station.counts
-        # The region is 40 m wide: at 4.5 m it takes more key frames than at 6 m, which `covered` pictures would be.
+        assert (station.values["KF_DISTANCE"], station.values["TRAIN_SECONDS"]) == (4.5, 2.0), "others are told, too"
         print("in flight: %s" % ", ".join("%s %g" % item for item in sorted(station.values.items())))
         end = time.time() + 120
         while fly.poll() is None:
@@ -211,6 +212,10 @@ def main(program, out):
     assert fly.returncode == 0, said
     for words in ("set KF_DISTANCE to 4.5", "set TRAIN_SECONDS to 2"):
         assert words in said, said
+    # By the mission alone there would be one key frame, and ten minutes of training.
+    with open(os.path.join(out, "out", "run.json")) as file:
+        run = json.load(file)
+    assert run["views"] >= 3 and run["stage_ms"]["train"] < 20e3, run
     print("passed")
 
 

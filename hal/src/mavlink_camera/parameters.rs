@@ -249,16 +249,14 @@ impl Parameters {
 
     /// The runtime has obeyed (`Some` with what it now is), or cannot.
     pub(super) fn answer(&mut self, id: ParameterId, obeyed: Option<f32>) -> PARAM_EXT_ACK_DATA {
+        // For the other ground stations; and, of what was refused, for those that leave what was typed on the screen.
+        self.due[id as usize] = true;
         match obeyed {
             Some(value) => {
                 self.bits[id as usize] = value.to_bits();
                 self.ack(id, ParamAck::PARAM_ACK_ACCEPTED)
             }
-            None => {
-                // For those that leave what was typed on the screen.
-                self.due[id as usize] = true;
-                self.ack(id, ParamAck::PARAM_ACK_FAILED)
-            }
+            None => self.ack(id, ParamAck::PARAM_ACK_FAILED),
         }
     }
 

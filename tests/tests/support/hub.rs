@@ -2,7 +2,7 @@
 //! frames are handed on, and requests for message rates are answered as ArduPilot answers them.
 
 use std::collections::HashSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -57,7 +57,7 @@ impl Drop for Hub {
     }
 }
 
-fn serve(vehicle: &PathBuf, mut ports: Vec<PtyLink>, heard: &Mutex<Heard>, over: &AtomicBool) {
+fn serve(vehicle: &Path, mut ports: Vec<PtyLink>, heard: &Mutex<Heard>, over: &AtomicBool) {
     let mut far: Option<(SerialLink, Framer)> = None;
     let mut framers: Vec<Framer> = ports.iter().map(|_| Framer::new()).collect();
     let mut encoder = Encoder::new(1, 1);
