@@ -1,4 +1,5 @@
 """A ground station beside a simulated aircraft and its onboard job: see gcs.sh."""
+import base64
 import json
 import os
 import shutil
@@ -10,6 +11,8 @@ import time
 import xml.etree.ElementTree as xml
 
 os.environ["MAVLINK20"] = "1"
+import jsonschema  # noqa: E402
+from mcap.reader import make_reader  # noqa: E402
 from pymavlink import mavftp, mavutil  # noqa: E402
 
 PORTS = (18570, 18571)  # the vehicle's side of a UDP hub, and the job's
@@ -158,6 +161,35 @@ def definition(station, folder):
     return rows, len(text), version
 
 
+def recorded(path, run):
+    """What Foxglove's own reader finds in the recording: every message as its schema says, as many as there were."""
+    counts, texts, states, pictures, times = {}, [], [], 0, []
+    with open(path, "rb") as file:
+        reader = make_reader(file)
+        assert reader.get_summary().statistics.message_count > 0, "no summary"
+        for schema, channel, message in reader.iter_messages():
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json"), channel
+            content = json.loads(message.data)
+            jsonschema.validate(content, json.loads(schema.data))
+            assert set(content) == set(json.loads(schema.data)["properties"]), (schema.name, content)
+            stamp = content["timestamp"]
+            assert stamp["sec"] * 10**9 + stamp["nsec"] == message.log_time
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+            times.append(message.log_time)
+            if channel.topic == "/keyframe/image":
+                pictures += base64.b64decode(content["data"])[:2] in (b"\xff\xd8", b"\x89P")
+            elif channel.topic == "/log":
+                texts.append(content["message"])
+            elif channel.topic == "/state":
+                states.append(content)
+    assert abs(max(times) * 1e-9 - time.time()) < 600, "Unix time"
+    assert counts["/aircraft/pose"] == counts["/aircraft/fix"] > 50, counts
+    assert counts["/exposure"] == run["hal"]["triggers"], (counts, run["hal"])
+    assert counts["/keyframe/pose"] == counts["/keyframe/image"] == pictures == run["views"], (counts, run["views"])
+    assert any("covered" in text for text in texts) and any(s["gaussians"] > 0 for s in states), (texts, states[-1:])
+    print("flight.mcap: %d bytes, %s" % (os.path.getsize(path), ", ".join("%s %d" % c for c in sorted(counts.items()))))
+
+
 def main(program, out):
     shutil.rmtree(out, ignore_errors=True)
     os.makedirs(os.path.join(out, "camera"))
@@ -171,7 +203,7 @@ def main(program, out):
         cwd=out, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )
     fly = subprocess.Popen(
-        [program, "fly", "--mission", "mission.toml", "--out", "out", "--silence", "4"],
+        [program, "fly", "--mission", "mission.toml", "--out", "out", "--silence", "4", "--record", "flight.mcap"],
         cwd=out, env=environment, stdout=log, stderr=log,
     )
     try:
@@ -216,6 +248,7 @@ def main(program, out):
     with open(os.path.join(out, "out", "run.json")) as file:
         run = json.load(file)
     assert run["views"] >= 3 and run["stage_ms"]["train"] < 20e3, run
+    recorded(os.path.join(out, "flight.mcap"), run)
     print("passed")
 
 

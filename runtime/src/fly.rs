@@ -24,6 +24,7 @@ mod geotags;
 mod handover;
 mod intake;
 mod job;
+mod record;
 mod shortage;
 mod show;
 
@@ -48,6 +49,7 @@ mod rehearsal;
 
 pub use handover::Handover;
 pub use intake::{EndOfFlight, Ended, FlightCounters};
+pub use record::{RecordError, Recorder, Recording};
 
 use crate::engine::device::{DeviceRequest, training_lens};
 use crate::engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path, scratch_bytes};
@@ -78,6 +80,8 @@ pub struct FlyOptions {
     pub end: EndOfFlight,
     /// The live page; this is its aircraft 0.
     pub watch: Watch,
+    /// Takes what happens in the flight.
+    pub recorder: Recorder,
 }
 
 /// How the job ended.
@@ -138,6 +142,7 @@ pub fn fly(
         geotags: Geotags::open(&disk, &options.out, mission.origin)
             .map_err(JobError::io(&options.out.join(geotags::FILE)))?,
         watch: options.watch.clone(),
+        recorder: options.recorder.clone(),
     })?;
     flight.handover().keep_in(store, model_path(&options.out));
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);

@@ -32,6 +32,8 @@ pub(super) struct Told {
     pub(super) gaussians: u32,
     /// Share of the schedule that is over, 0…1.
     pub(super) progress: f32,
+    /// Loss of the newest step.
+    pub(super) loss: f32,
     /// Nothing is trained any more in this flight.
     pub(super) training_over: bool,
 }

@@ -19,6 +19,7 @@ use models::picture;
 
 use super::geotags::Geotags;
 use super::handover::CaptureEnd;
+use super::record::{Entry, Recorder};
 use super::show::ShownCapture;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::coverage::Coverage;
@@ -103,6 +104,8 @@ pub struct FlightPlan {
     pub geotags: Geotags,
     /// The live page; this is its aircraft 0.
     pub watch: Watch,
+    /// Takes what happens.
+    pub recorder: Recorder,
 }
 
 /// A key frame that the job has not taken yet.
@@ -152,6 +155,7 @@ where
 {
     /// `clock` runs as the vehicle's own does.
     pub(super) fn new(mut plan: FlightPlan, vehicle: Vehicle<L, C, K>, clock: K, end: CaptureEnd) -> Self {
+        plan.recorder.set_clock(vehicle.now_ns());
         let mut selector = KeyframeSelector::new(plan.keyframes);
         plan.earlier.iter().for_each(|pose| selector.restore(*pose));
         let shown = ShownCapture::new(plan.watch.clone(), plan.intrinsics, &plan.earlier);
@@ -230,7 +234,7 @@ where
 
     fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         while let Ok((severity, text)) = self.end.words.try_recv() {
-            self.vehicle.status_text(severity, &text);
+            self.say(severity, text);
         }
         let alive = self.listen(wait)?;
         let now_ns = self.clock.now_ns();
@@ -272,9 +276,12 @@ where
                     tracing::warn!("link to the autopilot lost; waiting for it to come back");
                 }
                 Event::LinkBack => tracing::info!("link to the autopilot is back"),
-                Event::Pose(report) => self.shown.at = Some(report.position.to_array()),
+                Event::Pose(report) => {
+                    self.shown.at = Some(report.position.to_array());
+                    self.plan.recorder.note(report.time_ns, Entry::Pose(report));
+                }
                 Event::Asked { parameter, value } => self.set(parameter, value),
-                Event::Trigger(_) => {}
+                Event::Trigger(t) => self.plan.recorder.note(t.time_ns, Entry::Exposure(t.sequence)),
             }
         }
         let pictures = self.vehicle.pictures();
@@ -303,6 +310,7 @@ where
         self.plan.geotags.note(&frame, decision);
         if let Some(Ok(image)) = loaded {
             self.shown.key_frame(pose, &image, self.selector.map(), self.clock.now_ns());
+            self.plan.recorder.note_key_frame(frame.time_ns, pose, &image);
             self.end.count(true);
             let decoded = self.pending.iter().filter(|w| matches!(w, Waiting::Decoded(_))).count();
             let waiting = match decoded < DECODED_AHEAD {

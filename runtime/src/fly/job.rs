@@ -238,7 +238,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             last = Some(*report);
             supervisor.alive();
             shown.step(report);
-            capture.tell(|told| (told.gaussians, told.progress) = (count(report.gaussians), report.progress));
+            capture.tell(|told| {
+                (told.gaussians, told.progress, told.loss) = (count(report.gaussians), report.progress, report.loss);
+            });
             let now_ns = clock.now_ns();
             let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
             let alarmed = failsafe.glance(now_ns, capture.flags(), &budget, views);

@@ -30,6 +30,7 @@ use super::handover::handover;
 use super::intake::Intake;
 use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::job::Job;
+use super::record::Recorder;
 use crate::engine::{Reconstruct, model_path};
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
@@ -255,6 +256,7 @@ pub(super) fn rehearse_on(
         end: script.end,
         geotags: Geotags::open(disk, &out, script.vehicle.origin).expect("a file"),
         watch: watch.clone(),
+        recorder: Recorder::default(),
     };
     capture.keep_in(store, model_path(&out));
     let mut intake = Some(Intake::new(plan, vehicle, clock.clone(), end));

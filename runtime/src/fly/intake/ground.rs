@@ -48,7 +48,7 @@ where
                 true => MavSeverity::MAV_SEVERITY_INFO,
                 false => MavSeverity::MAV_SEVERITY_NOTICE,
             };
-            self.vehicle.status_text(severity, &line);
+            self.say(severity, line);
         }
     }
 }

@@ -6,11 +6,13 @@ use config::settings::SettingError;
 use config::training::TrainSettings;
 use hal::camera::Picture;
 use hal::error::HalError;
+use hal::mavlink::dialect::MavSeverity;
 use hal::mavlink_camera::ParameterId;
 use hal::traits::{Camera, Clock, Link};
 use models::coverage::CoverageMap;
 
 use super::{Intake, Phase};
+use crate::fly::record::{Entry, Seen};
 
 /// Between two looks at what the ground station is shown: it is told of changes, as often as it can read them.
 const SHOW_EVERY_NS: u64 = 1_000_000_000;
@@ -36,6 +38,12 @@ where
     C: Camera<Picture = Picture, Error = HalError>,
     K: Clock,
 {
+    /// Says a line to the ground station.
+    pub(super) fn say(&mut self, severity: MavSeverity, text: String) {
+        self.vehicle.status_text(severity, &text);
+        self.plan.recorder.note(self.vehicle.now_ns(), Entry::Words(severity, text));
+    }
+
     /// What the ground station asks for; it is told whether that was obeyed.
     pub(super) fn set(&mut self, parameter: ParameterId, value: f32) {
         let name = parameter.row().name;
@@ -102,6 +110,8 @@ where
         ] {
             self.vehicle.show_count(parameter, value);
         }
+        let seen = Seen { pictures: self.vehicle.pictures(), covered: self.shown.covered.unwrap_or(0) };
+        self.plan.recorder.note(self.vehicle.now_ns(), Entry::State(told, seen));
         self.vehicle.show_setting(ParameterId::KeyframeDistance, keyframes.t_min_m);
         self.vehicle.show_setting(ParameterId::KeyframeRotation, keyframes.r_max_deg);
         self.vehicle.show_setting(ParameterId::TrainingSeconds, self.plan.training_seconds.unwrap_or(0.0) as f32);
