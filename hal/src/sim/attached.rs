@@ -21,7 +21,6 @@ use super::photographer::{Photographer, PictureCounters, to_jpeg};
 use super::reference::Lens;
 use super::world::{PinholeView, World, WorldSettings};
 use crate::autopilot::{Autopilot, Ids};
-use crate::error::HalError;
 use crate::frames::{attitude_to_enu, attitude_to_ned, euler_to_ned, yaw_of_ned};
 use crate::link::{LinkAddress, Reconnecting};
 use crate::mavlink::MessageData;
@@ -189,11 +188,11 @@ impl Attached {
         while self.commands.next_reply(0, now_ns).is_some() {}
         self.autopilot.settle_own(now_ns);
         while let Some(answer) = self.autopilot.next_answer() {
-            self.channel.send(&answer)?;
+            self.say(&answer);
         }
         if now_ns >= self.next_beat_ns {
             self.next_beat_ns = now_ns + BEAT_NS;
-            self.beat(now_ns)?;
+            self.beat(now_ns);
         }
         while let Some(trigger) = self.autopilot.next_trigger() {
             self.report.triggers += 1;
@@ -233,30 +232,34 @@ impl Attached {
         }
     }
 
-    fn beat(&mut self, now_ns: u64) -> Result<(), HalError> {
-        self.channel.send(&HEARTBEAT_DATA {
+    /// Sends; a vehicle that is not there yet, or not any more, is waited for.
+    fn say<D: MessageData>(&mut self, message: &D) {
+        let _ = self.channel.send(message);
+    }
+
+    fn beat(&mut self, now_ns: u64) {
+        self.say(&HEARTBEAT_DATA {
             mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
             autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
             system_status: MavState::MAV_STATE_ACTIVE,
             mavlink_version: 3,
             ..HEARTBEAT_DATA::default()
-        })?;
+        });
         let request = self.autopilot.ask_time(now_ns);
-        self.channel.send(&request)?;
+        self.say(&request);
         if self.beats % ASK_EVERY_BEATS == 1 {
             for (id, every_us) in STREAMS {
-                self.channel.send(&COMMAND_LONG_DATA {
+                self.say(&COMMAND_LONG_DATA {
                     command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
                     target_system: self.settings.system_id,
                     target_component: 1,
                     param1: id as f32,
                     param2: every_us,
                     ..COMMAND_LONG_DATA::default()
-                })?;
+                });
             }
         }
         self.beats += 1;
-        Ok(())
     }
 
     /// Views of the exposures whose pose is known.

@@ -40,7 +40,7 @@ pub struct Args {
     /// runs beside it on a link of its own.
     #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["link", "reference", "card", "plan", "speed", "height",
         "forward_overlap", "side_overlap", "pitch", "triggers", "cross", "perfect", "linger"])]
-    autopilot: Option<LinkAddress>,
+    autopilot: Option<String>,
     /// Camera folder; the mission's when left out.
     #[arg(long, value_name = "DIR")]
     camera_dir: Option<PathBuf>,
@@ -125,7 +125,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             system_id: aircraft.system_id,
             prefix,
         };
-        return attach(&settings, autopilot, &camera_dir(args.camera_dir, &aircraft.camera)?);
+        return attach(&settings, &autopilot.parse()?, &camera_dir(args.camera_dir, &aircraft.camera)?);
     }
     let number = mission.aircraft.iter().position(|a| a.id == aircraft.id).unwrap_or(0) as u64;
     let plan = args.plan.as_deref().map(flight_plan::read).transpose()?;
