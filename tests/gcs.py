@@ -134,7 +134,11 @@ def definition(station, folder):
     uri, version = got[0].cam_definition_uri, got[0].cam_definition_version
     assert uri.startswith("mftp://") and version > 0, (uri, version)
     path = uri[len("mftp://") :]
-    ftp = mavftp.MAVFTP(station, 1, 100)
+    # Its own, but that it waits a third as long for whatever else might come after an answer.
+    defaults = dict(debug=0, pkt_loss_tx=0, pkt_loss_rx=0, max_backlog=5, burst_read_size=80, write_size=80, write_qsize=5)
+    times = dict(idle_detection_time=1.2, read_retry_time=1.0, retry_time=0.5)
+    every = [(k, int, v) for k, v in defaults.items()] + [(k, float, v) for k, v in times.items()]
+    ftp = mavftp.MAVFTP(station, 1, 100, settings=mavftp.MAVFTPSettings(every))
     ftp.temp_filename = os.path.join(folder, "temporary")
     os.chdir(folder)
     text = ftp.read("definition.xml", 1 << 20)
@@ -199,7 +203,7 @@ def main(program, out):
     environment = dict(os.environ, DGTR_KERNELS="default")
     log = open(os.path.join(out, "fly.log"), "w")
     sim = subprocess.Popen(
-        [program, "sim", "--mission", "mission.toml", "--link", "udpout:127.0.0.1:%d" % PORTS[0], "--speed", "3", "--linger", "6"],
+        [program, "sim", "--mission", "mission.toml", "--link", "udpout:127.0.0.1:%d" % PORTS[0], "--speed", "1.5", "--linger", "6"],
         cwd=out, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )
     fly = subprocess.Popen(
