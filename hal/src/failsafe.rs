@@ -24,7 +24,7 @@ pub enum Action {
 
 impl Action {
     /// A word for logs and STATUSTEXT.
-    pub fn name(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
             Self::Nominal => "nominal",
             Self::Warn => "warn",

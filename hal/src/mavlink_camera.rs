@@ -1,15 +1,29 @@
 //! Acting as a MAVLink camera, so that ArduPilot (CAM1_TYPE 6), PX4 and QGroundControl find one and drive it: heartbeat,
-//! information on request, capture commands answered at once, everything else refused politely. A state machine without
-//! I/O: frames in, replies out.
+//! information on request, capture commands answered at once, its definition file by MAVLink FTP and its parameters,
+//! everything else refused politely. A state machine without I/O: frames in, replies out.
+
+mod definition;
+mod ftp;
+mod parameters;
+mod talk;
+
+use core::cell::OnceCell;
 
 use heapless::Deque;
 
 use crate::mavlink::dialect::{
     CAMERA_CAPTURE_STATUS_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_INFORMATION_DATA, CAMERA_SETTINGS_DATA,
-    COMMAND_ACK_DATA, COMMAND_LONG_DATA, CameraCapFlags, CameraMode, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavResult,
-    MavState, MavType, STORAGE_INFORMATION_DATA, StorageStatus,
+    COMMAND_ACK_DATA, COMMAND_LONG_DATA, CameraCapFlags, CameraMode, FILE_TRANSFER_PROTOCOL_DATA, HEARTBEAT_DATA,
+    MavAutopilot, MavCmd, MavResult, MavState, MavType, PARAM_EXT_ACK_DATA, PARAM_EXT_REQUEST_LIST_DATA,
+    PARAM_EXT_REQUEST_READ_DATA, PARAM_EXT_SET_DATA, STORAGE_INFORMATION_DATA, StorageStatus,
 };
 use crate::mavlink::{Frame, MessageData};
+pub use parameters::{Activity, COUNT, Kind, Parameter, ParameterId, TABLE};
+pub use talk::{CameraInfo, Reply, Request};
+
+use definition::{Definition, MODEL, VENDOR};
+use ftp::FileServer;
+use parameters::{Asked, Parameters};
 
 /// Replies waiting to be sent.
 const REPLIES: usize = 16;
@@ -19,47 +33,19 @@ const REQUESTS: usize = 8;
 const LEAST_INTERVAL_S: f32 = 0.1;
 /// PX4 sends IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for the same exposure: one capture within this.
 const SAME_CAPTURE_NS: u64 = 200_000_000;
+/// Between two messages of a file or a list: 11 kB/s, what a line of 115,200 baud carries.
+const BULK_EVERY_NS: u64 = 25_000_000;
 
-/// What the camera says about itself.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct CameraInfo {
-    /// Picture width, pixels.
-    pub width: u32,
-    /// Picture height, pixels.
-    pub height: u32,
-}
-
-/// Something the camera was asked to do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request {
-    /// Take one picture now; the counter of this capture.
-    Capture(u32),
-}
-
-/// A message to send.
-#[derive(Clone, Debug)]
-pub enum Reply {
-    /// COMMAND_ACK
-    Ack(COMMAND_ACK_DATA),
-    /// CAMERA_INFORMATION
-    Information(CAMERA_INFORMATION_DATA),
-    /// CAMERA_SETTINGS
-    Settings(CAMERA_SETTINGS_DATA),
-    /// STORAGE_INFORMATION
-    Storage(STORAGE_INFORMATION_DATA),
-    /// CAMERA_CAPTURE_STATUS
-    Status(CAMERA_CAPTURE_STATUS_DATA),
-    /// CAMERA_IMAGE_CAPTURED
-    Captured(CAMERA_IMAGE_CAPTURED_DATA),
-}
+/// Where the definition file is: with this component, by MAVLink FTP.
+const URI: &str = "mftp:///definition.xml";
 
 /// What to send once the boot time is known.
 #[derive(Clone, Debug)]
-#[expect(clippy::large_enum_variant, reason = "no heap here; the queue is a few KiB")]
 enum Due {
     Ack(COMMAND_ACK_DATA),
     Message(u32),
     Captured(CAMERA_IMAGE_CAPTURED_DATA),
+    Set(PARAM_EXT_ACK_DATA),
 }
 
 /// A series of captures (an intervalometer set by IMAGE_START_CAPTURE).
@@ -76,13 +62,18 @@ pub struct MavlinkCamera {
     info: CameraInfo,
     component: u8,
     due: Deque<Due, REPLIES>,
-    requests: Deque<u32, REQUESTS>,
+    requests: Deque<Request, REQUESTS>,
     captures: u32,
     pictures: i32,
     last_capture_ns: Option<u64>,
     series: Option<Series>,
     /// SET_MESSAGE_INTERVAL for CAMERA_CAPTURE_STATUS: period and next time.
     status: Option<(u64, u64)>,
+    /// Made when somebody first asks.
+    definition: OnceCell<Definition>,
+    files: FileServer,
+    parameters: Parameters,
+    next_bulk_ns: u64,
 }
 
 impl MavlinkCamera {
@@ -98,6 +89,10 @@ impl MavlinkCamera {
             last_capture_ns: None,
             series: None,
             status: None,
+            definition: OnceCell::new(),
+            files: FileServer::default(),
+            parameters: Parameters::default(),
+            next_bulk_ns: 0,
         }
     }
 
@@ -112,19 +107,45 @@ impl MavlinkCamera {
         }
     }
 
-    /// Takes a frame from anyone; only commands to us (or to all cameras of our system) matter. Ground stations are other
+    /// Takes a frame from anyone; only what is for us (or for all cameras of our system) matters. Ground stations are other
     /// systems and may command us.
     pub fn handle(&mut self, frame: &Frame<'_>, own_system: u8, now_ns: u64) {
-        if frame.id() != COMMAND_LONG_DATA::ID {
-            return;
-        }
-        let Some(m) = frame.message::<COMMAND_LONG_DATA>() else { return };
         // 0 is everybody: PX4 sends DO_DIGICAM_CONTROL to the cameras of all systems.
-        let to_us = |target: u8, us: u8| target == us || target == 0;
-        if !to_us(m.target_system, own_system) || !to_us(m.target_component, self.component) {
-            return;
+        let own_component = self.component;
+        let to_us = |system: u8, component: u8| {
+            (system == own_system || system == 0) && (component == own_component || component == 0)
+        };
+        if let Some(m) = frame.message::<COMMAND_LONG_DATA>() {
+            if to_us(m.target_system, m.target_component) {
+                self.on_command(&m, frame, now_ns);
+            }
+        } else if let Some(m) = frame.message::<FILE_TRANSFER_PROTOCOL_DATA>() {
+            // A file is asked of one component.
+            if (m.target_system, m.target_component) == (own_system, own_component) {
+                let file = self.definition.get_or_init(Definition::new).bytes();
+                self.files.handle(&m, (frame.system(), frame.component()), file, now_ns);
+            }
+        } else if let Some(m) = frame.message::<PARAM_EXT_REQUEST_LIST_DATA>() {
+            if to_us(m.target_system, m.target_component) {
+                self.parameters.list();
+            }
+        } else if let Some(m) = frame.message::<PARAM_EXT_REQUEST_READ_DATA>() {
+            if to_us(m.target_system, m.target_component) {
+                self.parameters.read(&m);
+            }
+        } else if let Some(m) = frame.message::<PARAM_EXT_SET_DATA>()
+            && to_us(m.target_system, m.target_component)
+        {
+            match self.parameters.set(&m) {
+                Asked::Answer(ack) => self.queue_first(Due::Set(ack)),
+                // A full queue means that nobody obeys; whoever asks hears nothing and asks again.
+                Asked::Set(id, value) => drop(self.requests.push_back(Request::Set(id, value))),
+            }
         }
-        let result = self.command(&m, now_ns);
+    }
+
+    fn on_command(&mut self, m: &COMMAND_LONG_DATA, frame: &Frame<'_>, now_ns: u64) {
+        let result = self.command(m, now_ns);
         // To all components: others may know what we do not.
         if m.target_component == 0 && result == MavResult::MAV_RESULT_UNSUPPORTED {
             return;
@@ -138,6 +159,22 @@ impl MavlinkCamera {
             ..COMMAND_ACK_DATA::default()
         };
         self.queue_first(Due::Ack(ack));
+    }
+
+    /// What a ground station is shown of the job: a count, a share in percent, or the number of a word. Bounded by the table.
+    pub fn note_count(&mut self, id: ParameterId, value: u32) {
+        self.parameters.note_count(id, value);
+    }
+
+    /// As [`MavlinkCamera::note_count`], of a setting.
+    pub fn note_setting(&mut self, id: ParameterId, value: f32) {
+        self.parameters.note_real(id, value);
+    }
+
+    /// The answer to a [`Request::Set`]: what it is now, or `None` when that cannot be obeyed.
+    pub fn answer(&mut self, id: ParameterId, obeyed: Option<f32>) {
+        let ack = self.parameters.answer(id, obeyed);
+        self.queue(Due::Set(ack));
     }
 
     /// A picture was taken and posed: everyone is told.
@@ -158,7 +195,7 @@ impl MavlinkCamera {
             }
             self.capture(now_ns);
         }
-        self.requests.pop_front().map(Request::Capture)
+        self.requests.pop_front()
     }
 
     /// The next message to send.
@@ -169,8 +206,10 @@ impl MavlinkCamera {
             *next_ns = now_ns + *every_ns;
             self.queue(Due::Message(CAMERA_CAPTURE_STATUS_DATA::ID));
         }
-        Some(match self.due.pop_front()? {
+        let Some(due) = self.due.pop_front() else { return self.next_bulk(now_ns) };
+        Some(match due {
             Due::Ack(ack) => Reply::Ack(ack),
+            Due::Set(ack) => Reply::Set(ack),
             Due::Captured(message) => Reply::Captured(CAMERA_IMAGE_CAPTURED_DATA { time_boot_ms: boot_ms, ..message }),
             Due::Message(CAMERA_INFORMATION_DATA::ID) => Reply::Information(self.information(boot_ms)),
             Due::Message(CAMERA_SETTINGS_DATA::ID) => Reply::Settings(CAMERA_SETTINGS_DATA {
@@ -199,6 +238,20 @@ impl MavlinkCamera {
         })
     }
 
+    /// The next message of a file or a list, which must not fill the line.
+    fn next_bulk(&mut self, now_ns: u64) -> Option<Reply> {
+        let may = now_ns >= self.next_bulk_ns;
+        let file = self.definition.get().map_or(&[][..], Definition::bytes);
+        let bursts = self.files.bursts();
+        if let Some(m) = self.files.next(file, may) {
+            self.next_bulk_ns = if bursts { now_ns + BULK_EVERY_NS } else { self.next_bulk_ns };
+            return Some(Reply::File(m));
+        }
+        let value = if may { self.parameters.next()? } else { return None };
+        self.next_bulk_ns = now_ns + BULK_EVERY_NS;
+        Some(Reply::Value(value))
+    }
+
     fn information(&self, boot_ms: u32) -> CAMERA_INFORMATION_DATA {
         let name = |text: &str| {
             let mut bytes = [0; 32];
@@ -207,8 +260,8 @@ impl MavlinkCamera {
         };
         CAMERA_INFORMATION_DATA {
             time_boot_ms: boot_ms,
-            vendor_name: name("dgtr"),
-            model_name: name("companion"),
+            vendor_name: name(VENDOR),
+            model_name: name(MODEL),
             firmware_version: 1,
             focal_length: f32::NAN,
             sensor_size_h: f32::NAN,
@@ -216,6 +269,8 @@ impl MavlinkCamera {
             resolution_h: self.info.width.min(u16::MAX.into()) as u16,
             resolution_v: self.info.height.min(u16::MAX.into()) as u16,
             flags: CameraCapFlags::CAMERA_CAP_FLAGS_CAPTURE_IMAGE,
+            cam_definition_version: self.definition.get_or_init(Definition::new).version(),
+            cam_definition_uri: URI.into(),
             ..CAMERA_INFORMATION_DATA::default()
         }
     }
@@ -286,7 +341,7 @@ impl MavlinkCamera {
         self.last_capture_ns = Some(now_ns);
         self.captures = self.captures.saturating_add(1);
         // A full queue means that nobody takes pictures; the announcement would be untrue.
-        let _ = self.requests.push_back(self.captures);
+        let _ = self.requests.push_back(Request::Capture(self.captures));
     }
 
     fn queue(&mut self, due: Due) {

@@ -2,11 +2,12 @@
 //! of both. Everything follows from a seed.
 
 pub mod aircraft;
+pub mod attached;
 pub mod autopilot;
 pub mod axes;
 mod error;
 pub mod faulty_link;
-mod messages;
+pub(crate) mod messages;
 pub mod photographer;
 mod random;
 pub mod reference;
@@ -24,7 +25,6 @@ use config::geodesy::Geodetic;
 use glam::DVec2;
 
 pub use error::SimError;
-pub(crate) use messages::heartbeat;
 pub use session::{SessionReport, SessionSettings};
 
 use crate::link::LinkAddress;

@@ -4,7 +4,7 @@
 
 mod event;
 mod exposures;
-mod mount;
+pub(crate) mod mount;
 mod service;
 mod settings;
 

@@ -50,6 +50,45 @@ fn mavlink() {
     });
 }
 
+/// A download of the definition file, the list of parameters, one of them read and one set.
+fn station() -> Vec<Vec<u8>> {
+    let request = |kind: u8, bytes: &[u8]| [&[kind, u8::try_from(bytes.len()).expect("short")][..], bytes].concat();
+    let file = |opcode: u8, offset: u8, data: &[u8]| {
+        let size = u8::try_from(data.len()).expect("short");
+        request(0, &[&[1, 0, 0, opcode, size, 0, 0, 0, offset, 0, 0, 0][..], data].concat())
+    };
+    let named = |kind: u8, head: [u8; 2], name: &str, value: f32| {
+        let mut id = [0; 16];
+        id[..name.len()].copy_from_slice(name.as_bytes());
+        request(kind, &[&head[..], &id, &value.to_le_bytes()].concat())
+    };
+    vec![
+        [file(4, 0, b"/definition.xml"), file(15, 0, &[]), file(5, 9, &[0; 80]), file(1, 0, &[])].concat(),
+        [file(3, 0, b"/"), file(14, 0, b"definition.xml"), file(2, 0, &[])].concat(),
+        [request(1, &[100]), named(2, [0xFF, 0xFF], "KF_OVERLAP", 0.0), request(4, &[3, 1])].concat(),
+        [named(3, [0, 0], "KF_DISTANCE", 12.0), named(3, [4, 0], "TRAIN_SECONDS", 30.0)].concat(),
+    ]
+}
+
+#[test]
+fn a_ground_station_that_asks_the_camera() {
+    let settings = std::cell::Cell::new(0);
+    survive(&Reader {
+        name: "station",
+        seeds: station(),
+        text: false,
+        shell: None,
+        // Everything has a fixed size.
+        memory: (4 << 10, 0),
+        read: Read::Bytes(&|bytes| {
+            let answered = targets::ask_camera(bytes);
+            settings.set(settings.get() + answered.settings);
+            if answered.replies > 0 { Ok(true) } else { Err("no answer".into()) }
+        }),
+    });
+    assert!(settings.get() > 100, "{} settings reached the job", settings.get());
+}
+
 /// Events and leftovers are whatever the bytes say: what is checked is that all of them are accounted for.
 fn events(name: &'static str, memory: (usize, usize), read: &dyn Fn(&[u8])) {
     survive(&Reader {

@@ -106,6 +106,16 @@ impl KeyframeSelector {
         Some((&ground.map, views))
     }
 
+    /// Chooses by these distances and angles from now on; how many there may be stays as it was planned.
+    pub fn follow(&mut self, settings: KeyframeSettings) {
+        self.settings = KeyframeSettings { max: self.settings.max, ..settings };
+    }
+
+    /// There are as many as were planned for.
+    pub fn is_full(&self) -> bool {
+        self.chosen.len() >= self.settings.max as usize
+    }
+
     /// Takes a key frame of an earlier run as chosen.
     pub fn restore(&mut self, pose: Pose) {
         if self.chosen.len() < self.settings.max as usize {
@@ -165,7 +175,7 @@ impl KeyframeSelector {
             && !self.ground.as_ref().is_some_and(|g| g.wants(pose))
         {
             Decision::Covered
-        } else if self.chosen.len() >= self.settings.max as usize {
+        } else if self.is_full() {
             Decision::Full
         } else {
             Decision::Key

@@ -12,6 +12,7 @@ use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
 use config::plan::SORT_LANES_GPU;
 use config::upload::Encoding;
+use hal::mavlink_camera::Activity;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
 use models::formats::delivery::ENCODED_BYTES;
@@ -23,6 +24,7 @@ mod geotags;
 mod handover;
 mod intake;
 mod job;
+mod record;
 mod shortage;
 mod show;
 
@@ -47,6 +49,7 @@ mod rehearsal;
 
 pub use handover::Handover;
 pub use intake::{EndOfFlight, Ended, FlightCounters};
+pub use record::{RecordError, Recorder, Recording};
 
 use crate::engine::device::{DeviceRequest, training_lens};
 use crate::engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path, scratch_bytes};
@@ -77,6 +80,8 @@ pub struct FlyOptions {
     pub end: EndOfFlight,
     /// The live page; this is its aircraft 0.
     pub watch: Watch,
+    /// Takes what happens in the flight.
+    pub recorder: Recorder,
 }
 
 /// How the job ended.
@@ -128,6 +133,7 @@ pub fn fly(
         },
         intrinsics,
         keyframes: mission.keyframes,
+        training_seconds: mission.training.seconds,
         coverage: mission.coverage,
         region: mission.region(aircraft),
         earlier: store.poses(),
@@ -136,12 +142,13 @@ pub fn fly(
         geotags: Geotags::open(&disk, &options.out, mission.origin)
             .map_err(JobError::io(&options.out.join(geotags::FILE)))?,
         watch: options.watch.clone(),
+        recorder: options.recorder.clone(),
     })?;
     flight.handover().keep_in(store, model_path(&options.out));
     tracing::info!("{}: listening on {}, pictures from {:?}", aircraft.id, aircraft.link, aircraft.camera);
     supervisor.ready();
     supervisor.status(&format!("listening on {}", aircraft.link));
-    options.watch.craft(0, |craft| craft.state = "listening");
+    options.watch.craft(0, |craft| craft.state = Activity::Listening.name());
     let budget = RunBudget { steps: Some(mission.training.steps), seconds: mission.training.seconds };
     let health = Health::new(mission.failsafe, mission.memory.host_mib, &options.out);
     let failsafe = Failsafe::new(health, &mission.failsafe);

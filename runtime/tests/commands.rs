@@ -106,6 +106,12 @@ fn a_mission_written_by_init_is_accepted_by_plan_and_fly() {
     let fly = dgtr(&["fly", "--mission", path, "--aircraft", "east", "--out", out.to_str().unwrap()]);
     assert_eq!(fly.status.code(), Some(2));
     assert!(error_line(&fly).contains("carrier"), "{}", error_line(&fly));
+    // Where a recording cannot be written nothing is opened.
+    let out = out.to_str().unwrap();
+    let fly = dgtr(&["fly", "--mission", path, "--aircraft", "east", "--out", out, "--record", "/nonexistent/f.mcap"]);
+    assert_eq!((fly.status.code(), error_line(&fly).contains("/nonexistent/f.mcap")), (Some(2), true));
+    let sim = dgtr(&["sim", "--mission", path, "--aircraft", "east", "--autopilot", "nowhere"]);
+    assert_eq!((sim.status.code(), error_line(&sim).contains("nowhere")), (Some(2), true));
 }
 
 #[test]

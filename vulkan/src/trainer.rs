@@ -251,6 +251,12 @@ impl Trainer {
         self.before = (steps, seconds);
     }
 
+    /// How long the schedule may take from now on, seconds; `None`: its steps alone decide. What is over is over: its share
+    /// changes.
+    pub fn set_seconds(&mut self, seconds: Option<f64>) {
+        self.settings.seconds = seconds;
+    }
+
     /// Steps and seconds spent on the schedule, earlier processes' included.
     pub fn spent(&self) -> (u32, f64) {
         (self.before.0.saturating_add(self.steps), self.before.1 + self.elapsed_s)

@@ -4,8 +4,12 @@
 
 use hal::autopilot::{Autopilot, Ids};
 use hal::matcher::{Matcher, MatcherSettings};
-use hal::mavlink::Framer;
-use hal::mavlink_camera::{CameraInfo, MavlinkCamera};
+use hal::mavlink::dialect::{
+    COMMAND_LONG_DATA, FILE_TRANSFER_PROTOCOL_DATA, MavCmd, MavParamExtType, PARAM_EXT_REQUEST_LIST_DATA,
+    PARAM_EXT_REQUEST_READ_DATA, PARAM_EXT_SET_DATA,
+};
+use hal::mavlink::{Encoder, Framer};
+use hal::mavlink_camera::{COUNT, CameraInfo, Kind, MavlinkCamera, Reply, Request, TABLE};
 use hal::traits::{PictureClues, PoseSource, TriggerSource};
 use hal::trigger::{Trigger, TriggerKind};
 
@@ -70,6 +74,94 @@ pub fn parse(mut data: &[u8]) -> CaptureLoop {
         data = later;
     }
     capture
+}
+
+/// What a ground station asked, and what came of it.
+#[derive(Default)]
+pub struct Answered {
+    pub replies: u64,
+    pub settings: u64,
+}
+
+/// Target `station`: a kind, a length and as many bytes make a request for a file, a parameter or a message. Whatever they are,
+/// what leaves is of the one file and the table, and what is asked of the job lies within its bounds.
+pub fn ask_camera(mut data: &[u8]) -> Answered {
+    let mut camera = MavlinkCamera::new(CameraInfo { width: 640, height: 480 }, 100);
+    let (mut framer, mut encoder) = (Framer::new(), Encoder::new(255, 190));
+    let (mut answered, mut now_ns) = (Answered::default(), 1_000_000_000u64);
+    let (target_system, target_component) = (1, 100);
+    while let [kind, length, rest @ ..] = data {
+        let (given, later) = rest.split_at(rest.len().min(usize::from(*length)));
+        data = later;
+        let mut bytes = [0; 256];
+        bytes[..given.len()].copy_from_slice(given);
+        let [a, b, ..] = bytes;
+        let mut name = [0; 16];
+        name.copy_from_slice(&bytes[2..18]);
+        let mut value = [0; 128];
+        value.copy_from_slice(&bytes[18..146]);
+        let mut payload = [0; 251];
+        payload.copy_from_slice(&bytes[..251]);
+        let frame = match kind % 5 {
+            0 => {
+                let m = FILE_TRANSFER_PROTOCOL_DATA { target_network: 0, target_system, target_component, payload };
+                encoder.encode(&m, None)
+            }
+            1 => encoder.encode(&PARAM_EXT_REQUEST_LIST_DATA { target_system, target_component: a }, None),
+            2 => {
+                let (param_index, param_id) = (i16::from_le_bytes([a, b]), name.into());
+                let m = PARAM_EXT_REQUEST_READ_DATA { param_index, target_system, target_component, param_id };
+                encoder.encode(&m, None)
+            }
+            3 => {
+                let param_type = match a % 4 {
+                    0 => MavParamExtType::MAV_PARAM_EXT_TYPE_REAL32,
+                    1 => MavParamExtType::MAV_PARAM_EXT_TYPE_UINT32,
+                    2 => MavParamExtType::MAV_PARAM_EXT_TYPE_REAL64,
+                    _ => MavParamExtType::MAV_PARAM_EXT_TYPE_CUSTOM,
+                };
+                let (param_id, param_value) = (name.into(), value.into());
+                let m = PARAM_EXT_SET_DATA { target_system, target_component, param_id, param_value, param_type };
+                encoder.encode(&m, None)
+            }
+            _ => {
+                let command = MavCmd::MAV_CMD_REQUEST_MESSAGE;
+                let (param1, param2) = (f32::from(u16::from_le_bytes([a, b])), 0.0);
+                let m = COMMAND_LONG_DATA {
+                    command,
+                    target_system,
+                    target_component,
+                    param1,
+                    param2,
+                    ..Default::default()
+                };
+                encoder.encode(&m, None)
+            }
+        };
+        framer.push(frame);
+        while let Some(frame) = framer.next_frame() {
+            camera.handle(&frame, 1, now_ns);
+        }
+        while let Some(request) = camera.next_request(now_ns) {
+            let Request::Set(id, value) = request else { continue };
+            let Kind::Set(least, most, _) = id.row().kind else { panic!("{id:?} is read only") };
+            assert!((least..=most).contains(&value), "{id:?} {value}");
+            answered.settings += 1;
+            camera.answer(id, (a % 2 == 0).then_some(value));
+        }
+        // Ten looks, each as much later as lets a line breathe: a file and the list are longer than that.
+        for _ in 0..10 {
+            while let Some(reply) = camera.next_reply(0, now_ns) {
+                answered.replies += 1;
+                if let Reply::Value(m) = reply {
+                    assert!(usize::from(m.param_index) < COUNT && usize::from(m.param_count) == COUNT);
+                    assert_eq!(m.param_id.to_str(), Ok(TABLE[usize::from(m.param_index)].name));
+                }
+            }
+            now_ns = now_ns.wrapping_add(25_000_000);
+        }
+    }
+    answered
 }
 
 /// Target `matcher`: twelve bytes an event. Every exposure and every picture must come out exactly once.

@@ -3,6 +3,7 @@
 use std::vec::Vec;
 
 use super::*;
+use crate::mavlink::dialect::{MavParamExtType, ParamAck};
 use crate::mavlink::{Encoder, Framer};
 
 const S: u64 = 1_000_000_000;
@@ -44,6 +45,145 @@ fn command(
 
 fn captures(camera: &mut MavlinkCamera, now_ns: u64) -> usize {
     core::iter::from_fn(|| camera.next_request(now_ns)).count()
+}
+
+fn hear<D: MessageData>(camera: &mut MavlinkCamera, message: &D, now_ns: u64) {
+    let mut framer = Framer::new();
+    framer.push(Encoder::new(255, 190).encode(message, None));
+    camera.handle(&framer.next_frame().expect("a frame"), 1, now_ns);
+}
+
+/// Everything sent within a second of asking, one look every 5 ms.
+fn a_second(camera: &mut MavlinkCamera, from_ns: u64) -> Vec<(u64, Reply)> {
+    let looks = (0..200).map(|k| from_ns + k * S / 200);
+    looks
+        .flat_map(|now| core::iter::from_fn(|| camera.next_reply(0, now)).map(|r| (now, r)).collect::<Vec<_>>())
+        .collect()
+}
+
+fn set(id: &str, value: [u8; 4], param_type: MavParamExtType) -> PARAM_EXT_SET_DATA {
+    let mut param_value = [0; 128];
+    param_value[..4].copy_from_slice(&value);
+    PARAM_EXT_SET_DATA {
+        target_system: 1,
+        target_component: 100,
+        param_id: id.into(),
+        param_value: param_value.into(),
+        param_type,
+    }
+}
+
+/// Result and value of the acknowledgement that is sent.
+fn acknowledged(camera: &mut MavlinkCamera, now_ns: u64) -> Option<(ParamAck, f32)> {
+    let replies: Vec<Reply> = core::iter::from_fn(|| camera.next_reply(0, now_ns)).collect();
+    replies.iter().find_map(|reply| match reply {
+        Reply::Set(m) => Some((m.param_result, f32::from_le_bytes(m.param_value[..4].try_into().expect("four")))),
+        _ => None,
+    })
+}
+
+const REAL: MavParamExtType = MavParamExtType::MAV_PARAM_EXT_TYPE_REAL32;
+
+#[test]
+fn a_list_of_parameters_comes_one_by_one_at_a_pace_that_a_slow_line_carries() {
+    let mut camera = camera();
+    camera.note_count(ParameterId::KeyFrames, 7);
+    assert!(a_second(&mut camera, 0).is_empty(), "nobody has asked");
+    hear(&mut camera, &PARAM_EXT_REQUEST_LIST_DATA { target_system: 1, target_component: 0 }, S);
+    let sent = a_second(&mut camera, S);
+    let values: Vec<_> =
+        sent.iter().filter_map(|(at, r)| if let Reply::Value(m) = r { Some((at, m)) } else { None }).collect();
+    assert_eq!(values.iter().map(|(_, m)| m.param_index).collect::<Vec<_>>(), (0..COUNT as u16).collect::<Vec<_>>());
+    assert!(values.windows(2).all(|w| w[1].0 - w[0].0 >= BULK_EVERY_NS));
+    let key_frames = values[ParameterId::KeyFrames as usize].1;
+    assert_eq!(
+        (key_frames.param_id.to_str(), key_frames.param_value[0], key_frames.param_count),
+        (Ok("KEY_FRAMES"), 7, COUNT as u16)
+    );
+    // From now on a change is told without being asked for, and only a change.
+    camera.note_count(ParameterId::KeyFrames, 8);
+    camera.note_count(ParameterId::Covered, 900);
+    camera.note_count(ParameterId::Pictures, 0);
+    let told: Vec<_> = a_second(&mut camera, 3 * S)
+        .into_iter()
+        .map(|(_, r)| if let Reply::Value(m) = r { (m.param_index, m.param_value[0]) } else { panic!("{r:?}") })
+        .collect();
+    assert_eq!(told, [(ParameterId::KeyFrames as u16, 8), (ParameterId::Covered as u16, 100)]);
+}
+
+#[test]
+fn a_value_is_set_when_the_job_obeys_and_stays_as_it_was_otherwise() {
+    let mut camera = camera();
+    let (distance, twelve) = (ParameterId::KeyframeDistance, 12.5f32.to_le_bytes());
+    hear(&mut camera, &set("KF_DISTANCE", twelve, REAL), S);
+    assert_eq!(camera.next_request(S), Some(Request::Set(distance, 12.5)));
+    assert_eq!(acknowledged(&mut camera, S), None, "not before it is obeyed");
+    camera.answer(distance, Some(12.5));
+    assert_eq!(acknowledged(&mut camera, S), Some((ParamAck::PARAM_ACK_ACCEPTED, 12.5)));
+    // A repeated request is answered and not obeyed again.
+    hear(&mut camera, &set("KF_DISTANCE", twelve, REAL), S);
+    assert_eq!(
+        (camera.next_request(S), acknowledged(&mut camera, S)),
+        (None, Some((ParamAck::PARAM_ACK_ACCEPTED, 12.5)))
+    );
+    hear(&mut camera, &set("KF_DISTANCE", 3f32.to_le_bytes(), REAL), S);
+    assert!(camera.next_request(S).is_some());
+    camera.answer(distance, None);
+    assert_eq!(acknowledged(&mut camera, S), Some((ParamAck::PARAM_ACK_FAILED, 12.5)));
+}
+
+#[test]
+fn values_out_of_bounds_of_another_type_or_read_only_never_reach_the_job() {
+    let mut camera = camera();
+    let count = MavParamExtType::MAV_PARAM_EXT_TYPE_UINT32;
+    for (name, value, kind, expected) in [
+        ("KF_DISTANCE", f32::NAN.to_le_bytes(), REAL, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("KF_DISTANCE", f32::INFINITY.to_le_bytes(), REAL, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("KF_DISTANCE", (-0.1f32).to_le_bytes(), REAL, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("KF_ROTATION", 0f32.to_le_bytes(), REAL, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("TRAIN_SECONDS", 1e9f32.to_le_bytes(), REAL, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("KF_DISTANCE", 9u32.to_le_bytes(), count, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("STATE", 1u32.to_le_bytes(), count, ParamAck::PARAM_ACK_VALUE_UNSUPPORTED),
+        ("NO_SUCH_THING", 1u32.to_le_bytes(), count, ParamAck::PARAM_ACK_FAILED),
+    ] {
+        hear(&mut camera, &set(name, value, kind), S);
+        assert_eq!(acknowledged(&mut camera, S).map(|a| a.0), Some(expected), "{name}");
+        assert_eq!(camera.next_request(S), None, "{name}");
+    }
+    let elsewhere = PARAM_EXT_SET_DATA { target_component: 101, ..set("KF_DISTANCE", 9f32.to_le_bytes(), REAL) };
+    hear(&mut camera, &elsewhere, S);
+    assert_eq!((camera.next_request(S), acknowledged(&mut camera, S)), (None, None));
+}
+
+#[test]
+fn the_definition_named_by_the_information_is_read_in_a_burst() {
+    let mut camera = camera();
+    let (_, replies) = command(&mut camera, MavCmd::MAV_CMD_REQUEST_MESSAGE, [259.0, 0.0, 0.0, 0.0, 0.0], 0);
+    let Some(Reply::Information(m)) = replies.first() else { panic!("{replies:?}") };
+    let path = m.cam_definition_uri.to_str().ok().and_then(|uri| uri.strip_prefix("mftp://")).expect("MAVLink FTP");
+    let ask = |camera: &mut MavlinkCamera, opcode: u8, data: &[u8]| {
+        let mut payload = [0; 251];
+        (payload[3], payload[4]) = (opcode, data.len() as u8);
+        payload[12..12 + data.len()].copy_from_slice(data);
+        hear(
+            camera,
+            &FILE_TRANSFER_PROTOCOL_DATA { target_network: 0, target_system: 1, target_component: 100, payload },
+            S,
+        );
+    };
+    ask(&mut camera, 4, path.as_bytes());
+    ask(&mut camera, 15, &[]);
+    let sent = a_second(&mut camera, S);
+    let mut text = Vec::new();
+    for (_, reply) in &sent[1..] {
+        let Reply::File(m) = reply else { panic!("{reply:?}") };
+        assert_eq!((m.target_system, m.target_component, m.payload[3]), (255, 190, 128));
+        text.extend_from_slice(&m.payload[12..12 + usize::from(m.payload[4])]);
+    }
+    let text = std::string::String::from_utf8(text).expect("UTF-8");
+    assert!(text.contains(&std::format!("<definition version=\"{:05}\">", m.cam_definition_version)), "{text}");
+    assert!(text.ends_with("</mavlinkcamera>\n") && sent.len() > 5);
+    assert!(sent[1..].windows(2).all(|w| w[1].0 - w[0].0 >= BULK_EVERY_NS));
 }
 
 #[test]

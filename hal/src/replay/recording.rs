@@ -5,9 +5,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use config::geodesy::{EnuFrame, Geodetic};
-use glam::{DQuat, DVec3};
+use glam::DQuat;
 
-use crate::frames::{euler_to_ned, ned_to_enu, yaw_of_ned};
+use crate::frames::{euler_to_ned, yaw_of_ned};
 use crate::link::TlogLink;
 use crate::mavlink::dialect::{
     CAMERA_FEEDBACK_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GimbalDeviceFlags,
@@ -15,6 +15,7 @@ use crate::mavlink::dialect::{
 };
 use crate::mavlink::{Frame, Framer};
 use crate::sim::SimError;
+use crate::sim::messages;
 use crate::sim::track::{Sample, Track};
 use crate::traits::Link;
 
@@ -125,15 +126,13 @@ fn degrees(e7: i32) -> f64 {
 
 /// The true state in one SIM_STATE.
 fn sample(boot_s: f64, m: &SIM_STATE_DATA, gimbal: Option<GimbalAttitude>, frame: &EnuFrame) -> Sample {
-    let at = Geodetic { lat_deg: degrees(m.lat_int), lon_deg: degrees(m.lon_int), alt_m: m.alt.into() };
-    let attitude = DQuat::from_xyzw(m.q2.into(), m.q3.into(), m.q4.into(), m.q1.into()).normalize();
+    let (at, attitude, velocity) = messages::truth(m);
     let heading = DQuat::from_rotation_z(yaw_of_ned(attitude));
     let gimbal = match gimbal {
         Some((q, true)) => q,
         Some((q, false)) => heading * q,
         None => heading * euler_to_ned(0.0, -std::f64::consts::FRAC_PI_2, 0.0),
     };
-    let velocity = ned_to_enu(DVec3::new(m.vn.into(), m.ve.into(), m.vd.into()));
     Sample { time_s: boot_s, position: frame.to_enu(at), velocity, attitude, gimbal }
 }
 

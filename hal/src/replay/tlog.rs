@@ -224,7 +224,7 @@ impl Player {
     }
 
     fn beat(&mut self) -> Result<(), SimError> {
-        self.say(&crate::sim::heartbeat())
+        self.say(&crate::sim::messages::heartbeat())
     }
 
     /// Reads for a moment and answers requests for the time.

@@ -204,6 +204,14 @@ pub fn image_captured(boot_us: u64, unix_us: u64, index: u16, s: &Sample, at: Ge
     }
 }
 
+/// Place, attitude (FRD → NED) and velocity (ENU) in what [`sim_state`] says.
+pub fn truth(m: &SIM_STATE_DATA) -> (Geodetic, DQuat, DVec3) {
+    let at =
+        Geodetic { lat_deg: f64::from(m.lat_int) * 1e-7, lon_deg: f64::from(m.lon_int) * 1e-7, alt_m: m.alt.into() };
+    let attitude = DQuat::from_xyzw(m.q2.into(), m.q3.into(), m.q4.into(), m.q1.into()).normalize();
+    (at, attitude, ned_to_enu(DVec3::new(m.vn.into(), m.ve.into(), m.vd.into())))
+}
+
 /// The simulator's truth.
 pub fn sim_state(s: &Sample, at: Geodetic, rates: DVec3) -> SIM_STATE_DATA {
     let q = wxyz(s.attitude);

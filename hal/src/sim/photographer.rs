@@ -1,6 +1,7 @@
 //! The simulated camera: makes pictures ahead of time on a thread of its own and lets each file appear in the camera
 //! folder when it is due, whole (written under another name, then renamed), or spoiled as told.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -49,8 +50,9 @@ struct Delivery {
 /// A camera with its folder.
 pub struct Photographer {
     folder: PathBuf,
-    exposures: Vec<Exposure>,
-    next: usize,
+    exposures: VecDeque<Exposure>,
+    /// Exposures whose pictures were made.
+    taken: usize,
     made: Receiver<Result<Vec<u8>, SimError>>,
     held: Vec<Delivery>,
     seed: u64,
@@ -71,16 +73,43 @@ impl Photographer {
         folder: &Path,
         exposures: Vec<Exposure>,
         seed: u64,
-        mut picture: impl FnMut(usize) -> Result<Vec<u8>, SimError> + Send + 'static,
+        picture: impl FnMut(usize) -> Result<Vec<u8>, SimError> + Send + 'static,
+        afterwards: impl FnOnce(&AtomicBool) -> Result<(), SimError> + Send + 'static,
+    ) -> Result<Self, SimError> {
+        Self::start(folder, (0..exposures.len()).map(picture), exposures.into(), seed, afterwards)
+    }
+
+    /// A camera whose exposures come while it flies, by [`Photographer::expose`]; `pictures` brings the picture of each, in
+    /// their order, and ends with the flight. It runs on a thread.
+    ///
+    /// # Errors
+    /// [`SimError::Folder`].
+    pub fn on_demand(
+        folder: &Path,
+        seed: u64,
+        pictures: impl Iterator<Item = Result<Vec<u8>, SimError>> + Send + 'static,
+    ) -> Result<Self, SimError> {
+        Self::start(folder, pictures, VecDeque::new(), seed, |_| Ok(()))
+    }
+
+    fn start(
+        folder: &Path,
+        mut pictures: impl Iterator<Item = Result<Vec<u8>, SimError>> + Send + 'static,
+        exposures: VecDeque<Exposure>,
+        seed: u64,
         afterwards: impl FnOnce(&AtomicBool) -> Result<(), SimError> + Send + 'static,
     ) -> Result<Self, SimError> {
         std::fs::create_dir_all(folder).map_err(|source| SimError::Folder { path: folder.into(), source })?;
         let (sender, made) = sync_channel(AHEAD);
         let quit = Arc::new(AtomicBool::new(false));
-        let (count, quitting) = (exposures.len(), Arc::clone(&quit));
+        let quitting = Arc::clone(&quit);
         let thread = std::thread::spawn(move || {
-            for index in 0..count {
-                if quitting.load(Ordering::Relaxed) || sender.send(picture(index)).is_err() {
+            loop {
+                if quitting.load(Ordering::Relaxed) {
+                    return;
+                }
+                let Some(picture) = pictures.next() else { break };
+                if sender.send(picture).is_err() {
                     return;
                 }
             }
@@ -92,7 +121,7 @@ impl Photographer {
         Ok(Self {
             folder: folder.into(),
             exposures,
-            next: 0,
+            taken: 0,
             made,
             held: Vec::new(),
             seed,
@@ -108,6 +137,11 @@ impl Photographer {
         Self { waits: true, ..self }
     }
 
+    /// One more exposure, later than those before.
+    pub fn expose(&mut self, exposure: Exposure) {
+        self.exposures.push_back(exposure);
+    }
+
     /// What was done so far.
     pub fn counters(&self) -> PictureCounters {
         self.counters
@@ -115,7 +149,7 @@ impl Photographer {
 
     /// True when every picture was delivered, or was never meant to be.
     pub fn done(&self) -> bool {
-        self.next == self.exposures.len() && self.held.is_empty()
+        self.exposures.is_empty() && self.held.is_empty()
     }
 
     /// Delivers what is due after `flight_s` seconds of flight.
@@ -123,17 +157,17 @@ impl Photographer {
     /// # Errors
     /// A picture that could not be made or written.
     pub fn deliver(&mut self, flight_s: f64, acting: &FaultSettings) -> Result<(), SimError> {
-        while let Some(exposure) = self.exposures.get(self.next).filter(|e| e.ready_s <= flight_s) {
+        while self.exposures.front().is_some_and(|e| e.ready_s <= flight_s) {
             let made = if self.waits { self.made.recv().map_err(TryRecvError::from) } else { self.made.try_recv() };
             let bytes = match made {
                 Ok(made) => made?,
                 Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => return Err(SimError::CameraStopped { made: self.next }),
+                Err(TryRecvError::Disconnected) => return Err(SimError::CameraStopped { made: self.taken }),
             };
-            let name = exposure.name.clone();
+            let Some(exposure) = self.exposures.pop_front() else { break };
             self.counters.tardy += u64::from(flight_s > exposure.ready_s + TARDY_S);
-            self.next += 1;
-            self.take(flight_s, name, bytes, acting)?;
+            self.taken += 1;
+            self.take(flight_s, exposure.name, bytes, acting)?;
         }
         let mut k = 0;
         while k < self.held.len() {
@@ -155,7 +189,7 @@ impl Photographer {
         mut bytes: Vec<u8>,
         acting: &FaultSettings,
     ) -> Result<(), SimError> {
-        let n = self.next as u64;
+        let n = self.taken as u64;
         let seed = self.seed;
         let befalls = |percent, about| strikes(percent, seed, about, 0, n);
         if befalls(acting.picture_loss_pct, About::PictureLoss) {

@@ -6,6 +6,7 @@ use glam::{DQuat, DVec3};
 
 use crate::camera::Picture;
 use crate::matcher::Reason;
+use crate::mavlink_camera::ParameterId;
 use crate::pose::PoseError;
 use crate::trigger::Trigger;
 
@@ -24,6 +25,14 @@ pub enum Event {
     LinkLost,
     /// The autopilot is heard again.
     LinkBack,
+    /// A ground station asks for a setting to be changed, to a value within the bounds of its row; to be answered with
+    /// [`Vehicle::answer`](super::Vehicle::answer).
+    Asked {
+        /// Which.
+        parameter: ParameterId,
+        /// To what.
+        value: f32,
+    },
 }
 
 /// Where the aircraft is.

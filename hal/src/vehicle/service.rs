@@ -3,14 +3,14 @@
 
 use config::geodesy::{EnuFrame, Geodetic};
 
-use super::{CameraPose, Vehicle, VehicleSettings};
+use super::{CameraPose, Event, Vehicle, VehicleSettings};
 use crate::camera::Picture;
 use crate::error::HalError;
 use crate::mavlink::channel::Channel;
 use crate::mavlink::dialect::{CAMERA_IMAGE_CAPTURED_DATA, MavBool, MavSeverity, MavType, STATUSTEXT_DATA};
 use crate::mavlink::signing_store::{self, SigningStore};
 use crate::mavlink::{MessageData, Signer};
-use crate::mavlink_camera::{CameraInfo, MavlinkCamera, Reply, Request};
+use crate::mavlink_camera::{CameraInfo, MavlinkCamera, ParameterId, Reply, Request};
 use crate::traits::{Camera, Clock, Link};
 
 /// Heartbeats at 1 Hz, as the protocol asks.
@@ -123,6 +123,21 @@ where
         }
     }
 
+    /// What a ground station is shown of the job: see [`MavlinkCamera::note_count`].
+    pub fn show_count(&mut self, parameter: ParameterId, value: u32) {
+        self.service.component.note_count(parameter, value);
+    }
+
+    /// What a ground station is shown of a setting.
+    pub fn show_setting(&mut self, parameter: ParameterId, value: f32) {
+        self.service.component.note_setting(parameter, value);
+    }
+
+    /// The answer to [`Event::Asked`]: what the setting is now, or `None` when that cannot be obeyed.
+    pub fn answer(&mut self, parameter: ParameterId, obeyed: Option<f32>) {
+        self.service.component.answer(parameter, obeyed);
+    }
+
     /// Timers and answers that are due.
     pub(super) fn serve(&mut self, now_ns: u64) {
         let system = self.autopilot.ids().system;
@@ -168,6 +183,7 @@ where
         while let Some(request) = self.service.component.next_request(now_ns) {
             match request {
                 Request::Capture(sequence) => self.autopilot.announce_own(sequence, now_ns),
+                Request::Set(parameter, value) => self.emit(Event::Asked { parameter, value }),
             }
         }
         self.autopilot.settle_own(now_ns);
@@ -180,6 +196,9 @@ where
                 Reply::Storage(m) => send(&mut self.channel, m),
                 Reply::Status(m) => send(&mut self.channel, m),
                 Reply::Captured(m) => send(&mut self.channel, m),
+                Reply::File(m) => send(&mut self.channel, m),
+                Reply::Value(m) => send(&mut self.channel, m),
+                Reply::Set(m) => send(&mut self.channel, m),
             }
         }
     }

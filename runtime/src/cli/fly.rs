@@ -10,7 +10,7 @@ use super::CliError;
 use super::http::HttpArgs;
 use crate::cli::output::outln;
 use crate::engine::device::training_lens;
-use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, fly};
+use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
 use crate::interrupt::Interrupt;
 use crate::ortho::keep_scratch_in;
 use crate::report::{REPORT, ReportData, Timing, count, seconds};
@@ -41,6 +41,10 @@ pub struct Args {
     /// Give up when nothing was ever heard for this many seconds; 0 waits for ever.
     #[arg(long, value_name = "S", default_value_t = 0.0)]
     patience: f64,
+    /// Record the flight for Foxglove, as MCAP: poses, exposures, key frames with small pictures, state and figures, what the
+    /// ground station was told; 256 MiB at most.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
     /// The live page.
     #[command(flatten)]
     http: HttpArgs,
@@ -79,8 +83,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
     keep_scratch_in(&args.out);
-    let options = FlyOptions { out: args.out.clone(), end, watch: watch.clone() };
-    let outcome = fly(&mission, &aircraft, &options, &interrupt, Supervisor::from_environment())?;
+    let recording = args.record.as_deref().map(|path| Recording::create(path, mission.origin)).transpose()?;
+    let (recording, recorder) = recording.unzip();
+    let options =
+        FlyOptions { out: args.out.clone(), end, watch: watch.clone(), recorder: recorder.unwrap_or_default() };
+    let outcome = fly(&mission, &aircraft, &options, &interrupt, Supervisor::from_environment());
+    // The file is complete when nobody has anything to add.
+    drop((options, recording));
+    let outcome = outcome?;
     let mut report = report(&outcome);
     report.wall_s = started.elapsed().as_secs_f64();
     let path = report.write(&args.out)?;

@@ -1,11 +1,13 @@
 //! `dgtr sim`: an aircraft that is not there, for tests without an autopilot.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use config::mission::{CameraSource, Mission};
+use hal::link::LinkAddress;
 use hal::sim::aircraft::Imperfections;
+use hal::sim::attached::{AttachedSettings, photograph};
 use hal::sim::autopilot::{Announcing, AutopilotSettings};
 use hal::sim::reference::Lens;
 use hal::sim::survey::SurveySettings;
@@ -21,7 +23,7 @@ use crate::coverage::route;
 use crate::interrupt::Interrupt;
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
-/// the camera folder.
+/// the camera folder; or, with --autopilot, the camera alone beside an autopilot that runs already.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Mission file: origin, camera, region, seed and [faults].
@@ -33,6 +35,12 @@ pub struct Args {
     /// Where to speak: `pty` (its path is printed), `pty:/path/of/a/link`, `udpout:HOST:PORT`, `tcpin:HOST:PORT`.
     #[arg(long, value_name = "ADDRESS", default_value = "pty")]
     link: String,
+    /// Instead of an aircraft: a camera for the vehicle that is heard there, a running ArduPilot or PX4 SITL or any other. It
+    /// photographs the simulated ground from where the vehicle is whenever a picture is triggered, until Ctrl-C; `dgtr fly`
+    /// runs beside it on a link of its own.
+    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["link", "reference", "card", "plan", "speed", "height",
+        "forward_overlap", "side_overlap", "pitch", "triggers", "cross", "perfect", "linger"])]
+    autopilot: Option<String>,
     /// Camera folder; the mission's when left out.
     #[arg(long, value_name = "DIR")]
     camera_dir: Option<PathBuf>,
@@ -104,22 +112,29 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mission = Mission::read(&args.mission)?;
     let aircraft = mission.aircraft(args.aircraft.as_deref())?;
     let address = args.link.parse()?;
+    let lens = lens(&mission);
+    let prefix = format!("{}_", aircraft.id);
+    if let Some(autopilot) = &args.autopilot {
+        let settings = AttachedSettings {
+            world_seed: mission.seed,
+            world: WorldSettings::default(),
+            origin: mission.origin,
+            lens,
+            mount: mission.mount,
+            link: mission.link.clone(),
+            system_id: aircraft.system_id,
+            prefix,
+        };
+        return attach(&settings, &autopilot.parse()?, &camera_dir(args.camera_dir, &aircraft.camera)?);
+    }
     let number = mission.aircraft.iter().position(|a| a.id == aircraft.id).unwrap_or(0) as u64;
-    let c = &mission.camera;
     let plan = args.plan.as_deref().map(flight_plan::read).transpose()?;
     let settings = SimSettings {
         world_seed: mission.seed,
         seed: mission.seed.wrapping_mul(1000).wrapping_add(number),
         world: WorldSettings::default(),
         origin: mission.origin,
-        lens: Lens {
-            width: c.width,
-            height: c.height,
-            fx: c.fx.into(),
-            fy: c.fy.into(),
-            cx: c.cx.into(),
-            cy: c.cy.into(),
-        },
+        lens,
         region: mission.region(aircraft),
         route: plan.map(|plan| route(&plan, mission.origin, args.pitch)),
         survey: SurveySettings {
@@ -138,7 +153,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             ..AutopilotSettings::default()
         },
         session: SessionSettings { speed: args.speed, linger_s: args.linger, ..SessionSettings::default() },
-        prefix: format!("{}_", aircraft.id),
+        prefix,
     };
     let stop = stop_flag()?;
     if let Some(folder) = &args.card {
@@ -147,11 +162,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Ok(());
     }
     let camera_dir = camera_dir(args.camera_dir.clone(), &aircraft.camera)?;
-    let report = hal::sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut |pty| {
-        if let Some(path) = pty {
-            outln!("{}", path.display());
-        }
-    })?;
+    let report = hal::sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut say_where)?;
     tracing::info!(
         "{} exposures, {} pictures, {:.0} s of flight",
         report.triggers,
@@ -159,6 +170,24 @@ pub fn run(args: Args) -> Result<(), CliError> {
         report.flight_s
     );
     if report.completed { Ok(()) } else { Err(CliError::interrupted("the flight was ended early")) }
+}
+
+/// The camera of another program's vehicle, until Ctrl-C.
+fn attach(settings: &AttachedSettings, autopilot: &LinkAddress, folder: &Path) -> Result<(), CliError> {
+    let report = photograph(settings, autopilot, folder, &*stop_flag()?, &mut say_where)?;
+    outln!("{} exposures, {} pictures, {} missed", report.triggers, report.pictures.delivered, report.missed);
+    Ok(())
+}
+
+fn lens(mission: &Mission) -> Lens {
+    let c = &mission.camera;
+    Lens { width: c.width, height: c.height, fx: c.fx.into(), fy: c.fy.into(), cx: c.cx.into(), cy: c.cy.into() }
+}
+
+fn say_where(pty: Option<&Path>) {
+    if let Some(path) = pty {
+        outln!("{}", path.display());
+    }
 }
 
 /// A flag that Ctrl-C sets.

@@ -47,6 +47,8 @@ pub trait Reconstruct {
     fn look_closer(&mut self, _source: &mut dyn PictureSource, _go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
         Ok(true)
     }
+    /// Changes how long training may take; the share of the schedule that is over changes with it.
+    fn set_seconds(&mut self, seconds: Option<f64>);
     /// Whether the schedule of `budget` is over.
     fn is_done(&self, budget: &RunBudget) -> bool;
     /// Trains until the budget, the schedule, or `each` says stop.
@@ -206,6 +208,10 @@ impl Reconstruct for Reconstruction {
 
     fn look_closer(&mut self, source: &mut dyn PictureSource, go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
         self.cut_crops(source, go_on)
+    }
+
+    fn set_seconds(&mut self, seconds: Option<f64>) {
+        self.trainer.set_seconds(seconds);
     }
 
     fn is_done(&self, budget: &RunBudget) -> bool {

@@ -7,8 +7,9 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use hal::failsafe::Flags;
+use hal::failsafe::{Action, Flags};
 use hal::mavlink::dialect::MavSeverity;
+use hal::mavlink_camera::Activity;
 use image::RgbImage;
 use models::camera::{Pose, PosedImage};
 
@@ -21,12 +22,31 @@ pub(super) const AHEAD: usize = 2;
 /// Lines waiting to be said.
 const WORDS: usize = 16;
 
+/// What the job says of itself, for the ground station.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Told {
+    pub(super) activity: Activity,
+    /// The rung of the failsafe ladder.
+    pub(super) rung: Action,
+    pub(super) key_frames: u32,
+    pub(super) gaussians: u32,
+    /// Share of the schedule that is over, 0…1.
+    pub(super) progress: f32,
+    /// Loss of the newest step.
+    pub(super) loss: f32,
+    /// Nothing is trained any more in this flight.
+    pub(super) training_over: bool,
+}
+
 #[derive(Default)]
 struct Shared {
     waiting: AtomicUsize,
     stop: AtomicBool,
     over: AtomicBool,
     flags: Mutex<Flags>,
+    told: Mutex<Told>,
+    /// Training time that the ground station asks for; `None`: nothing new, `Some(None)`: the steps alone decide.
+    seconds: Mutex<Option<Option<f64>>>,
 }
 
 /// The job's end: an aircraft as a [`PictureSource`].
@@ -149,6 +169,16 @@ impl Handover {
         let _ = self.words.try_send((severity, text));
     }
 
+    /// Notes what the job does, for the ground station.
+    pub(super) fn tell(&self, change: impl FnOnce(&mut Told)) {
+        change(&mut self.shared.told.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+
+    /// Training time that was asked for since the last call.
+    pub(super) fn seconds_asked(&self) -> Option<Option<f64>> {
+        self.shared.seconds.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
     /// Asks capture to end.
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
@@ -200,6 +230,16 @@ impl CaptureEnd {
 
     pub(super) fn set_flags(&self, flags: Flags) {
         *self.shared.flags.lock().unwrap_or_else(PoisonError::into_inner) = flags;
+    }
+
+    /// What the job told last.
+    pub(super) fn told(&self) -> Told {
+        *self.shared.told.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Asks the job to train for so long; it looks before every turn.
+    pub(super) fn ask_seconds(&self, seconds: Option<f64>) {
+        *self.shared.seconds.lock().unwrap_or_else(PoisonError::into_inner) = Some(seconds);
     }
 
     pub(super) fn stop_asked(&self) -> bool {

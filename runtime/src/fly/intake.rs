@@ -9,25 +9,26 @@ use std::time::Duration;
 
 use config::coverage::CoverageSettings;
 use config::mission::KeyframeSettings;
-use glam::DVec2;
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::error::HalError;
-use hal::mavlink::dialect::MavSeverity;
 use hal::traits::{Camera, Clock, Link};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
-use models::coverage::{CoverageMap, Region};
 use models::picture;
 
 use super::geotags::Geotags;
 use super::handover::CaptureEnd;
+use super::record::{Entry, Recorder};
 use super::show::ShownCapture;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::coverage::Coverage;
 use crate::error::JobError;
 use crate::keyframe_store::KeyFrame;
 use crate::watch::Watch;
+
+mod ground;
+mod station;
 
 /// After the aircraft has landed, pictures that nobody announced may still be on their way from the camera for this long.
 const LATE_PICTURES_NS: u64 = 2_000_000_000;
@@ -87,6 +88,8 @@ pub struct FlightPlan {
     pub intrinsics: Intrinsics,
     /// The key-frame rule.
     pub keyframes: KeyframeSettings,
+    /// Longest training, seconds; what the ground station is shown and may change.
+    pub training_seconds: Option<f64>,
     /// When ground is covered.
     pub coverage: CoverageSettings,
     /// Which ground is to be: corners, metres east and north.
@@ -101,6 +104,8 @@ pub struct FlightPlan {
     pub geotags: Geotags,
     /// The live page; this is its aircraft 0.
     pub watch: Watch,
+    /// Takes what happens.
+    pub recorder: Recorder,
 }
 
 /// A key frame that the job has not taken yet.
@@ -138,6 +143,8 @@ pub(super) struct Intake<L: Link, C, K> {
     names: HashSet<String>,
     counters: FlightCounters,
     shown: ShownCapture,
+    /// When the ground station was last shown how things stand.
+    stationed_ns: Option<u64>,
 }
 
 impl<L, C, K> Intake<L, C, K>
@@ -148,6 +155,7 @@ where
 {
     /// `clock` runs as the vehicle's own does.
     pub(super) fn new(mut plan: FlightPlan, vehicle: Vehicle<L, C, K>, clock: K, end: CaptureEnd) -> Self {
+        plan.recorder.set_clock(vehicle.now_ns());
         let mut selector = KeyframeSelector::new(plan.keyframes);
         plan.earlier.iter().for_each(|pose| selector.restore(*pose));
         let shown = ShownCapture::new(plan.watch.clone(), plan.intrinsics, &plan.earlier);
@@ -165,6 +173,7 @@ where
             heard_ns: None,
             counters: FlightCounters::default(),
             shown,
+            stationed_ns: None,
         }
     }
 
@@ -174,6 +183,7 @@ where
     /// A link or camera that will not come back.
     pub(super) fn turn(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         let stop = self.end.stop_asked();
+        self.show_station();
         match self.phase {
             Phase::Flying => {
                 if stop {
@@ -222,45 +232,9 @@ where
         self.counters
     }
 
-    /// Begins a map of the ground once its height is known: with the first picture the autopilot has said where home is.
-    fn look_at_ground(&mut self) {
-        if self.selector.has_ground() {
-            return;
-        }
-        let corners = self.plan.region.iter().map(|c| DVec2::from(*c)).collect();
-        let height_m = self.plan.coverage.ground_m.map(f64::from).or(self.vehicle.home_m()).unwrap_or(0.0);
-        match Region::new(corners).and_then(|region| CoverageMap::new(&region, height_m, self.plan.coverage)) {
-            Ok(map) => self.selector.over(map, self.plan.intrinsics),
-            Err(e) => tracing::debug!("no map of the ground: {e}"),
-        }
-    }
-
-    /// What the key frames cover, and how to get the rest.
-    fn survey(&mut self) -> Option<Coverage> {
-        let (map, flown) = self.selector.ground()?;
-        let home_m = self.vehicle.home_m().unwrap_or(map.base_m());
-        let found = Coverage::of(map.clone(), Some(self.plan.vehicle.origin));
-        Some(found.with_reflight(&flown, self.plan.keyframes.t_min_m.into(), home_m))
-    }
-
-    /// Says it to the ground control station: whoever has to fly again is still there.
-    fn tell_coverage(&mut self) {
-        self.counters.coverage = self.survey();
-        if let Some(coverage) = &self.counters.coverage {
-            self.shown.coverage(coverage);
-            let line = coverage.line();
-            tracing::info!("{line}");
-            let severity = match coverage.gaps.is_empty() {
-                true => MavSeverity::MAV_SEVERITY_INFO,
-                false => MavSeverity::MAV_SEVERITY_NOTICE,
-            };
-            self.vehicle.status_text(severity, &line);
-        }
-    }
-
     fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
         while let Ok((severity, text)) = self.end.words.try_recv() {
-            self.vehicle.status_text(severity, &text);
+            self.say(severity, text);
         }
         let alive = self.listen(wait)?;
         let now_ns = self.clock.now_ns();
@@ -302,8 +276,12 @@ where
                     tracing::warn!("link to the autopilot lost; waiting for it to come back");
                 }
                 Event::LinkBack => tracing::info!("link to the autopilot is back"),
-                Event::Pose(report) => self.shown.at = Some(report.position.to_array()),
-                Event::Trigger(_) => {}
+                Event::Pose(report) => {
+                    self.shown.at = Some(report.position.to_array());
+                    self.plan.recorder.note(report.time_ns, Entry::Pose(report));
+                }
+                Event::Asked { parameter, value } => self.set(parameter, value),
+                Event::Trigger(t) => self.plan.recorder.note(t.time_ns, Entry::Exposure(t.sequence)),
             }
         }
         let pictures = self.vehicle.pictures();
@@ -332,6 +310,7 @@ where
         self.plan.geotags.note(&frame, decision);
         if let Some(Ok(image)) = loaded {
             self.shown.key_frame(pose, &image, self.selector.map(), self.clock.now_ns());
+            self.plan.recorder.note_key_frame(frame.time_ns, pose, &image);
             self.end.count(true);
             let decoded = self.pending.iter().filter(|w| matches!(w, Waiting::Decoded(_))).count();
             let waiting = match decoded < DECODED_AHEAD {

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use hal::failsafe::Action;
 use hal::mavlink::dialect::MavSeverity;
+use hal::mavlink_camera::Activity;
 use hal::traits::Clock;
 use vulkan::trainer::{RunBudget, StepReport};
 
@@ -96,6 +97,24 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         self.shown.state(state, self.reconstruction.keyframes(), self.reconstruction.gaussians());
     }
 
+    /// As [`Job::show`], and to the ground station.
+    fn act_as(&self, capture: &Handover, activity: Activity) {
+        self.show(activity.name());
+        capture.tell(|told| {
+            told.activity = activity;
+            (told.key_frames, told.gaussians) =
+                (count(self.reconstruction.keyframes()), count(self.reconstruction.gaussians()));
+        });
+    }
+
+    /// What the ground station has asked for since the last turn.
+    fn obey(&mut self, capture: &Handover) {
+        capture.tell(|told| told.training_over = self.training_failed);
+        let Some(seconds) = capture.seconds_asked() else { return };
+        self.budget.seconds = seconds;
+        self.reconstruction.set_seconds(seconds);
+    }
+
     /// Key frames taken so far.
     pub(super) fn keyframes(&self) -> usize {
         self.reconstruction.keyframes()
@@ -108,6 +127,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             self.supervisor.stopping();
             return Ok(false);
         }
+        self.obey(capture);
         // Asked before looking into the channel: what was handed over before the end is still there.
         let flying = capture.is_open();
         let taken = self.take(capture)?;
@@ -149,7 +169,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let Some(frame) = capture.next(patience)? else { return Ok(false) };
         tracing::info!("key frame {}: {}", self.reconstruction.keyframes() + 1, frame.name);
         self.reconstruction.add(frame, capture.waiting() > 0)?;
-        self.show("taking key frames");
+        self.act_as(capture, Activity::Collecting);
         Ok(true)
     }
 
@@ -166,6 +186,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let Some(rung) = self.failsafe.act(&mut self.reconstruction)? else { return Ok(()) };
         let line = format!("dgtr: {rung}");
         self.shown.rung(&self.failsafe.state());
+        capture.tell(|told| told.rung = rung.action);
         tracing::warn!("{line}");
         self.supervisor.status(&line);
         let severity = if rung.is_worse { MavSeverity::MAV_SEVERITY_WARNING } else { MavSeverity::MAV_SEVERITY_INFO };
@@ -178,7 +199,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     fn build(&mut self, capture: &mut Handover) -> Result<(), JobError> {
-        self.show("building a model");
+        self.act_as(capture, Activity::Building);
         let supervisor = &self.supervisor;
         let at_work = || {
             supervisor.alive();
@@ -209,7 +230,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
         let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
         let mut last = None;
-        self.show("training in flight");
+        self.act_as(capture, Activity::Training);
         let (clock, failsafe, supervisor, budget) = (&self.clock, &mut self.failsafe, &self.supervisor, self.budget);
         let shown = &mut self.shown;
         let views = self.reconstruction.keyframes();
@@ -217,6 +238,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             last = Some(*report);
             supervisor.alive();
             shown.step(report);
+            capture.tell(|told| {
+                (told.gaussians, told.progress, told.loss) = (count(report.gaussians), report.progress, report.loss);
+            });
             let now_ns = clock.now_ns();
             let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
             let alarmed = failsafe.glance(now_ns, capture.flags(), &budget, views);
@@ -293,4 +317,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     pub(super) fn failsafe(&self) -> hal::failsafe::State {
         self.failsafe.state()
     }
+}
+
+/// As a ground station is told.
+fn count(n: usize) -> u32 {
+    u32::try_from(n).unwrap_or(u32::MAX)
 }

@@ -30,6 +30,7 @@ use super::handover::handover;
 use super::intake::Intake;
 use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::job::Job;
+use super::record::Recorder;
 use crate::engine::{Reconstruct, model_path};
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
@@ -130,6 +131,8 @@ impl Reconstruct for Ledger {
         (self.built, self.steps) = (self.views.len(), 0);
         Ok(true)
     }
+
+    fn set_seconds(&mut self, _seconds: Option<f64>) {}
 
     fn is_done(&self, budget: &RunBudget) -> bool {
         budget.steps.is_some_and(|s| self.steps >= s)
@@ -245,6 +248,7 @@ pub(super) fn rehearse_on(
         vehicle: script.vehicle.clone(),
         intrinsics: intrinsics(&script.vehicle.lens),
         keyframes: KeyframeSettings::default(),
+        training_seconds: None,
         coverage: CoverageSettings::default(),
         region: script.ground.clone(),
         earlier: store.poses(),
@@ -252,6 +256,7 @@ pub(super) fn rehearse_on(
         end: script.end,
         geotags: Geotags::open(disk, &out, script.vehicle.origin).expect("a file"),
         watch: watch.clone(),
+        recorder: Recorder::default(),
     };
     capture.keep_in(store, model_path(&out));
     let mut intake = Some(Intake::new(plan, vehicle, clock.clone(), end));

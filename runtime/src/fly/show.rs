@@ -23,6 +23,8 @@ pub(super) struct ShownCapture {
     lens: Intrinsics,
     /// Where the aircraft was last, metres east, north, up.
     pub(super) at: Option<[f64; 3]>,
+    /// How much of the region was covered when that was last looked at, percent.
+    pub(super) covered: Option<u32>,
     surveyed_ns: Option<u64>,
 }
 
@@ -33,7 +35,7 @@ impl ShownCapture {
             let views = earlier.iter().map(|&pose| View { intrinsics: lens, pose });
             views.for_each(|view| page.ground.add(Shot::of(0, &view, 0.0)));
         });
-        Self { watch, lens, at: None, surveyed_ns: None }
+        Self { watch, lens, at: None, covered: None, surveyed_ns: None }
     }
 
     /// The aircraft as it is now.
@@ -62,10 +64,10 @@ impl ShownCapture {
         let shot = Shot::of(0, &View { intrinsics: self.lens, pose }, map.map_or(0.0, CoverageMap::base_m));
         self.watch.update(|page| {
             page.ground.add(shot);
-            let covered = due.map(|map| (100.0 * page.ground.survey(0, map)) as u32);
+            self.covered = due.map(|map| (100.0 * page.ground.survey(0, map)) as u32).or(self.covered);
             if let Some(craft) = page.aircraft.first_mut() {
                 craft.thumbnail.take(image);
-                craft.covered = covered.or(craft.covered);
+                craft.covered = self.covered.or(craft.covered);
             }
         });
     }

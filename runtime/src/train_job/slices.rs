@@ -158,6 +158,8 @@ mod tests {
             Ok(true)
         }
 
+        fn set_seconds(&mut self, _seconds: Option<f64>) {}
+
         fn is_done(&self, budget: &RunBudget) -> bool {
             budget.steps.is_some_and(|s| self.steps >= s)
         }

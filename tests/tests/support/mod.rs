@@ -1,6 +1,7 @@
 //! Starting, watching and ending `dgtr` processes.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod hub;
 pub mod plane;
 
 use std::path::{Path, PathBuf};
