@@ -103,7 +103,7 @@ enum Command {
     Import(import::Args),
     /// Makes the keys of aircraft and ground, and prints the public ones for the mission file.
     Keys(keys::Args),
-    /// Writes a mission file to start from, or prints the reference of all settings.
+    /// Writes a mission file to start from, asking for what is not given, or prints the reference of all settings.
     Init(init::Args),
     /// Prints what a memory budget holds, section by section.
     Plan(plan::Args),

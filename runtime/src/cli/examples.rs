@@ -23,13 +23,7 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
     ("export", &["dgtr export global.dgtr --to html", "dgtr export global.dgtr --to spz --out scene.spz"]),
     ("import", &["dgtr import scene.ply --out scene.dgtr"]),
     ("keys", &["dgtr keys --mission mission.toml", "dgtr keys --mission mission.toml --only west"]),
-    (
-        "init",
-        &[
-            "dgtr init",
-            "dgtr init --origin 47.4,8.5,430 --picture 4056x3040 --fov-deg 62 --aircraft west=serial:/dev/ttyAMA0:921600",
-        ],
-    ),
+    ("init", &["dgtr init", "dgtr init --origin 47.4,8.5,430 --picture 4056x3040 --fov-deg 62"]),
     ("plan", &["dgtr plan --mission mission.toml", "dgtr plan --budget-mib 300 --json"]),
     ("doctor", &["dgtr doctor", "dgtr doctor --mission mission.toml"]),
     ("demo", &["dgtr demo", "dgtr demo --seconds 20 --http 127.0.0.1:8080"]),
