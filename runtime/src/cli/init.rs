@@ -86,13 +86,17 @@ fn asked(args: &Args) -> std::io::Result<Given> {
     let mut terminal = Terminal::new(stdin().lock(), stderr());
     let list = |numbers: &[f64]| numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(",");
     let links: Vec<String> = args.aircraft.iter().map(|(id, link)| format!("{id}={link}")).collect();
-    // Where only a simulator flies, and the camera of a Raspberry Pi (HQ, 6 mm lens).
+    // Somewhere for a simulator to fly; picture and angle are the README's example.
     let origin = args.origin.map_or("47.4,8.5,430".to_owned(), |o| list(&o));
     let picture = args.picture.map_or("4056x3040".to_owned(), |[w, h]| format!("{w}x{h}"));
     let fov = args.fov_deg.unwrap_or(62.0).to_string();
     Ok(Given {
         name: terminal.ask("Name of the mission", &args.name, |text| Ok(text.to_owned()))?,
-        origin: terminal.ask("Middle of the area: latitude, longitude (degrees), height (m)", &origin, numbers::<3>)?,
+        origin: terminal.ask(
+            "Middle of the area: latitude, longitude (degrees), height (m); Enter to simulate",
+            &origin,
+            numbers::<3>,
+        )?,
         area_m: terminal.ask("Its extent east-west and north-south, metres", &list(&args.area_m), numbers::<2>)?,
         picture: terminal.ask("Size of the camera's pictures, pixels", &picture, size)?,
         fov_deg: terminal.ask("Its horizontal field of view, degrees", &fov, field_of_view)?,
