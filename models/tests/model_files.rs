@@ -255,3 +255,18 @@ fn a_ply_whose_numbers_are_bytes_is_refused_rather_than_blown_up() {
     let e = ply::read(&path).unwrap_err().to_string();
     assert!(e.contains("\"opacity\" is no float"), "{e}");
 }
+
+#[test]
+fn a_ply_that_claims_more_vertices_than_it_holds_is_refused_before_memory_is_taken() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.ply");
+    ply::write(&path, &GaussianCloud::with_capacity(0, 0), None).unwrap();
+    let text = String::from_utf8(std::fs::read(&path).unwrap()).unwrap();
+    for claimed in ["1", "4000000000", "9000000000000000000"] {
+        let bomb = text.replace("element vertex 0", &format!("element vertex {claimed}"));
+        assert_ne!(bomb, text);
+        std::fs::write(&path, bomb).unwrap();
+        let e = ply::read(&path).unwrap_err().to_string();
+        assert!(e.contains("its vertices"), "{claimed}: {e}");
+    }
+}

@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use config::error::ErrorKind;
 
 use crate::console;
@@ -17,6 +17,7 @@ mod demo;
 mod doctor;
 mod error;
 mod eval;
+mod examples;
 mod export;
 mod fly;
 mod http;
@@ -102,7 +103,7 @@ enum Command {
     Import(import::Args),
     /// Makes the keys of aircraft and ground, and prints the public ones for the mission file.
     Keys(keys::Args),
-    /// Writes a mission file to start from, or prints the reference of all settings.
+    /// Writes a mission file to start from, asking for what is not given, or prints the reference of all settings.
     Init(init::Args),
     /// Prints what a memory budget holds, section by section.
     Plan(plan::Args),
@@ -130,10 +131,20 @@ enum Lab {
     Manual(manual::Args),
 }
 
+/// All that the command line knows.
+fn program() -> clap::Command {
+    examples::with_examples(Cli::command())
+}
+
+fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Error> {
+    let mut matches = program().try_get_matches_from(arguments)?;
+    Cli::from_arg_matches_mut(&mut matches).map_err(|e| e.format(&mut program()))
+}
+
 /// Parses `arguments` (the first is the program's name), runs the command and says how it went: results on standard
 /// output, everything else on standard error.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
-    let cli = match Cli::try_parse_from(arguments) {
+    let cli = match parse(arguments) {
         Ok(cli) => cli,
         Err(e) => {
             // A closed pipe is no reason to fail.
@@ -182,9 +193,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         #[cfg(feature = "lab")]
         Command::Lab(Lab::Bench(args)) => bench::run(args),
         #[cfg(feature = "lab")]
-        Command::Lab(Lab::Manual(args)) => {
-            manual::run(args, <Cli as clap::CommandFactory>::command(), Lab::has_subcommand)
-        }
+        Command::Lab(Lab::Manual(args)) => manual::run(args, program(), Lab::has_subcommand),
     };
     if let Some(trace) = trace {
         trace.finish();
@@ -198,4 +207,43 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
 fn failed(e: &CliError) -> ExitCode {
     console::error(&e.to_string());
     e.exit_code()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every command that is shown, by its path, with its help.
+    fn shown(command: &clap::Command, path: &str) -> Vec<(String, String)> {
+        let commands = command.get_subcommands().filter(|c| !c.is_hide_set());
+        let of = |c: &clap::Command| {
+            let path = format!("{path} {}", c.get_name()).trim_start().to_owned();
+            let mut all = shown(c, &path);
+            if all.is_empty() {
+                all.push((path, c.clone().render_long_help().to_string()));
+            }
+            all
+        };
+        commands.flat_map(of).collect()
+    }
+
+    #[test]
+    fn every_commands_help_ends_with_examples_that_are_understood() {
+        let all = shown(&program(), "");
+        assert!(all.len() > 12, "{all:?}");
+        for (path, help) in &all {
+            let (_, examples) = help.rsplit_once("Example").unwrap_or_else(|| panic!("{path} has no example: {help}"));
+            let calls: Vec<&str> = examples.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
+            assert!((1..=2).contains(&calls.len()), "{path}: {calls:?}");
+            for call in calls {
+                assert!(call.starts_with(&format!("dgtr {path}")), "{path}: {call}");
+                if let Err(e) = parse(call.split_whitespace().map(OsString::from)) {
+                    panic!("{call}: {e}");
+                }
+            }
+        }
+        // And no example belongs to a command that is not there (any more).
+        #[cfg(feature = "lab")]
+        assert_eq!(all.len(), examples::EXAMPLES.len());
+    }
 }

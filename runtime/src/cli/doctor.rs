@@ -1,5 +1,6 @@
 //! `dgtr doctor`: what this machine has and lacks, one line each, with how to mend it.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use config::error::ErrorKind;
@@ -34,7 +35,7 @@ pub struct Args {
     pub calibrate: bool,
 }
 
-/// How a check came out.
+/// How a check came out. What is not well says how to mend it.
 enum Finding {
     Ok(String),
     /// Some jobs run without it.
@@ -42,6 +43,28 @@ enum Finding {
     /// Jobs fail without it.
     Missing(String),
 }
+
+impl Finding {
+    fn note(what: impl Display, mend: &str) -> Self {
+        Self::Note(with_mend(what, mend))
+    }
+
+    fn missing(what: impl Display, mend: &str) -> Self {
+        Self::Missing(with_mend(what, mend))
+    }
+}
+
+/// `what` and how to mend it: its own words behind a semicolon, as errors have them, else `mend`.
+fn with_mend(what: impl Display, mend: &str) -> String {
+    let what = what.to_string();
+    if what.contains("; ") { what } else { format!("{what}; {mend}") }
+}
+
+/// For what a driver does.
+const DRIVER: &str = "update its driver, or name another device with --device";
+/// For a network that ends with an error.
+const NETWORK: &str = "export it anew as models/networks/EXPORT.md says";
+const LIBRARY: &str = "install ONNX Runtime 1.22 or newer there, or point ORT_DYLIB_PATH at one";
 
 /// Runs `dgtr doctor`; fails with exit code 3 when something is missing.
 ///
@@ -61,7 +84,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         outln!("{state:<8} {what:<16} {}", text.split_whitespace().collect::<Vec<_>>().join(" "));
     };
     match Gpu::list() {
-        Err(e) => tell("vulkan", Finding::Missing(e.to_string())),
+        Err(e) => tell("vulkan", Finding::missing(e, DRIVER)),
         Ok(found) => {
             if found.len() > 1 {
                 tell("training", trains(&found, args.calibrate));
@@ -84,15 +107,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
             tell("onnx runtime", Finding::Ok(library.display().to_string()));
             match FeatureNetwork::open(None, 1).and_then(|mut network| network.check()) {
                 Ok(()) => tell("features", Finding::Ok("embedded XFeat runs".to_owned())),
-                Err(e) => tell("features", Finding::Missing(e.to_string())),
+                Err(e) => tell("features", Finding::missing(e, LIBRARY)),
             }
         }
-        Err(e) => tell("onnx runtime", Finding::Missing(e.to_string())),
+        Err(e) => tell("onnx runtime", Finding::missing(e, LIBRARY)),
     }
     for path in &args.model {
         match checked(path) {
             Ok(text) => tell("network", Finding::Ok(text)),
-            Err(e) => tell("network", Finding::Missing(e.to_string())),
+            Err(e) => tell("network", Finding::missing(e, NETWORK)),
         }
     }
     if let Some(path) = &args.mission {
@@ -108,27 +131,27 @@ pub fn run(args: Args) -> Result<(), CliError> {
         "pseudo terminal",
         match std::fs::OpenOptions::new().read(true).write(true).open("/dev/ptmx") {
             Ok(_) => Finding::Ok("/dev/ptmx opens (demo, sim and replay)".to_owned()),
-            Err(e) => Finding::Missing(format!("/dev/ptmx: {e}; mount devpts, or use udp: and tcp: links")),
+            Err(e) => Finding::missing(format!("/dev/ptmx: {e}"), "mount devpts, or use udp: and tcp: links"),
         },
     );
     tell(
         "memory",
         match resources::available_bytes() {
             Some(bytes) if bytes < 512 << 20 => {
-                Finding::Note(format!("{} MiB available; lower memory.device_mib", bytes >> 20))
+                Finding::note(format!("{} MiB available", bytes >> 20), "lower memory.device_mib")
             }
             Some(bytes) => Finding::Ok(format!("{} MiB available", bytes >> 20)),
-            None => Finding::Note("not known on this system".to_owned()),
+            None => Finding::note("not known on this system", "mount /proc"),
         },
     );
     tell(
         "disk",
         match resources::free_disk_bytes(Path::new(".")) {
             Some(bytes) if bytes < 256 << 20 => {
-                Finding::Note(format!("{} MiB free here; make room or lower keyframes.max (dgtr plan)", bytes >> 20))
+                Finding::note(format!("{} MiB free here", bytes >> 20), "make room or lower keyframes.max (dgtr plan)")
             }
             Some(bytes) => Finding::Ok(format!("{} MiB free here", bytes >> 20)),
-            None => Finding::Note("free space is not known on this system".to_owned()),
+            None => Finding::note("free space is not known on this system", "bound it with memory.disk_mib"),
         },
     );
     match missing {
@@ -153,7 +176,7 @@ fn checked(manifest: &Path) -> Result<String, OnnxError> {
 fn computes(info: &GpuInfo) -> Finding {
     match Gpu::open(Some(&info.name)).map_err(TrainError::from).and_then(|gpu| check_device(&gpu)) {
         Ok(agreed) => Finding::Ok(format!("{}: a kernel and its twin agree on {agreed} Gaussians", info.name)),
-        Err(e) => Finding::Missing(format!("{}: {e}", info.name)),
+        Err(e) => Finding::missing(format!("{}: {e}", info.name), DRIVER),
     }
 }
 
@@ -162,15 +185,16 @@ fn takes_a_plan(info: &GpuInfo) -> Finding {
     let request = PlanRequest { sort_lanes: info.sort_lanes(), ..PlanRequest::default() };
     let plan = match Plan::new(&request) {
         Ok(plan) => plan,
-        Err(e) => return Finding::Missing(e.to_string()),
+        Err(e) => return Finding::missing(e, "lower memory.device_mib"),
     };
     let what = format!("{}: {} MiB, {} Gaussians", info.name, request.device_mib, plan.gaussians);
     match Gpu::open(Some(&info.name)).and_then(|gpu| check_plan(&gpu, &plan)) {
         Ok(PlanFit::Whole) => Finding::Ok(format!("{what} fit")),
-        Ok(PlanFit::StorageReads) => {
-            Finding::Note(format!("{what} fit, read from storage buffers (slower): few texels"))
-        }
-        Err(e) => Finding::Missing(format!("{what}: {e}")),
+        Ok(PlanFit::StorageReads) => Finding::note(
+            format!("{what} fit, read from storage buffers (slower): few texels"),
+            "lower memory.max_gaussians",
+        ),
+        Err(e) => Finding::missing(format!("{what}: {e}"), "lower memory.device_mib"),
     }
 }
 
@@ -180,9 +204,8 @@ fn trains(found: &[GpuInfo], calibrate: bool) -> Finding {
         found.iter().map(if calibrate { devices::measured } else { devices::known }).collect();
     let chosen = &found[devices::fastest(found, &steps)].name;
     if steps.contains(&None) {
-        return Finding::Note(format!(
-            "on {chosen} until the first job, or dgtr doctor --calibrate, measures a step of each"
-        ));
+        let what = format!("on {chosen} until the first job measures a step of each");
+        return Finding::note(what, "dgtr doctor --calibrate measures it now");
     }
     let each = found.iter().zip(&steps).map(|(d, ms)| format!("{} {:.1} ms", d.name, ms.unwrap_or(f64::INFINITY)));
     Finding::Ok(format!("on {chosen} (a step: {}; --device names another)", each.collect::<Vec<_>>().join(", ")))
@@ -195,7 +218,7 @@ fn kernel_shape(info: &GpuInfo, calibrate: bool) -> Finding {
         false => None,
     };
     if calibrate && measured.is_none() {
-        return Finding::Note("kernels could not be measured; the default shape is used".to_owned());
+        return Finding::note("not measured, the default shape is used", "try again with nothing else on the device");
     }
     let (shape, source) = measured.unwrap_or_else(|| kernels::known(info));
     let why = match source {
@@ -222,15 +245,14 @@ fn serial_ports() -> Vec<Finding> {
         .unwrap_or_default();
     ports.sort();
     if ports.is_empty() {
-        let text = "none found; connect the autopilot (needed by `dgtr fly` on serial: links only)";
-        return vec![Finding::Note(text.to_owned())];
+        return vec![Finding::note("none found", "connect the autopilot (needed by `dgtr fly` on serial: links only)")];
     }
     ports
         .into_iter()
         .map(|p| match rustix::fs::access(&p, rustix::fs::Access::READ_OK | rustix::fs::Access::WRITE_OK) {
             Ok(()) => Finding::Ok(p.display().to_string()),
             Err(e) => {
-                Finding::Missing(format!("{}: {e}; sudo usermod -aG dialout $USER and log in again", p.display()))
+                Finding::missing(format!("{}: {e}", p.display()), "sudo usermod -aG dialout $USER and log in again")
             }
         })
         .collect()

@@ -14,9 +14,8 @@ use crate::{console, interrupt};
 /// Arguments of `dgtr ortho`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Example: dgtr ortho global.dgtr --out map --gsd 5\n\nWrites ortho.tif (colour and alpha), dsm.tif \
-                        (heights, metres), world files, small pictures of both, and map.georef.json. The reference system \
-                        is the UTM zone of the model's origin."
+    after_help = "Writes ortho.tif (colour and alpha), dsm.tif (heights, metres), world files, small pictures of both, and \
+                        map.georef.json. The reference system is the UTM zone of the model's origin."
 )]
 pub struct Args {
     /// The .dgtr model.

@@ -15,27 +15,29 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
     let mut all = vec![(
         "signatures",
         match (&signed, exposed) {
-            (Err(e), _) => Finding::Missing(e.to_string()),
+            (Err(e), _) => Finding::missing(e, "make keys with `dgtr keys`"),
             (Ok(true), _) => Finding::Ok("offers and receipts are signed by aircraft and ground".to_owned()),
             (Ok(false), None) => {
-                Finding::Note("nothing is signed; no endpoint of [upload] reaches beyond this machine".to_owned())
+                let what = "nothing is signed: no endpoint of [upload] reaches beyond this machine";
+                Finding::note(what, "before one does, `dgtr keys` makes keys")
             }
-            (Ok(false), Some(endpoint)) => Finding::Note(format!(
-                "insecure = true: whoever reaches {endpoint} can replace any model; `dgtr keys` makes keys"
-            )),
+            (Ok(false), Some(endpoint)) => Finding::note(
+                format!("insecure = true: whoever reaches {endpoint} can replace any model"),
+                "`dgtr keys` makes keys",
+            ),
         },
     )];
     if matches!(signed, Ok(true)) {
         let ids = mission.aircraft.iter().map(|a| a.id.as_str()).chain([GROUND]);
         let here: Vec<&str> = ids.filter(|id| private_path(&upload.keys, id).exists()).collect();
         if here.is_empty() {
-            let text = format!("none in {}; fly and serve need their own", upload.keys.display());
-            all.push(("private key", Finding::Note(text)));
+            let what = format!("none in {}, fly and serve need their own", upload.keys.display());
+            all.push(("private key", Finding::note(what, "`dgtr keys` makes them, or copy this machine's there")));
         }
         all.extend(here.into_iter().map(|id| {
             let finding = match Identity::of(mission, id) {
                 Ok(_) => Finding::Ok(format!("{id}'s, readable by its owner only")),
-                Err(e) => Finding::Missing(e.to_string()),
+                Err(e) => Finding::missing(e, "make it anew with `dgtr keys`"),
             };
             ("private key", finding)
         }));
@@ -45,7 +47,10 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
             Some(_) => {
                 Finding::Ok(format!("{endpoint} by TLS; an aircraft's certificate speaks under its own id only"))
             }
-            None => Finding::Note(format!("{endpoint} is not encrypted: models can be read on the way")),
+            None => Finding::note(
+                format!("{endpoint} is not encrypted: models can be read on the way"),
+                "use a tls/ endpoint with certificates in [upload] tls",
+            ),
         };
         ("encryption", finding)
     }));
@@ -58,13 +63,13 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
 /// Whether somebody else could speak as the autopilot of aircraft `id`.
 fn autopilot_link(id: &str, link: &str, signing: &Signing) -> Finding {
     match (link.parse::<LinkAddress>(), signing) {
-        (Err(e), _) => Finding::Missing(format!("{id}: {e}")),
+        (Err(e), _) => Finding::missing(format!("{id}: {e}"), "mend link of this aircraft in the mission file"),
         (Ok(_), Signing::Require) => Finding::Ok(format!("{id}: only signed MAVLink is believed")),
         (Ok(address), _) if !address.is_shared() => Finding::Ok(format!("{id}: {link} is a wire of its own")),
-        (Ok(_), Signing::Off | Signing::Accept) => Finding::Note(format!(
-            "{id}: whoever reaches {link} before the autopilot does can speak as it; set [link] signing = \"require\" and \
-             signing_key"
-        )),
+        (Ok(_), Signing::Off | Signing::Accept) => Finding::note(
+            format!("{id}: whoever reaches {link} before the autopilot does can speak as it"),
+            "set [link] signing = \"require\" and signing_key",
+        ),
     }
 }
 

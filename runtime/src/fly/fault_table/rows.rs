@@ -186,6 +186,14 @@ pub(super) const ROWS: &[Row] = &[
         ..USUAL
     },
     Row {
+        fault: "every picture 80 s late, line silent from the last exposure on",
+        settings: &[("SIM_LINK_PAUSE", 1.0), ("SIM_FLT_START", 40.0)],
+        also: |script| script.sim.imperfections.transfer_ms = 80_000.0,
+        noticed: |c, _| c.link_losses == 1 && c.pictures_reconciled == EXPOSURES && c.posed_frames == EXPOSURES,
+        rung: Action::Hold,
+        ..USUAL
+    },
+    Row {
         fault: "somebody says disarmed, twice a second",
         settings: &[("SIM_FORGE_DISARM", 1.0), ("SIM_FLT_START", 12.0)],
         noticed: |c, r| r.completed && c.posed_frames == EXPOSURES,

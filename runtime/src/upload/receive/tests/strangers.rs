@@ -44,6 +44,7 @@ fn garbage_that_is_faster_hides_neither_offers_nor_chunks_nor_receipts() {
     assert!(r.all_finished() && r.all_told());
     assert_eq!(bytes_here(&r), noise(50_000, 22));
     assert_eq!((r.counters.chunks, r.counters.corrupt, r.counters.retries), (4, 8, 0));
+    assert_eq!(b.fake.receipts.lock().expect("lock").len(), 1, "the aircraft itself has it");
     assert_eq!(r.counters.damaged + r.counters.forged, 200);
 }
 

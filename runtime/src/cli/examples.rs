@@ -1,0 +1,57 @@
+//! What every command's help ends with: one or two calls as people give them. One table, so that a test parses each.
+
+use clap::Command;
+
+/// A command's path below `dgtr` and its examples.
+pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
+    (
+        "train",
+        &["dgtr train pictures --out model --seconds 120", "dgtr train /media/card/DCIM --out model --preset medium"],
+    ),
+    ("eval", &["dgtr eval model/model.dgtr pictures --split test --baselines"]),
+    ("render", &["dgtr render model/model.dgtr --cameras pictures --out renders"]),
+    ("ortho", &["dgtr ortho global.dgtr --out map --gsd 5"]),
+    ("aggregate", &["dgtr aggregate west/model.dgtr east/model.dgtr --out merged"]),
+    ("serve", &["dgtr serve --mission mission.toml --out ground --http 127.0.0.1:8080"]),
+    (
+        "fly",
+        &[
+            "dgtr fly --mission mission.toml --out flight",
+            "dgtr fly --mission mission.toml --aircraft west --out flight --http 127.0.0.1:8080",
+        ],
+    ),
+    ("export", &["dgtr export global.dgtr --to html", "dgtr export global.dgtr --to spz --out scene.spz"]),
+    ("import", &["dgtr import scene.ply --out scene.dgtr"]),
+    ("keys", &["dgtr keys --mission mission.toml", "dgtr keys --mission mission.toml --only west"]),
+    ("init", &["dgtr init", "dgtr init --origin 47.4,8.5,430 --picture 4056x3040 --fov-deg 62"]),
+    ("plan", &["dgtr plan --mission mission.toml", "dgtr plan --budget-mib 300 --json"]),
+    ("doctor", &["dgtr doctor", "dgtr doctor --mission mission.toml"]),
+    ("demo", &["dgtr demo", "dgtr demo --seconds 20 --http 127.0.0.1:8080"]),
+    ("replay", &["dgtr replay pictures --link pty:port --speed 4"]),
+    ("sim", &["dgtr sim --mission mission.toml --speed 4", "dgtr sim --mission mission.toml --card card"]),
+    ("bench stages", &["dgtr bench stages --json stages.json"]),
+    ("bench map", &["dgtr bench map --out map"]),
+    ("bench detail", &["dgtr bench detail --out detail"]),
+    ("bench device", &["dgtr bench device --out board.md"]),
+    ("bench memory", &["dgtr bench memory pictures"]),
+    ("bench skips", &["dgtr bench skips pictures"]),
+    ("bench stress", &["dgtr bench stress"]),
+    ("bench time-error", &["dgtr bench time-error pictures --out time-error"]),
+];
+
+/// `program` with examples at the end of every command's help.
+pub(super) fn with_examples(program: Command) -> Command {
+    within(program, "")
+}
+
+fn within(command: Command, path: &str) -> Command {
+    let names: Vec<String> = command.get_subcommands().map(|c| c.get_name().to_owned()).collect();
+    let command = names.into_iter().fold(command, |command, name| {
+        let path = format!("{path} {name}");
+        command.mut_subcommand(&name, |c| within(c, path.trim_start()))
+    });
+    let Some((_, examples)) = EXAMPLES.iter().find(|e| e.0 == path) else { return command };
+    let before = command.get_after_help().map(|text| format!("{text}\n\n")).unwrap_or_default();
+    let word = if examples.len() > 1 { "Examples" } else { "Example" };
+    command.after_help(format!("{before}{word}:\n  {}", examples.join("\n  ")))
+}
