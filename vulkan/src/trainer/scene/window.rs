@@ -1,8 +1,8 @@
 //! Which cells are on the device, for how long, and which parts of which pictures are trained meanwhile.
 //!
-//! A window begins with the block of a picture that was looked at least and takes the cells which the largest part around it sees,
-//! and the nearest others for as long as there is room. What is trained are rectangles of pictures that see no cell
-//! which is away; one that sees the whole of what a picture shows is the whole picture.
+//! A window begins with the block of a picture that was looked at least and takes the cells which the largest part around it sees;
+//! then, for as long as there is room, the cells that such parts of other pictures lack, and the nearest. What is trained are these
+//! parts, and of other pictures the rectangles that see no cell which is away meanwhile.
 
 use config::plan::Plan;
 use config::training::Strategy;
@@ -17,10 +17,14 @@ use crate::trainer::{TrainError, Trainer};
 
 /// Blocks of a picture.
 const BLOCKS: usize = SIDE as usize * SIDE as usize;
-/// A sixteenth of a picture is worth a step; the part that a window began with always is.
+/// A sixteenth of a picture is worth a step; what was planned always is.
 const LEAST_BLOCKS: u32 = 4;
 /// The chance of a block that nobody looked at yet.
 const UNSEEN: u64 = 1 << 20;
+/// Blocks from which a window looks for parts to plan besides the first.
+const MOST_TRIES: usize = 48;
+/// An eighth of a picture is worth cells that would not be there without it.
+const LEAST_PLANNED: u32 = 8;
 /// A block that shows nothing, or more than the device holds.
 const NEVER: u32 = u32::MAX;
 
@@ -31,6 +35,8 @@ struct Item {
     part: Blocks,
     /// Blocks in which something shows.
     weight: u32,
+    /// The window has its cells for this part's sake.
+    planned: bool,
 }
 
 /// The cells at work and what is trained with them.
@@ -41,7 +47,7 @@ pub(crate) struct Window {
     /// Gaussians of the cells wanted.
     held: usize,
     items: Vec<Item>,
-    /// Nothing was trained yet: the item that the window began with comes first.
+    /// Nothing was trained yet: the part that the window began with comes first.
     first: bool,
     /// The step after which it ends.
     pub until: u32,
@@ -58,7 +64,7 @@ impl Window {
             cells: Vec::with_capacity(plan.cells()),
             wanted: Vec::with_capacity(plan.cells()),
             held: 0,
-            items: Vec::with_capacity(views + crops + 1),
+            items: Vec::with_capacity(views + crops + 1 + MOST_TRIES),
             first: false,
             until: 0,
             visits: vec![0; views * BLOCKS],
@@ -74,9 +80,12 @@ impl Window {
         self.visits.fill(0);
     }
 
-    /// How likely an item is chosen: by its blocks, each the less the oftener it was looked at.
+    /// How likely an item is chosen: by its blocks, each the less the oftener it was looked at; what was planned as if nobody had.
     fn chance(&self, item: &Item) -> u64 {
         let Picture::View(view) = item.picture else { return item.weight.into() };
+        if item.planned {
+            return UNSEEN * u64::from(item.weight);
+        }
         let visits = self.visits[view * BLOCKS..(view + 1) * BLOCKS].iter().enumerate();
         let part = visits.filter(|(block, visits)| item.part.mask() >> block & 1 == 1 && **visits != NEVER);
         part.map(|(_, visits)| UNSEEN / (1 + u64::from(*visits))).sum()
@@ -147,9 +156,7 @@ impl Trainer {
         }
         window.first = false;
         if let Picture::View(view) = chosen.picture {
-            let (mask, visits) = (chosen.part.mask(), &mut window.visits[view * BLOCKS..(view + 1) * BLOCKS]);
-            let looked_at = visits.iter_mut().enumerate().filter(|(block, v)| mask >> block & 1 == 1 && **v != NEVER);
-            looked_at.for_each(|(_, visits)| *visits += 1);
+            window.look_at(view, chosen.part);
         }
         (chosen.picture, chosen.part)
     }
@@ -193,9 +200,12 @@ impl Trainer {
                 cells.iter().filter(shows).map(|c| c.count).sum::<usize>()
             };
             let mut needed = 0;
-            let fits = parts_around(x, y).find(|part| {
-                needed = seen(*part);
-                needed <= capacity
+            // Half of the room is left to parts that others lack, where half shows a part worth the name.
+            let fits = [(capacity / 2, LEAST_PLANNED), (capacity, 1)].into_iter().find_map(|(room, least)| {
+                parts_around(x, y).filter(|part| part.count() >= least).find(|part| {
+                    needed = seen(*part);
+                    needed <= room
+                })
             });
             match fits {
                 Some(part) if needed > 0 => break (view, part),
@@ -204,21 +214,58 @@ impl Trainer {
             }
             window.visits[view * BLOCKS + usize::from(y) * usize::from(SIDE) + usize::from(x)] = NEVER;
         };
-        window.begin(cells, (view, part));
+        window.begin(cells.len());
+        window.plan_part(cells, (view, part));
+        for _ in 0..MOST_TRIES {
+            let Some((view, x, y)) = window.least_visited(views, self.sampler.rng()) else { break };
+            let room = capacity - window.held;
+            let mut large = parts_around(x, y).filter(|part| part.count() >= LEAST_PLANNED);
+            if let Some(part) = large.find(|part| window.lacks(cells, (view, *part)) <= room) {
+                window.plan_part(cells, (view, part));
+            }
+        }
         window.fill_up(cells, capacity);
-        window.choose_items(cells, (view, part), views);
+        window.choose_items(cells, views);
         Ok(())
     }
 }
 
+fn shows_in(cell: &Cell, sight: &Sight, part: Blocks) -> bool {
+    cell.count > 0 && sight.blocks(&cell.bounds).is_some_and(|blocks| blocks.mask() & part.mask() != 0)
+}
+
 impl Window {
-    /// The cells that show in the part of the view.
-    fn begin(&mut self, cells: &[Cell], (view, part): (usize, Blocks)) {
-        let sight = self.sights[view];
-        let shows = |c: &Cell| sight.blocks(&c.bounds).is_some_and(|b| b.mask() & part.mask() != 0);
+    /// Nothing is wanted of so many cells.
+    fn begin(&mut self, cells: usize) {
         self.wanted.clear();
-        self.wanted.extend(cells.iter().map(|c| c.count > 0 && shows(c)));
-        self.held = cells.iter().zip(&self.wanted).filter(|(_, wanted)| **wanted).map(|(c, _)| c.count).sum();
+        self.wanted.resize(cells, false);
+        self.items.clear();
+        self.held = 0;
+    }
+
+    /// Gaussians of the cells that show in a part of a view and are not wanted yet.
+    fn lacks(&self, cells: &[Cell], (view, part): (usize, Blocks)) -> usize {
+        let lacking = |(c, wanted): &(&Cell, &bool)| !**wanted && shows_in(c, &self.sights[view], part);
+        cells.iter().zip(&self.wanted).filter(lacking).map(|(cell, _)| cell.count).sum()
+    }
+
+    /// Wants the cells that show in a part of a view, which is then trained in this window.
+    fn plan_part(&mut self, cells: &[Cell], (view, part): (usize, Blocks)) {
+        for (wanted, cell) in self.wanted.iter_mut().zip(cells) {
+            if !*wanted && shows_in(cell, &self.sights[view], part) {
+                *wanted = true;
+                self.held += cell.count;
+            }
+        }
+        self.items.push(Item { picture: Picture::View(view), part, weight: part.count(), planned: true });
+        self.look_at(view, part);
+    }
+
+    /// Counts a look at a part of a view.
+    fn look_at(&mut self, view: usize, part: Blocks) {
+        let (mask, visits) = (part.mask(), &mut self.visits[view * BLOCKS..(view + 1) * BLOCKS]);
+        let looked_at = visits.iter_mut().enumerate().filter(|(block, v)| mask >> block & 1 == 1 && **v != NEVER);
+        looked_at.for_each(|(_, visits)| *visits += 1);
     }
 
     /// The nearest cells for as long as there is room.
@@ -245,10 +292,8 @@ impl Window {
         self.cells.extend((0..cells.len() as u32).filter(|i| self.wanted[*i as usize]));
     }
 
-    /// The part that the window began with, and of every picture the largest rectangle that sees no cell which is away.
-    fn choose_items(&mut self, cells: &[Cell], (view, part): (usize, Blocks), views: usize) {
-        self.items.clear();
-        self.items.push(Item { picture: Picture::View(view), part, weight: part.count() });
+    /// Besides the parts planned, of every picture the largest rectangle that sees no cell which is away.
+    fn choose_items(&mut self, cells: &[Cell], views: usize) {
         for (i, sight) in self.sights.iter().enumerate() {
             let (mut free, mut shown) = (u64::MAX, 0);
             for (cell, wanted) in cells.iter().zip(&self.wanted).filter(|(c, _)| c.count > 0) {
@@ -267,7 +312,7 @@ impl Window {
             let Some(part) = part else { continue };
             let weight = (part.mask() & shown).count_ones();
             if weight > 0 {
-                self.items.push(Item { picture, part, weight });
+                self.items.push(Item { picture, part, weight, planned: false });
             }
         }
         self.first = true;
