@@ -217,6 +217,27 @@ fn windows_allocate_nothing() {
 }
 
 #[test]
+fn a_file_that_fails_is_an_error_and_never_a_smaller_model() {
+    let Some(mut t) = trainer(400, Some(900), &windows_of(4)) else { return };
+    t.load(&three_places()).unwrap();
+    for place in 0..3 {
+        let v = look(place);
+        t.add_view(&posed(&v, &photo(place as u64, &v)), None).unwrap();
+    }
+    (0..3).for_each(|_| _ = t.step().unwrap());
+    // A disk that takes everything and gives nothing back.
+    t.keep_scene_in(std::fs::File::options().read(true).write(true).open("/dev/null").unwrap());
+    let error = (0..20).find_map(|_| t.step().err()).expect("the next window is read from the file");
+    assert!(matches!(error, TrainError::SceneFile(_)), "{error}");
+    let error = t.snapshot(&mut GaussianCloud::default()).unwrap_err();
+    assert!(error.to_string().contains("last checkpoint"), "{error}");
+    assert!(matches!(t.step(), Err(TrainError::SceneFile(_))));
+    t.keep_scene_in(tempfile::tempfile().unwrap());
+    t.load(&three_places()).unwrap();
+    assert!(t.step().is_ok());
+}
+
+#[test]
 fn what_cannot_be_trained_is_said_in_one_line() {
     let Some(mut t) = trainer(4, Some(900), &plain()) else { return };
     let mut scene = three_places();

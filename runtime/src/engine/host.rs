@@ -1,7 +1,7 @@
 //! Host memory of a job, planned like the device's: what it will hold at most, by a formula, before the first picture.
 //!
 //! ```text
-//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·R (+ 36·N + 8·R + cells) + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
+//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·R (+ 40·N + 8·R + cells) + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
 //! ```
 //!
 //! V views, N Gaussians of the scene, R on the device (where N > R), D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
@@ -18,8 +18,9 @@ const PROGRAM_BYTES: u64 = 96 << 20;
 const FEATURES_BYTES: u64 = 2 * (32 << 20);
 /// The trainer's own lists per Gaussian: density control and SH degrees.
 const LISTS_BYTES: u64 = 20;
-/// Per Gaussian of a scene in cells while it is divided into them: its index, its cell, and the cells once more.
-const DIVIDED_BYTES: u64 = 36;
+/// Per Gaussian of a scene in cells while it is divided into them: its index (8), and its cell (16) by the size of cells at hand and
+/// by the next.
+const DIVIDED_BYTES: u64 = 40;
 
 /// What a job will hold.
 #[derive(Clone, Copy, Debug)]

@@ -61,6 +61,8 @@ pub(crate) struct Scene {
     order: Vec<u32>,
     /// Gaussians that are not on the device.
     pub away: usize,
+    /// Every Gaussian is where the cells say: false from when the file fails while cells are moved until the next load.
+    whole: bool,
     window: Window,
     /// Cells that a rendering sees.
     drawn: Vec<u32>,
@@ -78,6 +80,7 @@ impl Scene {
             tags: Vec::with_capacity(tags),
             order: Vec::with_capacity(tags),
             away: 0,
+            whole: true,
             window: Window::new(plan),
             drawn: Vec::with_capacity(plan.cells()),
             means: Vec::with_capacity(if plan.is_paged() { SAMPLED_MEANS } else { 0 }),
@@ -99,7 +102,7 @@ impl Scene {
         self.cells.clear();
         self.tags.clear();
         self.store.clear();
-        self.away = 0;
+        (self.away, self.whole) = (0, true);
         self.window.close();
     }
 

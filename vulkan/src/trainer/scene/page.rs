@@ -13,6 +13,7 @@ impl Scene {
             (0..on_device).for_each(|i| take(Held::OnDevice(i)));
             return Ok(());
         }
+        self.check_whole()?;
         self.sort_by_cell(on_device);
         let mut from = 0;
         for (index, cell) in self.cells.iter().enumerate() {
@@ -25,6 +26,16 @@ impl Scene {
             }
         }
         Ok(())
+    }
+
+    /// What was lost on the way to the file or from it must not be taken for a smaller scene.
+    fn check_whole(&self) -> Result<(), TrainError> {
+        match self.whole {
+            true => Ok(()),
+            false => {
+                Err(TrainError::SceneFile("it failed while cells were moved; go on from the last checkpoint".into()))
+            }
+        }
     }
 
     fn sort_by_cell(&mut self, on_device: usize) {
@@ -43,11 +54,13 @@ impl Scene {
         on_device: usize,
         again: bool,
     ) -> Result<(), TrainError> {
+        self.check_whole()?;
         if again {
             self.count_to_cells_again(arena, parameters);
         }
         self.sort_by_cell(on_device);
         self.measure(arena, parameters);
+        self.whole = false;
         let Self { cells, store, order, tags, .. } = self;
         for cell in cells.iter_mut().filter(|cell| cell.on_device) {
             store.forget(&mut cell.chain);
@@ -65,6 +78,7 @@ impl Scene {
         }
         tags.clear();
         self.away += on_device;
+        self.whole = true;
         Ok(())
     }
 
@@ -104,6 +118,8 @@ impl Scene {
 
     /// Puts the cells `wanted`, in order, onto the empty device; returns how many Gaussians they have.
     fn page_in(&mut self, arena: &mut Arena, parameters: &Parameters, wanted: &[u32]) -> Result<usize, TrainError> {
+        self.check_whole()?;
+        self.whole = false;
         let mut n = 0;
         for &index in wanted {
             let cell = &mut self.cells[index as usize];
@@ -113,6 +129,7 @@ impl Scene {
             self.tags.resize(n, index);
         }
         self.away -= n;
+        self.whole = true;
         Ok(n)
     }
 }
