@@ -7,6 +7,10 @@
 
 use serde::{Deserialize, Serialize};
 
+pub use turn::ShTurn;
+
+mod turn;
+
 /// Number of SH coefficients per colour channel for a degree 0…3.
 pub const fn sh_coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
@@ -161,6 +165,15 @@ impl GaussianCloud {
     pub fn drop_invalid(&mut self) -> usize {
         let valid: Vec<bool> = (0..self.len()).map(|i| self.is_valid(i)).collect();
         self.retain(|i| valid[i])
+    }
+
+    /// Makes room for exactly `more` further Gaussians: a cloud that grows model by model never holds twice its size.
+    pub fn reserve_exact(&mut self, more: usize) {
+        self.means.reserve_exact(more);
+        self.log_scales.reserve_exact(more);
+        self.rotations.reserve_exact(more);
+        self.opacity_logits.reserve_exact(more);
+        self.sh.reserve_exact(more * self.sh_stride());
     }
 
     /// Appends another cloud; the lower SH degree is padded with zeros.

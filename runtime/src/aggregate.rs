@@ -1,11 +1,13 @@
 //! The ground's work: local models in, one global model out (the paper's §Model Aggregation).
 //!
 //! Bring every model into one frame → keep of each what its aircraft answers for → unite → let every aircraft's own
-//! model teach the union how its own training views look, where regions meet. Pictures are never needed.
+//! model teach the union how its own training views look, where regions meet. Pictures are never needed, and the Gaussians of
+//! one model at a time are in memory besides the union.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use config::disk::Disk;
 use config::error::{Error, ErrorKind};
 use config::geodesy::Geodetic;
 use config::ground::GroundSettings;
@@ -13,9 +15,15 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use vulkan::trainer::TrainError;
 
+use member::Member;
+use register::edge::Edges;
+use register::fit::RenderedFitter;
+use register::{Registered, Registrar};
+
 pub mod compare;
 pub mod distil;
 pub mod frame;
+pub mod member;
 pub mod merge;
 pub mod region;
 pub mod register;
@@ -31,6 +39,8 @@ pub struct LocalModel {
     pub header: ModelHeader,
     /// Its Gaussians.
     pub cloud: GaussianCloud,
+    /// BLAKE3 of the file.
+    pub content: [u8; 32],
 }
 
 impl LocalModel {
@@ -39,16 +49,8 @@ impl LocalModel {
     /// # Errors
     /// Unreadable, damaged, or not a model.
     pub fn read(path: &Path) -> Result<Self, AggregateError> {
-        let (header, cloud) = model::read(path)?;
-        Ok(Self { path: path.into(), header, cloud })
-    }
-
-    /// The aircraft's name, or the file's when it has none.
-    pub fn name(&self) -> &str {
-        match self.header.aircraft.as_str() {
-            "" => self.path.file_stem().and_then(|s| s.to_str()).unwrap_or("?"),
-            name => name,
-        }
+        let (header, cloud, content) = model::read_with_hash(path)?;
+        Ok(Self { path: path.into(), header, cloud, content })
     }
 }
 
@@ -72,6 +74,9 @@ pub enum AggregateError {
         /// How far.
         km: f64,
     },
+    /// Another model lies under the name of one that was counted already.
+    #[error("{0}: was replaced while it was being merged; run the command again")]
+    Changed(String),
     /// Distillation does not fit into `ground.device_mib`.
     #[error("ground: {0}")]
     Plan(#[from] config::plan::PlanError),
@@ -85,6 +90,7 @@ impl Error for AggregateError {
         match self {
             Self::Format(e) => e.kind(),
             Self::Train(e) => e.kind(),
+            Self::Changed(_) => ErrorKind::Failed,
             Self::NoModels | Self::NoOrigin(_) | Self::TooFar { .. } | Self::Plan(_) => ErrorKind::Input,
         }
     }
@@ -103,8 +109,8 @@ pub struct Outcome {
     pub models: Vec<(String, ModelHeader)>,
     /// Per model: what became of its Gaussians.
     pub kept: Vec<merge::Kept>,
-    /// Models that were moved onto their neighbours.
-    pub registered: Vec<register::Registration>,
+    /// How the models were moved onto their neighbours.
+    pub registered: Registered,
     /// Why none could be; the models were then merged where their GPS put them.
     pub not_registered: Option<String>,
     /// Regions in use, declared or derived.
@@ -127,45 +133,45 @@ pub struct Outcome {
 /// # Errors
 /// Models that do not belong together or cannot be written. A failing distillation is in [`Outcome::not_distilled`].
 pub fn run(
-    mut models: Vec<LocalModel>,
+    mut members: Vec<Member>,
     settings: &GroundSettings,
     origin: Option<Geodetic>,
     out: &Path,
     go_on: &dyn Fn() -> bool,
 ) -> Result<Outcome, AggregateError> {
-    if models.is_empty() {
+    if members.is_empty() {
         return Err(AggregateError::NoModels);
     }
     let mut outcome = Outcome { path: out.join("global.dgtr"), ..Default::default() };
     let start = Instant::now();
-    let origin = frame::unify(&mut models, origin)?;
+    let origin = frame::unify(&mut members, origin)?;
     outcome.seconds.push(("unify", start.elapsed().as_secs_f64()));
     let start = Instant::now();
     if settings.register {
-        match register::register(&mut models, settings.device.as_deref()) {
+        match registrar(settings, out).register(&mut members, go_on) {
             Ok(done) => outcome.registered = done,
             Err(e) => outcome.not_registered = Some(e),
         }
     }
     outcome.seconds.push(("register", start.elapsed().as_secs_f64()));
     let start = Instant::now();
-    let partition = region::Partition::new(&models);
-    let mut merged = merge::merge(&models, &partition, settings.max_gaussians.unwrap_or(usize::MAX));
+    let partition = region::Partition::new(&members);
+    let mut merged = merge::merge(&members, &partition, settings.max_gaussians.unwrap_or(usize::MAX))?;
     outcome.seconds.push(("merge", start.elapsed().as_secs_f64()));
     outcome.header = ModelHeader {
-        mission: models[0].header.mission.clone(),
+        mission: members[0].header.mission.clone(),
         aircraft: "global".into(),
         origin,
-        views: models.iter().flat_map(|m| m.header.views.clone()).collect(),
+        views: members.iter().flat_map(|m| m.header.views.clone()).collect(),
         seed: settings.seed,
         ..Default::default()
     };
-    outcome.models = models.iter().map(|m| (m.name().to_owned(), m.header.clone())).collect();
+    outcome.models = members.iter().map(|m| (m.name().to_owned(), m.header.clone())).collect();
     outcome.regions = partition.regions;
     model::write(&outcome.path, &outcome.header, &merged.cloud)?;
 
     let start = Instant::now();
-    match distil::distil(&models, &mut merged, settings, go_on) {
+    match distil::distil(&members, &mut merged, settings, go_on) {
         Ok(distilled) => {
             outcome.header.steps = u64::from(distilled.steps);
             outcome.distilled = Some(distilled);
@@ -181,6 +187,15 @@ pub fn run(
     model::write(&outcome.path, &outcome.header, &merged.cloud)?;
     outcome.seconds.push(("write", start.elapsed().as_secs_f64()));
     Ok(outcome)
+}
+
+/// Folder below `out` for what is known of pairs of models.
+const REGISTRATION: &str = "registration";
+
+/// Fits by rendering on the ground's device, and remembers it in `out`.
+pub fn registrar(settings: &GroundSettings, out: &Path) -> Registrar<RenderedFitter> {
+    let edges = Edges::open(&Disk::default(), &out.join(REGISTRATION));
+    Registrar::new(edges, RenderedFitter::new(settings.device.as_deref()))
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use config::error::{Error, ErrorKind};
 use config::mission::Mission;
 
+use crate::aggregate::member::Member;
 use crate::aggregate::{self, AggregateError, Outcome};
 use crate::keys::{GROUND, Identity};
 use crate::upload::UploadError;
@@ -148,17 +149,18 @@ pub fn merge(
     out: &Path,
     go_on: &dyn Fn() -> bool,
 ) -> Result<(Outcome, Vec<(PathBuf, ModelRefusal)>), ServeError> {
-    let (mut models, mut left_out) = (Vec::new(), Vec::new());
+    let (mut members, mut left_out) = (Vec::new(), Vec::new());
     for r in &reception.received {
         match admit::admit(mission, &r.aircraft, &r.path) {
-            Ok(model) => models.push(model),
+            // One at a time in memory.
+            Ok(model) => members.push(Member::of(model)),
             Err(why) => left_out.push((r.path.clone(), why)),
         }
     }
-    if models.is_empty() {
+    if members.is_empty() {
         return Err(ServeError::Nothing(mission.name.clone()));
     }
-    let outcome = aggregate::run(models, &mission.ground, Some(mission.origin), out, go_on)?;
+    let outcome = aggregate::run(members, &mission.ground, Some(mission.origin), out, go_on)?;
     Ok((outcome, left_out))
 }
 

@@ -7,7 +7,7 @@ use crate::settings::SettingError;
 /// Longest id or name, so that keys on the wire stay short and bounded.
 const MAX_NAME: usize = 32;
 /// Most aircraft of one mission.
-const MAX_AIRCRAFT: usize = 64;
+pub const MAX_AIRCRAFT: usize = 1024;
 /// Most corners of a region.
 const MAX_CORNERS: usize = 256;
 

@@ -197,6 +197,14 @@ fn finish(out: Hashing<&mut dyn Write>) -> std::io::Result<()> {
 /// # Errors
 /// As [`FormatError`] says; nothing is allocated that the file's own size and stated bounds do not cover.
 pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
+    read_with_hash(path).map(|(header, cloud, _)| (header, cloud))
+}
+
+/// As [`read`], with the BLAKE3 of the content, by which the same model is known again.
+///
+/// # Errors
+/// Those of [`read`].
+pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 32]), FormatError> {
     let mut opened = open(path)?;
     let header = read_header_of(path, &mut opened)?;
     let Opened { mut input, count, sh_degree, words, .. } = opened;
@@ -227,7 +235,7 @@ pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
     if dropped > 0 {
         tracing::warn!("{}: {dropped} Gaussians hold numbers that are not finite and were left out", path.display());
     }
-    Ok((header, cloud))
+    Ok((header, cloud, hash))
 }
 
 /// The header and the number of Gaussians alone, without the time to verify the columns: enough to list models.

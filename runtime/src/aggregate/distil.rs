@@ -16,13 +16,15 @@ use models::cloud::GaussianCloud;
 use models::metrics;
 use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
+use super::AggregateError;
+use super::member::Member;
 use super::merge::{Merged, opacity};
 use super::seam::Seams;
-use super::{AggregateError, LocalModel};
 use crate::engine::device::DeviceRequest;
 
-/// Views of each aircraft kept as pictures for the report.
+/// Views of each aircraft kept as pictures for the report, and of all of them.
 const SAMPLES_PER_MODEL: usize = 1;
+const MOST_SAMPLES: usize = 32;
 /// Stages of training, each at `STAGE_FACTOR` times the rates of the one before.
 const STAGES: u32 = 3;
 const STAGE_FACTOR: f32 = 0.25;
@@ -105,20 +107,20 @@ fn recipe(settings: &GroundSettings, sh_degree: u8, steps: u32) -> TrainSettings
 /// # Errors
 /// No device, or a memory plan that does not fit; `merged` is then what it was, within the plan.
 pub fn distil(
-    models: &[LocalModel],
+    members: &[Member],
     merged: &mut Merged,
     settings: &GroundSettings,
     go_on: &dyn Fn() -> bool,
 ) -> Result<Distilled, AggregateError> {
     let seams = Seams::find(merged, settings.seam_m);
-    let (mut lessons, views) = choose(models, &seams, settings);
+    let (mut lessons, views) = choose(members, &seams, settings);
     let mut report =
-        Distilled { views, seam_share: seams.share, agreement: vec![None; models.len()], ..Default::default() };
+        Distilled { views, seam_share: seams.share, agreement: vec![None; members.len()], ..Default::default() };
     if lessons.is_empty() || merged.cloud.is_empty() || settings.epochs == 0 {
         return Ok(report);
     }
     report.used = lessons.len();
-    let largest = models.iter().map(|m| m.cloud.len()).max().unwrap_or(0).max(merged.cloud.len());
+    let largest = members.iter().map(|m| m.gaussians).max().unwrap_or(0).max(merged.cloud.len());
     let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);
     let request = DeviceRequest {
         device: settings.device.clone(),
@@ -139,9 +141,9 @@ pub fn distil(
     report.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
 
     let start = Instant::now();
-    for (m, model) in models.iter().enumerate() {
+    for (m, member) in members.iter().enumerate() {
         if lessons.iter().any(|l| l.model == m) {
-            trainer.load(&model.cloud)?;
+            trainer.load(&member.cloud()?)?;
             for lesson in lessons.iter_mut().filter(|l| l.model == m) {
                 lesson.target = render(&mut trainer, &lesson.view)?;
             }
@@ -157,14 +159,14 @@ pub fn distil(
     }
     let (best, after) = distil_in_stages(&mut trainer, merged, &lessons, &before, settings, &mut report, go_on)?;
     report.seconds[1] = start.elapsed().as_secs_f64();
-    report.agreement = agreement(models.len(), &lessons, &before, &after);
+    report.agreement = agreement(members.len(), &lessons, &before, &after);
     report.reverted = best.is_none();
     if let Some(cloud) = best {
         merged.cloud = cloud;
     }
     let visible: Vec<bool> = merged.cloud.opacity_logits.iter().map(|&l| opacity(l) > settings.prune_opacity).collect();
     report.pruned = merged.retain(|i| visible[i]);
-    report.samples = samples(models.len(), &lessons, &before, &after);
+    report.samples = samples(members.len(), &lessons, &before, &after);
     Ok(report)
 }
 
@@ -232,9 +234,9 @@ fn rates(factor: f32) -> RateSettings {
 }
 
 /// The views that take part, without their pictures yet, and the number of views there are.
-fn choose(models: &[LocalModel], seams: &Seams, settings: &GroundSettings) -> (Vec<Lesson>, usize) {
+fn choose(members: &[Member], seams: &Seams, settings: &GroundSettings) -> (Vec<Lesson>, usize) {
     let (mut lessons, mut views) = (Vec::new(), 0);
-    for (m, model) in models.iter().enumerate() {
+    for (m, model) in members.iter().enumerate() {
         let between = if settings.between_views { between(&model.header.views) } else { Vec::new() };
         for (name, view) in model.header.views.iter().chain(&between) {
             views += 1;
@@ -314,7 +316,7 @@ fn agreement(models: usize, lessons: &[Lesson], before: &[RgbImage], after: &[Rg
     (0..models).map(of).collect()
 }
 
-/// The views with the most seam in them.
+/// The views with the most seam in them, of as many aircraft as the report can show.
 fn samples(models: usize, lessons: &[Lesson], before: &[RgbImage], after: &[RgbImage]) -> Vec<Sample> {
     let mut samples = Vec::new();
     for m in 0..models {
@@ -328,6 +330,9 @@ fn samples(models: usize, lessons: &[Lesson], before: &[RgbImage], after: &[RgbI
             global: after[i].clone(),
             psnr: [psnr(&lessons[i].target, &before[i]), psnr(&lessons[i].target, &after[i])],
         }));
+        if samples.len() >= MOST_SAMPLES {
+            break;
+        }
     }
     samples
 }

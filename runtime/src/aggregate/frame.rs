@@ -1,27 +1,29 @@
 //! One East-North-Up frame for models that were made around different origins.
 //!
-//! The change of frame is a rigid motion (ENU → ECEF → ENU), computed in f64 and rounded to f32 once. Spherical
-//! harmonics are left as they are: frames whose origins lie `d` apart are turned by d / 6371 km, 0.2° at the distance
-//! of [`MAX_APART_M`], far below what degree 3 can resolve.
+//! The change of frame is a rigid motion (ENU → ECEF → ENU), computed in f64 and rounded to f32 once. Whatever turns a
+//! model turns the spherical harmonics of its colours, too.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use config::geodesy::{EnuFrame, Geodetic};
-use models::cloud::GaussianCloud;
+use models::align::similarity::Similarity;
+use models::cloud::{GaussianCloud, ShTurn};
+use models::formats::model::ModelHeader;
 
-use super::{AggregateError, LocalModel};
+use super::AggregateError;
+use super::member::Member;
 
 /// Models whose origins lie farther apart than this do not belong to one mission (and f32 metres would lose millimetres).
 pub const MAX_APART_M: f64 = 20_000.0;
 
-/// A rigid motion from one ENU frame to another.
-#[derive(Clone, Copy, Debug)]
-pub struct Motion {
-    rotation: DQuat,
-    translation: DVec3,
-}
+/// A motion from one frame to another: a turn, a shift, and a change of scale where that is not known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion(Similarity);
 
 impl Motion {
+    /// Leaves everything where it is.
+    pub const NONE: Self = Self(Similarity::IDENTITY);
+
     /// From coordinates around `from` to coordinates around `to`.
     pub fn between(from: Geodetic, to: Geodetic) -> Self {
         let (from, to) = (EnuFrame::new(from), EnuFrame::new(to));
@@ -31,44 +33,69 @@ impl Motion {
         let lever = 1e5;
         let axis = |a: DVec3| (place(a * lever) - translation) / lever;
         let rotation = DQuat::from_mat3(&DMat3::from_cols(axis(DVec3::X), axis(DVec3::Y), axis(DVec3::Z)));
-        Self { rotation: rotation.normalize(), translation }
+        Self::rigid(rotation, translation)
     }
 
     /// Turns about the origin, then shifts.
     pub fn rigid(rotation: DQuat, translation: DVec3) -> Self {
-        Self { rotation: rotation.normalize(), translation }
+        Self::of(Similarity { scale: 1.0, rotation, translation })
+    }
+
+    /// Any similarity.
+    pub fn of(similarity: Similarity) -> Self {
+        Self(Similarity { rotation: similarity.rotation.normalize(), ..similarity })
+    }
+
+    /// First `self`, then `after`.
+    pub fn then(&self, after: &Self) -> Self {
+        Self(self.0.then(&after.0))
+    }
+
+    /// Its turn, shift and scale.
+    pub fn similarity(&self) -> &Similarity {
+        &self.0
     }
 
     /// Angle of its rotation, radians.
     pub fn angle(&self) -> f64 {
-        2.0 * self.rotation.w.abs().min(1.0).acos()
+        2.0 * self.0.rotation.w.abs().min(1.0).acos()
     }
 
     /// Moves a point.
     pub fn point(&self, p: DVec3) -> DVec3 {
-        self.rotation * p + self.translation
+        self.0.apply(p)
     }
 
-    /// Moves positions and orientations of a cloud.
+    /// Moves positions, orientations, sizes and the directions of colours of a cloud.
     pub fn cloud(&self, cloud: &mut GaussianCloud) {
+        if *self == Self::NONE {
+            return;
+        }
         for mean in &mut cloud.means {
             *mean = self.point(glam::Vec3::from(*mean).as_dvec3()).as_vec3().to_array();
         }
         for [w, x, y, z] in &mut cloud.rotations {
             let q = DQuat::from_xyzw(f64::from(*x), f64::from(*y), f64::from(*z), f64::from(*w));
-            let r = (self.rotation * q).as_quat();
+            let r = (self.0.rotation * q).as_quat();
             [*w, *x, *y, *z] = [r.w, r.x, r.y, r.z];
+        }
+        if self.0.scale != 1.0 {
+            let larger = self.0.scale.ln() as f32;
+            cloud.log_scales.as_flattened_mut().iter_mut().for_each(|s| *s += larger);
+        }
+        let (turn, degree, stride) = (ShTurn::new(self.0.rotation), cloud.sh_degree, cloud.sh_stride());
+        if degree > 0 {
+            cloud.sh.chunks_exact_mut(stride).for_each(|sh| turn.apply(degree, sh));
         }
     }
 
-    /// Moves everything a model says about places.
-    pub fn model(&self, model: &mut LocalModel) {
-        self.cloud(&mut model.cloud);
-        for (_, view) in &mut model.header.views {
+    /// Moves everything that a model says about places besides its Gaussians.
+    pub fn header(&self, header: &mut ModelHeader) {
+        for (_, view) in &mut header.views {
             view.pose.center = self.point(view.pose.center);
-            view.pose.rotation = (self.rotation * view.pose.rotation).normalize();
+            view.pose.rotation = (self.0.rotation * view.pose.rotation).normalize();
         }
-        self.corners(&mut model.header.region);
+        self.corners(&mut header.region);
     }
 
     /// Moves the corners of a region, which is drawn on the ground plane.
@@ -84,24 +111,25 @@ impl Motion {
 ///
 /// # Errors
 /// Some models have an origin and others have none; or two lie too far apart.
-pub fn unify(models: &mut [LocalModel], origin: Option<Geodetic>) -> Result<Option<Geodetic>, AggregateError> {
-    let Some(common) = origin.or_else(|| models.iter().find_map(|m| m.header.origin)) else { return Ok(None) };
-    for model in models.iter_mut() {
-        let Some(own) = model.header.origin else {
-            return Err(AggregateError::NoOrigin(model.name().into()));
+pub fn unify(members: &mut [Member], origin: Option<Geodetic>) -> Result<Option<Geodetic>, AggregateError> {
+    let Some(common) = origin.or_else(|| members.iter().find_map(|m| m.header.origin)) else { return Ok(None) };
+    for member in members.iter_mut() {
+        let Some(own) = member.header.origin else {
+            return Err(AggregateError::NoOrigin(member.name().into()));
         };
         if own == common {
             continue;
         }
         if !own.is_valid() {
-            return Err(AggregateError::NoOrigin(model.name().into()));
+            return Err(AggregateError::NoOrigin(member.name().into()));
         }
         let motion = Motion::between(own, common);
-        if motion.translation.length() > MAX_APART_M {
-            return Err(AggregateError::TooFar { name: model.name().into(), km: motion.translation.length() / 1e3 });
+        let apart_m = motion.0.translation.length();
+        if apart_m > MAX_APART_M {
+            return Err(AggregateError::TooFar { name: member.name().into(), km: apart_m / 1e3 });
         }
-        motion.model(model);
-        model.header.origin = Some(common);
+        member.moved(&motion);
+        member.header.origin = Some(common);
     }
     Ok(Some(common))
 }
@@ -148,5 +176,24 @@ mod tests {
         let moved = DQuat::from_xyzw(x, y, z, w) * DVec3::X;
         let truth = motion.point(q * DVec3::X) - motion.point(DVec3::ZERO);
         assert!((moved - truth).length() < 1e-6);
+    }
+    #[test]
+    fn colours_and_sizes_go_with_a_turn_and_a_change_of_scale() {
+        let motion = Motion::of(Similarity {
+            scale: 2.0,
+            rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
+            translation: DVec3::X,
+        });
+        let mut cloud = GaussianCloud::with_capacity(1, 1);
+        // Red towards the east only: the third function of degree 1 is −x.
+        let mut sh = [0.0f32; 12];
+        sh[9] = -1.0;
+        cloud.push([1.0, 0.0, 0.0], [0.0; 3], [1.0, 0.0, 0.0, 0.0], 0.0, &sh);
+        motion.cloud(&mut cloud);
+        assert!((glam::Vec3::from(cloud.means[0]) - glam::Vec3::new(1.0, 2.0, 0.0)).length() < 1e-6);
+        assert!((cloud.log_scales[0][0] - 2.0f32.ln()).abs() < 1e-6);
+        // Now towards the north: the first is −y.
+        let red: Vec<f32> = cloud.sh.iter().step_by(3).copied().collect();
+        assert!((red[1] + 1.0).abs() < 1e-5 && red[2].abs() < 1e-5 && red[3].abs() < 1e-5, "{red:?}");
     }
 }

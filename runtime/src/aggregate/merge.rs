@@ -5,18 +5,18 @@
 //! while another one saw the place, the other one's Gaussians stay, so that the union has no holes. Nowhere are two
 //! aircraft's Gaussians kept for the same cell, so nothing gets denser either.
 
+use std::collections::HashMap;
+
 use glam::DVec2;
 use models::cloud::GaussianCloud;
 use serde::Serialize;
 
-use super::LocalModel;
+use super::AggregateError;
+use super::member::Member;
 use super::region::Partition;
+use coverage::{Cell, Coverage};
 
-/// Cells along the longer side of the scene, for judging coverage: coarse enough to hold many Gaussians, fine
-/// enough to find a missed courtyard.
-const CELLS: f64 = 64.0;
-/// An owner with less than this share of another one's coverage leaves a hole.
-const HOLE_SHARE: f64 = 0.1;
+mod coverage;
 
 /// What became of one model's Gaussians.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
@@ -53,92 +53,25 @@ fn ground(mean: [f32; 3]) -> DVec2 {
     DVec2::new(f64::from(mean[0]), f64::from(mean[1]))
 }
 
-/// How much of each cell each model covers.
-struct Coverage {
-    low: DVec2,
-    side: f64,
-    columns: usize,
-    rows: usize,
-    /// `[model][cell]`, m².
-    area: Vec<Vec<f32>>,
-}
-
-impl Coverage {
-    fn new(models: &[LocalModel]) -> Self {
-        // 1st…99th percentile: one stray Gaussian a kilometre off must not make the cells useless.
-        let mut low = DVec2::INFINITY;
-        let mut high = DVec2::NEG_INFINITY;
-        for model in models.iter().filter(|m| !m.cloud.is_empty()) {
-            let stride = model.cloud.len().div_ceil(8192).max(1);
-            for axis in 0..2 {
-                let mut v: Vec<f32> = model.cloud.means.iter().step_by(stride).map(|m| m[axis]).collect();
-                v.sort_by(f32::total_cmp);
-                low[axis] = low[axis].min(f64::from(v[v.len() / 100]));
-                high[axis] = high[axis].max(f64::from(v[v.len() - 1 - v.len() / 100]));
-            }
-        }
-        let span = if low.cmple(high).all() { high - low } else { DVec2::ZERO };
-        let side = (span.max_element() / CELLS).max(1e-3);
-        let (columns, rows) = ((span.x / side) as usize + 1, (span.y / side) as usize + 1);
-        let mut this = Self { low, side, columns, rows, area: vec![vec![0.0; columns * rows]; models.len()] };
-        for (m, model) in models.iter().enumerate() {
-            for i in 0..model.cloud.len() {
-                if let Some(cell) = this.cell(ground(model.cloud.means[i])) {
-                    this.area[m][cell] += model.cloud.covered_m2(i).min(side * side) as f32;
-                }
-            }
-        }
-        this
-    }
-
-    fn cell(&self, p: DVec2) -> Option<usize> {
-        let at = (p - self.low) / self.side;
-        let inside = at.x >= 0.0 && at.y >= 0.0 && at.x < self.columns as f64 && at.y < self.rows as f64;
-        inside.then(|| at.y as usize * self.columns + at.x as usize)
-    }
-
-    /// m² that model `m` covers around a cell (3 × 3, so that a border through the cell does not look like a hole).
-    fn around(&self, m: usize, cell: usize) -> f64 {
-        let (x, y) = (cell % self.columns, cell / self.columns);
-        let mut sum = 0.0;
-        for v in y.saturating_sub(1)..(y + 2).min(self.rows) {
-            for u in x.saturating_sub(1)..(x + 2).min(self.columns) {
-                sum += f64::from(self.area[m][v * self.columns + u]);
-            }
-        }
-        sum
-    }
-
-    /// For each cell and each nominal owner: who fills in. `owner` itself unless it leaves a hole.
-    fn fill_in(&self, owner: usize, cell: usize) -> usize {
-        let own = self.around(owner, cell);
-        let best = (0..self.area.len())
-            .map(|m| (m, self.around(m, cell)))
-            .fold((owner, own), |a, b| if b.1 > a.1 { b } else { a });
-        if own < HOLE_SHARE * best.1 { best.0 } else { owner }
-    }
-}
-
-/// Filters and unites the models, and keeps the `budget` most important Gaussians.
-pub fn merge(models: &[LocalModel], partition: &Partition, budget: usize) -> Merged {
-    let coverage = Coverage::new(models);
-    let mut fill: Vec<Option<u16>> = vec![None; models.len() * coverage.columns * coverage.rows];
-    let degree = models.iter().map(|m| m.cloud.sh_degree).max().unwrap_or(0);
-    let total = models.iter().map(|m| m.cloud.len()).sum();
-    let mut merged = Merged { cloud: GaussianCloud::with_capacity(degree, total), ..Default::default() };
-    for (m, model) in models.iter().enumerate() {
-        let mut kept = Kept { gaussians: model.cloud.len(), ..Default::default() };
-        let keep: Vec<bool> = (0..model.cloud.len())
+/// Filters and unites the models, one at a time, and keeps the `budget` most important Gaussians.
+///
+/// # Errors
+/// A model's file cannot be read any more.
+pub fn merge(members: &[Member], partition: &Partition, budget: usize) -> Result<Merged, AggregateError> {
+    let coverage = Coverage::of(members)?;
+    let mut owners = partition.owners();
+    let mut fill: HashMap<(usize, Cell), usize> = HashMap::new();
+    let degree = members.iter().map(|m| m.sh_degree).max().unwrap_or(0);
+    let mut merged = Merged { cloud: GaussianCloud::with_capacity(degree, 0), ..Default::default() };
+    for (m, member) in members.iter().enumerate() {
+        let mut own = member.cloud()?;
+        let mut kept = Kept { gaussians: own.len(), ..Default::default() };
+        let keep: Vec<bool> = (0..own.len())
             .map(|i| {
-                let p = ground(model.cloud.means[i]);
-                let owner = partition.owner(p);
-                let keeper = match coverage.cell(p) {
-                    Some(cell) => {
-                        let known = &mut fill[owner * coverage.columns * coverage.rows + cell];
-                        usize::from(*known.get_or_insert_with(|| coverage.fill_in(owner, cell) as u16))
-                    }
-                    None => owner,
-                };
+                let p = ground(own.means[i]);
+                let owner = owners.owner(p);
+                let cell = coverage.cell(p);
+                let keeper = *fill.entry((owner, cell)).or_insert_with(|| coverage.fill_in(owner, cell));
                 // Where somebody fills in for the owner, the little the owner has stays too: it is less than a tenth.
                 match (owner == m, keeper == m) {
                     (true, _) => kept.own += 1,
@@ -148,14 +81,15 @@ pub fn merge(models: &[LocalModel], partition: &Partition, budget: usize) -> Mer
                 owner == m || keeper == m
             })
             .collect();
-        let mut own = model.cloud.clone();
         own.retain(|i| keep[i]);
+        merged.source.reserve_exact(own.len());
         merged.source.extend(std::iter::repeat_n(m as u16, own.len()));
+        merged.cloud.reserve_exact(own.len());
         merged.cloud.extend(&own);
         merged.kept.push(kept);
     }
     merged.keep_most_important(budget);
-    merged
+    Ok(merged)
 }
 
 impl Merged {

@@ -4,13 +4,19 @@
 //! the outer aircraft see beyond their own polygons, belongs to somebody. A model without a region gets the hull of
 //! the points its cameras look at.
 
+use std::collections::HashMap;
+
 use glam::{DVec2, DVec3};
 use models::coverage::hull;
+use models::formats::model::ModelHeader;
 
-use super::LocalModel;
+use super::member::{Bounds, Member};
 
 /// Distances closer than this count as equal, metres: corners that two polygons share differ by rounding.
 const TIE_M: f64 = 1e-6;
+/// Squares of ground along a middling region, and how many of them make a coarse one.
+const SQUARES: f64 = 16.0;
+const COARSE: f64 = 64.0;
 
 /// The part of the ground one aircraft answers for.
 #[derive(Clone, Debug)]
@@ -24,15 +30,15 @@ pub struct Region {
 }
 
 impl Region {
-    /// The declared region of a model, or the hull of what its cameras look at. None when there is neither.
-    pub fn of(model: &LocalModel) -> Option<Self> {
-        let cameras = model.header.views.iter().map(|(_, v)| v.pose.center.truncate()).collect();
-        if model.header.region.len() >= 3 {
-            let corners = model.header.region.iter().map(|c| DVec2::from(*c)).collect();
+    /// The declared region of a model, or the hull of what its cameras look at on ground of this height. None when there is
+    /// neither.
+    pub fn of(header: &ModelHeader, ground: f64) -> Option<Self> {
+        let cameras = header.views.iter().map(|(_, v)| v.pose.center.truncate()).collect();
+        if header.region.len() >= 3 {
+            let corners = header.region.iter().map(|c| DVec2::from(*c)).collect();
             return Some(Self { corners, declared: true, cameras });
         }
-        let ground = median_height(model);
-        let looked_at = model.header.views.iter().map(|(_, v)| look_at(v.pose.center, v.pose.forward(), ground));
+        let looked_at = header.views.iter().map(|(_, v)| look_at(v.pose.center, v.pose.forward(), ground));
         let corners = hull(looked_at.collect());
         (!corners.is_empty()).then_some(Self { corners, declared: false, cameras })
     }
@@ -69,19 +75,34 @@ impl Region {
 pub struct Partition {
     /// In the order of the models.
     pub regions: Vec<Option<Region>>,
+    /// Side of the squares of ground for which it is known which regions may be the nearest.
+    square_m: f64,
 }
 
 impl Partition {
     /// The partition of these models' regions.
-    pub fn new(models: &[LocalModel]) -> Self {
-        Self { regions: models.iter().map(Region::of).collect() }
+    pub fn new(members: &[Member]) -> Self {
+        Self::of(members.iter().map(|m| Region::of(&m.header, m.middle().z)).collect())
     }
 
-    /// Index of the model that answers for a point; 0 when no model has a region.
-    pub fn owner(&self, p: DVec2) -> usize {
+    fn of(regions: Vec<Option<Region>>) -> Self {
+        let side = |r: &Region| r.corners.iter().fold(Bounds::EMPTY, |b, c| b.around(*c)).span().max_element();
+        let mut sides: Vec<f64> = regions.iter().flatten().map(side).collect();
+        sides.sort_by(f64::total_cmp);
+        let middling = sides.get(sides.len() / 2).copied().unwrap_or(1.0);
+        Self { regions, square_m: (middling / SQUARES).max(1e-3) }
+    }
+
+    /// To ask for owners of many points.
+    pub fn owners(&self) -> Owners<'_> {
+        Owners { partition: self, near: [HashMap::new(), HashMap::new()] }
+    }
+
+    /// Index of the model among `candidates`, in rising order, that answers for a point; 0 when none of them has a region.
+    fn owner(&self, p: DVec2, candidates: impl Iterator<Item = usize>) -> usize {
         let mut best: Option<(usize, f64, &Region)> = None;
-        for (i, region) in self.regions.iter().enumerate() {
-            let Some(region) = region else { continue };
+        for i in candidates {
+            let Some(region) = &self.regions[i] else { continue };
             let distance = region.distance(p);
             let wins = match best {
                 None => true,
@@ -100,14 +121,40 @@ impl Partition {
     }
 }
 
-fn median_height(model: &LocalModel) -> f64 {
-    let stride = model.cloud.len().div_ceil(4096).max(1);
-    let mut z: Vec<f32> = model.cloud.means.iter().step_by(stride).map(|m| m[2]).filter(|z| z.is_finite()).collect();
-    if z.is_empty() {
-        return 0.0;
+/// Answers for many points: looks at the few regions that may be the nearest in a point's square of ground, so that a point
+/// costs what its neighbourhood costs, however many aircraft there are.
+#[derive(Debug)]
+pub struct Owners<'a> {
+    partition: &'a Partition,
+    /// By square, the regions that may own a point of it: squares of [`Partition::square_m`], and of [`COARSE`] times that,
+    /// in which those of the small ones are looked for.
+    near: [HashMap<(i64, i64), Vec<u16>>; 2],
+}
+
+impl Owners<'_> {
+    /// Index of the model that answers for a point; 0 when no model has a region.
+    pub fn owner(&mut self, p: DVec2) -> usize {
+        let square = |side: f64| ((p.x / side).floor() as i64, (p.y / side).floor() as i64);
+        let (fine, coarse) = (self.partition.square_m, self.partition.square_m * COARSE);
+        let [few, several] = &mut self.near;
+        let few = few.entry(square(fine)).or_insert_with(|| {
+            let all = 0..self.partition.regions.len() as u16;
+            let several = several.entry(square(coarse)).or_insert_with(|| nearest(self.partition, p, coarse, all));
+            nearest(self.partition, p, fine, several.iter().copied())
+        });
+        self.partition.owner(p, few.iter().map(|i| usize::from(*i)))
     }
-    let middle = z.len() / 2;
-    f64::from(*z.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+/// Those of `among` that may be the nearest region of a point in the square of this side around `p`.
+fn nearest(partition: &Partition, p: DVec2, side: f64, among: impl Iterator<Item = u16>) -> Vec<u16> {
+    let middle = ((p / side).floor() + 0.5) * side;
+    let to = |i: u16| Some((i, partition.regions[usize::from(i)].as_ref()?.distance(middle)));
+    let distances: Vec<(u16, f64)> = among.filter_map(to).collect();
+    let least = distances.iter().map(|d| d.1).fold(f64::INFINITY, f64::min);
+    // From the middle to any point of the square, both distances change by half its diagonal at most.
+    let reach = least + side * std::f64::consts::SQRT_2 + 2.0 * TIE_M;
+    distances.into_iter().filter(|d| d.1 <= reach).map(|d| d.0).collect()
 }
 
 /// Where the optical axis meets the ground, no farther off than three times the height; below the camera when it looks up.
@@ -126,8 +173,32 @@ mod tests {
         Region { corners: corners.iter().map(|c| DVec2::from(*c)).collect(), declared, cameras: vec![] }
     }
 
-    fn partition(regions: Vec<Option<Region>>) -> Partition {
-        Partition { regions }
+    fn owner(partition: &Partition, p: DVec2) -> usize {
+        partition.owners().owner(p)
+    }
+
+    #[test]
+    fn the_owner_found_among_the_regions_near_by_is_the_owner_among_all() {
+        let mut random = 7u64;
+        let mut next = |to: f64| {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            (random >> 33) as f64 / (1u64 << 31) as f64 * to
+        };
+        let mut regions = Vec::new();
+        for i in 0..60 {
+            let (x, y, w, h) = (next(2000.0), next(2000.0), 20.0 + next(200.0), 20.0 + next(200.0));
+            let mut region = region(&[[x, y], [x + w, y], [x + 0.5 * w, y + 0.3 * h], [x, y + h]], i % 3 > 0);
+            region.cameras = (0..4).map(|_| DVec2::new(x + next(w), y + next(h))).collect();
+            regions.push((i % 10 > 0).then_some(region));
+        }
+        let partition = Partition::of(regions);
+        let mut owners = partition.owners();
+        for _ in 0..20_000 {
+            let p = DVec2::new(next(6000.0) - 2000.0, next(6000.0) - 2000.0);
+            assert_eq!(owners.owner(p), partition.owner(p, 0..60), "{p}");
+        }
+        let few: usize = owners.near[0].values().map(Vec::len).sum();
+        assert!(few < 12 * owners.near[0].len(), "{few} candidates in {} squares", owners.near[0].len());
     }
 
     #[test]
@@ -149,31 +220,31 @@ mod tests {
     fn a_point_on_the_common_border_has_exactly_one_owner() {
         let west = region(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], true);
         let east = region(&[[1.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0]], true);
-        let p = partition(vec![Some(west), Some(east)]);
+        let p = Partition::of(vec![Some(west), Some(east)]);
         for y in [0.0, 0.5, 1.0, 7.0] {
-            assert_eq!(p.owner(DVec2::new(1.0, y)), 0);
+            assert_eq!(owner(&p, DVec2::new(1.0, y)), 0);
         }
-        assert_eq!(p.owner(DVec2::new(0.999, 0.5)), 0);
-        assert_eq!(p.owner(DVec2::new(1.001, 0.5)), 1);
+        assert_eq!(owner(&p, DVec2::new(0.999, 0.5)), 0);
+        assert_eq!(owner(&p, DVec2::new(1.001, 0.5)), 1);
     }
 
     #[test]
     fn ground_beyond_all_regions_belongs_to_the_nearest() {
         let west = region(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], true);
         let east = region(&[[3.0, 0.0], [4.0, 0.0], [4.0, 1.0], [3.0, 1.0]], true);
-        let p = partition(vec![Some(west), Some(east)]);
-        assert_eq!(p.owner(DVec2::new(-100.0, 0.5)), 0);
-        assert_eq!(p.owner(DVec2::new(100.0, 0.5)), 1);
-        assert_eq!(p.owner(DVec2::new(1.9, 0.5)), 0);
-        assert_eq!(p.owner(DVec2::new(2.1, 0.5)), 1);
+        let p = Partition::of(vec![Some(west), Some(east)]);
+        assert_eq!(owner(&p, DVec2::new(-100.0, 0.5)), 0);
+        assert_eq!(owner(&p, DVec2::new(100.0, 0.5)), 1);
+        assert_eq!(owner(&p, DVec2::new(1.9, 0.5)), 0);
+        assert_eq!(owner(&p, DVec2::new(2.1, 0.5)), 1);
     }
 
     #[test]
     fn declared_regions_come_before_derived_ones_and_none_owns_nothing() {
         let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
-        let p = partition(vec![None, Some(region(&square, false)), Some(region(&square, true))]);
-        assert_eq!(p.owner(DVec2::new(0.5, 0.5)), 2);
-        assert_eq!(partition(vec![None, None]).owner(DVec2::ZERO), 0);
+        let p = Partition::of(vec![None, Some(region(&square, false)), Some(region(&square, true))]);
+        assert_eq!(owner(&p, DVec2::new(0.5, 0.5)), 2);
+        assert_eq!(owner(&Partition::of(vec![None, None]), DVec2::ZERO), 0);
     }
 
     #[test]
@@ -182,9 +253,9 @@ mod tests {
         let mut b = region(&[[1.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0]], false);
         a.cameras.push(DVec2::new(1.0, 0.5));
         b.cameras.push(DVec2::new(3.0, 0.5));
-        let p = partition(vec![Some(a), Some(b)]);
-        assert_eq!(p.owner(DVec2::new(1.9, 0.5)), 0);
-        assert_eq!(p.owner(DVec2::new(2.1, 0.5)), 1);
+        let p = Partition::of(vec![Some(a), Some(b)]);
+        assert_eq!(owner(&p, DVec2::new(1.9, 0.5)), 0);
+        assert_eq!(owner(&p, DVec2::new(2.1, 0.5)), 1);
     }
 
     #[test]

@@ -63,9 +63,7 @@ impl Seams {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::aggregate::merge::merge;
-    use crate::aggregate::region::Partition;
-    use crate::aggregate::testing::{carpet, model, nadir};
+    use crate::aggregate::testing::{carpet, model, nadir, united};
 
     #[test]
     fn only_views_over_the_border_see_the_seam() {
@@ -73,7 +71,7 @@ mod tests {
         let east = [[0.0, -50.0], [100.0, -50.0], [100.0, 50.0], [0.0, 50.0]];
         let all = carpet([-100.0, -50.0], [100.0, 50.0], 1.0);
         let models = [model("west", &west, all.clone()), model("east", &east, all)];
-        let merged = merge(&models, &Partition::new(&models), usize::MAX);
+        let merged = united(&models, usize::MAX);
         let seams = Seams::find(&merged, 4.0);
         assert!(seams.share > 0.03 && seams.share < 0.1, "{}", seams.share);
         assert_eq!(seams.seen_by(&nadir(-60.0, 0.0, 30.0)), 0.0);
@@ -83,7 +81,7 @@ mod tests {
     #[test]
     fn one_model_has_no_seam() {
         let models = [model("a", &[], carpet([0.0, 0.0], [20.0, 20.0], 1.0))];
-        let merged = merge(&models, &Partition::new(&models), usize::MAX);
+        let merged = united(&models, usize::MAX);
         assert_eq!(Seams::find(&merged, 4.0).share, 0.0);
     }
 }

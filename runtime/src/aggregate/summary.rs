@@ -4,6 +4,10 @@ use crate::report::{Comparison, MapRegion, ModelRow, ReportData, Table, Timing, 
 use crate::run_json::RunReport;
 
 use super::Outcome;
+use super::register::Registration;
+
+/// Neighbours named in a row of the report.
+const NEIGHBOURS_SHOWN: usize = 4;
 
 /// `run.json` of an aggregation.
 pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
@@ -20,6 +24,9 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
         run.skip("gaussians_outside_own_region", kept.foreign as u64);
         run.skip("gaussians_over_budget", kept.over_budget as u64);
     }
+    let r = &outcome.registered;
+    let registered = serde_json::json!({ "pairs": r.pairs, "fitted": r.fitted, "models": r.models.len() });
+    run.more.insert("registered".into(), registered);
     if let Some(d) = &outcome.distilled {
         run.steps = d.steps.into();
         run.skip("views_without_seam", (d.views - d.used) as u64);
@@ -86,6 +93,7 @@ pub fn report(outcome: &Outcome) -> ReportData {
     let stages = outcome.seconds.iter();
     data.timings.extend(stages.map(|(s, t)| Timing { name: (*s).into(), of: String::new(), seconds: *t }));
     data.tables.push(merge_table(outcome));
+    registration(outcome, &mut data);
     distillation(outcome, &mut data);
     data
 }
@@ -108,6 +116,37 @@ fn merge_table(outcome: &Outcome) -> Table {
         head: head.map(String::from).to_vec(),
         rows: outcome.models.iter().enumerate().map(row).collect(),
     }
+}
+
+fn registration(outcome: &Outcome, data: &mut ReportData) {
+    if let Some(why) = &outcome.not_registered {
+        data.warnings
+            .push(format!("The models were merged where their GPS put them, they could not be registered: {why}"));
+    }
+    let r = &outcome.registered;
+    data.warnings.extend(r.warnings.iter().cloned());
+    if r.models.is_empty() {
+        return;
+    }
+    let row = |m: &Registration| {
+        let mut neighbours = m.neighbours.iter().take(NEIGHBOURS_SHOWN).cloned().collect::<Vec<_>>().join(", ");
+        if m.neighbours.len() > NEIGHBOURS_SHOWN {
+            neighbours += &format!(" and {} more", m.neighbours.len() - NEIGHBOURS_SHOWN);
+        }
+        let metres = |v: f64| format!("{v:.2} m");
+        vec![m.name.clone(), neighbours, metres(m.moved_m), format!("{:.2}°", m.turned_deg), metres(m.rms_m)]
+    };
+    data.tables.push(Table {
+        title: "Registration".into(),
+        note: format!(
+            "Models that show the same ground are brought together. {} pairs overlap; {} of them were fitted now, the others \
+             were known.",
+            count(r.pairs as u64),
+            count(r.fitted as u64)
+        ),
+        head: ["", "fitted onto", "moved by", "turned by", "neighbours' points apart"].map(String::from).to_vec(),
+        rows: r.models.iter().map(row).collect(),
+    });
 }
 
 fn distillation(outcome: &Outcome, data: &mut ReportData) {

@@ -1,6 +1,6 @@
 //! Small clouds, models and cameras for tests.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
@@ -8,6 +8,9 @@ use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
 
 use super::LocalModel;
+use super::member::Member;
+use super::merge::{Merged, merge};
+use super::region::Partition;
 
 /// A grid of flat round Gaussians on z = 0, coloured by place.
 pub fn carpet(low: [f64; 2], high: [f64; 2], spacing: f64) -> GaussianCloud {
@@ -28,7 +31,21 @@ pub fn carpet(low: [f64; 2], high: [f64; 2], spacing: f64) -> GaussianCloud {
 /// A model with a region and no views.
 pub fn model(name: &str, region: &[[f64; 2]], cloud: GaussianCloud) -> LocalModel {
     let header = ModelHeader { aircraft: name.into(), region: region.to_vec(), ..Default::default() };
-    LocalModel { path: PathBuf::from(name), header, cloud }
+    LocalModel { path: PathBuf::from(name), header, cloud, content: [0; 32] }
+}
+
+/// A model as it arrives: in a file of `dir`.
+pub fn written(dir: &Path, local: &LocalModel) -> Member {
+    let path = dir.join(&local.path).with_extension("dgtr");
+    models::formats::model::write(&path, &local.header, &local.cloud).expect("write");
+    Member::of(LocalModel::read(&path).expect("read"))
+}
+
+/// Models merged without more ado.
+pub fn united(models: &[LocalModel], budget: usize) -> Merged {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let members: Vec<Member> = models.iter().map(|m| written(dir.path(), m)).collect();
+    merge(&members, &Partition::new(&members), budget).expect("merged")
 }
 
 /// A 64 × 48 camera looking straight down.

@@ -2,7 +2,7 @@
 
 use config::geodesy::Geodetic;
 
-use super::testing::{carpet, model, nadir};
+use super::testing::{carpet, model, nadir, written};
 use super::*;
 
 const WEST: [[f64; 2]; 4] = [[-40.0, -20.0], [0.0, -20.0], [0.0, 20.0], [-40.0, 20.0]];
@@ -19,6 +19,19 @@ fn pair() -> Vec<LocalModel> {
         }
     }
     vec![west, east]
+}
+
+/// Aggregates models that arrived as files.
+fn run(
+    models: Vec<LocalModel>,
+    settings: &GroundSettings,
+    origin: Option<Geodetic>,
+    out: &Path,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Outcome, AggregateError> {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let members = models.iter().map(|m| written(dir.path(), m)).collect();
+    super::run(members, settings, origin, out, go_on)
 }
 
 fn settings() -> GroundSettings {
@@ -117,7 +130,9 @@ fn models_around_different_origins_meet_in_one_frame() {
     let mut models = pair();
     models[0].header.origin = Some(home);
     models[1].header.origin = Some(home);
-    frame::Motion::between(home, away).model(&mut models[1]);
+    let away_from_home = frame::Motion::between(home, away);
+    away_from_home.cloud(&mut models[1].cloud);
+    away_from_home.header(&mut models[1].header);
     models[1].header.origin = Some(away);
     let merge_only = GroundSettings { epochs: 0, ..settings() };
     let outcome = run(models, &merge_only, None, &dir.path().join("a"), &|| true).expect("aggregate");

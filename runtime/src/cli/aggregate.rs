@@ -8,6 +8,7 @@ use config::ground::GroundSettings;
 use models::dataset::Dataset;
 
 use crate::aggregate::compare::{add_to, compare, perceptual};
+use crate::aggregate::member::Member;
 use crate::aggregate::{self, LocalModel, Outcome, summary};
 use crate::cli::output::outln;
 use crate::interrupt::Interrupt;
@@ -125,8 +126,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mut settings = GroundSettings::default();
     args.settings.apply(&mut settings)?;
     let stop = Interrupt::install()?;
-    let models = args.models.iter().map(|p| LocalModel::read(p)).collect::<Result<Vec<_>, _>>()?;
-    let outcome = aggregate::run(models, &settings, None, &args.out, &|| !stop.requested())?;
+    let members = args.models.iter().map(|p| LocalModel::read(p).map(Member::of)).collect::<Result<Vec<_>, _>>()?;
+    let outcome = aggregate::run(members, &settings, None, &args.out, &|| !stop.requested())?;
     let mut run = summary::run_report("aggregate", &outcome, settings.seed);
     let mut data = summary::report(&outcome);
     let names = outcome.models.iter().map(|m| m.0.clone());

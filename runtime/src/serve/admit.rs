@@ -64,7 +64,8 @@ fn motion(mission: Geodetic, own: Geodetic) -> Option<Motion> {
 
 /// Whether at least one Gaussian lies in the region or no farther from it than the region is long.
 fn touches_region(model: &LocalModel) -> bool {
-    let Some(region) = Region::of(model) else { return false };
+    // The mission declares it, so that no height is asked for.
+    let Some(region) = Region::of(&model.header, 0.0) else { return false };
     let low = region.corners.iter().copied().fold(DVec2::INFINITY, DVec2::min);
     let high = region.corners.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
     let near = |mean: &[f32; 3]| region.distance(Vec3::from(*mean).as_dvec3().truncate()) <= low.distance(high);

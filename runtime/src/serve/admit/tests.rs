@@ -1,4 +1,5 @@
 use super::*;
+use crate::aggregate::member::Member;
 use crate::aggregate::merge::merge;
 use crate::aggregate::region::Partition;
 use crate::aggregate::testing::{carpet, model, nadir};
@@ -20,8 +21,9 @@ fn the_missions_regions_win_over_what_models_claim() {
     let far = [[-1e4, -1e4], [1e4, -1e4], [1e4, 1e4], [-1e4, 1e4]];
     let west = written(dir.path(), "west", |m| m.header.region = far.to_vec());
     let east = written(dir.path(), "east", |_| {});
-    let models = [admit(&mission, "west", &west), admit(&mission, "east", &east)].map(|m| m.expect("admitted"));
-    let kept = merge(&models, &Partition::new(&models), usize::MAX).kept;
+    let models =
+        [admit(&mission, "west", &west), admit(&mission, "east", &east)].map(|m| Member::of(m.expect("admitted")));
+    let kept = merge(&models, &Partition::new(&models), usize::MAX).expect("merged").kept;
     assert_eq!((kept[0].own, kept[1].own), (1600, 1600));
 }
 

@@ -1,0 +1,304 @@
+//! One pair of models: both are rendered from the same places, features of the two renderings are matched, lifted by the
+//! rendered depths, and a motion is fitted to the pairs of points. No picture is needed for it, only the models.
+
+use glam::{DMat3, DVec3, Vec3};
+use models::align::similarity::{Similarity, umeyama};
+use models::camera::{Intrinsics, View};
+use models::cloud::GaussianCloud;
+use models::formats::model::ModelHeader;
+use models::init::mutual_matches;
+use models::metrics::to_rgb8;
+use models::onnx::features::{FeatureNetwork, Features};
+use vulkan::trainer::{Rendering, Trainer};
+
+use super::Fitter;
+use super::edge::Fitted;
+use crate::aggregate::frame::Motion;
+use crate::aggregate::member::Member;
+use crate::engine::device::renderer;
+
+/// Views of one model that are looked at through the other.
+const VIEWS: usize = 8;
+/// Longer side of the renderings, pixels: a feature every few of them is plenty for a rigid motion.
+const SIDE: u32 = 480;
+/// Features per rendering.
+const FEATURES: usize = 700;
+/// A pixel shows a model when less than this much light passes through it.
+const CLEAR: f32 = 0.3;
+/// Share of a view that both models must show.
+const OVERLAP: f64 = 0.1;
+/// Fewer agreeing points than this prove nothing.
+const LEAST_POINTS: usize = 40;
+/// Motions beyond these are taken for a mistake: GPS is not that wrong.
+const MOST_METRES: f64 = 15.0;
+const MOST_DEGREES: f64 = 6.0;
+/// Nor a scale that nobody measured so far from 1.
+const MOST_SCALE: f64 = 1.2;
+
+/// A renderer and what it holds.
+struct Stage {
+    trainer: Trainer,
+    size: u32,
+    gaussians: usize,
+    sh_degree: u8,
+    shows: [u8; 32],
+}
+
+/// Fits by rendering: one network and two renderers, opened when the first pair asks for them and kept for all others.
+pub struct RenderedFitter {
+    device: Option<String>,
+    network: Option<FeatureNetwork>,
+    /// Of the first and of the second of a pair.
+    stages: [Option<Stage>; 2],
+    /// The first of the last pair: its content and its views.
+    first: Option<([u8; 32], ModelHeader)>,
+}
+
+impl RenderedFitter {
+    /// On this device; nothing is opened yet.
+    pub fn new(device: Option<&str>) -> Self {
+        Self { device: device.map(str::to_owned), network: None, stages: [None, None], first: None }
+    }
+
+    /// Shows `cloud` on a stage, which is opened anew only for a model larger than any before.
+    fn show(&mut self, which: usize, content: &[u8; 32], cloud: &GaussianCloud, size: u32) -> Result<(), String> {
+        let stage = &mut self.stages[which];
+        match stage {
+            Some(s) if s.gaussians >= cloud.len() && s.sh_degree >= cloud.sh_degree && s.size >= size => {
+                s.trainer.load(cloud).map_err(|e| e.to_string())?;
+                s.shows = *content;
+            }
+            _ => {
+                // The smaller one goes first: two would have to fit in side by side.
+                *stage = None;
+                let trainer = renderer(self.device.as_deref(), cloud, size, size).map_err(|e| e.to_string())?;
+                let (gaussians, sh_degree) = (cloud.len(), cloud.sh_degree);
+                *stage = Some(Stage { trainer, size, gaussians, sh_degree, shows: *content });
+            }
+        }
+        Ok(())
+    }
+
+    fn render(&mut self, which: usize, view: &View, into: &mut Rendering) -> Result<(), String> {
+        let stage = self.stages[which].as_mut().ok_or("a renderer was not opened")?;
+        stage.trainer.render(view, into).map_err(|e| e.to_string())
+    }
+
+    fn features(&mut self, rendering: &Rendering) -> Result<Features, String> {
+        let network = match &mut self.network {
+            Some(network) => network,
+            none => none.insert(FeatureNetwork::open(None, 2).map_err(|e| e.to_string())?),
+        };
+        let picture = to_rgb8(&rendering.rgb, rendering.width, rendering.height).ok_or("a rendering without pixels")?;
+        network.extract(&picture, FEATURES).map_err(|e| e.to_string())
+    }
+}
+
+impl Fitter for RenderedFitter {
+    fn fit(&mut self, first: &Member, second: &Member) -> Result<Option<Fitted>, String> {
+        if first.gaussians == 0 || second.gaussians == 0 {
+            return Ok(None);
+        }
+        let on_stage = self.stages[0].as_ref().is_some_and(|s| s.shows == *first.content());
+        if !on_stage || self.first.as_ref().is_none_or(|f| f.0 != *first.content()) {
+            let (header, cloud) = first.as_written().map_err(|e| e.to_string())?;
+            self.show(0, first.content(), &cloud, SIDE)?;
+            self.first = Some((*first.content(), header));
+        }
+        let (mut header, mut cloud) = second.as_written().map_err(|e| e.to_string())?;
+        let prior = second.to_frame_of(first);
+        prior.header(&mut header);
+        prior.cloud(&mut cloud);
+        let Some((_, anchor)) = &self.first else { return Ok(None) };
+        let views = shared_views(&anchor.views, &header.views);
+        if views.is_empty() {
+            return Ok(None);
+        }
+        self.show(1, second.content(), &cloud, SIDE)?;
+        drop(cloud);
+        let mut pairs: Vec<(DVec3, DVec3)> = Vec::new();
+        let mut renderings = (Rendering::default(), Rendering::default());
+        for view in &views {
+            self.render(0, view, &mut renderings.0)?;
+            self.render(1, view, &mut renderings.1)?;
+            let both = |i: &usize| renderings.0.transmittance[*i] < CLEAR && renderings.1.transmittance[*i] < CLEAR;
+            let pixels = renderings.0.transmittance.len();
+            if ((0..pixels).filter(both).count() as f64) < OVERLAP * pixels as f64 {
+                continue;
+            }
+            let (fa, fb) = (self.features(&renderings.0)?, self.features(&renderings.1)?);
+            for (i, j) in mutual_matches(&fa, &fb) {
+                let lifted = (lift(view, &renderings.0, fa.keypoints[i]), lift(view, &renderings.1, fb.keypoints[j]));
+                if let (Some(p), Some(q)) = lifted {
+                    pairs.push((q, p));
+                }
+            }
+        }
+        let has_free_scale = !(first.is_georeferenced() && second.is_georeferenced());
+        Ok(fitted(&pairs, has_free_scale))
+    }
+}
+
+/// Views of either model from which the other might be seen: those nearest to the other's cameras.
+fn shared_views(of_first: &[(String, View)], of_second: &[(String, View)]) -> Vec<View> {
+    let nearest = |v: &View, others: &[(String, View)]| {
+        let d = others.iter().map(|(_, o)| o.pose.center.distance_squared(v.pose.center));
+        d.fold(f64::INFINITY, f64::min)
+    };
+    let mut ranked: Vec<(f64, View)> = of_first.iter().map(|(_, v)| (nearest(v, of_second), *v)).collect();
+    ranked.extend(of_second.iter().map(|(_, v)| (nearest(v, of_first), *v)));
+    ranked.sort_by(|x, y| x.0.total_cmp(&y.0));
+    let Some(first) = ranked.first() else { return Vec::new() };
+    // One size for all, which the network is opened for.
+    let k = first.1.intrinsics;
+    let shrink = (SIDE as f32 / k.width.max(k.height) as f32).min(1.0);
+    let small = |side: u32| ((side as f32 * shrink) as u32).max(8);
+    let lens = |k: Intrinsics| k.resized(small(k.width), small(k.height));
+    ranked.into_iter().take(VIEWS).map(|(_, v)| View { intrinsics: lens(v.intrinsics), pose: v.pose }).collect()
+}
+
+/// The surface point under a key point, by the depth of the Gaussians there.
+fn lift(view: &View, rendering: &Rendering, [x, y]: [f32; 2]) -> Option<DVec3> {
+    let (px, py) = (x.max(0.0) as usize, y.max(0.0) as usize);
+    let at = py * rendering.width as usize + px;
+    if px >= rendering.width as usize || py >= rendering.height as usize {
+        return None;
+    }
+    let opaque = 1.0 - rendering.transmittance[at];
+    if opaque < 1.0 - CLEAR {
+        return None;
+    }
+    // Blended depth is weighted by opacity (the paper's equation); the surface lies at the mean.
+    let depth = rendering.depth[at] / opaque;
+    let k = &view.intrinsics;
+    let p = Vec3::new((x - k.cx) / k.fx * depth, (y - k.cy) / k.fy * depth, depth).as_dvec3();
+    let p = view.pose.rotation * p + view.pose.center;
+    p.is_finite().then_some(p)
+}
+
+/// The motion of pairs (from, to) by iterated trimming: the median shift first, then least squares over what agrees. Without
+/// a free scale it is rigid: where both scales come from the same kind of GPS it keeps both.
+fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
+    if pairs.len() < LEAST_POINTS {
+        return None;
+    }
+    let median = |pick: &dyn Fn(&(DVec3, DVec3)) -> f64, of: &[(DVec3, DVec3)]| {
+        let mut v: Vec<f64> = of.iter().map(pick).collect();
+        v.sort_by(f64::total_cmp);
+        v[v.len() / 2]
+    };
+    let shift = DVec3::from_array(std::array::from_fn(|k| median(&|(q, p)| p[k] - q[k], pairs)));
+    let mut motion = Motion::rigid(glam::DQuat::IDENTITY, shift);
+    let mut kept: Vec<(DVec3, DVec3)> = Vec::new();
+    for _ in 0..8 {
+        let error = |(q, p): &(DVec3, DVec3)| motion.point(*q).distance(*p);
+        // Three times the median, but never so tight that rounding throws points out.
+        let limit = (3.0 * median(&error, if kept.is_empty() { pairs } else { &kept })).max(0.02);
+        kept = pairs.iter().filter(|pair| error(pair) <= limit).copied().collect();
+        if kept.len() < LEAST_POINTS {
+            return None;
+        }
+        let (from, to): (Vec<DVec3>, Vec<DVec3>) = kept.iter().copied().unzip();
+        let by = umeyama(&from, &to, None).ok()?;
+        let scale = if has_free_scale { by.scale } else { 1.0 };
+        let n = kept.len() as f64;
+        let translation = to.iter().sum::<DVec3>() / n - scale * (by.rotation * (from.iter().sum::<DVec3>() / n));
+        motion = Motion::of(Similarity { scale, rotation: by.rotation, translation });
+    }
+    let rms = |f: &dyn Fn(&DVec3) -> DVec3| {
+        (kept.iter().map(|(q, p)| f(q).distance_squared(*p)).sum::<f64>() / kept.len() as f64).sqrt()
+    };
+    let rms_m = [rms(&|q| *q), rms(&|q| motion.point(*q))];
+    let middle = kept.iter().map(|(q, _)| *q).sum::<DVec3>() / kept.len() as f64;
+    let Similarity { scale, rotation, translation } = *motion.similarity();
+    let plausible = motion.point(middle).distance(middle) <= MOST_METRES
+        && motion.angle().to_degrees() <= MOST_DEGREES
+        && scale.max(1.0 / scale) <= MOST_SCALE
+        && rms_m[1] < rms_m[0];
+    plausible.then(|| Fitted {
+        turn: rotation.to_array(),
+        scale,
+        shift: translation.to_array(),
+        places: places(&kept, middle),
+        points: [kept.len() as u32, pairs.len() as u32],
+        rms_m,
+    })
+}
+
+/// Six places with the middle and the covariance of all: what a motion costs at them it costs at all points.
+fn places(kept: &[(DVec3, DVec3)], middle: DVec3) -> [[f64; 3]; 6] {
+    let covariance = kept.iter().fold(DMat3::ZERO, |sum, (q, _)| {
+        let d = *q - middle;
+        sum + DMat3::from_cols(d * d.x, d * d.y, d * d.z)
+    }) * (1.0 / kept.len() as f64);
+    // Columns of its Cholesky factor; √3 makes the mean of six outer products the covariance.
+    let c = covariance.to_cols_array_2d();
+    let mut l = [[0.0f64; 3]; 3];
+    for j in 0..3 {
+        let below: f64 = (0..j).map(|k| l[k][j] * l[k][j]).sum();
+        l[j][j] = (c[j][j] - below).max(1e-12).sqrt();
+        for i in j + 1..3 {
+            let below: f64 = (0..j).map(|k| l[k][i] * l[k][j]).sum();
+            l[j][i] = (c[j][i] - below) / l[j][j];
+        }
+    }
+    std::array::from_fn(|i| {
+        let column = DVec3::from(l[i / 2]) * 3.0f64.sqrt();
+        (if i % 2 == 0 { middle + column } else { middle - column }).to_array()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+
+    fn pairs(n: u32, truth: &Motion, outliers: u32) -> Vec<(DVec3, DVec3)> {
+        (0..n)
+            .map(|i| {
+                let t = f64::from(i);
+                let q = DVec3::new((t * 7.3) % 60.0, (t * 3.1) % 40.0, (t * 1.7) % 4.0);
+                let wrong = if i < outliers { DVec3::new(5.0 + t % 9.0, -t % 7.0, 1.0) } else { DVec3::ZERO };
+                (q, truth.point(q) + wrong)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn two_models_of_the_same_ground_are_brought_together_despite_false_matches() {
+        let truth = Motion::rigid(DQuat::from_rotation_z(0.02), DVec3::new(0.8, -0.5, 0.3));
+        let fit = fitted(&pairs(200, &truth, 60), false).expect("fits");
+        let (motion, p) = (fit.motion(), DVec3::new(20.0, 30.0, 2.0));
+        assert!(motion.point(p).distance(truth.point(p)) < 1e-6, "{motion:?}");
+        assert!(fit.points[0] >= 140 && fit.rms_m[1] < 1e-6 && fit.rms_m[0] > 0.5);
+    }
+
+    #[test]
+    fn a_scale_is_fitted_only_where_it_is_free() {
+        let truth = Motion::of(Similarity { scale: 1.05, rotation: DQuat::IDENTITY, translation: DVec3::X });
+        assert!((fitted(&pairs(200, &truth, 0), true).expect("fits").scale - 1.05).abs() < 1e-9);
+        assert_eq!(fitted(&pairs(200, &truth, 0), false).expect("fits").scale, 1.0);
+    }
+
+    #[test]
+    fn too_few_points_or_a_motion_no_gps_is_wrong_by_leave_a_model_where_it_is() {
+        let small = Motion::rigid(DQuat::IDENTITY, DVec3::X);
+        assert!(fitted(&pairs(20, &small, 0), false).is_none());
+        let absurd = Motion::rigid(DQuat::IDENTITY, DVec3::X * 40.0);
+        assert!(fitted(&pairs(200, &absurd, 0), false).is_none());
+    }
+
+    #[test]
+    fn six_places_have_the_middle_and_the_spread_of_all() {
+        let all = pairs(300, &Motion::NONE, 0);
+        let middle = all.iter().map(|(q, _)| *q).sum::<DVec3>() / 300.0;
+        let six = places(&all, middle).map(DVec3::from);
+        assert!((six.iter().sum::<DVec3>() / 6.0).distance(middle) < 1e-9);
+        for (i, j) in [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2)] {
+            let of = |p: &DVec3| (p[i] - middle[i]) * (p[j] - middle[j]);
+            let (few, many) =
+                (six.iter().map(of).sum::<f64>() / 6.0, all.iter().map(|(q, _)| of(q)).sum::<f64>() / 300.0);
+            assert!((few - many).abs() < 1e-6 * (1.0 + many.abs()), "{i} {j}: {few} {many}");
+        }
+    }
+}

@@ -1,0 +1,300 @@
+//! The pose graph of all models: where each lies so that neighbours agree as well as they can, and none leaves where its
+//! telemetry puts it without need.
+//!
+//! A model's correction is position, heading, tilt and, where it is not known, scale, about the middle of its ground. An edge is
+//! six places that two models show ([`Link`]). One false edge must not bend the scene: edges are weighed by Geman and McClure's
+//! function, whose width shrinks from where every edge counts to where only those that agree do (graduated non-convexity, Yang
+//! et al. 2020). The linear systems are solved by conjugate gradients, block by block: time and memory grow as the edges do.
+
+use glam::{DQuat, DVec3};
+use models::align::similarity::Similarity;
+
+/// What telemetry is worth, one standard deviation: position, tilt and heading, scale.
+/// Position as in [`config`]'s GPS priors without RTK.
+const POSITION_M: f64 = 3.0;
+const TILT_RAD: f64 = 0.017;
+const HEADING_RAD: f64 = 0.05;
+const SCALE: f64 = 0.05;
+/// The width of the weighing shrinks by this factor (Yang et al. 2020).
+const SHRINK: f64 = 1.4;
+/// Steps of Gauss and Newton after the last change of the weights; angles are small.
+const LAST_STEPS: usize = 3;
+/// Conjugate gradients end at this share of the first residual, or after so many rounds.
+const TOLERANCE: f64 = 1e-9;
+const MOST_ROUNDS: usize = 1000;
+/// An edge counted less than this is set aside.
+const SET_ASIDE: f64 = 0.25;
+
+/// One model.
+#[derive(Clone, Copy, Debug)]
+pub struct Node {
+    /// About what it turns.
+    pub middle: DVec3,
+    /// Its size is not known from telemetry.
+    pub has_free_scale: bool,
+}
+
+/// What two models show in common: places as the first has them and as the second has them.
+#[derive(Clone, Copy, Debug)]
+pub struct Link {
+    /// The first model.
+    pub a: usize,
+    /// The second.
+    pub b: usize,
+    /// The same six places in both.
+    pub places: [(DVec3, DVec3); 6],
+    /// What their common place is known to, metres.
+    pub sigma_m: f64,
+    /// Farther apart than this they are not the same places, metres.
+    pub limit_m: f64,
+}
+
+/// Where everything goes.
+#[derive(Clone, Debug)]
+pub struct Settled {
+    /// Per node.
+    pub corrections: Vec<Similarity>,
+    /// Per link: whether it counts.
+    pub holds: Vec<bool>,
+}
+
+type Block = [f64; 7];
+
+/// The state of one node: shift, turn, logarithm of the scale.
+#[derive(Clone, Copy)]
+struct State {
+    shift: DVec3,
+    turn: DQuat,
+    log_scale: f64,
+}
+
+impl State {
+    const START: Self = Self { shift: DVec3::ZERO, turn: DQuat::IDENTITY, log_scale: 0.0 };
+
+    fn lever(&self, node: &Node, p: DVec3) -> DVec3 {
+        self.log_scale.exp() * (self.turn * (p - node.middle))
+    }
+
+    fn step(&mut self, by: &Block) {
+        self.shift += DVec3::new(by[0], by[1], by[2]);
+        self.turn = (DQuat::from_scaled_axis(DVec3::new(by[3], by[4], by[5])) * self.turn).normalize();
+        self.log_scale += by[6];
+    }
+
+    fn similarity(&self, node: &Node) -> Similarity {
+        let (scale, rotation) = (self.log_scale.exp(), self.turn);
+        Similarity { scale, rotation, translation: node.middle + self.shift - scale * (rotation * node.middle) }
+    }
+}
+
+/// Settles the graph.
+pub fn settle(nodes: &[Node], links: &[Link]) -> Settled {
+    let mut solver = Solver {
+        nodes,
+        links,
+        states: vec![State::START; nodes.len()],
+        weights: vec![1.0; links.len()],
+        levers: vec![[(DVec3::ZERO, DVec3::ZERO); 6]; links.len()],
+    };
+    solver.step();
+    let beyond = |s: &Solver<'_>, i: usize| s.apart2(i) / links[i].limit_m.powi(2);
+    let worst = (0..links.len()).map(|i| beyond(&solver, i)).fold(0.0, f64::max);
+    let mut width = 2.0 * worst;
+    while width > 1.0 {
+        for i in 0..links.len() {
+            solver.weights[i] = (width / (beyond(&solver, i) + width)).powi(2);
+        }
+        solver.step();
+        width /= SHRINK;
+    }
+    for _ in 0..LAST_STEPS {
+        for i in 0..links.len() {
+            solver.weights[i] = (1.0 / (beyond(&solver, i) + 1.0)).powi(2);
+        }
+        solver.step();
+    }
+    Settled {
+        corrections: solver.states.iter().zip(nodes).map(|(s, n)| s.similarity(n)).collect(),
+        holds: solver.weights.iter().map(|w| *w >= SET_ASIDE).collect(),
+    }
+}
+
+struct Solver<'a> {
+    nodes: &'a [Node],
+    links: &'a [Link],
+    states: Vec<State>,
+    weights: Vec<f64>,
+    /// Per link and place: from both middles, as the states have them.
+    levers: Vec<[(DVec3, DVec3); 6]>,
+}
+
+impl Solver<'_> {
+    /// Mean square distance of a link's places, m².
+    fn apart2(&self, link: usize) -> f64 {
+        let l = &self.links[link];
+        let place = |i: usize, p: DVec3| {
+            let (n, s) = (&self.nodes[i], &self.states[i]);
+            n.middle + s.shift + s.lever(n, p)
+        };
+        l.places.iter().map(|(a, b)| place(l.a, *a).distance_squared(place(l.b, *b))).sum::<f64>() / 6.0
+    }
+
+    /// What a link's places weigh.
+    fn weight(&self, link: usize) -> f64 {
+        self.weights[link] / (6.0 * self.links[link].sigma_m.powi(2))
+    }
+
+    /// 1/σ² of what telemetry says; a scale that is known does not move.
+    fn prior(&self, node: usize) -> Block {
+        let per = |sigma: f64| 1.0 / (sigma * sigma);
+        let (p, t, h) = (per(POSITION_M), per(TILT_RAD), per(HEADING_RAD));
+        let scale = if self.nodes[node].has_free_scale { per(SCALE) } else { 1.0 };
+        [p, p, p, t, t, h, scale]
+    }
+
+    /// One step of Gauss and Newton.
+    fn step(&mut self) {
+        for (levers, l) in self.levers.iter_mut().zip(self.links) {
+            for (lever, (a, b)) in levers.iter_mut().zip(&l.places) {
+                *lever = (self.states[l.a].lever(&self.nodes[l.a], *a), self.states[l.b].lever(&self.nodes[l.b], *b));
+            }
+        }
+        let mut gradient = vec![[0.0; 7]; self.nodes.len()];
+        for (i, l) in self.links.iter().enumerate() {
+            let w = self.weight(i);
+            for (ya, yb) in &self.levers[i] {
+                let (a, b) = (l.a, l.b);
+                let apart = self.nodes[a].middle + self.states[a].shift + *ya
+                    - (self.nodes[b].middle + self.states[b].shift + *yb);
+                self.push(&mut gradient[a], *ya, -w * apart, a);
+                self.push(&mut gradient[b], *yb, w * apart, b);
+            }
+        }
+        for (i, g) in gradient.iter_mut().enumerate() {
+            let (s, prior) = (&self.states[i], self.prior(i));
+            let turned = s.turn.to_scaled_axis();
+            let now = [s.shift.x, s.shift.y, s.shift.z, turned.x, turned.y, turned.z, s.log_scale];
+            (0..7).for_each(|k| g[k] -= prior[k] * now[k]);
+        }
+        let steps = self.solve(gradient);
+        self.states.iter_mut().zip(&steps).for_each(|(s, by)| s.step(by));
+    }
+
+    /// Adds what a pull on a place with this lever does to a node's block.
+    fn push(&self, block: &mut Block, lever: DVec3, pull: DVec3, node: usize) {
+        let torque = lever.cross(pull);
+        let stretch = if self.nodes[node].has_free_scale { lever.dot(pull) } else { 0.0 };
+        let add = [pull.x, pull.y, pull.z, torque.x, torque.y, torque.z, stretch];
+        (0..7).for_each(|k| block[k] += add[k]);
+    }
+
+    /// How a place with this lever moves when its node's block does.
+    fn moved(&self, block: &Block, lever: DVec3, node: usize) -> DVec3 {
+        let stretch = if self.nodes[node].has_free_scale { block[6] } else { 0.0 };
+        DVec3::new(block[0], block[1], block[2])
+            + DVec3::new(block[3], block[4], block[5]).cross(lever)
+            + stretch * lever
+    }
+
+    /// The matrix of the normal equations times `x`.
+    fn times(&self, x: &[Block], into: &mut [Block]) {
+        for (i, block) in into.iter_mut().enumerate() {
+            let prior = self.prior(i);
+            *block = std::array::from_fn(|k| prior[k] * x[i][k]);
+        }
+        for (i, l) in self.links.iter().enumerate() {
+            let w = self.weight(i);
+            for (ya, yb) in &self.levers[i] {
+                let u = w * (self.moved(&x[l.a], *ya, l.a) - self.moved(&x[l.b], *yb, l.b));
+                self.push(&mut into[l.a], *ya, u, l.a);
+                self.push(&mut into[l.b], *yb, -u, l.b);
+            }
+        }
+    }
+
+    /// Factors of the blocks on the diagonal.
+    fn blocks(&self) -> Vec<[Block; 7]> {
+        let mut blocks: Vec<[Block; 7]> = (0..self.nodes.len())
+            .map(|i| {
+                let prior = self.prior(i);
+                std::array::from_fn(|r| std::array::from_fn(|c| if r == c { prior[r] } else { 0.0 }))
+            })
+            .collect();
+        for (i, l) in self.links.iter().enumerate() {
+            let w = self.weight(i);
+            for (ya, yb) in &self.levers[i] {
+                for (node, lever) in [(l.a, *ya), (l.b, *yb)] {
+                    for column in 0..7 {
+                        let unit: Block = std::array::from_fn(|k| f64::from(u8::from(k == column)));
+                        let mut pulled = [0.0; 7];
+                        self.push(&mut pulled, lever, w * self.moved(&unit, lever, node), node);
+                        (0..7).for_each(|row| blocks[node][row][column] += pulled[row]);
+                    }
+                }
+            }
+        }
+        blocks.into_iter().map(cholesky).collect()
+    }
+
+    /// Solves the normal equations by conjugate gradients.
+    fn solve(&self, gradient: Vec<Block>) -> Vec<Block> {
+        let factors = self.blocks();
+        let dot = |a: &[Block], b: &[Block]| a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| a * b).sum();
+        let conditioned =
+            |r: &[Block]| -> Vec<Block> { r.iter().zip(&factors).map(|(r, f)| substitute(f, r)).collect() };
+        let mut x = vec![[0.0; 7]; gradient.len()];
+        let mut r = gradient;
+        let mut z = conditioned(&r);
+        let mut p = z.clone();
+        let mut rz: f64 = dot(&r, &z);
+        let enough = rz * TOLERANCE * TOLERANCE;
+        let mut ap = x.clone();
+        for _ in 0..MOST_ROUNDS {
+            if rz <= enough || rz <= f64::MIN_POSITIVE {
+                break;
+            }
+            self.times(&p, &mut ap);
+            let pap: f64 = dot(&p, &ap);
+            let alpha = rz / pap;
+            for (i, block) in x.iter_mut().enumerate() {
+                (0..7).for_each(|k| block[k] += alpha * p[i][k]);
+                (0..7).for_each(|k| r[i][k] -= alpha * ap[i][k]);
+            }
+            z = conditioned(&r);
+            let next: f64 = dot(&r, &z);
+            let beta = next / rz;
+            rz = next;
+            p.iter_mut().zip(&z).for_each(|(p, z)| (0..7).for_each(|k| p[k] = z[k] + beta * p[k]));
+        }
+        x
+    }
+}
+
+/// The lower factor of a symmetric positive definite block (the priors make it so).
+fn cholesky(mut m: [Block; 7]) -> [Block; 7] {
+    for j in 0..7 {
+        let below: f64 = (0..j).map(|k| m[j][k] * m[j][k]).sum();
+        m[j][j] = (m[j][j] - below).max(f64::MIN_POSITIVE).sqrt();
+        for i in j + 1..7 {
+            let below: f64 = (0..j).map(|k| m[i][k] * m[j][k]).sum();
+            m[i][j] = (m[i][j] - below) / m[j][j];
+        }
+    }
+    m
+}
+
+fn substitute(factor: &[Block; 7], b: &Block) -> Block {
+    let mut x = *b;
+    for i in 0..7 {
+        let below: f64 = (0..i).map(|k| factor[i][k] * x[k]).sum();
+        x[i] = (x[i] - below) / factor[i][i];
+    }
+    for i in (0..7).rev() {
+        let above: f64 = (i + 1..7).map(|k| factor[k][i] * x[k]).sum();
+        x[i] = (x[i] - above) / factor[i][i];
+    }
+    x
+}
+
+#[cfg(test)]
+mod tests;

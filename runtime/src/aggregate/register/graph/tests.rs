@@ -1,0 +1,118 @@
+//! Promises of the pose graph, on fields of models whose true places are known.
+
+use super::*;
+
+/// Models in a square field, each off by its own error, and links between neighbours that see the truth.
+struct Field {
+    side: usize,
+    nodes: Vec<Node>,
+    /// What is wrong with each.
+    errors: Vec<Similarity>,
+    links: Vec<Link>,
+}
+
+fn wobble(i: usize, k: usize) -> f64 {
+    (((i * 7 + k) as f64 * 12.9898).sin() * 43_758.545_3).fract()
+}
+
+impl Field {
+    fn new(side: usize, has_free_scale: bool) -> Self {
+        let middle = |i: usize| DVec3::new((i % side) as f64 * 100.0, (i / side) as f64 * 100.0, 0.0);
+        let nodes: Vec<Node> = (0..side * side).map(|i| Node { middle: middle(i), has_free_scale }).collect();
+        let errors = (0..side * side).map(|i| {
+            let scale = if has_free_scale { 1.0 + 0.03 * wobble(i, 6) } else { 1.0 };
+            let rotation = DQuat::from_rotation_z(0.05 * wobble(i, 3)) * DQuat::from_rotation_x(0.01 * wobble(i, 4));
+            let shift = DVec3::new(wobble(i, 0), wobble(i, 1), wobble(i, 2)) * 3.0;
+            Similarity { scale, rotation, translation: middle(i) + shift - scale * (rotation * middle(i)) }
+        });
+        let mut field = Self { side, errors: errors.collect(), nodes, links: Vec::new() };
+        for i in 0..side * side {
+            for j in [i + 1, i + side] {
+                if j < side * side && (j != i + 1 || j % side != 0) {
+                    field.link(i, j, DVec3::ZERO);
+                }
+            }
+        }
+        field
+    }
+
+    /// Six places half-way between two models; the second one's are `off`.
+    fn link(&mut self, a: usize, b: usize, off: DVec3) {
+        let half_way = 0.5 * (self.nodes[a].middle + self.nodes[b].middle);
+        let places = [DVec3::X, -DVec3::X, DVec3::Y, -DVec3::Y, DVec3::Z, -DVec3::Z].map(|d| {
+            let truth = half_way + d * DVec3::new(30.0, 25.0, 4.0);
+            (self.errors[a].apply(truth), self.errors[b].apply(truth + off))
+        });
+        self.links.push(Link { a, b, places, sigma_m: 0.05, limit_m: 0.5 });
+    }
+
+    /// The greatest distance of neighbours' places after settling, metres.
+    fn worst_gap(&self, settled: &Settled, honest: usize) -> f64 {
+        let apart = |l: &Link| {
+            let c = &settled.corrections;
+            l.places.iter().map(|(a, b)| c[l.a].apply(*a).distance(c[l.b].apply(*b))).fold(0.0, f64::max)
+        };
+        self.links[..honest].iter().map(apart).fold(0.0, f64::max)
+    }
+}
+
+#[test]
+fn loops_close_to_millimetres_and_telemetry_holds_the_whole() {
+    let field = Field::new(6, false);
+    let settled = settle(&field.nodes, &field.links);
+    assert!(settled.holds.iter().all(|h| *h));
+    let gap = field.worst_gap(&settled, field.links.len());
+    assert!(gap < 0.03, "{gap} m");
+    // What all have in common only telemetry says: the mean of 36 errors, not one model's.
+    let moved = |i: usize| settled.corrections[i].apply(field.errors[i].apply(field.nodes[i].middle));
+    let off: DVec3 = (0..36).map(|i| moved(i) - field.nodes[i].middle).sum::<DVec3>() / 36.0;
+    assert!(off.length() < 1.2, "{off}");
+    assert!(settled.corrections.iter().all(|c| c.scale == 1.0));
+}
+
+#[test]
+fn one_false_edge_is_set_aside_and_bends_nothing() {
+    let mut field = Field::new(6, false);
+    let honest = field.links.len();
+    let without = settle(&field.nodes, &field.links);
+    for (a, b) in [(14, 15), (0, field.side), (7, 21)] {
+        field.links.truncate(honest);
+        field.link(a, b, DVec3::new(7.0, -5.0, 1.0));
+        let settled = settle(&field.nodes, &field.links);
+        assert_eq!(settled.holds.iter().position(|h| !h), Some(honest), "{a}–{b}");
+        assert!(settled.holds[..honest].iter().all(|h| *h));
+        for (i, node) in field.nodes.iter().enumerate() {
+            let at = |s: &Settled| s.corrections[i].apply(node.middle);
+            assert!(at(&settled).distance(at(&without)) < 0.02, "{a}–{b} moved {i}");
+        }
+    }
+}
+
+#[test]
+fn a_model_without_neighbours_stays_where_its_telemetry_puts_it() {
+    let mut field = Field::new(3, false);
+    field.links.retain(|l| l.a != 8 && l.b != 8);
+    let settled = settle(&field.nodes, &field.links);
+    assert!(settled.corrections[8].apply(field.nodes[8].middle).distance(field.nodes[8].middle) < 1e-9);
+    assert!(settle(&[], &[]).corrections.is_empty());
+}
+
+#[test]
+fn a_scale_that_is_free_is_found() {
+    let field = Field::new(4, true);
+    let settled = settle(&field.nodes, &field.links);
+    assert!(field.worst_gap(&settled, field.links.len()) < 0.05);
+    let scales: Vec<f64> = field.errors.iter().zip(&settled.corrections).map(|(e, c)| e.scale * c.scale).collect();
+    let (low, high) = scales.iter().fold((f64::MAX, 0.0f64), |(l, h), s| (l.min(*s), h.max(*s)));
+    assert!(high - low < 0.004, "{scales:?}");
+}
+
+#[test]
+fn a_thousand_aircraft_settle_in_seconds() {
+    let mut field = Field::new(32, false);
+    field.link(100, 101, DVec3::new(7.0, -5.0, 1.0));
+    let start = std::time::Instant::now();
+    let settled = settle(&field.nodes, &field.links);
+    assert_eq!(settled.holds.iter().filter(|h| !**h).count(), 1);
+    assert!(start.elapsed().as_secs() < 60, "{:?}", start.elapsed());
+}
