@@ -39,9 +39,10 @@ pub use error::MissionError;
 pub use keyframes::KeyframeSettings;
 pub use memory::MemorySettings;
 pub use reference::reference;
+pub use validate::MAX_AIRCRAFT;
 
-/// A mission file larger than this is refused before it is parsed.
-const MAX_FILE_BYTES: u64 = 1 << 20;
+/// A mission file larger than this is refused before it is parsed: room for [`MAX_AIRCRAFT`] with a region of 64 corners each.
+const MAX_FILE_BYTES: u64 = 4 << 20;
 
 record! {
     /// What all aircraft and the ground share.

@@ -6,6 +6,7 @@ pub mod detail;
 pub mod device;
 pub mod figures;
 pub mod front;
+pub mod ground;
 pub mod map;
 pub mod memory;
 pub mod skips;

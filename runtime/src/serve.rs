@@ -5,6 +5,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use config::error::{Error, ErrorKind};
@@ -19,8 +20,10 @@ use crate::upload::receive::{ReceiveCounters, Received, Receiver};
 
 pub mod admit;
 mod board;
+mod joining;
 
 pub use board::Board;
+pub use joining::{Joined, Joining};
 
 /// After the last model is here, the aircraft have so long to take their receipts.
 const RECEIPTS: Duration = Duration::from_secs(10);
@@ -134,7 +137,13 @@ fn admission(mission: &Mission) -> Result<Admission, UploadError> {
     let identity = Identity::of(mission, GROUND)?;
     let (name, aircraft) = (mission.name.clone(), mission.aircraft.iter().map(|a| a.id.clone()).collect());
     let mission = mission.clone();
-    let check = Box::new(move |id: &str, path: &Path| admit::admit(&mission, id, path).map(drop));
+    // One model is in memory at a time, however many arrive at once.
+    let alone = Mutex::new(());
+    let check = Box::new(move |id: &str, path: &Path| {
+        // It guards nothing that a panic could leave half done.
+        let _alone = alone.lock().unwrap_or_else(PoisonError::into_inner);
+        admit::admit(&mission, id, path).map(drop)
+    });
     Ok(Admission { mission: name, aircraft, identity, check })
 }
 

@@ -42,6 +42,8 @@ fn settings() -> GroundSettings {
         epochs: 30,
         rate: 2.0,
         between_views: false,
+        // Where models go is registration's to say; here they stay.
+        register: false,
         ..Default::default()
     }
 }

@@ -2,6 +2,7 @@
 
 mod detail;
 mod device;
+mod ground;
 mod map;
 mod memory;
 mod skips;
@@ -30,6 +31,8 @@ enum Command {
     Detail(detail::Args),
     /// All that a board or a card can tell in ten minutes, as a report to send in.
     Device(device::Args),
+    /// A ground station of many simulated aircraft: seconds for each, memory, how well they meet.
+    Ground(ground::Args),
     /// Planned against measured bytes, and quality, across memory budgets.
     Memory(memory::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
@@ -64,6 +67,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Map(args) => map::run(args),
         Command::Detail(args) => detail::run(args),
         Command::Device(args) => device::run(args),
+        Command::Ground(args) => ground::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),

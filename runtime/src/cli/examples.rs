@@ -33,6 +33,7 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
     ("bench map", &["dgtr bench map --out map"]),
     ("bench detail", &["dgtr bench detail --out detail"]),
     ("bench device", &["dgtr bench device --out board.md"]),
+    ("bench ground", &["dgtr bench ground --out field --aircraft 24 --side-m 700"]),
     ("bench memory", &["dgtr bench memory pictures"]),
     ("bench skips", &["dgtr bench skips pictures"]),
     ("bench stress", &["dgtr bench stress"]),

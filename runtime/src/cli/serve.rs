@@ -12,7 +12,7 @@ use crate::console::Progress;
 use crate::interrupt::Interrupt;
 use crate::ortho::{draw_file, keep_scratch_in};
 use crate::report::{ReportData, Timing, bytes};
-use crate::serve::{self, Board, Reception, ServeError};
+use crate::serve::{self, Board, Joining, Reception, ServeError};
 use crate::service::Supervisor;
 use crate::session::{Owner, Session};
 
@@ -66,12 +66,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let stop = AtomicBool::new(false);
     let supervisor = Supervisor::from_environment();
     let mut told = None;
+    let mut joining = Joining::start(&mission, &args.out);
     let mut bar = Progress::new("receive", mission.aircraft.len() as u64);
     let reception = serve::receive(&mission, &args.out, timeout, &stop, &mut |p| {
         stop.store(interrupt.requested(), Ordering::Relaxed);
         supervisor.ready();
         supervisor.alive();
         board.round(p);
+        joining.arrived(&p.received);
         if told.replace(p.finished) != Some(p.finished) {
             supervisor.status(&format!("{} of {} final models", p.finished, p.aircraft));
         }
@@ -93,12 +95,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
         supervisor.alive();
         true
     };
+    let joined = joining.finish(&at_work);
     let (outcome, left_out) = serve::merge(&mission, &reception, &args.out, &at_work)?;
     let mut run = summary::run_report("serve", &outcome, mission.ground.seed);
     run.wall_s += reception.seconds;
     run.stage_ms.insert("receive".into(), reception.seconds * 1e3);
     let counters = serde_json::to_value(reception.counters).unwrap_or_default();
     run.more.insert("received".into(), counters);
+    run.more.insert("joined_s".into(), joined.seconds.into());
+    run.more.insert("fitted_early".into(), joined.fitted.into());
     run.more.insert("refused".into(), serde_json::to_value(&reception.refusals).unwrap_or_default());
     run.more.insert("missing".into(), reception.missing.clone().into());
     let mut data = summary::report(&outcome);

@@ -1,5 +1,6 @@
 //! What the map of the page shows beside regions: pictures with their footprints, squares of ground and how well they are
-//! covered, and the orthophoto so far. Bounded: [`MAX_SHOTS`] pictures and `MAX_CELLS` squares of each aircraft.
+//! covered, and the orthophoto so far. Bounded: [`MAX_SHOTS`] pictures and `MAX_CELLS` squares of each aircraft, and
+//! [`MAX_SHOTS_OF_ALL`] pictures of all.
 
 use std::path::Path;
 
@@ -14,6 +15,8 @@ use serde::{Serialize, Serializer};
 
 /// Pictures shown of one aircraft: `keyframes.max` is at most this.
 pub const MAX_SHOTS: usize = 4096;
+/// Pictures shown of all aircraft: what a browser draws without making anybody wait.
+pub const MAX_SHOTS_OF_ALL: usize = 32_768;
 /// A ray that comes down less steeply than this (its sine) meets the ground too far away to be drawn.
 const LEAST_DESCENT: f64 = 0.17;
 /// Bounds on the two files of a map that are read.
@@ -32,6 +35,9 @@ pub struct Ground {
     /// Grows whenever squares or pictures were taken anew.
     #[serde(skip)]
     surveys: u64,
+    /// Pictures of each aircraft.
+    #[serde(skip)]
+    shown: Vec<usize>,
 }
 
 /// One picture. Metres east and north, to the decimetre.
@@ -85,9 +91,13 @@ impl Ground {
         Self { shots: Vec::with_capacity(key_frames.min(MAX_SHOTS)), ..Self::default() }
     }
 
-    /// Shows a picture; beyond the bound none.
+    /// Shows a picture; beyond the bounds none.
     pub fn add(&mut self, shot: Shot) {
-        if self.shots.iter().filter(|s| s.of == shot.of).count() < MAX_SHOTS {
+        if self.shown.len() <= shot.of {
+            self.shown.resize(shot.of + 1, 0);
+        }
+        if self.shown[shot.of] < MAX_SHOTS && self.shots.len() < MAX_SHOTS_OF_ALL {
+            self.shown[shot.of] += 1;
             self.shots.push(shot);
         }
     }
@@ -118,6 +128,9 @@ impl Ground {
     /// Forgets what is shown of an aircraft.
     pub fn forget(&mut self, of: usize) {
         self.shots.retain(|s| s.of != of);
+        if let Some(shown) = self.shown.get_mut(of) {
+            *shown = 0;
+        }
         self.squares.retain(|s| s.of != of);
         self.surveys += 1;
     }
@@ -210,6 +223,9 @@ mod tests {
         (0..MAX_SHOTS + 9).for_each(|_| ground.add(shot));
         ground.add(Shot { of: 1, ..shot });
         assert_eq!(ground.shots.len(), MAX_SHOTS + 1);
+        (2..40).for_each(|of| (0..MAX_SHOTS).for_each(|_| ground.add(Shot { of, ..shot })));
+        assert_eq!(ground.shots.len(), MAX_SHOTS_OF_ALL);
+        (2..40).for_each(|of| ground.forget(of));
         ground.forget(0);
         assert!(ground.shots.len() == 1 && ground.squares.is_empty() && !ground.is_empty());
     }

@@ -1,5 +1,6 @@
 //! What the ground knows of every aircraft, on the live page: what is under way, and what the models that are here say.
 
+use std::collections::HashMap;
 use std::path::Path;
 use std::time::{Instant, SystemTime};
 
@@ -8,6 +9,7 @@ use models::coverage::{CoverageMap, Region};
 use models::formats::model::{self, ModelHeader};
 
 use super::{Progress, Received};
+use crate::report::Thumbnail;
 use crate::report::ground::Shot;
 use crate::watch::Watch;
 
@@ -32,7 +34,11 @@ impl<'a> Board<'a> {
         let watch = Watch::of(mission, &ids, "nothing has arrived yet", out);
         watch.update(|page| {
             page.title = format!("Mission {}: ground", mission.name);
-            page.aircraft.iter_mut().for_each(|craft| craft.axes = ["seconds", "steps of the models that arrived"]);
+            for craft in &mut page.aircraft {
+                craft.axes = ["seconds", "steps of the models that arrived"];
+                // No picture comes to the ground: its room, times all aircraft, is given back.
+                craft.thumbnail = Thumbnail::default();
+            }
         });
         Self {
             mission,
@@ -60,9 +66,12 @@ impl<'a> Board<'a> {
             let words = format!("{} of {} final models are here", progress.finished, progress.aircraft);
             self.watch.update(|page| page.subtitle = words);
         }
+        let here: HashMap<&str, &Received> = progress.received.iter().map(|r| (r.aircraft.as_str(), r)).collect();
+        let transfers = progress.transfers.iter().map(|t| (t.0.as_str(), (t.1, t.2)));
+        let transfers: HashMap<&str, (usize, usize)> = transfers.collect();
         for (i, aircraft) in self.mission.aircraft.iter().enumerate() {
-            let here = progress.received.iter().find(|r| r.aircraft == aircraft.id);
-            let under_way = progress.transfers.iter().find(|t| t.0 == aircraft.id).map(|t| (t.1, t.2));
+            let here = here.get(aircraft.id.as_str()).copied();
+            let under_way = transfers.get(aircraft.id.as_str()).copied();
             let left_s = self.left_s(i, under_way);
             self.watch.craft(i, |craft| {
                 (craft.chunks, craft.left_s) = (under_way, left_s);

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use config::disk::Disk;
+use config::mission::MAX_AIRCRAFT;
 
 use super::Source;
 use super::medium::Medium;
@@ -19,7 +20,7 @@ use super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::transport::{Inlet, Outlet, Patience, TransportError};
 
 /// Most aircraft folders looked at; more than any mission has.
-const MAX_ENTRIES: usize = 1024;
+const MAX_ENTRIES: usize = 4 * MAX_AIRCRAFT;
 
 /// Writes a file so that it is either absent, old, or complete.
 pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {

@@ -5,6 +5,7 @@
 //! Whoever waits for a chunk at its end goes on waiting in the next round, so that neither a slow link nor a vanished
 //! aircraft holds up the others.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,6 +30,10 @@ mod slot;
 const ANSWER: Duration = Duration::from_secs(10);
 /// How often a round looks whether a transfer has come to its end.
 const LOOK_UP: Duration = Duration::from_millis(2);
+/// Transfers at work at the same time, and the stack of each one's thread: however many aircraft there are, these are the
+/// threads and the memory they take. The others have their turn as these end.
+const AT_WORK: usize = 64;
+const STACK_BYTES: usize = 1 << 20;
 
 /// What happened so far. Everything not received is in here.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -128,6 +133,8 @@ pub struct Receiver {
     link: Arc<Link>,
     dir: PathBuf,
     seats: Vec<Seat>,
+    /// Whose turn it is when not all can be at work at once.
+    turn: usize,
     wake: Wake<()>,
     /// Keeps `wake` open when no inlet wakes us.
     _waker: SyncSender<()>,
@@ -178,6 +185,7 @@ impl Receiver {
             link: Arc::new(link),
             dir: dir.into(),
             seats,
+            turn: 0,
             wake,
             _waker: waker,
             counters: ReceiveCounters::default(),
@@ -218,20 +226,15 @@ impl Receiver {
     pub fn round(&mut self, stop: &AtomicBool) -> Result<bool, UploadError> {
         self.look();
         let until = Instant::now() + Duration::from_secs_f64(self.link.settings.poll_s);
-        for seat in self.seats.iter_mut().filter(|s| s.wants_work()) {
-            let Place::Here(mut slot) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
-            let link = self.link.clone();
-            seat.place = Place::AtWork(std::thread::spawn(move || {
-                let advance = slot.advance(&link, until);
-                (slot, advance)
-            }));
-        }
+        // Each seat has one turn in a round.
+        let mut waiting: VecDeque<usize> = self.in_turn().filter(|i| self.seats[*i].wants_work()).collect();
         loop {
+            self.put_to_work(&mut waiting, until);
             if stop.load(Ordering::Relaxed) {
                 self.link.stop.store(true, Ordering::Relaxed);
             }
             self.collect();
-            if Instant::now() >= until || !self.seats.iter().any(Seat::is_at_work) {
+            if Instant::now() >= until || (waiting.is_empty() && !self.seats.iter().any(Seat::is_at_work)) {
                 break;
             }
             std::thread::sleep(LOOK_UP);
@@ -239,27 +242,67 @@ impl Receiver {
         Ok(self.seats.iter().any(|s| s.is_at_work() || s.wants_work()))
     }
 
+    /// All seats, beginning with the one whose turn it is.
+    fn in_turn(&self) -> impl Iterator<Item = usize> + use<> {
+        let (turn, n) = (self.turn, self.seats.len());
+        (0..n).map(move |i| (turn + i) % n)
+    }
+
+    /// Lets those at the front of the queue advance, as many as may be at work at once.
+    fn put_to_work(&mut self, waiting: &mut VecDeque<usize>, until: Instant) {
+        let mut at_work = self.seats.iter().filter(|s| s.is_at_work()).count();
+        while at_work < AT_WORK
+            && let Some(i) = waiting.pop_front()
+        {
+            let seat = &mut self.seats[i];
+            let Place::Here(mut slot) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
+            let link = self.link.clone();
+            let work = move || {
+                let advance = slot.advance(&link, until);
+                (slot, advance)
+            };
+            match std::thread::Builder::new().stack_size(STACK_BYTES).spawn(work) {
+                Ok(worker) => seat.place = Place::AtWork(worker),
+                Err(e) => {
+                    // What is on disk is whole at any time: the next round tries again.
+                    tracing::debug!("serve: no thread for {}: {e}", seat.id);
+                    self.counters.retries += 1;
+                    self.reopen(i);
+                    break;
+                }
+            }
+            self.turn = (i + 1) % self.seats.len();
+            at_work += 1;
+        }
+    }
+
+    /// Goes on from what is on disk.
+    fn reopen(&mut self, i: usize) {
+        let Link { settings, admission, .. } = &*self.link;
+        let id = self.seats[i].id.clone();
+        let slot = Slot::open(&id, &self.dir.join(&id), settings, admission);
+        self.seats[i].put_back(Box::new(slot));
+    }
+
     /// Takes back the transfers that have come to the end of their turn.
     fn collect(&mut self) {
-        for seat in &mut self.seats {
+        for i in 0..self.seats.len() {
+            let seat = &mut self.seats[i];
             if !matches!(&seat.place, Place::AtWork(worker) if worker.is_finished()) {
                 continue;
             }
             let Place::AtWork(worker) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
-            let slot = match worker.join() {
+            match worker.join() {
                 Ok((slot, advance)) => {
+                    seat.put_back(slot);
                     self.counters.add(&advance.counters);
                     self.refusals.absorb(advance.refusals);
-                    slot
                 }
-                // What is on disk is whole at any time: go on from there.
                 Err(_) => {
                     self.counters.retries += 1;
-                    let Link { settings, admission, .. } = &*self.link;
-                    Box::new(Slot::open(&seat.id, &self.dir.join(&seat.id), settings, admission))
+                    self.reopen(i);
                 }
-            };
-            seat.put_back(slot);
+            }
         }
     }
 
@@ -284,9 +327,13 @@ impl Receiver {
                 tracing::debug!("serve: {}: {e}", inlet.name());
             }
         }
+        // By aircraft, each one's in the order they were seen.
+        seen.sort_by(|a, b| a.0.aircraft.cmp(&b.0.aircraft));
         for seat in &mut self.seats {
             if let Place::Here(slot) = &mut seat.place {
-                slot.choose(seen.iter().filter(|(o, _)| o.aircraft == seat.id), &mut self.counters);
+                let from = seen.partition_point(|(o, _)| o.aircraft < seat.id);
+                let to = seen.partition_point(|(o, _)| o.aircraft <= seat.id);
+                slot.choose(seen[from..to].iter(), &mut self.counters);
                 seat.progress = slot.progress();
                 (seat.is_over, seat.is_told) = (slot.is_over(), slot.is_told());
             }

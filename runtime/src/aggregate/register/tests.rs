@@ -149,6 +149,12 @@ fn a_damaged_edge_is_named_and_fitted_again() {
 fn a_false_edge_is_named_and_the_others_hold() {
     let dir = tempfile::tempdir().expect("temp dir");
     let mut members = field(dir.path(), 4, 4);
+    {
+        let mut members = field(dir.path(), 4, 4);
+        let mut exact = Exact::default();
+        registrar(&dir.path().join("honest"), &mut exact).register(&mut members, &|| true).expect("registered");
+        eprintln!("HONEST {}", worst_disagreement(&members));
+    }
     let mut exact = Exact { lies: vec![[[1, 1], [2, 1]]], ..Default::default() };
     let report = registrar(dir.path(), &mut exact).register(&mut members, &|| true).expect("registered");
     assert_eq!(report.warnings.len(), 1, "{:?}", report.warnings);
