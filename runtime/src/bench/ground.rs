@@ -86,6 +86,12 @@ impl Field {
         self.side_m / self.columns() as f64
     }
 
+    /// Gaussians along the side of a model: so many that all models lie on one grid.
+    fn along(&self) -> usize {
+        let of_region = (self.gaussians as f64).sqrt() / (1.0 + 2.0 * BEYOND);
+        24 * (of_region / 20.0).floor().max(1.0) as usize
+    }
+
     fn corner(&self, i: usize) -> DVec2 {
         DVec2::new((i % self.columns()) as f64, (i / self.columns()) as f64) * self.pitch()
     }
@@ -120,15 +126,16 @@ impl Field {
     /// The model of one aircraft, where its GPS puts it.
     fn model(&self, i: usize) -> (ModelHeader, GaussianCloud) {
         let (low, side) = (self.corner(i) - BEYOND * self.pitch(), (1.0 + 2.0 * BEYOND) * self.pitch());
-        let along = (self.gaussians as f64).sqrt().floor().max(1.0) as usize;
+        let along = self.along();
         let spacing = side / along as f64;
-        let sigma = (0.4 * spacing as f32).ln();
+        // They cover each other's gaps, as trained ones do: through a gap nothing is lifted.
+        let sigma = (0.6 * spacing as f32).ln();
         let mut cloud = GaussianCloud::with_capacity(1, along * along);
         for row in 0..along {
             for column in 0..along {
                 let p = low + (DVec2::new(column as f64, row as f64) + 0.5) * spacing;
-                // What is there is the same for all: the ground is patched, every patch as large as a Gaussian.
-                let patch = (p / spacing).floor();
+                // What is there is the same for all: the ground is patched, every patch two Gaussians wide.
+                let patch = (p / (2.0 * spacing)).floor();
                 let mut sh = [0.0f32; 12];
                 for (k, v) in sh.iter_mut().enumerate() {
                     let of = 16 * patch.y as i64 + k as i64;
@@ -163,7 +170,7 @@ impl Field {
         let mut text = format!(
             "name = {MISSION:?}\norigin = {{ lat_deg = {}, lon_deg = {}, alt_m = {} }}\n\
              camera = {{ width = {w}, height = {h}, fx = {FOCAL:.1}, fy = {FOCAL:.1}, cx = {}.0, cy = {}.0 }}\n\
-             upload = {{ folder = \"stick\", poll_s = 0.2 }}\nground = {{ epochs = 0, seed = {} }}\n",
+             upload = {{ folder = \"stick\", poll_s = 0.2 }}\nground = {{ epochs = 0, seed = {} }}\nmap = {{ ground = false }}\n",
             ORIGIN.lat_deg,
             ORIGIN.lon_deg,
             ORIGIN.alt_m,
@@ -268,7 +275,7 @@ fn scores(field: &Field, [first, second]: [&RunReport; 2], out: &Path) -> Result
     let (header, cloud) = model::read(&global)?;
     Ok(GroundScores {
         aircraft: field.aircraft,
-        gaussians: [field.aircraft * field.model(0).1.len(), cloud.len()],
+        gaussians: [field.aircraft * field.along().pow(2), cloud.len()],
         pairs: number(second, "pairs"),
         fitted: [fitted(first), fitted(second)].map(|n| n as usize),
         joined_s: [mean(&early[..compared]), mean(&late[late.len().saturating_sub(compared)..])],
@@ -323,6 +330,51 @@ fn least_region(field: &Field, cloud: &GaussianCloud) -> f64 {
             counts[i] += 1;
         }
     }
-    let each = field.model(0).1.len() as f64 / (1.0 + 2.0 * BEYOND).powi(2);
+    let each = field.along().pow(2) as f64 / (1.0 + 2.0 * BEYOND).powi(2);
     counts.into_iter().map(|n| n as f64 / each).fold(f64::INFINITY, f64::min)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::aggregate::LocalModel;
+    use crate::aggregate::member::Member;
+    use crate::aggregate::register::Fitter;
+    use crate::aggregate::register::fit::RenderedFitter;
+
+    const FIELD: Field = Field { aircraft: 4, side_m: 280.0, gaussians: 10_000, limit_mib: 512, seed: 1 };
+
+    /// With real renderings and the real network (skipped, with a word, where there is no device or no ONNX Runtime).
+    #[test]
+    fn neighbours_of_the_field_are_brought_together_by_rendering_them() {
+        let dir = tempfile::tempdir().expect("temp dir");
+        let member = |i: usize| {
+            let (header, cloud) = FIELD.model(i);
+            let path = dir.path().join(id(i));
+            model::write(&path, &header, &cloud).expect("written");
+            Member::of(LocalModel::read(&path).expect("read"))
+        };
+        let mut fitter = RenderedFitter::new(None);
+        for (a, b) in FIELD.neighbours() {
+            let found = match fitter.fit(&member(a), &member(b)) {
+                Ok(found) => found.expect("they share a fifth of their ground"),
+                Err(e) => return eprintln!("skipped: {e}"),
+            };
+            let border = 0.5 * (FIELD.corner(a) + FIELD.corner(b) + FIELD.pitch()).extend(0.0);
+            let (first, second) = (FIELD.error(a).point(border), FIELD.error(b).point(border));
+            let left = found.motion().point(second).distance(first);
+            assert!(left < 0.3, "{a}–{b}: {left} m left of {}; {found:?}", second.distance(first));
+        }
+    }
+
+    #[test]
+    fn a_field_has_its_edges_once_and_its_models_on_one_grid() {
+        let field = Field { aircraft: 200, side_m: 2000.0, ..FIELD };
+        // 14 whole rows of 14 or 15 columns and what is left.
+        assert_eq!(field.columns(), 15);
+        assert_eq!(field.neighbours().count(), 13 * 14 + 4 + 12 * 15 + 5);
+        let mission = Mission::parse(&field.mission(), Path::new("")).expect("a mission");
+        assert_eq!(mission.aircraft.len(), 200);
+        assert!(field.along() * field.along() <= field.gaussians && field.along() % 24 == 0);
+    }
 }

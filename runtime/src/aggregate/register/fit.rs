@@ -29,6 +29,12 @@ const CLEAR: f32 = 0.3;
 const OVERLAP: f64 = 0.1;
 /// Fewer agreeing points than this prove nothing.
 const LEAST_POINTS: usize = 40;
+/// And fewer than this share of all matches.
+const LEAST_SHARE: f64 = 0.2;
+/// Pairs of points agree on a shift when theirs are no farther apart: what a heading wrong by a degree does over a view's ground.
+const AGREE_M: f64 = 1.0;
+/// Shifts that are tried.
+const MOST_TRIED: usize = 500;
 /// Motions beyond these are taken for a mistake: GPS is not that wrong.
 const MOST_METRES: f64 = 15.0;
 const MOST_DEGREES: f64 = 6.0;
@@ -176,8 +182,8 @@ fn lift(view: &View, rendering: &Rendering, [x, y]: [f32; 2]) -> Option<DVec3> {
     p.is_finite().then_some(p)
 }
 
-/// The motion of pairs (from, to) by iterated trimming: the median shift first, then least squares over what agrees. Without
-/// a free scale it is rigid: where both scales come from the same kind of GPS it keeps both.
+/// The motion of pairs (from, to) by iterated trimming: the shift that most of them agree on first, then least squares over what
+/// agrees. Without a free scale it is rigid: where both scales come from the same kind of GPS it keeps both.
 fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
     if pairs.len() < LEAST_POINTS {
         return None;
@@ -187,15 +193,16 @@ fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
         v.sort_by(f64::total_cmp);
         v[v.len() / 2]
     };
-    let shift = DVec3::from_array(std::array::from_fn(|k| median(&|(q, p)| p[k] - q[k], pairs)));
+    let shift = agreed_shift(pairs)?;
     let mut motion = Motion::rigid(glam::DQuat::IDENTITY, shift);
-    let mut kept: Vec<(DVec3, DVec3)> = Vec::new();
+    let mut kept: Vec<(DVec3, DVec3)> =
+        pairs.iter().filter(|(q, p)| (*p - *q).distance(shift) <= AGREE_M).copied().collect();
     for _ in 0..8 {
         let error = |(q, p): &(DVec3, DVec3)| motion.point(*q).distance(*p);
         // Three times the median, but never so tight that rounding throws points out.
-        let limit = (3.0 * median(&error, if kept.is_empty() { pairs } else { &kept })).max(0.02);
+        let limit = (3.0 * median(&error, &kept)).max(0.02);
         kept = pairs.iter().filter(|pair| error(pair) <= limit).copied().collect();
-        if kept.len() < LEAST_POINTS {
+        if kept.len() < LEAST_POINTS || (kept.len() as f64) < LEAST_SHARE * pairs.len() as f64 {
             return None;
         }
         let (from, to): (Vec<DVec3>, Vec<DVec3>) = kept.iter().copied().unzip();
@@ -223,6 +230,21 @@ fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
         points: [kept.len() as u32, pairs.len() as u32],
         rms_m,
     })
+}
+
+/// The shift within [`AGREE_M`] of which most pairs lie, of those GPS may be wrong by. Half of the matches may be wrong where
+/// ground repeats itself: a median would be led astray.
+fn agreed_shift(pairs: &[(DVec3, DVec3)]) -> Option<DVec3> {
+    let shifts: Vec<DVec3> = pairs.iter().map(|(q, p)| *p - *q).filter(|d| d.length() <= MOST_METRES).collect();
+    let agreeing = |d: &DVec3| shifts.iter().filter(|other| other.distance(*d) <= AGREE_M).count();
+    let tried = shifts.iter().step_by(shifts.len().div_ceil(MOST_TRIED).max(1));
+    // The first of equals: the same pairs give the same motion.
+    tried
+        .fold(None, |best: Option<(usize, DVec3)>, d| {
+            let n = agreeing(d);
+            if best.is_none_or(|b| n > b.0) { Some((n, *d)) } else { best }
+        })
+        .map(|b| b.1)
 }
 
 /// Six places with the middle and the covariance of all: what a motion costs at them it costs at all points.
@@ -271,6 +293,15 @@ mod tests {
         let (motion, p) = (fit.motion(), DVec3::new(20.0, 30.0, 2.0));
         assert!(motion.point(p).distance(truth.point(p)) < 1e-6, "{motion:?}");
         assert!(fit.points[0] >= 140 && fit.rms_m[1] < 1e-6 && fit.rms_m[0] > 0.5);
+    }
+
+    #[test]
+    fn six_of_ten_matches_may_be_false() {
+        let truth = Motion::rigid(DQuat::from_rotation_z(0.01), DVec3::new(-0.6, 1.5, 0.3));
+        let fit = fitted(&pairs(200, &truth, 120), false).expect("fits");
+        let p = DVec3::new(20.0, 30.0, 2.0);
+        assert!(fit.motion().point(p).distance(truth.point(p)) < 1e-6, "{fit:?}");
+        assert!(fitted(&pairs(200, &truth, 180), false).is_none(), "nine of ten may not");
     }
 
     #[test]

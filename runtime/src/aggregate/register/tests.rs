@@ -59,15 +59,18 @@ fn field(dir: &Path, columns: usize, rows: usize) -> Vec<Member> {
     (0..columns * rows).map(|i| aircraft(dir, [i % columns, i / columns], 2.0)).collect()
 }
 
-/// How far neighbours are from agreeing, metres: their errors after they were moved.
+/// How far neighbours are from agreeing, metres: where they put the place between them.
 fn worst_disagreement(members: &[Member]) -> f64 {
-    let left = |m: &Member| {
-        let (x, y) = (place(m)[0] as f64 * 40.0 + 30.0, place(m)[1] as f64 * 40.0 + 30.0);
-        let truth = DVec3::new(x, y, 0.0);
-        m.motion().point(truth + error(place(m))) - truth
-    };
-    let left: Vec<DVec3> = members.iter().map(left).collect();
-    left.iter().flat_map(|a| left.iter().map(|b| a.distance(*b))).fold(0.0, f64::max)
+    let truth = |m: &Member| DVec3::new(place(m)[0] as f64 * 40.0 + 30.0, place(m)[1] as f64 * 40.0 + 30.0, 0.0);
+    let mut worst = 0.0f64;
+    for (a, b) in members.iter().flat_map(|a| members.iter().map(move |b| (a, b))) {
+        let between = 0.5 * (truth(a) + truth(b));
+        if truth(a).distance(truth(b)) < 60.0 {
+            let put = |m: &Member| m.motion().point(between + error(place(m)));
+            worst = worst.max(put(a).distance(put(b)));
+        }
+    }
+    worst
 }
 
 /// 24 aircraft; 64 were the most, and each round fitted every pair: 2,024 fits for 23 of 24.
@@ -87,7 +90,7 @@ fn each_pair_of_neighbours_is_fitted_once_and_an_aircraft_that_joins_fits_its_ow
     assert_eq!((report.fitted, report.pairs, report.models.len()), (3, fitted + 3, 24));
     assert!(report.warnings.is_empty(), "{:?}", report.warnings);
     let after = worst_disagreement(&all);
-    assert!(before > 3.0 && after < 0.1, "{before} m, then {after} m");
+    assert!(before > 3.0 && after < 0.02, "{before} m, then {after} m");
     drop(registrar);
     assert_eq!(exact.fits, fitted + 3);
 }
@@ -149,17 +152,11 @@ fn a_damaged_edge_is_named_and_fitted_again() {
 fn a_false_edge_is_named_and_the_others_hold() {
     let dir = tempfile::tempdir().expect("temp dir");
     let mut members = field(dir.path(), 4, 4);
-    {
-        let mut members = field(dir.path(), 4, 4);
-        let mut exact = Exact::default();
-        registrar(&dir.path().join("honest"), &mut exact).register(&mut members, &|| true).expect("registered");
-        eprintln!("HONEST {}", worst_disagreement(&members));
-    }
     let mut exact = Exact { lies: vec![[[1, 1], [2, 1]]], ..Default::default() };
     let report = registrar(dir.path(), &mut exact).register(&mut members, &|| true).expect("registered");
     assert_eq!(report.warnings.len(), 1, "{:?}", report.warnings);
     assert!(report.warnings[0].contains("a-1-1") && report.warnings[0].contains("a-2-1"));
-    assert!(worst_disagreement(&members) < 0.15, "{}", worst_disagreement(&members));
+    assert!(worst_disagreement(&members) < 0.02, "{}", worst_disagreement(&members));
 }
 
 #[test]
