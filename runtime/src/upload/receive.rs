@@ -33,7 +33,7 @@ const LOOK_UP: Duration = Duration::from_millis(2);
 /// Transfers at work at the same time, and the stack of each one's thread: however many aircraft there are, these are the
 /// threads and the memory they take. The others have their turn as these end.
 const AT_WORK: usize = 64;
-const STACK_BYTES: usize = 1 << 20;
+const STACK_BYTES: usize = 512 << 10;
 
 /// What happened so far. Everything not received is in here.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]

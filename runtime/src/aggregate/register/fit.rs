@@ -44,10 +44,19 @@ const MOST_SCALE: f64 = 1.2;
 /// A renderer and what it holds.
 struct Stage {
     trainer: Trainer,
-    size: u32,
+    size: (u32, u32),
     gaussians: usize,
     sh_degree: u8,
     shows: [u8; 32],
+}
+
+impl Stage {
+    fn has_room(&self, cloud: &GaussianCloud, size: (u32, u32)) -> bool {
+        self.gaussians >= cloud.len()
+            && self.sh_degree >= cloud.sh_degree
+            && self.size.0 >= size.0
+            && self.size.1 >= size.1
+    }
 }
 
 /// Fits by rendering: one network and two renderers, opened when the first pair asks for them and kept for all others.
@@ -67,17 +76,23 @@ impl RenderedFitter {
     }
 
     /// Shows `cloud` on a stage, which is opened anew only for a model larger than any before.
-    fn show(&mut self, which: usize, content: &[u8; 32], cloud: &GaussianCloud, size: u32) -> Result<(), String> {
+    fn show(
+        &mut self,
+        which: usize,
+        content: &[u8; 32],
+        cloud: &GaussianCloud,
+        size: (u32, u32),
+    ) -> Result<(), String> {
         let stage = &mut self.stages[which];
         match stage {
-            Some(s) if s.gaussians >= cloud.len() && s.sh_degree >= cloud.sh_degree && s.size >= size => {
+            Some(s) if s.has_room(cloud, size) => {
                 s.trainer.load(cloud).map_err(|e| e.to_string())?;
                 s.shows = *content;
             }
             _ => {
                 // The smaller one goes first: two would have to fit in side by side.
                 *stage = None;
-                let trainer = renderer(self.device.as_deref(), cloud, size, size).map_err(|e| e.to_string())?;
+                let trainer = renderer(self.device.as_deref(), cloud, size.0, size.1).map_err(|e| e.to_string())?;
                 let (gaussians, sh_degree) = (cloud.len(), cloud.sh_degree);
                 *stage = Some(Stage { trainer, size, gaussians, sh_degree, shows: *content });
             }
@@ -105,22 +120,30 @@ impl Fitter for RenderedFitter {
         if first.gaussians == 0 || second.gaussians == 0 {
             return Ok(None);
         }
-        let on_stage = self.stages[0].as_ref().is_some_and(|s| s.shows == *first.content());
-        if !on_stage || self.first.as_ref().is_none_or(|f| f.0 != *first.content()) {
-            let (header, cloud) = first.as_written().map_err(|e| e.to_string())?;
-            self.show(0, first.content(), &cloud, SIDE)?;
-            self.first = Some((*first.content(), header));
-        }
         let (mut header, mut cloud) = second.as_written().map_err(|e| e.to_string())?;
         let prior = second.to_frame_of(first);
         prior.header(&mut header);
         prior.cloud(&mut cloud);
+        let mut anchor_cloud = None;
+        if self.first.as_ref().is_none_or(|f| f.0 != *first.content()) {
+            let (header, cloud) = first.as_written().map_err(|e| e.to_string())?;
+            (self.first, anchor_cloud) = (Some((*first.content(), header)), Some(cloud));
+        }
         let Some((_, anchor)) = &self.first else { return Ok(None) };
         let views = shared_views(&anchor.views, &header.views);
-        if views.is_empty() {
-            return Ok(None);
+        let Some(lens) = views.first().map(|v| v.intrinsics) else { return Ok(None) };
+        let size = (lens.width, lens.height);
+        if !self.stages[0]
+            .as_ref()
+            .is_some_and(|s| s.shows == *first.content() && s.size.0 >= size.0 && s.size.1 >= size.1)
+        {
+            let anchor_cloud = match anchor_cloud {
+                Some(cloud) => cloud,
+                None => first.as_written().map_err(|e| e.to_string())?.1,
+            };
+            self.show(0, first.content(), &anchor_cloud, size)?;
         }
-        self.show(1, second.content(), &cloud, SIDE)?;
+        self.show(1, second.content(), &cloud, size)?;
         drop(cloud);
         let mut pairs: Vec<(DVec3, DVec3)> = Vec::new();
         let mut renderings = (Rendering::default(), Rendering::default());
