@@ -144,7 +144,7 @@ pub fn run(
     }
     let mut outcome = Outcome { path: out.join("global.dgtr"), ..Default::default() };
     let start = Instant::now();
-    let origin = frame::unify(&mut members, origin)?;
+    let origin = member::unify(&mut members, origin)?;
     outcome.seconds.push(("unify", start.elapsed().as_secs_f64()));
     let start = Instant::now();
     if settings.register {

@@ -10,9 +10,6 @@ use models::align::similarity::Similarity;
 use models::cloud::{GaussianCloud, ShTurn};
 use models::formats::model::ModelHeader;
 
-use super::AggregateError;
-use super::member::Member;
-
 /// Models whose origins lie farther apart than this do not belong to one mission (and f32 metres would lose millimetres).
 pub const MAX_APART_M: f64 = 20_000.0;
 
@@ -105,33 +102,6 @@ impl Motion {
             *corner = [p.x, p.y];
         }
     }
-}
-
-/// Brings all models around `origin`, or around the first one's when None. Returns the common origin.
-///
-/// # Errors
-/// Some models have an origin and others have none; or two lie too far apart.
-pub fn unify(members: &mut [Member], origin: Option<Geodetic>) -> Result<Option<Geodetic>, AggregateError> {
-    let Some(common) = origin.or_else(|| members.iter().find_map(|m| m.header.origin)) else { return Ok(None) };
-    for member in members.iter_mut() {
-        let Some(own) = member.header.origin else {
-            return Err(AggregateError::NoOrigin(member.name().into()));
-        };
-        if own == common {
-            continue;
-        }
-        if !own.is_valid() {
-            return Err(AggregateError::NoOrigin(member.name().into()));
-        }
-        let motion = Motion::between(own, common);
-        let apart_m = motion.0.translation.length();
-        if apart_m > MAX_APART_M {
-            return Err(AggregateError::TooFar { name: member.name().into(), km: apart_m / 1e3 });
-        }
-        member.moved(&motion);
-        member.header.origin = Some(common);
-    }
-    Ok(Some(common))
 }
 
 #[cfg(test)]

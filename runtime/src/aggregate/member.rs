@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 
-use super::frame::Motion;
+use super::frame::{MAX_APART_M, Motion};
 use super::{AggregateError, LocalModel};
 
 /// Means that stand for all when the ground of a model is measured.
@@ -81,7 +81,7 @@ impl Ground {
 pub struct Member {
     /// Its file.
     pub path: PathBuf,
-    /// What it says about itself, in the common frame once [`super::frame::unify`] and registration have moved it.
+    /// What it says about itself, in the common frame once [`unify`] and registration have moved it.
     pub header: ModelHeader,
     /// Gaussians in the file.
     pub gaussians: usize,
@@ -187,6 +187,33 @@ impl Member {
             false => Err(AggregateError::Changed(self.path.display().to_string())),
         }
     }
+}
+
+/// Brings all models around `origin`, or around the first one's when None. Returns the common origin.
+///
+/// # Errors
+/// Some models have an origin and others have none; or two lie too far apart.
+pub fn unify(members: &mut [Member], origin: Option<Geodetic>) -> Result<Option<Geodetic>, AggregateError> {
+    let Some(common) = origin.or_else(|| members.iter().find_map(|m| m.header.origin)) else { return Ok(None) };
+    for member in members.iter_mut() {
+        let Some(own) = member.header.origin else {
+            return Err(AggregateError::NoOrigin(member.name().into()));
+        };
+        if own == common {
+            continue;
+        }
+        if !own.is_valid() {
+            return Err(AggregateError::NoOrigin(member.name().into()));
+        }
+        let motion = Motion::between(own, common);
+        let apart_m = motion.point(DVec3::ZERO).length();
+        if apart_m > MAX_APART_M {
+            return Err(AggregateError::TooFar { name: member.name().into(), km: apart_m / 1e3 });
+        }
+        member.moved(&motion);
+        member.header.origin = Some(common);
+    }
+    Ok(Some(common))
 }
 
 #[cfg(test)]

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 use config::mission::Mission;
 
 use super::{Received, admit};
-use crate::aggregate::member::Member;
-use crate::aggregate::{frame, registrar};
+use crate::aggregate::member::{Member, unify};
+use crate::aggregate::registrar;
 
 /// How often a waiting ground says that it is alive.
 const LOOK_UP: Duration = Duration::from_millis(100);
@@ -91,7 +91,7 @@ fn work(mission: &Mission, out: &Path, queue: &Receiver<Arrival>) -> Joined {
         // What does not count is named where it is merged.
         let Ok(model) = admit::admit(mission, &aircraft, &path) else { continue };
         let mut member = [Member::of(model)];
-        if frame::unify(&mut member, Some(mission.origin)).is_err() {
+        if unify(&mut member, Some(mission.origin)).is_err() {
             continue;
         }
         members.retain(|m| m.name() != aircraft);
