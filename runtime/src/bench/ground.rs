@@ -375,6 +375,6 @@ mod tests {
         assert_eq!(field.neighbours().count(), 13 * 14 + 4 + 12 * 15 + 5);
         let mission = Mission::parse(&field.mission(), Path::new("")).expect("a mission");
         assert_eq!(mission.aircraft.len(), 200);
-        assert!(field.along() * field.along() <= field.gaussians && field.along() % 24 == 0);
+        assert!(field.along() * field.along() <= field.gaussians && field.along().is_multiple_of(24));
     }
 }
