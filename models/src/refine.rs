@@ -170,10 +170,11 @@ impl Refiner {
         });
         let mut report = AddReport::default();
         let size = image.image.dimensions();
-        let features = self.extract(&image.image, size, turns, &mut report)?;
+        let grey = image.mask.as_ref().map(|mask| Grey::new(&image.image, Some(mask), self.settings.feature_side));
+        let features = self.extract(&image.image, size, turns, grey.as_ref(), &mut report)?;
         let as_told = features.clone();
         self.insert(&image.name, image.time_ns, &image.view, &image.sigma);
-        self.set_features(features, turns, Some(&image.image), &mut report);
+        self.set_features(features, turns, Some(image), &mut report);
         self.link(&candidates, &mut report);
         // A heading that is wrong by a quarter or half turn: descriptors do not match unless the picture is
         // turned accordingly. Only for frames that should overlap and do not.
@@ -182,15 +183,15 @@ impl Refiner {
                 break;
             }
             let turns = (turns + more) % 4;
-            let features = self.extract(&image.image, size, turns, &mut report)?;
-            self.set_features(features, turns, Some(&image.image), &mut report);
+            let features = self.extract(&image.image, size, turns, grey.as_ref(), &mut report)?;
+            self.set_features(features, turns, Some(image), &mut report);
             let clock = Instant::now();
             self.link_wide(&candidates[..candidates.len().min(2)], &mut report);
             report.match_seconds += clock.elapsed().as_secs_f64();
         }
         if report.extractions > 1 && report.pairs_verified == 0 {
             // No direction links it: the next frames should find it in the likeliest.
-            self.set_features(as_told, turns, Some(&image.image), &mut report);
+            self.set_features(as_told, turns, Some(image), &mut report);
         }
         self.finish(report)
     }

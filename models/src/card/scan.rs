@@ -40,9 +40,21 @@ pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
     }
     found.files.sort();
     found.files.dedup();
+    let names: HashSet<PathBuf> = found.files.iter().map(|f| f.with_extension("")).collect();
+    found.files.retain(|file| !is_mask(file, &names));
     found.geotags.sort();
     found.geotags.dedup();
     Ok(found)
+}
+
+/// OpenDroneMap's way: `a_mask.png` beside `a.jpg`. A picture that happens to have such a name stays one.
+fn is_mask(file: &Path, pictures: &HashSet<PathBuf>) -> bool {
+    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+    let picture = stem.len().checked_sub("_mask".len()).and_then(|end| {
+        let (picture, marked) = stem.split_at_checked(end)?;
+        marked.eq_ignore_ascii_case("_mask").then_some(picture)
+    });
+    picture.is_some_and(|picture| pictures.contains(&file.with_file_name(picture)))
 }
 
 fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()> {

@@ -21,6 +21,8 @@ pub struct DatasetFrame {
     pub distortion: Distortion,
     /// How the stored picture is turned on loading.
     pub orientation: Orientation,
+    /// Its mask, where there is one: a picture of the stored one's shape, black where nothing is to be learnt.
+    pub mask: Option<PathBuf>,
     /// Pose from GPS and gimbal angles, where recorded.
     pub prior: Option<PosePrior>,
     /// The row of `gps.csv` that it comes from.

@@ -62,9 +62,14 @@ impl Refiner {
             let camera = self.camera_of(frame);
             let turns =
                 upright::turns_like(&reference.0, reference.1, &camera, &frame.intrinsics, self.ground_at(first));
-            let Some(grey) = frame.grey.as_ref().filter(|_| turns != frame.turns) else { continue };
-            let (image, size) = (grey.picture(), (frame.intrinsics.width, frame.intrinsics.height));
-            let features = self.extract(&image, size, turns, report)?;
+            if frame.grey.is_none() || turns == frame.turns {
+                continue;
+            }
+            let size = (frame.intrinsics.width, frame.intrinsics.height);
+            let Some(grey) = self.frames[i].grey.take() else { continue };
+            let features = self.extract(&grey.picture(), size, turns, Some(&grey), report);
+            self.frames[i].grey = Some(grey);
+            let features = features?;
             let (focal, radial, max) = (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
             let frame = &mut self.frames[i];
             let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
