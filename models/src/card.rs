@@ -44,8 +44,9 @@ pub use record::{Attitude, AttitudeSource, Fix, Record, nadir_rotation};
 pub struct Card {
     /// In order of capture: by time where known, else by name.
     pub pictures: Vec<CardPicture>,
-    /// Origin of the priors' east-north-up frame; its height is that of the ground as far as anything tells it.
-    pub origin: Geodetic,
+    /// Origin of the priors' east-north-up frame; its height is that of the ground as far as anything tells it. `None` where no
+    /// picture says where it was taken: then the priors have no positions, and the pictures tell the scene up to a similarity.
+    pub origin: Option<Geodetic>,
     /// One line per thing a user should know: what was left out and why, what contradicts the rest.
     pub notes: Vec<String>,
     /// Names with the extension of a picture that were found.
@@ -71,7 +72,7 @@ impl Card {
     /// Reads what the pictures below `folders` say of themselves; of no picture more than its head is read.
     ///
     /// # Errors
-    /// A folder cannot be read, nothing in it is a picture, no picture has a position, or a file of positions is bad.
+    /// A folder cannot be read, nothing in it is a picture, or a file of positions is bad.
     pub fn open(folders: &[PathBuf], options: &CardOptions) -> Result<Self, CardError> {
         let scan::Scanned { files, notes: mut lines, geotags, .. } = scan::pictures(folders)?;
         let first = folders.first().cloned().unwrap_or_default();
@@ -91,12 +92,18 @@ impl Card {
         }
         record::in_order(&mut records);
         if !records.iter().any(|r| r.fix.is_some()) {
-            return Err(CardError::NoPositions { path: first, pictures: records.len() });
+            lines.push(format!(
+                "none of {} pictures says where it was taken (no GPS in EXIF or XMP, no geotags): the scene has no place, no north and no scale (neighbours are 1 apart); --geotags or --log would give them",
+                records.len()
+            ));
+            let pictures = priors::without_positions(&records);
+            lines.extend(notes.lines());
+            return Ok(Self { pictures, origin: None, notes: lines, found });
         }
         vote::settle(&mut records, &mut notes);
         let origin = priors::origin(&records);
         let pictures = priors::of(&records, &EnuFrame::new(origin), &mut notes);
         lines.extend(notes.lines());
-        Ok(Self { pictures, origin, notes: lines, found })
+        Ok(Self { pictures, origin: Some(origin), notes: lines, found })
     }
 }

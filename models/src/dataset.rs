@@ -70,6 +70,8 @@ pub struct CardNotes {
     pub distortion_unknown: bool,
     /// Files that were found.
     pub found: usize,
+    /// No picture says where it was taken.
+    pub floats: bool,
 }
 
 /// What the pictures of a card say of one of them.
@@ -117,7 +119,13 @@ impl Dataset {
         let card = Card::open(folders, options)?;
         let focal_sigma = card.pictures.iter().map(|p| p.focal_sigma).fold(0.0, f64::max);
         let distortion_unknown = card.pictures.iter().all(|p| p.lens.distortion.is_none());
-        let notes = CardNotes { lines: card.notes, focal_sigma, distortion_unknown, found: card.found };
+        let notes = CardNotes {
+            lines: card.notes,
+            focal_sigma,
+            distortion_unknown,
+            found: card.found,
+            floats: card.origin.is_none(),
+        };
         let frames = card.pictures.into_iter().map(|p| {
             let size = p.lens.size.unwrap_or((1, 1));
             let view = View { intrinsics: p.lens.intrinsics(size), pose: p.prior.pose };
@@ -135,7 +143,7 @@ impl Dataset {
         });
         let root = folders.first().cloned().unwrap_or_default();
         let frames = frames.collect();
-        Self { root, frames, split: Split::default(), origin: Some(card.origin), card: Some(notes) }
+        Self { root, frames, split: Split::default(), origin: card.origin, card: Some(notes) }
             .with_split()?
             .with_masks()
     }

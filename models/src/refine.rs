@@ -9,6 +9,7 @@
 //! when not.
 
 mod adjust;
+mod bootstrap;
 mod gauge;
 mod grey;
 mod intake;
@@ -32,6 +33,7 @@ mod triangulate;
 mod twoview;
 mod upright;
 
+pub use bootstrap::BootstrapReport;
 pub use report::{AddReport, RefineReport, RefinedPoint, SharedEstimate};
 
 use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
@@ -112,6 +114,8 @@ pub struct Refiner {
     pair_grounds: Vec<f64>,
     points: Vec<RefinedPoint>,
     solves: u32,
+    /// The poses are pictures' alone: nothing says where, how large and which way the scene is.
+    floating: bool,
     totals: RefineReport,
 }
 
@@ -146,6 +150,7 @@ impl Refiner {
             pair_grounds: Vec::new(),
             points: Vec::new(),
             solves: 0,
+            floating: false,
             totals: RefineReport::default(),
         })
     }

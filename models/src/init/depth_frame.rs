@@ -164,6 +164,17 @@ impl DepthFrame {
         self.mask.as_ref()
     }
 
+    /// Takes the confidence from the depths that the mask leaves out.
+    pub fn leave_out(&self, depth: &mut DepthGrid) {
+        let Some(mask) = &self.mask else { return };
+        for at in 0..depth.confidence.len() {
+            let (x, y) = depth.pixel(at % depth.width, at / depth.width);
+            if !mask.keeps(x as u32, y as u32) {
+                depth.confidence[at] = 0.0;
+            }
+        }
+    }
+
     /// The picture at the network's size.
     ///
     /// # Errors
@@ -192,14 +203,7 @@ impl DepthFrame {
     pub fn set_depth(&mut self, depth: Option<DepthGrid>) -> io::Result<()> {
         self.has_depth = false;
         let Some(mut depth) = depth else { return Ok(()) };
-        if let Some(mask) = &self.mask {
-            for at in 0..depth.confidence.len() {
-                let (x, y) = depth.pixel(at % depth.width, at / depth.width);
-                if !mask.keeps(x as u32, y as u32) {
-                    depth.confidence[at] = 0.0;
-                }
-            }
-        }
+        self.leave_out(&mut depth);
         match &mut self.depth {
             Some(old) => old.replace(depth)?,
             none => *none = Some(Kept::new(depth, self.file.as_ref())?),

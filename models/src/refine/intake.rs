@@ -84,6 +84,7 @@ impl Refiner {
             rotation_sigma: largest(sigma.rotation_rad, 0.5),
             position_sigma: largest(sigma.position_m, 30.0),
             rotation_refused: false,
+            unplaced: false,
             adjusted: false,
             tied: false,
             turns: 0,
