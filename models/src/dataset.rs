@@ -11,6 +11,7 @@ use config::lens::Distortion;
 use image::imageops;
 
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use crate::card::control::SurveyedPoint;
 use crate::card::{Card, CardOptions};
 use crate::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use crate::formats::telemetry;
@@ -72,6 +73,8 @@ pub struct CardNotes {
     pub found: usize,
     /// No picture says where it was taken.
     pub floats: bool,
+    /// Surveyed points marked in pictures.
+    pub control: Vec<SurveyedPoint>,
 }
 
 /// What the pictures of a card say of one of them.
@@ -125,6 +128,7 @@ impl Dataset {
             distortion_unknown,
             found: card.found,
             floats: card.origin.is_none(),
+            control: card.control,
         };
         let frames = card.pictures.into_iter().map(|p| {
             let size = p.lens.size.unwrap_or((1, 1));

@@ -10,10 +10,13 @@
 
 mod adjust;
 mod bootstrap;
+mod control;
 mod gauge;
 mod grey;
 mod intake;
+mod joining;
 mod keyframe;
+mod level;
 mod linking;
 mod matching;
 mod motion;
@@ -34,7 +37,8 @@ mod twoview;
 mod upright;
 
 pub use bootstrap::BootstrapReport;
-pub use report::{AddReport, RefineReport, RefinedPoint, SharedEstimate};
+pub use control::ControlPoint;
+pub use report::{AddReport, ControlResidual, RefineReport, RefinedPoint, SharedEstimate};
 
 use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
 use crate::onnx::OnnxError;
@@ -116,6 +120,10 @@ pub struct Refiner {
     solves: u32,
     /// The poses are pictures' alone: nothing says where, how large and which way the scene is.
     floating: bool,
+    /// Surveyed points, whether the poses have been brought to them, and whether they alone say where the scene is.
+    control: Vec<ControlPoint>,
+    anchored: bool,
+    fixed: bool,
     totals: RefineReport,
 }
 
@@ -151,6 +159,9 @@ impl Refiner {
             points: Vec::new(),
             solves: 0,
             floating: false,
+            control: Vec::new(),
+            anchored: false,
+            fixed: false,
             totals: RefineReport::default(),
         })
     }

@@ -17,6 +17,9 @@ const SKIPPED: [&str; 7] =
 /// Files of positions that are found by their names.
 const GEOTAGS: [&str; 3] = ["geo.txt", "geotags.csv", "location.txt"];
 
+/// Surveyed points are found by this name.
+const CONTROL: &str = "gcp_list.txt";
+
 /// What was found.
 #[derive(Debug, Default)]
 pub(super) struct Scanned {
@@ -24,6 +27,8 @@ pub(super) struct Scanned {
     pub files: Vec<PathBuf>,
     /// Files of positions.
     pub geotags: Vec<PathBuf>,
+    /// Files of surveyed points.
+    pub control: Vec<PathBuf>,
     /// One line per folder that could not be read, or for a bound that was met.
     pub notes: Vec<String>,
     /// Device and number of the folders looked through: a link may lead back.
@@ -44,6 +49,7 @@ pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
     found.files.retain(|file| !is_mask(file, &names));
     found.geotags.sort();
     found.geotags.dedup();
+    found.control.sort();
     Ok(found)
 }
 
@@ -80,6 +86,8 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
         } else if kind.is_file() || (is_link && path.is_file()) {
             if GEOTAGS.contains(&name.as_str()) {
                 found.geotags.push(path);
+            } else if name == CONTROL {
+                found.control.push(path);
             } else if ["jpg", "jpeg", "jpe", "png", "tif", "tiff"].iter().any(|e| name.ends_with(&format!(".{e}"))) {
                 if found.files.len() == MAX_FILES {
                     found

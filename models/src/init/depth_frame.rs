@@ -169,7 +169,8 @@ impl DepthFrame {
         let Some(mask) = &self.mask else { return };
         for at in 0..depth.confidence.len() {
             let (x, y) = depth.pixel(at % depth.width, at / depth.width);
-            if !mask.keeps(x as u32, y as u32) {
+            // The sample has the colour of its whole block.
+            if !mask.keeps_around([f64::from(x), f64::from(y)], 0.5 * depth.stride as f64) {
                 depth.confidence[at] = 0.0;
             }
         }

@@ -132,8 +132,9 @@ fn what_a_mask_leaves_out_becomes_no_gaussian_and_no_depth_prior() {
             under += sure.filter(|i| leg(at(*i)[0] + 1, at(*i)[1] + 1)).count();
         });
         let cloud = made.unwrap().cloud;
-        // Red of the leg, as its first spherical harmonic has it: the ground's is at most half of it.
-        let of_leg = (0..cloud.len()).filter(|i| cloud.sh[i * cloud.sh.len() / cloud.len()] > 1.2).count();
+        // The ground's blue is 90 everywhere, the leg's 250.
+        let blue = |i: usize| cloud.sh[i * cloud.sh.len() / cloud.len() + 2] > 0.0;
+        let of_leg = (0..cloud.len()).filter(|i| blue(*i)).count();
         (cloud.len(), of_leg, under)
     };
     let ((all, seen, under), (left, none, nowhere)) = (run(false), run(true));

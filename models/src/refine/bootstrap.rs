@@ -6,8 +6,7 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use glam::{DMat3, DQuat, DVec3};
-use nalgebra::Matrix3;
+use glam::{DQuat, DVec3};
 
 use super::adjust::{Limits, adjust};
 use super::linking::{LINKED_SIGMA, Pair, median};
@@ -35,14 +34,8 @@ const RETRY: f64 = 1.5;
 const COARSE_PX: f64 = 8.0;
 /// Errors of a place that stands on the ground as if it were flat, pixels: relief of a fifth of the height at half a baseline.
 const ROUGH_PX: f64 = 60.0;
-/// Height above the ground that the scene is given, metres: what is assumed of aircraft elsewhere, so that limits in metres fit.
-pub(super) const HEIGHT: f64 = 50.0;
 /// How far the poses may be wrong once all are placed: a chain of pictures bends.
 const SIGMA: PoseSigma = PoseSigma { position_m: [15.0; 3], rotation_rad: [0.15; 3] };
-/// Pictures of other groups that each picture is compared with, most alike first.
-const ALIKE: usize = 3;
-/// Pictures of a group that say how it is turned against the others.
-const REPRESENTATIVES: usize = 4;
 
 /// What [`Refiner::bootstrap`] made of the pictures.
 #[derive(Clone, Debug, Default)]
@@ -360,148 +353,5 @@ impl Refiner {
             adjust(&mut problem, Limits { loss, max_steps, deadline });
             self.take(&problem);
         }
-    }
-
-    /// Lays the scene on the plane that most points lie near, pictures above it at [`HEIGHT`].
-    fn level(&mut self, tracks: &Tracks) {
-        let cameras = self.cameras();
-        let mut views = Vec::new();
-        let mut points: Vec<DVec3> = Vec::new();
-        for t in 0..tracks.len() as u32 {
-            let mut seen = self.sightings(tracks, t);
-            if seen.len() >= 2 {
-                points.extend(
-                    self.robust_point(&cameras, &mut seen, self.settings.outlier_px, &mut views).map(|p| p.world),
-                );
-            }
-        }
-        let centers: Vec<DVec3> = self.frames.iter().filter(|f| !f.unplaced).map(|f| f.pose.center).collect();
-        let Some((foot, up)) = plane(&points, &centers) else { return };
-        let turn = DQuat::from_rotation_arc(up, DVec3::Z);
-        let height = median(&mut centers.iter().map(|c| (*c - foot).dot(up)).collect::<Vec<_>>());
-        let scale = if height > 1e-9 { HEIGHT / height } else { 1.0 };
-        for frame in self.frames.iter_mut() {
-            frame.pose.rotation = (turn * frame.pose.rotation).normalize();
-            frame.pose.center = turn * (frame.pose.center - foot) * scale;
-        }
-        self.ground = Some(0.0);
-    }
-
-    /// The largest group that pairs join, and the others.
-    fn parted(&self) -> (Vec<usize>, Vec<Vec<usize>>) {
-        let mut groups = self.groups();
-        let largest = (0..groups.len()).max_by_key(|g| (groups[*g].len(), std::cmp::Reverse(*g))).unwrap_or(0);
-        let most = if groups.is_empty() { Vec::new() } else { groups.remove(largest) };
-        (most, groups)
-    }
-
-    /// Frames of `among` that look most like frame `i`.
-    fn most_alike(&self, i: usize, among: &[usize]) -> Vec<usize> {
-        let own = self.frames[i].look();
-        let alike = |j: &usize| -> f32 { self.frames[*j].look().iter().zip(&own).map(|(a, b)| a * b).sum() };
-        let mut rated: Vec<(f32, usize)> = among.iter().map(|j| (alike(j), *j)).collect();
-        rated.sort_by(|a, b| b.0.total_cmp(&a.0));
-        rated.into_iter().take(ALIKE).map(|(_, j)| j).collect()
-    }
-
-    /// Descriptors know no other heading than their own: a line that was flown the other way links to nothing. Each group is turned
-    /// as some of its pictures have to be to match the largest one, and all are linked anew.
-    fn turn_groups(&mut self) -> Result<(), RefineError> {
-        let (most, groups) = self.parted();
-        if groups.is_empty() || self.networks.is_none() {
-            return Ok(());
-        }
-        let (mut report, mut turned) = (super::AddReport::default(), false);
-        for group in groups {
-            let mut best = (0, 0);
-            for &i in group.iter().step_by(group.len().div_ceil(REPRESENTATIVES)) {
-                let as_it_was = self.frames[i].turns;
-                for more in 0..4 {
-                    self.extract_turned(i, (as_it_was + more) % 4, &mut report)?;
-                    for j in self.most_alike(i, &most) {
-                        let agree = self.coarse(j, i, false, true).1.map_or(0, |found| found.inliers.len());
-                        best = best.max((agree, more));
-                    }
-                }
-                self.extract_turned(i, as_it_was, &mut report)?;
-            }
-            if best.0 > 0 && best.1 > 0 {
-                turned = true;
-                for &i in &group {
-                    self.extract_turned(i, (self.frames[i].turns + best.1) % 4, &mut report)?;
-                }
-            }
-        }
-        self.totals.absorb(&report);
-        if turned {
-            self.link_anew(&mut super::AddReport::default());
-        }
-        Ok(())
-    }
-
-    /// Links groups of pictures that the order of capture leaves apart (another line, a second flight) by those that look most
-    /// alike; how many pairs that made.
-    fn join_by_appearance(&mut self) -> usize {
-        let (most, groups) = self.parted();
-        let mut report = super::AddReport::default();
-        for group in &groups {
-            for &i in group {
-                for j in self.most_alike(i, &most) {
-                    self.try_pair(i.min(j), i.max(j), false, true, &mut report);
-                }
-            }
-        }
-        self.totals.absorb(&report);
-        report.pairs_verified
-    }
-}
-
-/// A point of the plane that most of `points` lie near, and its normal on the side of `centers`; `None` of too few.
-fn plane(points: &[DVec3], centers: &[DVec3]) -> Option<(DVec3, DVec3)> {
-    let mut kept = points.to_vec();
-    let mut found = None;
-    for _ in 0..4 {
-        if kept.len() < PLACED_FROM {
-            break;
-        }
-        let middle = kept.iter().sum::<DVec3>() / kept.len() as f64;
-        let mut spread = DMat3::ZERO;
-        for p in &kept {
-            let d = *p - middle;
-            spread += DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-        }
-        let eigen = Matrix3::from_column_slice(&spread.to_cols_array()).symmetric_eigen();
-        let least = eigen.eigenvalues.imin();
-        let column = eigen.eigenvectors.column(least);
-        let normal = DVec3::new(column[0], column[1], column[2]).try_normalize()?;
-        found = Some((middle, normal));
-        // Trees and roofs are no ground, points at the horizon no measure.
-        let off = |p: &DVec3| (*p - middle).dot(normal).abs();
-        let usual = median(&mut kept.iter().map(off).collect::<Vec<_>>());
-        kept.retain(|p| off(p) <= 3.0 * usual);
-    }
-    let (foot, normal) = found?;
-    let above = centers.iter().filter(|c| (**c - foot).dot(normal) > 0.0).count();
-    Some((foot, if above * 2 < centers.len() { -normal } else { normal }))
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a test may
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_ground_is_found_below_the_cameras_whatever_grows_on_it() {
-        let turn = DQuat::from_rotation_x(0.7) * DQuat::from_rotation_z(1.1);
-        let mut points: Vec<DVec3> = (0..400).map(|i| DVec3::new(f64::from(i % 20), f64::from(i / 20), 0.0)).collect();
-        points.extend((0..60).map(|i| DVec3::new(f64::from(i % 8), f64::from(i / 8), 2.0 + f64::from(i % 3))));
-        let points: Vec<DVec3> = points.into_iter().map(|p| turn * p).collect();
-        for side in [1.0, -1.0] {
-            let centers: Vec<DVec3> = (0..5).map(|i| turn * DVec3::new(f64::from(i), 3.0, 30.0 * side)).collect();
-            let (foot, up) = plane(&points, &centers).unwrap();
-            assert!(up.distance(turn * DVec3::Z * side) < 0.01, "{up}");
-            assert!((foot.dot(up)).abs() < 0.1);
-        }
-        assert!(plane(&points[..5], &[]).is_none());
     }
 }

@@ -3,8 +3,8 @@
 //! a picture that lies on its side. On brighton_beach's card, where six of 18 are turned around, that left a line of forest hanging
 //! by a few matches, one picture of it 25 m off.
 
-use super::bootstrap::HEIGHT;
 use super::keyframe::KeyFrame;
+use super::level::HEIGHT;
 use super::linking::LINKED_SIGMA;
 use super::tracks::Union;
 use super::{AddReport, RefineError, RefineReport, Refiner, upright};
@@ -27,6 +27,8 @@ impl Refiner {
         if self.solves == 0 {
             return Ok(report);
         }
+        // What is doubted now may go back to where telemetry had it.
+        self.anchored = false;
         if self.floating {
             self.reach_untied();
         }

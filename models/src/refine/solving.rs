@@ -45,6 +45,9 @@ impl Refiner {
             self.take(&problem);
             report.replaced_frames = self.replace_strays(&problem, &tracks, &chosen);
         }
+        if !self.anchored {
+            self.move_to_control();
+        }
         let mut problem = self.problem(&tracks, &chosen, FINE_PX);
         let limits = Limits { loss: Loss::Cauchy(2.0), max_steps: 12, deadline };
         report.steps += adjust(&mut problem, limits).steps;
@@ -61,6 +64,7 @@ impl Refiner {
         self.take(&problem);
         report.shared = self.shared_estimate(&problem, &sigma);
         self.harvest(&tracks, &mut report);
+        report.control = self.control_residuals();
         for frame in &mut self.frames {
             frame.adjusted = frame.pairs > 0;
             if frame.adjusted {
@@ -109,6 +113,7 @@ impl Refiner {
             points: Vec::with_capacity(chosen.len()),
             starts: vec![0],
             observations: Vec::new(),
+            anchors: Vec::new(),
             shared: self.shared,
             shared_weight: {
                 let radial = weight(s.radial_sigma);
@@ -130,6 +135,7 @@ impl Refiner {
                 problem.starts.push(problem.observations.len() as u32);
             }
         }
+        self.anchor(&mut problem);
         problem
     }
 

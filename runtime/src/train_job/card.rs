@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::ops::ControlFlow;
 use std::path::Path;
 
+use config::geodesy::Geodetic;
 use config::refine::RefineSettings;
 use models::camera::View;
 use models::card::name_list;
@@ -14,6 +15,8 @@ use models::refine::Refiner;
 
 use crate::console::Progress;
 use crate::error::JobError;
+
+mod control;
 
 /// Poses of a card, in the folder of the model.
 const FILE: &str = "transforms.json";
@@ -78,7 +81,10 @@ pub(super) fn settle(
             set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
         }
         Some(settings) => match refined(set, &notes, settings, go_on, &mut remarks)? {
-            Some(settled) => settled,
+            Some((settled, fixed)) => {
+                set.origin = set.origin.or(fixed);
+                settled
+            }
             None => return Ok(None),
         },
     };
@@ -160,13 +166,17 @@ fn scale_to_baselines(set: &Dataset, settled: &mut HashMap<String, Settled>) {
     }
 }
 
+/// What the pictures settle on, and where on Earth surveyed points put a scene that did not know it.
+type Agreed = (HashMap<String, Settled>, Option<Geodetic>);
+
+/// `None` when asked to stop.
 fn refined(
     set: &Dataset,
     notes: &CardNotes,
     settings: &RefineSettings,
     go_on: &dyn Fn() -> bool,
     remarks: &mut Remarks,
-) -> Result<Option<HashMap<String, Settled>>, JobError> {
+) -> Result<Option<Agreed>, JobError> {
     let all: Vec<usize> = (0..set.frames.len()).collect();
     let mut settings = settings.clone();
     settings.max_keyframes = settings.max_keyframes.max(all.len());
@@ -204,6 +214,7 @@ fn refined(
         return Ok(None);
     }
     remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
+    refiner.set_control(control::points(set, &notes.control, scale));
     if notes.floats {
         let placed = refiner.bootstrap()?;
         tracing::info!(
@@ -244,14 +255,18 @@ fn refined(
         let what = if notes.floats { "cannot be placed; left out" } else { "their stated poses are kept" };
         tracing::warn!("{}: see too little of what others see; {what}", name_list(&untied));
     }
+    control::announce(&solved.control);
+    let fixed = refiner.is_fixed().then(|| notes.control[0].position);
     if notes.floats {
         remarks.push(("pictures_not_placed", serde_json::json!(untied)));
-        scale_to_baselines(set, &mut settled);
+        if fixed.is_none() {
+            scale_to_baselines(set, &mut settled);
+        }
         if settled.len() < 2 {
             let what = "its pictures cannot be placed by what they show; take them with more overlap, or give --geotags or --log";
             return Err(JobError::Request(format!("{}: {what}", set.root.display())));
         }
     }
     remarks.push(("refine", serde_json::to_value(&solved)?));
-    Ok(Some(settled))
+    Ok(Some((settled, fixed)))
 }
