@@ -97,7 +97,7 @@ mod tests {
             Rgb([(100.0 + 2.0 * p.x).round() as u8, (100.0 + 2.0 * p.y).round() as u8, 50])
         });
         let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-        PosedImage { name: "s".into(), time_ns: 0, image, view, sigma }
+        PosedImage { name: "s".into(), time_ns: 0, image, view, mask: None, sigma }
     }
 
     #[test]

@@ -3,6 +3,8 @@
 use glam::{DQuat, DVec2, DVec3, Mat4, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
+use crate::picture::mask::Mask;
+
 mod projection;
 
 pub use projection::{Pinhole, Projector, Unprojector};
@@ -144,6 +146,8 @@ pub struct PosedImage {
     pub time_ns: u64,
     /// Undistorted RGB.
     pub image: image::RgbImage,
+    /// Which of its pixels count, at its size; `None`: all.
+    pub mask: Option<Mask>,
     /// Lens and place. `intrinsics` matches `image`'s size.
     pub view: View,
     /// How far the pose may be wrong.

@@ -11,6 +11,7 @@
 //! | Skydio `drone-skydio:` | `Latitude`, `Longitude` | `AbsoluteAltitude`, `RelativeAltitude` | `CameraOrientationNEDYaw/Pitch/Roll`, −90° = nadir | `CalibratedFocalLength` |
 //! | Pix4D `Camera:` (senseFly, Sequoia, MicaSense, Autel, Yuneec, Sentera) | ±`GPSXYAccuracy` | ±`GPSZAccuracy` | `Yaw/Pitch/Roll`, 0° = nadir with the heading at the top of the picture; a pitch below −45° (Autel) is taken as −90° = nadir; senseFly's roll has the other sign | `PerspectiveFocalLength` (mm), `PerspectiveDistortion` r1 r2 r3 t1 t2, `PrincipalPoint` (mm) |
 //! | `geo.txt` (OpenDroneMap), Mission Planner's and our own CSV | as stated, with its accuracies | as stated | yaw, pitch, roll: 0° = nadir in `geo.txt` | – |
+//! | `gcp_list.txt` | surveyed points marked in pictures: they hold the poses, and give a card without GPS its place, north and scale | as stated | – | – |
 //! | flight log | at the exposure, 1.5 m | as logged | the airframe's (10°), the gimbal's where logged (3°) | – |
 
 use std::path::{Path, PathBuf};
@@ -18,6 +19,7 @@ use std::path::{Path, PathBuf};
 use config::geodesy::{EnuFrame, Geodetic};
 
 mod container;
+pub mod control;
 pub mod dataflash;
 mod error;
 mod exif;
@@ -44,8 +46,11 @@ pub use record::{Attitude, AttitudeSource, Fix, Record, nadir_rotation};
 pub struct Card {
     /// In order of capture: by time where known, else by name.
     pub pictures: Vec<CardPicture>,
-    /// Origin of the priors' east-north-up frame; its height is that of the ground as far as anything tells it.
-    pub origin: Geodetic,
+    /// Origin of the priors' east-north-up frame; its height is that of the ground as far as anything tells it. `None` where no
+    /// picture says where it was taken: then the priors have no positions, and the pictures tell the scene up to a similarity.
+    pub origin: Option<Geodetic>,
+    /// Surveyed points that were marked in pictures.
+    pub control: Vec<control::SurveyedPoint>,
     /// One line per thing a user should know: what was left out and why, what contradicts the rest.
     pub notes: Vec<String>,
     /// Names with the extension of a picture that were found.
@@ -58,6 +63,8 @@ pub struct CardOptions {
     /// A file of positions (`geo.txt`, Mission Planner's or our own CSV); files of these names on the card are found
     /// without it.
     pub geotags: Option<PathBuf>,
+    /// A file of surveyed points (`gcp_list.txt`); one of this name on the card is found without it.
+    pub control: Option<PathBuf>,
     /// Exposures out of a flight log, in order.
     pub exposures: Vec<Exposure>,
 }
@@ -71,9 +78,9 @@ impl Card {
     /// Reads what the pictures below `folders` say of themselves; of no picture more than its head is read.
     ///
     /// # Errors
-    /// A folder cannot be read, nothing in it is a picture, no picture has a position, or a file of positions is bad.
+    /// A folder cannot be read, nothing in it is a picture, or a file of positions is bad.
     pub fn open(folders: &[PathBuf], options: &CardOptions) -> Result<Self, CardError> {
-        let scan::Scanned { files, notes: mut lines, geotags, .. } = scan::pictures(folders)?;
+        let scan::Scanned { files, notes: mut lines, geotags, control: marked, .. } = scan::pictures(folders)?;
         let first = folders.first().cloned().unwrap_or_default();
         let found = files.len();
         let mut notes = notes::Notes::default();
@@ -89,14 +96,26 @@ impl Card {
         if !options.exposures.is_empty() {
             lines.push(exposures::apply(&options.exposures, &mut records));
         }
+        let mut control = Vec::new();
+        for file in options.control.iter().chain(&marked) {
+            let points = control::read(file)?;
+            lines.push(control::summary(file, &points, &records));
+            control.extend(points);
+        }
         record::in_order(&mut records);
         if !records.iter().any(|r| r.fix.is_some()) {
-            return Err(CardError::NoPositions { path: first, pictures: records.len() });
+            lines.push(format!(
+                "none of {} pictures says where it was taken (no GPS in EXIF or XMP, no geotags): the scene has no place, no north and no scale (neighbours are 1 apart); --geotags or --log would give them",
+                records.len()
+            ));
+            let pictures = priors::without_positions(&records);
+            lines.extend(notes.lines());
+            return Ok(Self { pictures, origin: None, control, notes: lines, found });
         }
         vote::settle(&mut records, &mut notes);
         let origin = priors::origin(&records);
         let pictures = priors::of(&records, &EnuFrame::new(origin), &mut notes);
         lines.extend(notes.lines());
-        Ok(Self { pictures, origin, notes: lines, found })
+        Ok(Self { pictures, origin: Some(origin), control, notes: lines, found })
     }
 }

@@ -11,6 +11,7 @@ use config::lens::Distortion;
 use image::imageops;
 
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use crate::card::control::SurveyedPoint;
 use crate::card::{Card, CardOptions};
 use crate::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use crate::formats::telemetry;
@@ -20,6 +21,7 @@ use crate::undistort::undistort;
 mod ahead;
 mod error;
 mod frame;
+mod masks;
 mod points;
 mod selection;
 mod sources;
@@ -69,6 +71,10 @@ pub struct CardNotes {
     pub distortion_unknown: bool,
     /// Files that were found.
     pub found: usize,
+    /// No picture says where it was taken.
+    pub floats: bool,
+    /// Surveyed points marked in pictures.
+    pub control: Vec<SurveyedPoint>,
 }
 
 /// What the pictures of a card say of one of them.
@@ -105,7 +111,7 @@ impl Dataset {
                 frame.prior = frame.telemetry.map(|t| t.prior);
             }
         }
-        Self { root: root.to_owned(), frames, split: Split::default(), origin, card: None }.with_split()
+        Self { root: root.to_owned(), frames, split: Split::default(), origin, card: None }.with_split()?.with_masks()
     }
 
     /// Reads the pictures below `folders` by what they say of themselves, whatever reconstruction lies beside them.
@@ -116,7 +122,14 @@ impl Dataset {
         let card = Card::open(folders, options)?;
         let focal_sigma = card.pictures.iter().map(|p| p.focal_sigma).fold(0.0, f64::max);
         let distortion_unknown = card.pictures.iter().all(|p| p.lens.distortion.is_none());
-        let notes = CardNotes { lines: card.notes, focal_sigma, distortion_unknown, found: card.found };
+        let notes = CardNotes {
+            lines: card.notes,
+            focal_sigma,
+            distortion_unknown,
+            found: card.found,
+            floats: card.origin.is_none(),
+            control: card.control,
+        };
         let frames = card.pictures.into_iter().map(|p| {
             let size = p.lens.size.unwrap_or((1, 1));
             let view = View { intrinsics: p.lens.intrinsics(size), pose: p.prior.pose };
@@ -127,33 +140,28 @@ impl Dataset {
                 view,
                 distortion,
                 orientation,
+                mask: None,
                 prior: Some(p.prior),
                 telemetry: None,
             }
         });
         let root = folders.first().cloned().unwrap_or_default();
         let frames = frames.collect();
-        Self { root, frames, split: Split::default(), origin: Some(card.origin), card: Some(notes) }.with_split()
+        Self { root, frames, split: Split::default(), origin: card.origin, card: Some(notes) }
+            .with_split()?
+            .with_masks()
     }
 
     /// Takes poses and lenses that the pictures have settled on in place of a card's priors; pictures that are not among them
     /// (they could not be decoded) are left out of the set.
     pub fn settle(&mut self, settled: &HashMap<String, Settled>) {
-        let mut number = vec![None; self.frames.len()];
-        let mut frames = Vec::with_capacity(settled.len());
-        for (i, mut frame) in std::mem::take(&mut self.frames).into_iter().enumerate() {
+        self.retain(|frame| settled.contains_key(&frame.name));
+        for frame in &mut self.frames {
             let Some(Settled { view, distortion }) = settled.get(&frame.name) else { continue };
             frame.distortion = *distortion;
             // The pictures may have been smaller when they were asked.
             let full = &frame.view.intrinsics;
             frame.view = View { intrinsics: view.intrinsics.resized(full.width, full.height), pose: view.pose };
-            number[i] = Some(frames.len());
-            frames.push(frame);
-        }
-        self.frames = frames;
-        let regions = self.split.regions.iter_mut().flat_map(|r| r.lists.values_mut());
-        for list in self.split.lists.values_mut().chain(regions) {
-            *list = list.iter().filter_map(|i| number[*i]).collect();
         }
         self.card = None;
     }
@@ -164,8 +172,10 @@ impl Dataset {
             let back = f.orientation.inverse();
             let lens = back.of_lens(&LensDescription::new(&f.view.intrinsics, f.distortion));
             let pose = Pose { rotation: back.of_rotation(f.view.pose.rotation), center: f.view.pose.center };
-            let path = std::path::absolute(&f.path).unwrap_or_else(|_| f.path.clone());
-            Shot { path: path.to_string_lossy().into_owned(), lens, pose }
+            let whole = |path: &Path| {
+                std::path::absolute(path).unwrap_or_else(|_| path.to_owned()).to_string_lossy().into_owned()
+            };
+            Shot { path: whole(&f.path), lens, pose, mask: f.mask.as_deref().map(whole) }
         });
         Reconstruction { shots: shots.collect(), origin: self.origin }
     }
@@ -243,7 +253,8 @@ impl Dataset {
             image = imageops::resize(&image, intrinsics.width, intrinsics.height, imageops::FilterType::Lanczos3);
         }
         let time_ns = frame.prior.map_or(0, |p| p.time_ns);
-        Ok(PosedImage { name: frame.name.clone(), time_ns, image, view: View { intrinsics, pose }, sigma })
+        let mask = frame.mask_at(&intrinsics)?;
+        Ok(PosedImage { name: frame.name.clone(), time_ns, image, mask, view: View { intrinsics, pose }, sigma })
     }
 }
 

@@ -22,6 +22,11 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
 /// Mean structural similarity of two interleaved RGB pictures (`3·width·height` values in 0…1) over all pixels and
 /// channels, with zeros around the border as 3DGS's convolution has them. NaN when a size does not fit.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
+    ssim_where(a, b, width, height, |_| true)
+}
+
+/// As [`ssim`], the mean over the pixels for which `kept` says so; NaN when that is none.
+pub fn ssim_where(a: &[f32], b: &[f32], width: usize, height: usize, kept: impl Fn(usize) -> bool + Sync) -> f64 {
     if a.len() != 3 * width * height || b.len() != a.len() || a.is_empty() {
         return f64::NAN;
     }
@@ -36,6 +41,7 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
             let (mx, my) = (blur(&x), blur(&y));
             let (xx, yy, xy) = (blur(&|i| x(i) * x(i)), blur(&|i| y(i) * y(i)), blur(&|i| x(i) * y(i)));
             (0..width * height)
+                .filter(|i| kept(*i))
                 .map(|i| {
                     let (vx, vy, cov) = (xx[i] - mx[i] * mx[i], yy[i] - my[i] * my[i], xy[i] - mx[i] * my[i]);
                     (2.0 * mx[i] * my[i] + C1) * (2.0 * cov + C2)
@@ -44,7 +50,7 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
                 .sum::<f64>()
         })
         .sum();
-    total / (3 * width * height) as f64
+    total / (3 * (0..width * height).filter(|i| kept(*i)).count()) as f64
 }
 
 /// 8-bit RGB as interleaved values in 0…1.

@@ -6,6 +6,7 @@
 //! it. (libjpeg-turbo is faster yet, but its crates want cmake and an assembler, which a board's two commands do not bring.)
 
 pub mod crops;
+pub mod mask;
 pub(crate) mod tiff;
 
 use std::fs::File;
@@ -67,6 +68,17 @@ impl Orientation {
             3 => imageops::rotate270(&image),
             _ => image,
         }
+    }
+
+    /// Where a place of the turned picture lies in the stored one, both as shares of width and height.
+    pub fn stored_place(&self, [u, v]: [f64; 2]) -> [f64; 2] {
+        let [x, y] = match self.turns {
+            1 => [v, 1.0 - u],
+            2 => [1.0 - u, 1.0 - v],
+            3 => [1.0 - v, u],
+            _ => [u, v],
+        };
+        [if self.mirrored { 1.0 - x } else { x }, y]
     }
 
     /// Rotation camera → world of the camera whose top is the turned picture's.
@@ -241,6 +253,9 @@ mod tests {
             let lens = orientation.of_lens(&stored);
             assert_eq!(orientation.inverse().of_lens(&lens), stored, "{tag}");
             assert_eq!(lens.size, Some(turned.dimensions()), "{tag}");
+            let (w, h) = (f64::from(turned.width()), f64::from(turned.height()));
+            let place = orientation.stored_place([(f64::from(at.0) + 0.5) / w, (f64::from(at.1) + 0.5) / h]);
+            assert_eq!([place[0] * 8.0, place[1] * 6.0], pixel, "{tag}");
             // The same ray of the world: the stored camera's axes and the turned one's.
             let [x, y] =
                 lens.lens(turned.dimensions()).unproject([f64::from(at.0) + 0.5, f64::from(at.1) + 0.5]).unwrap();

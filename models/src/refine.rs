@@ -9,10 +9,14 @@
 //! when not.
 
 mod adjust;
+mod bootstrap;
+mod control;
 mod gauge;
 mod grey;
 mod intake;
+mod joining;
 mod keyframe;
+mod level;
 mod linking;
 mod matching;
 mod motion;
@@ -32,7 +36,9 @@ mod triangulate;
 mod twoview;
 mod upright;
 
-pub use report::{AddReport, RefineReport, RefinedPoint, SharedEstimate};
+pub use bootstrap::BootstrapReport;
+pub use control::ControlPoint;
+pub use report::{AddReport, ControlResidual, RefineReport, RefinedPoint, SharedEstimate};
 
 use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
 use crate::onnx::OnnxError;
@@ -112,6 +118,12 @@ pub struct Refiner {
     pair_grounds: Vec<f64>,
     points: Vec<RefinedPoint>,
     solves: u32,
+    /// The poses are pictures' alone: nothing says where, how large and which way the scene is.
+    floating: bool,
+    /// Surveyed points, whether the poses have been brought to them, and whether they alone say where the scene is.
+    control: Vec<ControlPoint>,
+    anchored: bool,
+    fixed: bool,
     totals: RefineReport,
 }
 
@@ -146,6 +158,10 @@ impl Refiner {
             pair_grounds: Vec::new(),
             points: Vec::new(),
             solves: 0,
+            floating: false,
+            control: Vec::new(),
+            anchored: false,
+            fixed: false,
             totals: RefineReport::default(),
         })
     }
@@ -170,10 +186,11 @@ impl Refiner {
         });
         let mut report = AddReport::default();
         let size = image.image.dimensions();
-        let features = self.extract(&image.image, size, turns, &mut report)?;
+        let grey = image.mask.as_ref().map(|mask| Grey::new(&image.image, Some(mask), self.settings.feature_side));
+        let features = self.extract(&image.image, size, turns, grey.as_ref(), &mut report)?;
         let as_told = features.clone();
         self.insert(&image.name, image.time_ns, &image.view, &image.sigma);
-        self.set_features(features, turns, Some(&image.image), &mut report);
+        self.set_features(features, turns, Some(image), &mut report);
         self.link(&candidates, &mut report);
         // A heading that is wrong by a quarter or half turn: descriptors do not match unless the picture is
         // turned accordingly. Only for frames that should overlap and do not.
@@ -182,15 +199,15 @@ impl Refiner {
                 break;
             }
             let turns = (turns + more) % 4;
-            let features = self.extract(&image.image, size, turns, &mut report)?;
-            self.set_features(features, turns, Some(&image.image), &mut report);
+            let features = self.extract(&image.image, size, turns, grey.as_ref(), &mut report)?;
+            self.set_features(features, turns, Some(image), &mut report);
             let clock = Instant::now();
             self.link_wide(&candidates[..candidates.len().min(2)], &mut report);
             report.match_seconds += clock.elapsed().as_secs_f64();
         }
         if report.extractions > 1 && report.pairs_verified == 0 {
             // No direction links it: the next frames should find it in the likeliest.
-            self.set_features(as_told, turns, Some(&image.image), &mut report);
+            self.set_features(as_told, turns, Some(image), &mut report);
         }
         self.finish(report)
     }

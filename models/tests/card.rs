@@ -73,7 +73,7 @@ fn exif_and_dji_xmp_become_a_pose_above_the_take_off_with_its_covariance() {
     survey(dir.path(), 5, |i| Tags { dop: Some(1.2), ..tags(i) }.with_dji([90.0, -75.0, 0.0], 40.0));
     let card = open(dir.path());
     assert_eq!((card.pictures.len(), card.found, card.notes.len()), (5, 5, 0), "{:?}", card.notes);
-    assert!((card.origin.alt_m - HOME.alt_m).abs() < 0.01, "{:?}", card.origin);
+    assert!((card.origin.unwrap().alt_m - HOME.alt_m).abs() < 0.01, "{:?}", card.origin);
     let p = &card.pictures[2];
     assert!((p.prior.pose.center - DVec3::new(0.0, 0.0, 40.0)).length() < 0.02, "{}", p.prior.pose.center);
     let forward = p.prior.pose.forward();
@@ -145,7 +145,7 @@ fn without_an_attitude_the_camera_looks_down_along_the_course_and_is_little_beli
         assert!((x - 10.0).abs() < 0.1 && (y - 10.0).abs() < 0.1 && (z - 30.0).abs() < 0.1, "{x} {y} {z}");
     }
     assert_note(&card, &["6 pictures", "no attitude"]);
-    assert!(card.origin.alt_m < HOME.alt_m + 0.1, "a typical height above unknown ground: {:?}", card.origin);
+    assert!(card.origin.unwrap().alt_m < HOME.alt_m + 0.1, "a typical height above unknown ground: {:?}", card.origin);
 }
 
 #[test]
@@ -266,14 +266,15 @@ fn a_step_in_height_between_two_flights_is_taken_out_and_said() {
 }
 
 #[test]
-fn a_card_without_any_position_or_picture_is_refused_in_one_line() {
+fn a_card_without_a_picture_is_refused_and_one_without_positions_floats_and_says_so_in_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let open = || Card::open(&[dir.path().to_owned()], &CardOptions::default());
     assert!(matches!(open(), Err(CardError::NoPictures { .. })));
     survey(dir.path(), 3, |i| Tags { position: None, ..tags(i) });
-    let error = open().unwrap_err();
-    assert!(matches!(error, CardError::NoPositions { pictures: 3, .. }), "{error}");
-    assert!(error.to_string().contains("--geotags") && !error.to_string().contains('\n'));
+    let card = open().unwrap();
+    assert_eq!((card.pictures.len(), card.origin), (3, None));
+    assert!(card.pictures.iter().all(|p| p.prior.sigma.position_m == [f32::INFINITY; 3]));
+    assert_note(&card, &["none of 3 pictures", "no scale", "--geotags"]);
     let missing = Card::open(&[dir.path().join("nowhere")], &CardOptions::default()).unwrap_err();
     assert!(matches!(missing, CardError::Folder { .. }) && missing.to_string().contains("nowhere"), "{missing}");
 }
@@ -295,7 +296,7 @@ fn geotags_and_a_flight_log_give_positions_to_a_dumb_camera() {
     let card = Card::open(&[dir.path().to_owned()], &options).unwrap();
     assert_note(&card, &["flight log", "8 of 8 pictures matched to 8 exposures"]);
     let second = picture(&card, "0001.JPG").prior;
-    assert!((EnuFrame::new(card.origin).to_enu(at(1)) - second.pose.center).length() < 1e-6);
+    assert!((EnuFrame::new(card.origin.unwrap()).to_enu(at(1)) - second.pose.center).length() < 1e-6);
     let text: String = std::iter::once("EPSG:4326\n".to_owned())
         .chain((0..7).map(|i| format!("DJI_{i:04}.JPG {:.9} {:.9} {:.3}\n", at(i).lon_deg, at(i).lat_deg, at(i).alt_m)))
         .collect();

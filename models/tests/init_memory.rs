@@ -41,7 +41,7 @@ fn picture(i: usize, size: (u32, u32)) -> PosedImage {
         Rgb([(hash >> 56) as u8, (hash >> 48) as u8, 90])
     });
     let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-    PosedImage { name: i.to_string(), time_ns: 0, image, view: View { intrinsics, pose }, sigma }
+    PosedImage { name: i.to_string(), time_ns: 0, image, view: View { intrinsics, pose }, mask: None, sigma }
 }
 
 /// Peak of Rust's bytes, of the resident set, and the plan, all since before the initialiser was opened.

@@ -34,6 +34,7 @@ fn survey() -> Reconstruction {
             path: format!("DJI_{i:04}.JPG"),
             lens: lenses[i as usize % 2],
             pose: Pose { rotation, center: DVec3::new(f64::from(i) * 13.6, -3.0, 40.25) },
+            mask: (i == 2).then(|| "masks/DJI_0002.JPG.png".to_owned()),
         }
     });
     Reconstruction { shots: shots.collect(), origin: Some(ORIGIN) }

@@ -284,11 +284,11 @@ impl Reconstruction {
         let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
         for i in self.initialised..until {
             if let Some(view) = self.trainer.view_pose(i) {
-                let image = self.trainer.view_image(i)?;
+                let (image, mask) = (self.trainer.view_image(i)?, self.trainer.view_mask(i)?);
                 let (name, View { pose, .. }) = self.views[i].clone();
                 let view = View { pose, ..view };
                 let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-                initialiser.add(&PosedImage { name, time_ns: 0, image, view, sigma })?;
+                initialiser.add(&PosedImage { name, time_ns: 0, image, mask, view, sigma })?;
             }
         }
         self.initialised = self.initialised.max(until);

@@ -8,7 +8,7 @@ use models::baselines::{MeanColor, nearest_view, warp_over_ground};
 use models::camera::{PosedImage, View};
 use models::dataset::Dataset;
 use models::formats::write_atomic;
-use models::metrics::{psnr, ssim, to_f32, to_rgb8};
+use models::metrics::{psnr, ssim_where, to_f32, to_rgb8};
 use models::onnx::metric::PerceptualMetric;
 use serde::Serialize;
 use vulkan::trainer::{Rendering, Trainer};
@@ -104,13 +104,18 @@ pub fn evaluate(
         let truth = set.load(i, scale)?;
         let view = View { intrinsics: truth.view.intrinsics, pose: transfer.apply(&truth.view.pose) };
         trainer.render(&view, &mut rendering)?;
-        let Some(picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
+        let Some(mut picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
             return Err(JobError::RenderingSize(truth.name));
         };
         if let Some(dir) = save {
             save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
         }
         let mut view = score(&truth, &to_f32(&picture));
+        // A metric that knows no masks is shown the truth where nothing is compared.
+        if let Some(mask) = &truth.mask {
+            let places = picture.enumerate_pixels_mut().zip(truth.image.pixels());
+            places.filter(|((x, y, _), _)| !mask.keeps(*x, *y)).for_each(|((_, _, p), truth)| *p = *truth);
+        }
         if let Some(metric) = &mut metric {
             view.perceptual = Some(metric.distance(&truth.image, &picture)?);
         }
@@ -145,10 +150,16 @@ pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64
 fn score(truth: &PosedImage, rgb: &[f32]) -> ViewScore {
     let k = &truth.view.intrinsics;
     let target = to_f32(&truth.image);
+    let kept = |i: usize| truth.mask.as_ref().is_none_or(|m| m.keeps(i as u32 % k.width, i as u32 / k.width));
+    // What is left out counts as rendered right in the windows that reach over it, and not at all by itself.
+    let shown: Vec<f32> = (0..target.len())
+        .map(|i| if kept(i / 3) { rgb.get(i).copied().unwrap_or(f32::NAN) } else { target[i] })
+        .collect();
+    let of = |values: &[f32]| -> Vec<f32> { (0..values.len()).filter(|i| kept(i / 3)).map(|i| values[i]).collect() };
     ViewScore {
         name: truth.name.clone(),
-        psnr: psnr(rgb, &target).min(PSNR_CAP),
-        ssim: ssim(rgb, &target, k.width as usize, k.height as usize),
+        psnr: psnr(&of(&shown), &of(&target)).min(PSNR_CAP),
+        ssim: ssim_where(&shown, &target, k.width as usize, k.height as usize, kept),
         perceptual: None,
     }
 }
@@ -172,4 +183,39 @@ pub fn save_png(picture: &image::RgbImage, path: &Path) -> Result<(), JobError> 
         .write_to(&mut bytes, image::ImageFormat::Png)
         .map_err(|source| JobError::Encode { path: path.to_owned(), source })?;
     Ok(write_atomic(path, |out| out.write_all(bytes.get_ref()))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DQuat, DVec3};
+    use image::{Rgb, RgbImage};
+    use models::camera::{Intrinsics, Pose, PoseSigma};
+    use models::picture::mask::Mask;
+
+    use super::*;
+
+    #[test]
+    fn what_a_mask_leaves_out_is_not_scored() {
+        let intrinsics = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 16.0, cy: 12.0 };
+        let pose = Pose { rotation: DQuat::IDENTITY, center: DVec3::ZERO };
+        let truth = |mask| PosedImage {
+            name: "a.jpg".into(),
+            time_ns: 0,
+            image: RgbImage::from_fn(32, 24, |x, y| Rgb([(7 * x) as u8, (9 * y) as u8, 80])),
+            mask,
+            view: View { intrinsics, pose },
+            sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
+        };
+        let masked = truth(Some(Mask::from_fn(32, 24, |x, _| x < 20)));
+        let mut rgb = to_f32(&masked.image);
+        rgb.iter_mut().enumerate().filter(|(i, _)| i / 3 % 32 >= 20).for_each(|(_, v)| *v = 1.0 - *v);
+        let score_of = |truth: &PosedImage| (score(truth, &rgb).psnr, score(truth, &rgb).ssim);
+        assert_eq!(score_of(&masked), (PSNR_CAP, 1.0));
+        let whole = score_of(&truth(None));
+        assert!(whole.0 < 20.0 && whole.1 < 0.9, "{whole:?}");
+        // An error of a tenth everywhere is 20 dB over whatever part is looked at.
+        let off: Vec<f32> = to_f32(&masked.image).iter().map(|v| v + 0.1).collect();
+        assert!((score(&masked, &off).psnr - 20.0).abs() < 1e-3);
+        assert!(score(&masked, &rgb[..30]).ssim.is_nan(), "a rendering of another size");
+    }
 }

@@ -204,6 +204,7 @@ impl KeyframeStore {
             time_ns: entry.dgtr.time_ns,
             image: picture::resized(image, (self.lens.width, self.lens.height)),
             view: View { intrinsics: self.lens, pose: entry.dgtr.pose },
+            mask: None,
             sigma: entry.dgtr.sigma(),
         })
     }

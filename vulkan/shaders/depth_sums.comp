@@ -14,7 +14,7 @@ void main() {
     for (uint i = lane; i < pixels; i += LOOP_LANES) {
         uvec2 wanted = target[i];
         float confidence = float(wanted.x >> 24) * (1.0 / 255.0);
-        if (confidence > 0.0 && confidence >= frame.min_confidence) {
+        if (confidence > 0.0 && confidence >= frame.min_confidence && !left_out(wanted.x)) {
             float d = image[i].w, e = float(wanted.y) * (1.0 / 65535.0);
             n += 1.0;
             float before = d - mean_d, before_e = e - mean_e;

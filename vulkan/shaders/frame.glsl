@@ -29,6 +29,13 @@ layout(constant_id = 6) const bool HALF_MOMENTS = false;
 #define FETCH(name, i) texelFetch(name, i)
 #endif
 
+// In place of a confidence, in the pictures and in the step's target: the pixel is left out of every comparison.
+const uint LEFT_OUT = 1u;
+
+bool left_out(uint texel) {
+    return texel >> 24 == LEFT_OUT;
+}
+
 // PCG hash (Jarzynski & Olano 2020): same numbers on every device.
 uint pcg(uint v) {
     uint s = v * 747796405u + 2891336453u;

@@ -51,15 +51,17 @@ void main() {
             uvec2 wanted = FETCH(target, int(at)).xy;
             vec4 y = unpackUnorm4x8(wanted.x);
             vec3 x = raw.xyz * frame.exposure_gain + frame.exposure_offset;
-            vec3 d = x - y.xyz;
+            bool compared = !left_out(wanted.x);
+            vec3 d = compared ? x - y.xyz : vec3(0.0);
             l1 += abs(d.x) + abs(d.y) + abs(d.z);
             vec3 g = frame.l1_weight * sign(d)
                 - frame.ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
+            g = compared ? g : vec3(0.0);
             offset_gradient += g;
             g *= frame.exposure_gain;
             gain_gradient += g * raw.xyz; // by the logarithm of the gain
             float depth = 0.0;
-            if (y.w > 0.0 && y.w >= frame.min_confidence) {
+            if (compared && y.w > 0.0 && y.w >= frame.min_confidence) {
                 depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
             }
             image_gradient[at] = vec4(g, depth);

@@ -1,6 +1,6 @@
 #version 450
 // SSIM, first pass: along rows, the window's means of x, y, x2+y2 and xy for each channel (x rendered with exposure,
-// y target). SSIM only ever needs the sum of the two variances.
+// y target; what is left out counts as rendered right). SSIM only ever needs the sum of the two variances.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "window.glsl"
@@ -23,7 +23,8 @@ void main() {
         // Fetched in any case, from inside the row: cheaper than a branch.
         int at = row * width + clamp(x, 0, width - 1);
         vec3 shown = FETCH(image, at).xyz * frame.exposure_gain + frame.exposure_offset;
-        vec3 wanted = unpackUnorm4x8(FETCH(target, at).x).xyz;
+        uint texel = FETCH(target, at).x;
+        vec3 wanted = left_out(texel) ? shown : unpackUnorm4x8(texel).xyz;
         a = inside ? shown : a;
         b = inside ? wanted : b;
         [[unroll]] for (int c = 0; c < 3; c++) {

@@ -64,5 +64,5 @@ pub fn posed(view: &View, photo: &[[f32; 3]]) -> PosedImage {
     let image =
         RgbImage::from_fn(w, h, |x, y| image::Rgb(photo[(y * w + x) as usize].map(|v| (v * 255.0).round() as u8)));
     let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-    PosedImage { name: "a".into(), time_ns: 0, image, view: *view, sigma }
+    PosedImage { name: "a".into(), time_ns: 0, image, view: *view, mask: None, sigma }
 }

@@ -70,7 +70,7 @@ fn a_crop_of_the_whole_picture_trains_as_the_picture_does_to_the_bit() {
         let mut trainer = trainer(CROPS_ONLY, 6)?;
         trainer.add_view(&picture, None).unwrap();
         if with_crop {
-            trainer.add_crop(0, &picture.image, CropPlace { x: 0, y: 0, whole: (64, 48) }).unwrap();
+            trainer.add_crop(0, &picture.image, None, CropPlace { x: 0, y: 0, whole: (64, 48) }).unwrap();
         }
         (0..20).for_each(|_| assert_eq!(trainer.step().unwrap().crop, with_crop.then_some(0)));
         Some(model(&mut trainer))
@@ -90,7 +90,7 @@ fn crops_and_views_give_the_same_bits_however_few_of_them_are_on_the_device() {
         let whole = larger(&v);
         for (view, x, y) in [(0, 0, 0), (1, 64, 0), (0, 64, 48), (1, 31, 17)] {
             let (image, place) = quarter(&whole, x, y);
-            trainer.add_crop(view, &image, place).unwrap();
+            trainer.add_crop(view, &image, None, place).unwrap();
         }
         let looked_at: Vec<_> =
             (0..40).map(|_| trainer.step().unwrap()).map(|r| (r.view, r.crop, r.loss.to_bits())).collect();
@@ -114,7 +114,7 @@ fn a_crop_moves_with_its_view_and_allocates_nothing() {
     let whole = larger(&v);
     for (x, y) in [(0, 0), (64, 0), (0, 48)] {
         let (image, place) = quarter(&whole, x, y);
-        trainer.add_crop(0, &image, place).unwrap();
+        trainer.add_crop(0, &image, None, place).unwrap();
     }
     (0..6).for_each(|_| _ = trainer.step().unwrap());
     let before = (allocations(), trainer.views_read_back());
@@ -138,7 +138,7 @@ fn a_crop_that_does_not_fit_is_an_error_and_none_is_added() {
     let whole = larger(&v);
     let (image, place) = quarter(&whole, 64, 48);
     let refused = |trainer: &mut Trainer, view: usize, image: &RgbImage, place: CropPlace| {
-        matches!(trainer.add_crop(view, image, place), Err(TrainError::BadView { .. }))
+        matches!(trainer.add_crop(view, image, None, place), Err(TrainError::BadView { .. }))
     };
     assert!(refused(&mut trainer, 1, &image, place), "no such view");
     assert!(refused(&mut trainer, 0, &image, CropPlace { x: 65, ..place }), "beyond the right edge");
@@ -146,7 +146,7 @@ fn a_crop_that_does_not_fit_is_an_error_and_none_is_added() {
     assert!(refused(&mut trainer, 0, &RgbImage::new(0, 0), place), "no pixels");
     assert!(refused(&mut trainer, 0, &whole, CropPlace { x: 0, y: 0, ..place }), "more pixels than planned");
     assert_eq!(trainer.crops(), 0);
-    (0..4).for_each(|_| trainer.add_crop(0, &image, place).unwrap());
-    assert_eq!(trainer.add_crop(0, &image, place), Err(TrainError::TooManyCrops { planned: 4 }));
+    (0..4).for_each(|_| trainer.add_crop(0, &image, None, place).unwrap());
+    assert_eq!(trainer.add_crop(0, &image, None, place), Err(TrainError::TooManyCrops { planned: 4 }));
     assert_eq!(trainer.crops(), 4);
 }

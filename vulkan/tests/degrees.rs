@@ -49,7 +49,7 @@ fn gaussians_of_mixed_degrees_are_drawn_and_differentiated_as_their_twins() {
     let (gaussians, camera, limits) = (Gaussian::<f32>::of_cloud(&c), Camera::<f32>::of(&v), Limits::default());
     let all = |_: usize| 1.0;
     let twin = forward(&gaussians, &camera, own, all, &limits);
-    let target = Target { width: 48, rgb: &photo, depth: None, background: [0.0; 3] };
+    let target = Target { width: 48, rgb: &photo, depth: None, kept: None, background: [0.0; 3] };
     let settings = plain().loss;
     let slopes = backward(&gaussians, &camera, own, all, &limits, &twin, &target, &Exposure::default(), &settings);
     for (at, p) in twin.picture.iter().enumerate() {

@@ -94,7 +94,7 @@ impl Scene {
     fn target(&self) -> Target<'_, f64> {
         let depth: Option<(&[f64], &[f64])> =
             if self.settings.depth > 0.0 { Some((&self.prior, &self.confidence)) } else { None };
-        Target { width: SIZE[0] as usize, rgb: &self.photo, depth, background: self.background }
+        Target { width: SIZE[0] as usize, rgb: &self.photo, depth, kept: None, background: self.background }
     }
 
     fn rendered(&self) -> Forward<f64> {

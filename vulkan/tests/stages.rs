@@ -3,8 +3,9 @@
 
 mod scenes;
 
-use models::camera::{OrthographicView, Pose};
+use models::camera::{OrthographicView, Pose, PosedImage};
 use models::cloud::GaussianCloud;
+use models::picture::mask::Mask;
 use scenes::device::{plain, posed, trainer};
 use scenes::{answer, cloud, photo, view};
 use vulkan::trainer::{Rendering, TrainError};
@@ -89,19 +90,29 @@ fn assert_same(what: &str, drawn: &Rendering, expected: &[Pixel<f32>]) {
 
 #[test]
 fn whole_steps_move_every_parameter_as_the_twin_does() {
+    steps_follow_the_twin(None);
+}
+
+#[test]
+fn whole_steps_on_a_masked_picture_move_every_parameter_as_the_twin_does() {
+    steps_follow_the_twin(Some(Mask::from_fn(37, 29, |x, y| !(x > 9 && x < 24 && y > 4))));
+}
+
+fn steps_follow_the_twin(mask: Option<Mask>) {
     let v = view(37, 29);
     let c = cloud(5, 40, 3);
     let settings = plain();
     let photo = photo(5, &v);
     let Some(mut gpu) = trainer(&c, &v, &settings) else { return };
-    gpu.add_view(&posed(&v, &photo), None).unwrap();
+    gpu.add_view(&PosedImage { mask: mask.clone(), ..posed(&v, &photo) }, None).unwrap();
+    let kept = mask.map(|m| (0..37 * 29).map(|i| m.keeps(i % 37, i / 37)).collect::<Vec<_>>());
     let camera = Camera::<f64>::of(&v);
     let extent = config::training::scene_extent(&c.means, &[[0.0; 3]]);
     let mut twin = TwinTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
     let rgb: Vec<[f64; 3]> = photo.iter().map(|p| p.map(f64::from)).collect();
     let mut got = GaussianCloud::default();
     for step in 0..8u32 {
-        let target = Target { width: 37, rgb: &rgb, depth: None, background: [0.0; 3] };
+        let target = Target { width: 37, rgb: &rgb, depth: None, kept: kept.as_deref(), background: [0.0; 3] };
         let report = gpu.step().unwrap();
         let gradient = twin.step(&camera, &target, settings.progress(step, 0.0));
         let total = gradient.loss.total as f32;

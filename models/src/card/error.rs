@@ -28,17 +28,6 @@ pub enum CardError {
         /// What was found instead.
         why: String,
     },
-    /// Not one picture says where it was taken.
-    #[error(
-        "{}: none of its {pictures} pictures says where it was taken (no GPS in EXIF or XMP, no geotags); give positions with --geotags or --log",
-        path.display()
-    )]
-    NoPositions {
-        /// The first folder.
-        path: PathBuf,
-        /// Pictures found.
-        pictures: usize,
-    },
 }
 
 impl Error for CardError {

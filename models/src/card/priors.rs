@@ -104,6 +104,29 @@ pub(super) fn of(records: &[Record], frame: &EnuFrame, notes: &mut Notes) -> Vec
     pictures
 }
 
+/// One picture per record, none of which has a position: all looking down from one place, which may be anywhere.
+pub(super) fn without_positions(records: &[Record]) -> Vec<CardPicture> {
+    let of = |r: &Record| {
+        let rotation = r.attitude.map_or_else(|| nadir_rotation(0.0, 0.0, 0.0), |a| a.rotation);
+        let pose =
+            Pose { rotation: r.orientation.of_rotation(rotation), center: DVec3::new(0.0, 0.0, UNKNOWN_HEIGHT_M) };
+        let unknown = [f32::INFINITY; 3];
+        CardPicture {
+            name: r.name.clone(),
+            path: r.path.clone(),
+            orientation: r.orientation,
+            lens: r.orientation.of_lens(&r.lens),
+            focal_sigma: r.focal_sigma,
+            prior: PosePrior {
+                pose,
+                sigma: PoseSigma { position_m: unknown, rotation_rad: unknown },
+                time_ns: r.time_ns.map_or(0, |t| t.0),
+            },
+        }
+    };
+    records.iter().map(of).collect()
+}
+
 /// Standard deviations about the camera's axes of a tilt and a heading.
 fn about_axes(rotation: DQuat, tilt: f64, heading: f64) -> [f32; 3] {
     let up = rotation.conjugate() * DVec3::Z;

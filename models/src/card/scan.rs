@@ -17,6 +17,9 @@ const SKIPPED: [&str; 7] =
 /// Files of positions that are found by their names.
 const GEOTAGS: [&str; 3] = ["geo.txt", "geotags.csv", "location.txt"];
 
+/// Surveyed points are found by this name.
+const CONTROL: &str = "gcp_list.txt";
+
 /// What was found.
 #[derive(Debug, Default)]
 pub(super) struct Scanned {
@@ -24,6 +27,8 @@ pub(super) struct Scanned {
     pub files: Vec<PathBuf>,
     /// Files of positions.
     pub geotags: Vec<PathBuf>,
+    /// Files of surveyed points.
+    pub control: Vec<PathBuf>,
     /// One line per folder that could not be read, or for a bound that was met.
     pub notes: Vec<String>,
     /// Device and number of the folders looked through: a link may lead back.
@@ -40,9 +45,22 @@ pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
     }
     found.files.sort();
     found.files.dedup();
+    let names: HashSet<PathBuf> = found.files.iter().map(|f| f.with_extension("")).collect();
+    found.files.retain(|file| !is_mask(file, &names));
     found.geotags.sort();
     found.geotags.dedup();
+    found.control.sort();
     Ok(found)
+}
+
+/// OpenDroneMap's way: `a_mask.png` beside `a.jpg`. A picture that happens to have such a name stays one.
+fn is_mask(file: &Path, pictures: &HashSet<PathBuf>) -> bool {
+    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+    let picture = stem.len().checked_sub("_mask".len()).and_then(|end| {
+        let (picture, marked) = stem.split_at_checked(end)?;
+        marked.eq_ignore_ascii_case("_mask").then_some(picture)
+    });
+    picture.is_some_and(|picture| pictures.contains(&file.with_file_name(picture)))
 }
 
 fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()> {
@@ -68,6 +86,8 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
         } else if kind.is_file() || (is_link && path.is_file()) {
             if GEOTAGS.contains(&name.as_str()) {
                 found.geotags.push(path);
+            } else if name == CONTROL {
+                found.control.push(path);
             } else if ["jpg", "jpeg", "jpe", "png", "tif", "tiff"].iter().any(|e| name.ends_with(&format!(".{e}"))) {
                 if found.files.len() == MAX_FILES {
                     found

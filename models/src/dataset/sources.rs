@@ -58,7 +58,8 @@ pub(super) fn frames(root: &Path, found: Reconstruction) -> Result<Vec<DatasetFr
             // The programs that write reconstructions do not obey orientation tags; their lenses are of the stored picture.
             let orientation = Orientation::default();
             let distortion = shot.lens.distortion;
-            Ok(DatasetFrame { name, path, view, distortion, orientation, prior: None, telemetry: None })
+            let mask = shot.mask.map(|mask| root.join(mask));
+            Ok(DatasetFrame { name, path, view, distortion, orientation, mask, prior: None, telemetry: None })
         })
         .collect()
 }

@@ -87,7 +87,7 @@ impl Model {
                 );
                 return Err(FormatError::invalid(&self.file("images"), what));
             };
-            shots.push(Shot { path: image.name, lens: *lens, pose: image.pose });
+            shots.push(Shot { path: image.name, lens: *lens, pose: image.pose, mask: None });
         }
         Ok(Reconstruction { shots, origin: origin::read(&self.folder)? })
     }

@@ -172,7 +172,7 @@ pub fn read(path: &Path) -> Result<Reconstruction, FormatError> {
         if !(pose.rotation.is_finite() && pose.center.is_finite()) {
             return Err(bad("its pose is not a number".to_owned()));
         }
-        shots.push(Shot { path: name, lens, pose });
+        shots.push(Shot { path: name, lens, pose, mask: None });
     }
     Ok(Reconstruction { shots, origin })
 }

@@ -32,6 +32,8 @@ pub struct Shot {
     pub lens: LensDescription,
     /// Camera (OpenCV axes) → world.
     pub pose: Pose,
+    /// Path of the picture's mask, where the file names one.
+    pub mask: Option<String>,
 }
 
 /// A lens as a file describes it; picture size and principal point may have to be taken from the picture.

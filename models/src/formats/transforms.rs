@@ -43,6 +43,7 @@ struct RawLens {
 struct RawFrame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
+    mask_path: Option<String>,
     #[serde(flatten)]
     lens: RawLens,
 }
@@ -77,7 +78,7 @@ pub fn read(path: &Path) -> Result<Reconstruction, FormatError> {
         let bad = |what: String| FormatError::invalid(path, format!("frame {:?}: {what}", frame.file_path));
         let pose = opengl_to_pose(&frame.transform_matrix).map_err(|e| bad(e.to_owned()))?;
         let lens = lens(&frame.lens, &raw.lens).map_err(bad)?;
-        shots.push(Shot { path: frame.file_path, lens, pose });
+        shots.push(Shot { path: frame.file_path, lens, pose, mask: frame.mask_path });
     }
     Ok(Reconstruction { shots, origin })
 }
@@ -183,6 +184,9 @@ pub fn write(path: &Path, reconstruction: &Reconstruction) -> Result<(), FormatE
         ];
         for (name, value) in terms.into_iter().filter(|(_, v)| *v != 0.0) {
             frame[name] = value.into();
+        }
+        if let Some(mask) = &shot.mask {
+            frame["mask_path"] = mask.as_str().into();
         }
         frames.push(frame);
     }

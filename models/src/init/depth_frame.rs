@@ -9,6 +9,7 @@ use image::RgbImage;
 
 use super::frame_file::{AsBytes, FrameFile, Kept};
 use crate::camera::{Projector, Unprojector, View};
+use crate::picture::mask::Mask;
 
 /// Depth of one picture on a grid of every `stride`-th pixel.
 #[derive(Clone, Debug)]
@@ -125,6 +126,8 @@ pub struct DepthFrame {
     /// The reference view that the depth was made from.
     pub made_as: Option<View>,
     image: Kept<RgbImage>,
+    /// Which of its pixels count, at the network's size.
+    mask: Option<Mask>,
     /// The last depth, which is known no more when `has_depth` is false: a new one takes its place in the file.
     depth: Option<Kept<DepthGrid>>,
     has_depth: bool,
@@ -144,10 +147,33 @@ impl DepthFrame {
             made_with: Vec::new(),
             made_as: None,
             image,
+            mask: None,
             depth: None,
             has_depth: false,
             file: file.cloned(),
         })
+    }
+
+    /// With a mask at the network's size: what it leaves out has no depth.
+    pub fn masked(self, mask: Option<Mask>) -> Self {
+        Self { mask, ..self }
+    }
+
+    /// Which pixels count; `None`: all.
+    pub fn mask(&self) -> Option<&Mask> {
+        self.mask.as_ref()
+    }
+
+    /// Takes the confidence from the depths that the mask leaves out.
+    pub fn leave_out(&self, depth: &mut DepthGrid) {
+        let Some(mask) = &self.mask else { return };
+        for at in 0..depth.confidence.len() {
+            let (x, y) = depth.pixel(at % depth.width, at / depth.width);
+            // The sample has the colour of its whole block.
+            if !mask.keeps_around([f64::from(x), f64::from(y)], 0.5 * depth.stride as f64) {
+                depth.confidence[at] = 0.0;
+            }
+        }
     }
 
     /// The picture at the network's size.
@@ -177,7 +203,8 @@ impl DepthFrame {
     /// Writing to the file fails.
     pub fn set_depth(&mut self, depth: Option<DepthGrid>) -> io::Result<()> {
         self.has_depth = false;
-        let Some(depth) = depth else { return Ok(()) };
+        let Some(mut depth) = depth else { return Ok(()) };
+        self.leave_out(&mut depth);
         match &mut self.depth {
             Some(old) => old.replace(depth)?,
             none => *none = Some(Kept::new(depth, self.file.as_ref())?),

@@ -15,7 +15,7 @@ use crate::camera::{DepthPrior, Pose, PosedImage, View};
 use crate::onnx::features::{FeatureNetwork, Features};
 use crate::onnx::manifest::{Contract, Poses};
 use crate::onnx::network::{LazySession, Network};
-use crate::onnx::picture::{center_crop, resized};
+use crate::onnx::picture::{center_crop, center_window, resized};
 use crate::onnx::session::check_library;
 
 use super::InitError;
@@ -37,6 +37,8 @@ pub use memory::most_frame_bytes;
 const RANGE_FEATURES: usize = 600;
 /// Longer side of the picture they are found in, pixels: to bound depths, a half of a pixel more does not matter.
 const RANGE_SIDE: u32 = 320;
+/// Features keep this far from what a mask leaves out, pixels: half a cell of the network's descriptors.
+const MARGIN: f64 = 4.0;
 /// Every how many pictures the depth range is measured again.
 const RANGE_EVERY: usize = 5;
 /// A depth is made again when its pictures' refined poses move it by more than this, pixels.
@@ -188,8 +190,15 @@ impl Initialiser {
             // What knows no intrinsics was trained on square pixels: crop to its shape, never stretch.
             Pairs::Unposed(_) => center_crop(&picture.image, k, w, h),
         };
+        let mask = picture.mask.as_ref().map(|mask| match &self.pairs {
+            Pairs::Posed(_) => mask.resized(w, h),
+            Pairs::Unposed(_) => {
+                let (x, y, width, height) = center_window(mask.dimensions(), (w, h));
+                mask.window(x, y, width, height).resized(w, h)
+            }
+        });
         let view = View { intrinsics, pose: picture.view.pose };
-        self.frames.push(DepthFrame::new(picture.name.clone(), image, view, self.file.as_ref())?);
+        self.frames.push(DepthFrame::new(picture.name.clone(), image, view, self.file.as_ref())?.masked(mask));
         self.report.pictures = self.frames.len();
         self.report.add_ms += started.elapsed().as_secs_f64() * 1e3;
         self.measure_range()
@@ -272,7 +281,11 @@ impl Initialiser {
         let shrink = (f64::from(RANGE_SIDE) / f64::from(w.max(h))).min(1.0);
         let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
         let view = View { intrinsics: frame.view.intrinsics.resized(fit(w), fit(h)), pose: frame.view.pose };
-        let found = network.extract(&resized(&image, fit(w), fit(h)), RANGE_FEATURES)?;
+        let mut found = network.extract(&resized(&image, fit(w), fit(h)), RANGE_FEATURES)?;
+        if let Some(mask) = frame.mask() {
+            let larger = f64::from(w) / f64::from(fit(w));
+            found.retain(|p| mask.keeps_around(p.map(|v| f64::from(v) * larger), MARGIN * larger));
+        }
         if let Some((j, previous_view, previous)) = &self.last_features
             && j + 1 == i
         {

@@ -3,6 +3,7 @@
 
 use super::*;
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use crate::picture::mask::Mask;
 use config::init::InitSettings;
 use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
@@ -28,7 +29,7 @@ fn picture(i: usize, x: f64, y: f64) -> PosedImage {
         Rgb([texture(p.x, p.y), texture(p.y + 100.0, p.x), 90])
     });
     let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-    PosedImage { name: format!("{i}"), time_ns: 0, image, view: View { intrinsics, pose }, sigma }
+    PosedImage { name: format!("{i}"), time_ns: 0, image, view: View { intrinsics, pose }, mask: None, sigma }
 }
 
 fn no_runtime() -> bool {
@@ -103,6 +104,43 @@ fn a_plane_comes_out_flat_within_the_budget_and_the_same_every_time() {
     assert!(near as f64 > 0.8 * a.cloud.len() as f64, "{near} of {} within 1.5 m", a.cloud.len());
     assert_eq!(priors, 5);
     assert_eq!(a.cloud, run().0.cloud);
+}
+
+#[test]
+fn what_a_mask_leaves_out_becomes_no_gaussian_and_no_depth_prior() {
+    if no_runtime() {
+        return;
+    }
+    // A leg of the aircraft, which every picture shows at the same place.
+    let leg = |x: u32, y: u32| x >= 120 && y >= 80;
+    let run = |masked: bool| {
+        let mut init = Initialiser::open(&settings(), None).unwrap();
+        for i in 0..5 {
+            let mut p = picture(i, 12.0 * i as f64, 0.0);
+            for (x, y, color) in p.image.enumerate_pixels_mut().filter(|(x, y, _)| leg(*x, *y)) {
+                *color = Rgb([250, 10 + ((x * 7 + y * 3) % 11 * 4) as u8, 250]);
+            }
+            p.mask = masked.then(|| Mask::from_fn(192, 144, |x, y| !leg(x, y)));
+            init.add(&p).unwrap();
+        }
+        let mut under = 0;
+        let made = init.build(5000, &mut |_, prior| {
+            let at = |i: usize| {
+                [(i as u32 % prior.width) * 192 / prior.width, (i as u32 / prior.width) * 144 / prior.height]
+            };
+            let sure = (0..prior.confidence.len()).filter(|i| prior.confidence[*i] > 0.0);
+            under += sure.filter(|i| leg(at(*i)[0] + 1, at(*i)[1] + 1)).count();
+        });
+        let cloud = made.unwrap().cloud;
+        // The ground's blue is 90 everywhere, the leg's 250.
+        let blue = |i: usize| cloud.sh[i * cloud.sh.len() / cloud.len() + 2] > 0.0;
+        let of_leg = (0..cloud.len()).filter(|i| blue(*i)).count();
+        (cloud.len(), of_leg, under)
+    };
+    let ((all, seen, under), (left, none, nowhere)) = (run(false), run(true));
+    assert!(seen > 100 && under > 100, "{seen} and {under} of {all}");
+    assert_eq!((none, nowhere), (0, 0), "of {left}");
+    assert!(left > 2000);
 }
 
 #[test]

@@ -33,6 +33,24 @@ pub struct Features {
 }
 
 impl Features {
+    /// Forgets the key points for which `keeps` says no.
+    pub fn retain(&mut self, keeps: impl Fn([f32; 2]) -> bool) {
+        let mut kept = 0;
+        for i in 0..self.keypoints.len() {
+            if keeps(self.keypoints[i]) {
+                self.keypoints.swap(kept, i);
+                self.descriptors.copy_within(i * DESCRIPTOR..(i + 1) * DESCRIPTOR, kept * DESCRIPTOR);
+                if i < self.scores.len() {
+                    self.scores.swap(kept, i);
+                }
+                kept += 1;
+            }
+        }
+        self.keypoints.truncate(kept);
+        self.descriptors.truncate(kept * DESCRIPTOR);
+        self.scores.truncate(kept);
+    }
+
     /// Descriptor of keypoint `i`.
     pub fn descriptor(&self, i: usize) -> &[f32] {
         &self.descriptors[i * DESCRIPTOR..(i + 1) * DESCRIPTOR]

@@ -72,13 +72,18 @@ pub fn resized(image: &RgbImage, width: u32, height: u32) -> RgbImage {
 
 /// The largest centred part of a picture that has the shape `width` × `height`, at that size, and its camera.
 pub fn center_crop(image: &RgbImage, k: &Intrinsics, width: u32, height: u32) -> (RgbImage, Intrinsics) {
-    let ratio = f64::from(width) / f64::from(height);
-    let w = (f64::from(image.height()) * ratio).round().clamp(1.0, f64::from(image.width())) as u32;
-    let h = (f64::from(w) / ratio).round().clamp(1.0, f64::from(image.height())) as u32;
-    let (x, y) = ((image.width() - w) / 2, (image.height() - h) / 2);
+    let (x, y, w, h) = center_window(image.dimensions(), (width, height));
     let part = image::imageops::crop_imm(image, x, y, w, h).to_image();
     let cropped = Intrinsics { width: w, height: h, cx: k.cx - x as f32, cy: k.cy - y as f32, ..*k };
     (resized(&part, width, height), cropped.resized(width, height))
+}
+
+/// The largest window of the shape of `wanted` in the middle of a picture of `size`: its left and upper edge, width and height.
+pub fn center_window(size: (u32, u32), wanted: (u32, u32)) -> (u32, u32, u32, u32) {
+    let ratio = f64::from(wanted.0) / f64::from(wanted.1);
+    let w = (f64::from(size.1) * ratio).round().clamp(1.0, f64::from(size.0)) as u32;
+    let h = (f64::from(w) / ratio).round().clamp(1.0, f64::from(size.1)) as u32;
+    ((size.0 - w) / 2, (size.1 - h) / 2, w, h)
 }
 
 /// Source pixels and weights of one target pixel along one axis: a triangle filter as wide as the shrinking factor.

@@ -125,6 +125,11 @@ impl SurveyCrs {
         Some(Self { geographic: geographic()?, source })
     }
 
+    /// Whether its first two coordinates are angles.
+    pub fn is_in_degrees(&self) -> bool {
+        self.source.is_latlong()
+    }
+
     /// Easting, northing (or longitude and latitude in degrees) and height → WGS 84; `None` outside of the projection.
     pub fn geodetic(&self, p: DVec3) -> Option<Geodetic> {
         let unit = |v: f64| if self.source.is_latlong() { v.to_radians() } else { v };

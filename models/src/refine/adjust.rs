@@ -130,6 +130,7 @@ mod tests {
                 .collect(),
             starts: (0..=12).map(|i| 3 * i).collect(),
             observations: Vec::new(),
+            anchors: Vec::new(),
             shared: Shared {
                 mount: so3::exp(DVec3::new(0.01, -0.02, 0.015)),
                 delay: 0.1,

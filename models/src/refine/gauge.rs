@@ -66,7 +66,7 @@ impl Refiner {
     }
 
     /// Frames that verified pairs join, each group sorted.
-    fn groups(&self) -> Vec<Vec<usize>> {
+    pub(super) fn groups(&self) -> Vec<Vec<usize>> {
         let mut root: Vec<usize> = (0..self.frames.len()).collect();
         let find = |root: &Vec<usize>, mut i: usize| {
             while root[i] != i {

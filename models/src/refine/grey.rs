@@ -3,24 +3,46 @@
 use glam::DVec2;
 use image::{RgbImage, imageops};
 
+use crate::picture::mask::Mask;
+
+/// Grey value of a pixel that a mask leaves out.
+const LEFT_OUT: u8 = 0;
+/// Key points keep this far from what is left out, pixels at the network's size: an edge of the aircraft is a corner in every
+/// picture, and descriptors come from cells of 8 pixels.
+const MARGIN: i32 = 8;
+
 /// Luma of a key frame.
 pub(crate) struct Grey {
     width: i32,
     height: i32,
     data: Vec<u8>,
+    /// Some of the pixels are left out.
+    masked: bool,
     /// Pixels here per pixel of the original.
     pub scale: DVec2,
 }
 
 impl Grey {
-    pub fn new(image: &RgbImage, side: u32) -> Self {
+    pub fn new(image: &RgbImage, mask: Option<&Mask>, side: u32) -> Self {
         let small = super::upright::prepare(image, side, 0);
-        let grey = imageops::grayscale(small.as_ref());
+        let mut grey = imageops::grayscale(small.as_ref());
+        if let Some(mask) = mask {
+            let mask = mask.resized(grey.width(), grey.height());
+            for (x, y, value) in grey.enumerate_pixels_mut() {
+                value.0[0] = if mask.keeps(x, y) { value.0[0].max(LEFT_OUT + 1) } else { LEFT_OUT };
+            }
+        }
         let scale = DVec2::new(
             f64::from(grey.width()) / f64::from(image.width()),
             f64::from(grey.height()) / f64::from(image.height()),
         );
-        Self { width: grey.width() as i32, height: grey.height() as i32, data: grey.into_raw(), scale }
+        Self {
+            width: grey.width() as i32,
+            height: grey.height() as i32,
+            data: grey.into_raw(),
+            masked: mask.is_some(),
+            scale,
+        }
     }
 
     pub fn bytes(&self) -> usize {
@@ -35,7 +57,18 @@ impl Grey {
         })
     }
 
-    /// Bilinear value at a place in its own pixels; `None` outside.
+    /// Whether a key point at a place in pixels of the original lies on, and not at the edge of, what is to be learnt.
+    pub fn keeps(&self, place: [f32; 2]) -> bool {
+        if !self.masked {
+            return true;
+        }
+        let [x, y] = [f64::from(place[0]) * self.scale.x, f64::from(place[1]) * self.scale.y].map(|v| v as i32);
+        let range = |at: i32, side: i32| (at - MARGIN).max(0)..(at + MARGIN + 1).min(side);
+        let value = |x: i32, y: i32| self.data[y as usize * self.width as usize + x as usize];
+        range(y, self.height).all(|v| range(x, self.width).all(|u| value(u, v) != LEFT_OUT))
+    }
+
+    /// Bilinear value at a place in its own pixels; `None` outside, and beside what is left out.
     pub fn at(&self, p: DVec2) -> Option<f64> {
         let q = p - 0.5;
         let (x, y) = (q.x.floor(), q.y.floor());
@@ -46,8 +79,30 @@ impl Grey {
         let i = (y as i32 * self.width + x as i32) as usize;
         let w = self.width as usize;
         let d = &self.data;
+        if self.masked && [d[i], d[i + 1], d[i + w], d[i + w + 1]].contains(&LEFT_OUT) {
+            return None;
+        }
         let top = f64::from(d[i]) * (1.0 - u) + f64::from(d[i + 1]) * u;
         let low = f64::from(d[i + w]) * (1.0 - u) + f64::from(d[i + w + 1]) * u;
         Some(top * (1.0 - v) + low * v)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_out_has_no_value_and_no_key_point_beside_it() {
+        let image = RgbImage::from_pixel(128, 96, image::Rgb([0; 3]));
+        let mask = Mask::from_fn(128, 96, |x, _| x < 64);
+        // At half the size the edge lies at 32.
+        let grey = Grey::new(&image, Some(&mask), 64);
+        assert!(grey.at(DVec2::new(31.0, 20.0)).is_some(), "black ground is ground");
+        assert!(grey.at(DVec2::new(32.0, 20.0)).is_none() && grey.at(DVec2::new(50.0, 20.0)).is_none());
+        assert!(grey.keeps([46.0, 40.0]) && !grey.keeps([50.0, 40.0]) && !grey.keeps([100.0, 40.0]));
+        let whole = Grey::new(&image, None, 64);
+        assert!(whole.keeps([100.0, 40.0]) && whole.at(DVec2::new(50.0, 20.0)) == Some(0.0));
     }
 }

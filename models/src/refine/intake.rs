@@ -3,7 +3,7 @@
 use super::grey::Grey;
 use super::keyframe::KeyFrame;
 use super::{AddReport, RefineError, Refiner, upright};
-use crate::camera::{Pose, PoseSigma, View};
+use crate::camera::{Pose, PoseSigma, PosedImage, View};
 use crate::onnx::features::Features;
 use image::RgbImage;
 use std::time::Instant;
@@ -43,12 +43,13 @@ impl Refiner {
         Ok(())
     }
 
-    /// Key points in pixels of a picture of `size`, of which `image` may be a smaller copy.
+    /// Key points in pixels of a picture of `size`, of which `image` may be a smaller copy; those that `grey` leaves out are none.
     pub(super) fn extract(
         &mut self,
         image: &RgbImage,
         size: (u32, u32),
         turns: u8,
+        grey: Option<&Grey>,
         report: &mut AddReport,
     ) -> Result<Features, RefineError> {
         let clock = Instant::now();
@@ -58,6 +59,9 @@ impl Refiner {
         let mut features = network.extract(&seen, 2 * self.settings.max_features)?;
         for p in &mut features.keypoints {
             *p = upright::restore(*p, seen.width(), seen.height(), turns, size);
+        }
+        if let Some(grey) = grey {
+            features.retain(|p| grey.keeps(p));
         }
         report.extractions += 1;
         report.extract_seconds += clock.elapsed().as_secs_f64();
@@ -80,6 +84,7 @@ impl Refiner {
             rotation_sigma: largest(sigma.rotation_rad, 0.5),
             position_sigma: largest(sigma.position_m, 30.0),
             rotation_refused: false,
+            unplaced: false,
             adjusted: false,
             tied: false,
             turns: 0,
@@ -100,7 +105,7 @@ impl Refiner {
         &mut self,
         features: Features,
         turns: u8,
-        image: Option<&RgbImage>,
+        picture: Option<&PosedImage>,
         report: &mut AddReport,
     ) {
         let newest = self.frames.len().saturating_sub(1) as u32;
@@ -112,14 +117,14 @@ impl Refiner {
         frame.colors = frame
             .seen
             .iter()
-            .map(|p| match image {
-                Some(image) => {
+            .map(|p| match picture {
+                Some(PosedImage { image, .. }) => {
                     image.get_pixel((p[0] as u32).min(image.width() - 1), (p[1] as u32).min(image.height() - 1)).0
                 }
                 None => [128; 3],
             })
             .collect();
-        frame.grey = image.map(|image| Grey::new(image, self.settings.feature_side));
+        frame.grey = picture.map(|p| Grey::new(&p.image, p.mask.as_ref(), self.settings.feature_side));
         self.union.shrink(first);
         self.union.grow(newest, count);
     }
@@ -152,4 +157,42 @@ impl Refiner {
 
 pub(super) fn invalid(name: &str, what: &'static str) -> RefineError {
     RefineError::Invalid { name: name.to_owned(), what }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use config::refine::RefineSettings;
+    use glam::{DQuat, DVec3};
+
+    use super::*;
+    use crate::camera::Intrinsics;
+    use crate::picture::mask::Mask;
+
+    #[test]
+    fn no_key_point_is_taken_from_what_a_mask_leaves_out() {
+        if crate::onnx::session::find_library().is_err() {
+            return println!("skipped: no ONNX Runtime");
+        }
+        let cell = |x: u32, y: u32| (x / 9).wrapping_mul(0x9E37_79B9) ^ (y / 9).wrapping_mul(0x85EB_CA6B);
+        let image =
+            RgbImage::from_fn(320, 240, |x, y| image::Rgb([(cell(x, y).wrapping_mul(0xC2B2_AE35) >> 24) as u8; 3]));
+        let mask = Mask::from_fn(320, 240, |x, y| x < 200 && y > 30);
+        let view = View {
+            intrinsics: Intrinsics { width: 320, height: 240, fx: 250.0, fy: 250.0, cx: 160.0, cy: 120.0 },
+            pose: Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center: DVec3::new(0.0, 0.0, 40.0) },
+        };
+        let sigma = PoseSigma { position_m: [3.0; 3], rotation_rad: [0.1; 3] };
+        let found = |mask: Option<&Mask>| {
+            let mut refiner = Refiner::open(&RefineSettings::default()).unwrap();
+            let name = "a.jpg".to_owned();
+            let image = image.clone();
+            refiner.add(&PosedImage { name, time_ns: 0, image, mask: mask.cloned(), view, sigma }).unwrap();
+            refiner.frames[0].seen.clone()
+        };
+        let outside = |p: &&[f32; 2]| !mask.keeps(p[0] as u32, p[1] as u32);
+        let (all, kept) = (found(None), found(Some(&mask)));
+        assert!(all.iter().filter(outside).count() > 50 && kept.len() > 50, "{} {}", all.len(), kept.len());
+        assert_eq!(kept.iter().filter(outside).count(), 0);
+    }
 }

@@ -23,6 +23,8 @@ pub(crate) struct KeyFrame {
     pub position_sigma: f64,
     /// The pictures say that the prior's rotation cannot be right.
     pub rotation_refused: bool,
+    /// Nothing says where it was taken: it takes part in nothing.
+    pub unplaced: bool,
     /// A bundle adjustment has placed it.
     pub adjusted: bool,
     /// Enough points hold it in place.
@@ -52,6 +54,17 @@ pub(crate) struct KeyFrame {
 impl KeyFrame {
     pub fn descriptor(&self, i: usize) -> &[i8] {
         &self.descriptors[i * DESCRIPTOR..(i + 1) * DESCRIPTOR]
+    }
+
+    /// What the picture looks like on the whole: the mean of its descriptors, of unit length.
+    pub fn look(&self) -> Vec<f32> {
+        let mut mean = vec![0.0f32; DESCRIPTOR];
+        for d in self.descriptors.chunks_exact(DESCRIPTOR) {
+            mean.iter_mut().zip(d).for_each(|(m, v)| *m += f32::from(*v));
+        }
+        let length = mean.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
+        mean.iter_mut().for_each(|v| *v /= length);
+        mean
     }
 
     /// Takes the best `max` of features found with the picture turned by `turns`; colours are the caller's.

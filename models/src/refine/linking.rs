@@ -59,6 +59,7 @@ impl Refiner {
             .iter()
             .take(before)
             .enumerate()
+            .filter(|(_, f)| !f.unplaced)
             .map(|(i, f)| (overlap((&self.camera_of(f), &f.intrinsics), (camera, lens), self.ground_at(i)), i as u32))
             .filter(|(share, _)| *share >= self.settings.min_overlap)
             .collect();
@@ -89,46 +90,18 @@ impl Refiner {
 
     /// Two passes: the best key points, guided by telemetry, give a relative pose; that pose then guides all of them
     /// along their epipolar lines.
-    fn try_pair(&mut self, a: usize, b: usize, guided: bool, any_heading: bool, report: &mut AddReport) {
-        let (fa, fb) = (&self.frames[a], &self.frames[b]);
-        let (ca, cb) = (self.camera_of(fa), self.camera_of(fb));
-        let ground = self.ground_at(a);
-        let rotation_sigma = fa.rotation_sigma.hypot(fb.rotation_sigma);
-        let position_sigma = fa.position_sigma.hypot(fb.position_sigma);
-        let baseline = (fa.pose.center - fb.pose.center).length();
+    pub(super) fn try_pair(&mut self, a: usize, b: usize, guided: bool, any_heading: bool, report: &mut AddReport) {
         report.pairs_tried += 1;
-        let predicted: Vec<_> = match guided {
-            true => fb.keypoints.iter().map(|p| predict(&cb, &ca, ground, *p)).collect(),
-            false => vec![Some(ca.c); fb.keypoints.len()],
-        };
-        let radius =
-            if guided { search_radius(&ca, &cb, rotation_sigma, position_sigma, ground) } else { f64::INFINITY };
-        let first = MatchLimits {
-            min_cosine: self.settings.min_cosine,
-            cosine_margin: self.settings.cosine_margin,
-            features: COARSE_FEATURES,
-        };
-        let matches = match_frames(fa, fb, &Guide { predicted: &predicted, radius, lines: None }, first);
-        let to_b = fb.pose.rotation.conjugate();
-        let prior =
-            RelativePose { rotation: to_b * fa.pose.rotation, translation: to_b * (fa.pose.center - fb.pose.center) };
-        let limits = TwoViewLimits {
-            threshold: self.settings.epipolar_px / ca.f.min_element().min(cb.f.min_element()),
-            min_inliers: self.settings.min_inliers * if any_heading { 2 } else { 1 },
-            any_heading,
-            rotation_sigma: if any_heading { WIDE_TILT } else { rotation_sigma },
-            direction_sigma: if any_heading { 2.0 } else { (position_sigma / baseline.max(1e-6)).min(2.0) },
-            rounds: ROUNDS,
-        };
-        let rays = |matches: &[Match]| -> Vec<RayPair> {
-            let ray =
-                |m: &Match| RayPair { a: ca.ray(fa.keypoints[m.a as usize]), b: cb.ray(fb.keypoints[m.b as usize]) };
-            matches.iter().map(ray).collect()
-        };
-        let Some(coarse) = verify(&rays(&matches), prior, limits) else {
-            report.matches += matches.len();
+        let (matches, coarse) = self.coarse(a, b, guided, any_heading);
+        let Some(coarse) = coarse else {
+            report.matches += matches;
             return;
         };
+        let (fa, fb) = (&self.frames[a], &self.frames[b]);
+        let ca = self.camera_of(fa);
+        let ground = self.ground_at(a);
+        let baseline = (fa.pose.center - fb.pose.center).length();
+        let (first, limits) = self.limits(a, b, any_heading);
         // Where b must have stood for that relative pose, at the length of the GPS baseline.
         let length = if coarse.rotation_only { 0.0 } else { baseline };
         let rotation = (fa.pose.rotation * coarse.pose.rotation.conjugate()).normalize();
@@ -146,6 +119,7 @@ impl Refiner {
         };
         let matches = match_frames(fa, fb, &guide, MatchLimits { features: usize::MAX, ..first });
         report.matches += matches.len();
+        let rays = |matches: &[Match]| rays(&self.frames, (a, &ca), (b, &cb), matches);
         let limits = TwoViewLimits { any_heading: false, rounds: 0, ..limits };
         // The telemetry's weight is in the coarse pose already; its own error is what matters now.
         let fine = TwoViewLimits { rotation_sigma: 0.05, direction_sigma: 0.3, ..limits };
@@ -156,6 +130,49 @@ impl Refiner {
                 self.accept(a, b, &matches, &found, report);
             }
         }
+    }
+
+    /// What may match between two frames, and what a relative pose of them must keep to.
+    fn limits(&self, a: usize, b: usize, any_heading: bool) -> (MatchLimits, TwoViewLimits) {
+        let (fa, fb) = (&self.frames[a], &self.frames[b]);
+        let (ca, cb) = (self.camera_of(fa), self.camera_of(fb));
+        let position_sigma = fa.position_sigma.hypot(fb.position_sigma);
+        let baseline = (fa.pose.center - fb.pose.center).length();
+        let matches = MatchLimits {
+            min_cosine: self.settings.min_cosine,
+            cosine_margin: self.settings.cosine_margin,
+            features: COARSE_FEATURES,
+        };
+        let pose = TwoViewLimits {
+            threshold: self.settings.epipolar_px / ca.f.min_element().min(cb.f.min_element()),
+            min_inliers: self.settings.min_inliers * if any_heading { 2 } else { 1 },
+            any_heading,
+            rotation_sigma: if any_heading { WIDE_TILT } else { fa.rotation_sigma.hypot(fb.rotation_sigma) },
+            direction_sigma: if any_heading { 2.0 } else { (position_sigma / baseline.max(1e-6)).min(2.0) },
+            rounds: ROUNDS,
+        };
+        (matches, pose)
+    }
+
+    /// The first pass: how many of the best key points match, and what relative pose they agree on, if any.
+    pub(super) fn coarse(&self, a: usize, b: usize, guided: bool, any_heading: bool) -> (usize, Option<TwoView>) {
+        let (fa, fb) = (&self.frames[a], &self.frames[b]);
+        let (ca, cb) = (self.camera_of(fa), self.camera_of(fb));
+        let ground = self.ground_at(a);
+        let rotation_sigma = fa.rotation_sigma.hypot(fb.rotation_sigma);
+        let position_sigma = fa.position_sigma.hypot(fb.position_sigma);
+        let predicted: Vec<_> = match guided {
+            true => fb.keypoints.iter().map(|p| predict(&cb, &ca, ground, *p)).collect(),
+            false => vec![Some(ca.c); fb.keypoints.len()],
+        };
+        let radius =
+            if guided { search_radius(&ca, &cb, rotation_sigma, position_sigma, ground) } else { f64::INFINITY };
+        let (first, limits) = self.limits(a, b, any_heading);
+        let matches = match_frames(fa, fb, &Guide { predicted: &predicted, radius, lines: None }, first);
+        let to_b = fb.pose.rotation.conjugate();
+        let prior =
+            RelativePose { rotation: to_b * fa.pose.rotation, translation: to_b * (fa.pose.center - fb.pose.center) };
+        (matches.len(), verify(&rays(&self.frames, (a, &ca), (b, &cb), &matches), prior, limits))
     }
 
     /// Drops inliers whose surroundings differ and moves the others' key points in `b` to where the pictures agree.
@@ -264,6 +281,11 @@ impl Refiner {
             self.ground = Some(median(&mut self.pair_grounds.clone()));
         }
     }
+}
+
+fn rays(frames: &[KeyFrame], a: (usize, &Pinhole), b: (usize, &Pinhole), matches: &[Match]) -> Vec<RayPair> {
+    let ray = |(i, camera): (usize, &Pinhole), k: u32| camera.ray(frames[i].keypoints[k as usize]);
+    matches.iter().map(|m| RayPair { a: ray(a, m.a), b: ray(b, m.b) }).collect()
 }
 
 /// Lines in `a` on which the key points of `b` must lie: unit normal and offset, pixels.

@@ -128,7 +128,7 @@ mod tests {
     fn a_key_point_off_by_two_pixels_is_pulled_to_its_place_through_rotation_and_exposure() {
         for heading in [0.0, 0.7, 3.1] {
             let (a, b) = (nadir(0.0, 0.0), nadir(6.0, heading));
-            let (ga, gb) = (Grey::new(&picture(&a, 1.0), 640), Grey::new(&picture(&b, 0.6), 640));
+            let (ga, gb) = (Grey::new(&picture(&a, 1.0), None, 640), Grey::new(&picture(&b, 0.6), None, 640));
             let at = [70.3f32, 60.8];
             let truth = predict(&a, &b, Ground(Some(0.0)), at).unwrap().as_vec2();
             let start = [truth.x + 1.5, truth.y - 1.2];
@@ -141,8 +141,8 @@ mod tests {
     #[test]
     fn blank_patches_edges_and_other_places_are_refused() {
         let (a, b) = (nadir(0.0, 0.0), nadir(6.0, 0.0));
-        let (ga, gb) = (Grey::new(&picture(&a, 1.0), 640), Grey::new(&picture(&b, 1.0), 640));
-        let blank = Grey::new(&RgbImage::new(128, 128), 640);
+        let (ga, gb) = (Grey::new(&picture(&a, 1.0), None, 640), Grey::new(&picture(&b, 1.0), None, 640));
+        let blank = Grey::new(&RgbImage::new(128, 128), None, 640);
         let side = |grey, camera, at| Side { grey, camera, at };
         let ground = Ground(Some(0.0));
         assert!(align_patch(&side(&blank, &a, [64.0; 2]), &side(&gb, &b, [64.0; 2]), ground).is_none());

@@ -52,6 +52,14 @@ pub(crate) struct Observation {
     pub pixel: [f32; 2],
 }
 
+/// What is known of the place of a surveyed point.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Anchor {
+    pub place: DVec3,
+    /// One over sigma of each axis.
+    pub weight: DVec3,
+}
+
 /// Robust loss on a squared residual in units of its sigma.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Loss {
@@ -74,6 +82,8 @@ impl Loss {
 
 /// A telemetry value beyond three sigma is doubted (a GPS height that jumps, a heading turned around).
 const PRIOR_LOSS: Loss = Loss::Cauchy(3.0);
+/// A surveyed point beyond three sigma is doubted as telemetry is.
+const ANCHOR_LOSS: Loss = Loss::Cauchy(3.0);
 /// Residual charged for a point behind its camera, pixels: more than any it can cause in front.
 const BEHIND_PX: f64 = 2000.0;
 
@@ -86,6 +96,8 @@ pub(crate) struct Problem {
     /// Observations of point i: `starts[i]..starts[i + 1]`.
     pub starts: Vec<u32>,
     pub observations: Vec<Observation>,
+    /// Of the last points, in their order.
+    pub anchors: Vec<Anchor>,
     pub shared: Shared,
     /// One over the prior sigma of each shared parameter.
     pub shared_weight: [f64; SHARED],
@@ -109,6 +121,14 @@ impl Problem {
         &self.observations[self.starts[point] as usize..self.starts[point + 1] as usize]
     }
 
+    /// Whitened residual of a surveyed point against its place, the weights of its axes, and its cost and weight in the sum;
+    /// `None` of any other point.
+    pub fn anchor_of(&self, point: usize) -> Option<(DVec3, DVec3, (f64, f64))> {
+        let anchor = self.anchors.get(point.checked_sub(self.points.len() - self.anchors.len())?)?;
+        let off = (self.points[point] - anchor.place) * anchor.weight;
+        Some((off, anchor.weight, ANCHOR_LOSS.at(off.length_squared())))
+    }
+
     /// Residual in pixels, when the point is in front.
     pub fn residual(&self, camera: &Pinhole, point: DVec3, o: &Observation) -> Option<DVec2> {
         let p = camera.local(point);
@@ -125,6 +145,7 @@ impl Problem {
         }
         let per_px = 1.0 / self.pixel_sigma;
         for (i, p) in self.points.iter().enumerate() {
+            sum += self.anchor_of(i).map_or(0.0, |(_, _, (cost, _))| cost);
             for o in self.sightings(i) {
                 let r = self.residual(&cameras[o.camera as usize], *p, o).map_or(BEHIND_PX, |r| r.length());
                 sum += loss.at((r * per_px).powi(2)).0;

@@ -4,10 +4,13 @@
 //! by a few matches, one picture of it 25 m off.
 
 use super::keyframe::KeyFrame;
+use super::level::HEIGHT;
 use super::linking::LINKED_SIGMA;
 use super::tracks::Union;
 use super::{AddReport, RefineError, RefineReport, Refiner, upright};
 
+/// How far a chain of pictures without positions may have bent, a tenth of its height.
+const BENT: f64 = 0.1 * HEIGHT;
 /// Positions that the adjustment moved further than this from telemetry's are searched for as if they were not known,
 /// standard deviations.
 const DOUBT: f64 = 3.0;
@@ -24,30 +27,46 @@ impl Refiner {
         if self.solves == 0 {
             return Ok(report);
         }
+        // What is doubted now may go back to where telemetry had it.
+        self.anchored = false;
+        if self.floating {
+            self.reach_untied();
+        }
         self.extract_upright(&mut report)?;
+        for frame in &mut self.frames {
+            doubt(frame);
+            if self.floating {
+                frame.position_sigma = frame.position_sigma.max(BENT);
+            }
+        }
+        self.link_anew(&mut report);
+        Ok(report)
+    }
+
+    /// Forgets all pairs and links every key frame to those before it that should see the same ground.
+    pub(super) fn link_anew(&mut self, report: &mut AddReport) {
         self.union = Union::with_capacity(self.settings.max_keyframes * self.settings.max_features);
         self.pairs.clear();
         for (i, frame) in self.frames.iter_mut().enumerate() {
             frame.first_node = self.union.grow(i as u32, frame.seen.len());
             frame.pairs = 0;
             frame.settled.fill(false);
-            doubt(frame);
         }
         // The pairs of the first look are gone, and so is their part in the counts.
         let RefineReport { extract_seconds, match_seconds, frames_invalid, frames_over_cap, .. } = self.totals;
         self.totals =
             RefineReport { extract_seconds, match_seconds, frames_invalid, frames_over_cap, ..Default::default() };
         let clock = std::time::Instant::now();
-        for b in 1..self.frames.len() {
+        let unplaced: Vec<bool> = self.frames.iter().map(|f| f.unplaced).collect();
+        for b in (1..self.frames.len()).filter(|b| !unplaced[*b]) {
             let verified = report.pairs_verified;
             let candidates = self.candidates(&self.camera_of(&self.frames[b]), &self.frames[b].intrinsics, b);
             report.pairs_verified = 0;
-            self.link_guided(b, &candidates, &mut report);
+            self.link_guided(b, &candidates, report);
             report.pairs_verified += verified;
         }
         report.match_seconds = clock.elapsed().as_secs_f64();
-        self.totals.absorb(&report);
-        Ok(report)
+        self.totals.absorb(report);
     }
 
     /// Extracts features anew where a picture was not turned as the others are.
@@ -62,21 +81,31 @@ impl Refiner {
             let camera = self.camera_of(frame);
             let turns =
                 upright::turns_like(&reference.0, reference.1, &camera, &frame.intrinsics, self.ground_at(first));
-            let Some(grey) = frame.grey.as_ref().filter(|_| turns != frame.turns) else { continue };
-            let (image, size) = (grey.picture(), (frame.intrinsics.width, frame.intrinsics.height));
-            let features = self.extract(&image, size, turns, report)?;
-            let (focal, radial, max) = (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
-            let frame = &mut self.frames[i];
-            let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
-            frame.describe(features, turns, max, (focal, &radial));
-            // Colours are no longer there; that of the nearest key point is.
-            let nearest = |p: &[f32; 2]| {
-                let apart = |q: &[f32; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
-                let place = (0..before.len()).min_by(|a, b| apart(&before[*a]).total_cmp(&apart(&before[*b])));
-                place.map_or([128; 3], |k| colors[k])
-            };
-            frame.colors = frame.seen.iter().map(nearest).collect();
+            if turns != frame.turns {
+                self.extract_turned(i, turns, report)?;
+            }
         }
+        Ok(())
+    }
+
+    /// Extracts the features of a frame anew, its picture turned, where it was kept.
+    pub(super) fn extract_turned(&mut self, i: usize, turns: u8, report: &mut AddReport) -> Result<(), RefineError> {
+        let size = (self.frames[i].intrinsics.width, self.frames[i].intrinsics.height);
+        let Some(grey) = self.frames[i].grey.take() else { return Ok(()) };
+        let features = self.extract(&grey.picture(), size, turns, Some(&grey), report);
+        self.frames[i].grey = Some(grey);
+        let features = features?;
+        let (focal, radial, max) = (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
+        let frame = &mut self.frames[i];
+        let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
+        frame.describe(features, turns, max, (focal, &radial));
+        // Colours are no longer there; that of the nearest key point is.
+        let nearest = |p: &[f32; 2]| {
+            let apart = |q: &[f32; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
+            let place = (0..before.len()).min_by(|a, b| apart(&before[*a]).total_cmp(&apart(&before[*b])));
+            place.map_or([128; 3], |k| colors[k])
+        };
+        frame.colors = frame.seen.iter().map(nearest).collect();
         Ok(())
     }
 }

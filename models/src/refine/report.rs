@@ -82,6 +82,8 @@ pub struct RefineReport {
     pub converged: bool,
     /// Height of the ground, world metres.
     pub ground_m: Option<f64>,
+    /// How surveyed points and pictures agree.
+    pub control: Vec<ControlResidual>,
     /// What all frames share.
     pub shared: SharedEstimate,
     /// Wall time in the feature network.
@@ -147,4 +149,17 @@ pub struct RefinedPoint {
     pub error_px: f32,
     /// Largest angle between two of its rays, degrees.
     pub angle_deg: f32,
+}
+
+/// How a surveyed point and the pictures agree after a solve.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ControlResidual {
+    /// What the survey calls it.
+    pub name: String,
+    /// Pictures that agree on where it is; below two it has no part.
+    pub views: usize,
+    /// Where the pictures see it less where it was surveyed: east, north, up, metres; zero without two views.
+    pub off_m: [f64; 3],
+    /// Root mean square distance of its marks, pixels.
+    pub error_px: f64,
 }

@@ -235,6 +235,12 @@ impl PointEquation {
             by_lens += jx.transpose() * jl * weight;
             rows.push(Row { camera: o.camera, weight, r, jc, jl, cross: jc.transpose() * jx * weight });
         }
+        if let Some((off, per_m, (_, weight))) = problem.anchor_of(point) {
+            for k in 0..3 {
+                v[(k, k)] += per_m[k] * per_m[k] * weight;
+                gradient[k] += per_m[k] * off[k] * weight;
+            }
+        }
         for k in 0..3 {
             v[(k, k)] += lambda * v[(k, k)] + 1e-12;
         }

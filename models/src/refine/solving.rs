@@ -45,6 +45,9 @@ impl Refiner {
             self.take(&problem);
             report.replaced_frames = self.replace_strays(&problem, &tracks, &chosen);
         }
+        if !self.anchored {
+            self.move_to_control();
+        }
         let mut problem = self.problem(&tracks, &chosen, FINE_PX);
         let limits = Limits { loss: Loss::Cauchy(2.0), max_steps: 12, deadline };
         report.steps += adjust(&mut problem, limits).steps;
@@ -61,6 +64,7 @@ impl Refiner {
         self.take(&problem);
         report.shared = self.shared_estimate(&problem, &sigma);
         self.harvest(&tracks, &mut report);
+        report.control = self.control_residuals();
         for frame in &mut self.frames {
             frame.adjusted = frame.pairs > 0;
             if frame.adjusted {
@@ -93,7 +97,7 @@ impl Refiner {
     }
 
     /// The adjustment's problem at the present poses: chosen tracks that triangulate to below `max_px`.
-    fn problem(&self, tracks: &Tracks, chosen: &[u32], max_px: f64) -> Problem {
+    pub(super) fn problem(&self, tracks: &Tracks, chosen: &[u32], max_px: f64) -> Problem {
         let s = &self.settings;
         let weight = |sigma: f64| if sigma > 0.0 { 1.0 / sigma } else { 0.0 };
         let priors = self.frames.iter().zip(self.velocities()).map(|(f, velocity)| {
@@ -109,6 +113,7 @@ impl Refiner {
             points: Vec::with_capacity(chosen.len()),
             starts: vec![0],
             observations: Vec::new(),
+            anchors: Vec::new(),
             shared: self.shared,
             shared_weight: {
                 let radial = weight(s.radial_sigma);
@@ -120,7 +125,7 @@ impl Refiner {
         let cameras = self.cameras();
         let mut views = Vec::new();
         for t in chosen {
-            let mut seen = tracks.get(*t as usize).to_vec();
+            let mut seen = self.sightings(tracks, *t);
             if let Some(point) = self.robust_point(&cameras, &mut seen, max_px, &mut views) {
                 problem.points.push(point.world);
                 problem.observations.extend(seen.iter().map(|s| Observation {
@@ -130,15 +135,16 @@ impl Refiner {
                 problem.starts.push(problem.observations.len() as u32);
             }
         }
+        self.anchor(&mut problem);
         problem
     }
 
-    fn cameras(&self) -> Vec<Pinhole> {
+    pub(super) fn cameras(&self) -> Vec<Pinhole> {
         self.frames.iter().map(|f| self.camera_of(f)).collect()
     }
 
     /// Triangulates a track; while it does not fit, the sighting furthest off is left out, down to two.
-    fn robust_point(
+    pub(super) fn robust_point(
         &self,
         cameras: &[Pinhole],
         seen: &mut Vec<Sighting>,
@@ -170,7 +176,7 @@ impl Refiner {
     }
 
     /// Writes adjusted poses and shared parameters back.
-    fn take(&mut self, problem: &Problem) {
+    pub(super) fn take(&mut self, problem: &Problem) {
         for (frame, pose) in self.frames.iter_mut().zip(&problem.poses) {
             if pose.center.is_finite() && pose.rotation.is_finite() {
                 frame.pose = *pose;
@@ -186,7 +192,7 @@ impl Refiner {
     fn replace_strays(&mut self, problem: &Problem, tracks: &Tracks, chosen: &[u32]) -> usize {
         let mut wanted = vec![0usize; self.frames.len()];
         let mut held = vec![0usize; self.frames.len()];
-        chosen.iter().flat_map(|t| tracks.get(*t as usize)).for_each(|s| wanted[s.frame as usize] += 1);
+        chosen.iter().flat_map(|t| self.sightings(tracks, *t)).for_each(|s| wanted[s.frame as usize] += 1);
         problem.observations.iter().for_each(|o| held[o.camera as usize] += 1);
         let strays: Vec<usize> =
             (0..self.frames.len()).filter(|i| wanted[*i] >= TIED && held[*i] * 2 < wanted[*i]).collect();
@@ -198,7 +204,7 @@ impl Refiner {
         let mut views = Vec::new();
         for t in chosen {
             let (own, mut others): (Vec<Sighting>, Vec<Sighting>) =
-                tracks.get(*t as usize).iter().partition(|s| strays.contains(&(s.frame as usize)));
+                self.sightings(tracks, *t).iter().partition(|s| strays.contains(&(s.frame as usize)));
             if own.is_empty() {
                 continue;
             }
@@ -258,7 +264,7 @@ impl Refiner {
         self.points.clear();
         let mut views = Vec::new();
         for t in 0..tracks.len() {
-            let mut seen = tracks.get(t).to_vec();
+            let mut seen = self.sightings(tracks, t as u32);
             let all = seen.len();
             let Some(p) = self.robust_point(&cameras, &mut seen, self.settings.outlier_px, &mut views) else {
                 report.outlier_observations += all;

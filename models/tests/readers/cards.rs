@@ -51,7 +51,7 @@ fn pix4d() -> Tags {
 fn card(path: &Path) -> Verdict {
     let folder = path.parent().expect("a folder").to_owned();
     line(Card::open(&[folder], &CardOptions::default()), |card| {
-        card.origin.is_valid()
+        card.origin.is_none_or(|origin| origin.is_valid())
             && card.pictures.iter().all(|p| {
                 let (pose, sigma) = (p.prior.pose, p.prior.sigma);
                 pose.center.is_finite()

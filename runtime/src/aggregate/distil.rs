@@ -284,6 +284,7 @@ impl Lesson {
             time_ns: 0,
             image: self.target.clone(),
             view: self.view,
+            mask: None,
             sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
         }
     }

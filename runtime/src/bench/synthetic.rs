@@ -74,7 +74,7 @@ pub fn picture(view: &View, seed: u64) -> PosedImage {
         Rgb(colours[(u + 8 * v) as usize % 64].map(|c| (c + stripe) as u8))
     });
     let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
-    PosedImage { name: format!("synthetic {seed}"), time_ns: 0, image, view: *view, sigma }
+    PosedImage { name: format!("synthetic {seed}"), time_ns: 0, image, view: *view, mask: None, sigma }
 }
 
 #[cfg(test)]

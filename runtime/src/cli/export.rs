@@ -182,6 +182,7 @@ fn views(header: &ModelHeader) -> Reconstruction {
         path: name.clone(),
         lens: LensDescription::new(&view.intrinsics, Distortion::default()),
         pose: view.pose,
+        mask: None,
     });
     Reconstruction { shots: shots.collect(), origin: header.origin }
 }

@@ -54,6 +54,9 @@ pub struct Args {
     /// Positions of a card's pictures: geo.txt of OpenDroneMap, Mission Planner's list, geotags.csv of `dgtr fly`.
     #[arg(long, value_name = "FILE")]
     geotags: Option<PathBuf>,
+    /// Surveyed points marked in a card's pictures: gcp_list.txt of OpenDroneMap (found by that name without this).
+    #[arg(long, value_name = "FILE")]
+    gcp: Option<PathBuf>,
     /// The flight's log beside a card: MAVLink (.tlog) or ArduPilot (.BIN), matched to the pictures by order and time.
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
@@ -191,6 +194,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         folders: args.folders,
         card: CardOptions {
             geotags: args.geotags,
+            control: args.gcp,
             exposures: args.log.as_deref().map(log::exposures).transpose()?.unwrap_or_default(),
         },
         out: args.out,

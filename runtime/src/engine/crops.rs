@@ -1,7 +1,8 @@
 //! Crops of key frames that are larger than what they are trained at: what the training picture cannot show.
 
 use image::{RgbImage, imageops};
-use models::picture::crops::{crops, finest};
+use models::picture::crops::{Crop, crops, finest};
+use models::picture::mask::Mask;
 use vulkan::trainer::CropPlace;
 
 use super::{PictureSource, Reconstruction};
@@ -34,9 +35,9 @@ impl Reconstruction {
         let mut size = (0, 0);
         for i in 0..self.views.len() {
             let name = self.views[i].0.clone();
-            if let Some(whole) = source.whole(&name, scale)? {
+            if let Some((whole, mask)) = source.whole(&name, scale)? {
                 size = whole.dimensions();
-                self.add_crops(i, &whole, share)?;
+                self.add_crops(i, &whole, mask.as_ref(), share)?;
             }
             progress.set(i as u64 + 1, || name);
             if !go_on() {
@@ -73,12 +74,24 @@ impl Reconstruction {
     }
 
     /// Cuts the `share` crops with the most detail out of the picture of view `index`.
-    fn add_crops(&mut self, index: usize, whole: &RgbImage, share: usize) -> Result<(), JobError> {
+    fn add_crops(&mut self, index: usize, whole: &RgbImage, mask: Option<&Mask>, share: usize) -> Result<(), JobError> {
         let lens = self.views[index].1.intrinsics;
         let factor = (f64::from(whole.width()) / f64::from(lens.width)).ceil() as u32;
-        for c in finest(&crops(whole, (lens.width, lens.height), factor), share) {
+        let mut windows = crops(whole, (lens.width, lens.height), factor);
+        let masks = |c: &Crop| mask.map(|mask| mask.window(c.x, c.y, c.width, c.height));
+        // What is left out has no detail worth a crop.
+        for c in &mut windows {
+            let pixels = (c.width * c.height) as f32;
+            c.detail *= masks(c).map_or(1.0, |mask| mask.count() as f32 / pixels);
+        }
+        for c in finest(&windows, share) {
             let image = imageops::crop_imm(whole, c.x, c.y, c.width, c.height).to_image();
-            self.trainer.add_crop(index, &image, CropPlace { x: c.x, y: c.y, whole: whole.dimensions() })?;
+            self.trainer.add_crop(
+                index,
+                &image,
+                masks(&c).as_ref(),
+                CropPlace { x: c.x, y: c.y, whole: whole.dimensions() },
+            )?;
         }
         Ok(())
     }

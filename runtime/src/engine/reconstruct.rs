@@ -100,6 +100,7 @@ impl Reconstruct for Reconstruction {
         let lens = scaled(&picture.view.intrinsics, self.settings.scale)?;
         if (lens.width, lens.height) != picture.image.dimensions() {
             picture.image = resize(&picture.image, lens.width, lens.height, FilterType::Lanczos3);
+            picture.mask = picture.mask.map(|mask| mask.resized(lens.width, lens.height));
         }
         picture.view.intrinsics = lens;
         let prior = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
@@ -324,6 +325,7 @@ mod tests {
             time_ns: 0,
             image: image::RgbImage::from_fn(32, 24, |x, y| image::Rgb([(8 * x) as u8, (10 * y) as u8, 90])),
             view: View { intrinsics, pose },
+            mask: None,
             sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
         }
     }

@@ -7,6 +7,7 @@ use config::mission::KeyframeSettings;
 use image::RgbImage;
 use models::camera::PosedImage;
 use models::dataset::{Dataset, PoseSource};
+use models::picture::mask::Mask;
 
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::error::JobError;
@@ -28,11 +29,11 @@ pub trait PictureSource {
     /// Width and height of an earlier picture as the camera took it, where it is still there.
     fn size_of(&self, name: &str) -> Option<(u32, u32)>;
 
-    /// An earlier picture decoded again, at `scale` of the camera's size; `None` where it is not there any more.
+    /// An earlier picture decoded again, at `scale` of the camera's size, and its mask; `None` where it is not there any more.
     ///
     /// # Errors
     /// It is there and cannot be read.
-    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<RgbImage>, JobError>;
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<(RgbImage, Option<Mask>)>, JobError>;
 }
 
 /// The pictures of a data set, each decoded once.
@@ -113,8 +114,9 @@ impl PictureSource for Folder<'_> {
         Some((lens.width, lens.height))
     }
 
-    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<RgbImage>, JobError> {
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<(RgbImage, Option<Mask>)>, JobError> {
         let Some(i) = self.index_of(name) else { return Ok(None) };
-        Ok(Some(self.set.load_posed(i, scale, self.poses)?.image))
+        let PosedImage { image, mask, .. } = self.set.load_posed(i, scale, self.poses)?;
+        Ok(Some((image, mask)))
     }
 }

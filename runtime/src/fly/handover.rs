@@ -12,6 +12,7 @@ use hal::mavlink::dialect::MavSeverity;
 use hal::mavlink_camera::Activity;
 use image::RgbImage;
 use models::camera::{Pose, PosedImage};
+use models::picture::mask::Mask;
 
 use crate::engine::PictureSource;
 use crate::error::JobError;
@@ -204,13 +205,14 @@ impl PictureSource for Handover {
         self.store.as_ref().map(|(store, _)| store.camera_size())
     }
 
-    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<RgbImage>, JobError> {
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<(RgbImage, Option<Mask>)>, JobError> {
         let Some((store, _)) = &self.store else { return Ok(None) };
         // What is damaged is set aside at the next start.
-        Ok(store.whole(name, scale).unwrap_or_else(|e| {
+        let whole = store.whole(name, scale).unwrap_or_else(|e| {
             tracing::warn!("{e}; no crops of it");
             None
-        }))
+        });
+        Ok(whole.map(|image| (image, None)))
     }
 
     fn is_open(&self) -> bool {

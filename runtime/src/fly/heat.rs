@@ -48,7 +48,9 @@ fn land(temperature: &str) -> (u64, bool) {
             View { intrinsics: intrinsics(&lens), pose: Pose { rotation: DQuat::IDENTITY, center: DVec3::ZERO } };
         let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
         let image = image::RgbImage::new(lens.width, lens.height);
-        ledger.add(PosedImage { name: format!("{i}.png"), time_ns: 0, image, view, sigma }, false).expect("taken");
+        ledger
+            .add(PosedImage { name: format!("{i}.png"), time_ns: 0, image, view, mask: None, sigma }, false)
+            .expect("taken");
     }
     let offerer = Offerer::start(&UploadSettings::default(), Source::unsigned("rehearsal", "one")).expect("a thread");
     let limits = FailsafeSettings { disk_low_mib: 0, ..FailsafeSettings::default() };

@@ -361,6 +361,7 @@ where
             time_ns: frame.time_ns,
             image: picture::resized(image, (lens.width, lens.height)),
             view: View { intrinsics: lens, pose: Pose { rotation: frame.pose.rotation, center: frame.pose.position } },
+            mask: None,
             sigma: PoseSigma { position_m: frame.pose.position_sigma_m, rotation_rad: frame.pose.rotation_sigma_rad },
         };
         KeyFrame { posed, file: frame.picture.clone() }

@@ -48,6 +48,7 @@ fn frame(i: usize) -> KeyFrame {
             intrinsics: intrinsics(&LENS),
             pose: Pose { rotation: DQuat::IDENTITY, center: DVec3::new(5.0 * i as f64, 0.0, 40.0) },
         },
+        mask: None,
         sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [0.1; 3] },
     };
     KeyFrame { file: Picture::Rgb(posed.image.clone()), posed }

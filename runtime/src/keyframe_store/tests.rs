@@ -36,6 +36,7 @@ fn frame(name: &str, x: f64) -> KeyFrame {
             intrinsics: LENS,
             pose: Pose { rotation: DQuat::from_rotation_x(3.0), center: DVec3::new(x, 2.0, 40.0) },
         },
+        mask: None,
         sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [f32::INFINITY; 3] },
     };
     KeyFrame { file: Picture::Rgb(posed.image.clone()), posed }

@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::ops::ControlFlow;
 use std::path::Path;
 
+use config::geodesy::Geodetic;
 use config::refine::RefineSettings;
 use models::camera::View;
 use models::card::name_list;
@@ -14,6 +15,8 @@ use models::refine::Refiner;
 
 use crate::console::Progress;
 use crate::error::JobError;
+
+mod control;
 
 /// Poses of a card, in the folder of the model.
 const FILE: &str = "transforms.json";
@@ -27,6 +30,10 @@ const UNKNOWN_RADIAL: f64 = 0.05;
 const DETAIL: u32 = 2;
 /// What `[refine]` allows of either.
 const MOST_DETAIL: u32 = 8192;
+
+/// Looks at pictures without positions after the first: each finds some from the places of the others (brighton_beach's 18
+/// without GPS: 15, 17, 17 and 18 tied).
+const FLOATING_LOOKS: usize = 3;
 
 /// What settling a card is to be remembered for, in run.json.
 pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
@@ -65,12 +72,19 @@ pub(super) fn settle(
         return Ok(Some(remarks));
     }
     let settled = match refine {
+        None if notes.floats => {
+            let what = "no picture says where it was taken, which only the pictures themselves can tell; leave --no-refine out";
+            return Err(JobError::Request(format!("{}: {what}", set.root.display())));
+        }
         None => {
             let stated = |f: &DatasetFrame| Settled { view: f.view, distortion: f.distortion };
             set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
         }
         Some(settings) => match refined(set, &notes, settings, go_on, &mut remarks)? {
-            Some(settled) => settled,
+            Some((settled, fixed)) => {
+                set.origin = set.origin.or(fixed);
+                settled
+            }
             None => return Ok(None),
         },
     };
@@ -114,6 +128,7 @@ struct Found<'a> {
 
 impl<'a> Found<'a> {
     fn in_pictures(set: &'a Dataset, refiner: &Refiner) -> Self {
+        let floats = set.card.as_ref().is_some_and(|c| c.floats);
         let mut found =
             Self { settled: HashMap::with_capacity(set.frames.len()), contradicted: Vec::new(), untied: Vec::new() };
         for frame in &set.frames {
@@ -121,6 +136,11 @@ impl<'a> Found<'a> {
             let (Some(pose), Some(intrinsics)) = (refiner.pose(name), refiner.intrinsics(name)) else { continue };
             if !refiner.is_tied(name) {
                 found.untied.push(name);
+                if floats {
+                    continue;
+                }
+            } else if floats {
+                // Its prior says nothing.
             } else if let Some(prior) = frame.prior {
                 let away = prior.pose.rotation.angle_between(pose.rotation).to_degrees();
                 let sigma = f64::from(prior.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b))).to_degrees();
@@ -136,19 +156,37 @@ impl<'a> Found<'a> {
     }
 }
 
+/// A scene without a scale is given one: half of the pictures lie less than 1 from the one taken before.
+fn scale_to_baselines(set: &Dataset, settled: &mut HashMap<String, Settled>) {
+    let centers: Vec<_> = set.frames.iter().filter_map(|f| Some(settled.get(&f.name)?.view.pose.center)).collect();
+    let mut baselines: Vec<f64> = centers.windows(2).map(|w| w[0].distance(w[1])).filter(|d| *d > 0.0).collect();
+    baselines.sort_by(f64::total_cmp);
+    if let Some(&usual) = baselines.get(baselines.len() / 2) {
+        settled.values_mut().for_each(|s| s.view.pose.center /= usual);
+    }
+}
+
+/// What the pictures settle on, and where on Earth surveyed points put a scene that did not know it.
+type Agreed = (HashMap<String, Settled>, Option<Geodetic>);
+
+/// `None` when asked to stop.
 fn refined(
     set: &Dataset,
     notes: &CardNotes,
     settings: &RefineSettings,
     go_on: &dyn Fn() -> bool,
     remarks: &mut Remarks,
-) -> Result<Option<HashMap<String, Settled>>, JobError> {
+) -> Result<Option<Agreed>, JobError> {
     let all: Vec<usize> = (0..set.frames.len()).collect();
     let mut settings = settings.clone();
     settings.max_keyframes = settings.max_keyframes.max(all.len());
     settings.focal_sigma = settings.focal_sigma.max(notes.focal_sigma);
     if notes.distortion_unknown {
         settings.radial_sigma = settings.radial_sigma.max(UNKNOWN_RADIAL);
+    }
+    if notes.floats {
+        // Without telemetry there is nothing that could be off for all alike.
+        (settings.mount_sigma_deg, settings.delay_sigma_s) = (0.0, 0.0);
     }
     settings.feature_side = (settings.feature_side * DETAIL).min(MOST_DETAIL);
     settings.max_features = (settings.max_features * DETAIL as usize).min(MOST_DETAIL as usize);
@@ -176,21 +214,32 @@ fn refined(
         return Ok(None);
     }
     remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
-    let first = (refiner.solve()?, Found::in_pictures(set, &refiner));
-    refiner.relink()?;
-    let second = refiner.solve()?;
-    // The second look knows more than the first; where it ties fewer pictures together all the same, the first is believed.
-    let (solved, found) = match second.frames_tied < first.0.frames_tied {
-        true => first,
-        false => (second, Found::in_pictures(set, &refiner)),
-    };
+    refiner.set_control(control::points(set, &notes.control, scale));
+    if notes.floats {
+        let placed = refiner.bootstrap()?;
+        tracing::info!(
+            "{} of {} pictures placed, from {}",
+            placed.placed,
+            all.len(),
+            placed.start.map_or_else(String::new, |s| s.join(" and "))
+        );
+    }
+    let (mut solved, mut found) = (refiner.solve()?, Found::in_pictures(set, &refiner));
+    for _ in 0..if notes.floats { FLOATING_LOOKS } else { 1 } {
+        refiner.relink()?;
+        let again = refiner.solve()?;
+        // A later look knows more than those before; where it ties fewer pictures together all the same, they are believed.
+        if again.frames_tied >= solved.frames_tied {
+            (solved, found) = (again, Found::in_pictures(set, &refiner));
+        }
+    }
     progress.finish(&format!(
         "{} of {} pictures tied together, reprojection {:.2} px",
         solved.frames_tied,
         all.len(),
         solved.reprojection_rms_px
     ));
-    let Found { settled, contradicted, untied } = found;
+    let Found { mut settled, contradicted, untied } = found;
     if !contradicted.is_empty() {
         let mut angles: Vec<f64> = contradicted.iter().map(|c| c.1).collect();
         angles.sort_by(f64::total_cmp);
@@ -203,8 +252,21 @@ fn refined(
         remarks.push(("pictures_turned", serde_json::json!(names)));
     }
     if !untied.is_empty() {
-        tracing::warn!("{}: see too little of what others see; their stated poses are kept", name_list(&untied));
+        let what = if notes.floats { "cannot be placed; left out" } else { "their stated poses are kept" };
+        tracing::warn!("{}: see too little of what others see; {what}", name_list(&untied));
+    }
+    control::announce(&solved.control);
+    let fixed = refiner.is_fixed().then(|| notes.control[0].position);
+    if notes.floats {
+        remarks.push(("pictures_not_placed", serde_json::json!(untied)));
+        if fixed.is_none() {
+            scale_to_baselines(set, &mut settled);
+        }
+        if settled.len() < 2 {
+            let what = "its pictures cannot be placed by what they show; take them with more overlap, or give --geotags or --log";
+            return Err(JobError::Request(format!("{}: {what}", set.root.display())));
+        }
     }
     remarks.push(("refine", serde_json::to_value(&solved)?));
-    Ok(Some(settled))
+    Ok(Some((settled, fixed)))
 }

@@ -97,6 +97,7 @@ fn key_frame(i: u32) -> KeyFrame {
         time_ns: u64::from(i),
         image: image::RgbImage::from_pixel(LENS.width, LENS.height, image::Rgb([i as u8; 3])),
         view: View { intrinsics: LENS, pose },
+        mask: None,
         sigma: PoseSigma { position_m: [1.0, 1.0, f32::INFINITY], rotation_rad: [0.1; 3] },
     };
     KeyFrame { file: Picture::Rgb(posed.image.clone()), posed }

@@ -62,7 +62,8 @@ fn apart(a: &Answer, b: &Answer) -> f32 {
 
 /// Steps of the twin: their losses.
 fn twin_losses(t: &mut TwinTrainer<f32>, v: &View, photo: &[[f32; 3]], steps: usize) -> Vec<f32> {
-    let target = Target { width: v.intrinsics.width as usize, rgb: photo, depth: None, background: [0.0; 3] };
+    let target =
+        Target { width: v.intrinsics.width as usize, rgb: photo, depth: None, kept: None, background: [0.0; 3] };
     (0..steps).map(|_| t.step(&Camera::of(v), &target, 0.0).loss.total).collect()
 }
 

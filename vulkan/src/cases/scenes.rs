@@ -73,7 +73,8 @@ pub fn answer_in<R: Real>(
     let degree = |_: usize| cloud.sh_degree;
     let rendered = forward(&gaussians, &camera, degree, all, &limits);
     let rgb: Vec<_> = photo.iter().map(|p| p.map(|v| R::of(v.into()))).collect();
-    let target = Target { width: view.intrinsics.width as usize, rgb: &rgb, depth: None, background: [R::ZERO; 3] };
+    let target =
+        Target { width: view.intrinsics.width as usize, rgb: &rgb, depth: None, kept: None, background: [R::ZERO; 3] };
     let exposure = Exposure::default();
     let gradient = backward(&gaussians, &camera, degree, all, &limits, &rendered, &target, &exposure, settings);
     Answer {

@@ -222,7 +222,7 @@ pub fn ssim_of_constant_pictures_has_no_negative_variance() -> Outcome {
     let counted = Tally::default();
     for (x, y) in [(0.0, 0.0), (1.0, 1.0), (0.3, 0.7), (0.999, 0.9991), (1000.0, 1.0)] {
         let truth = vec![[y; 3]; 25 * 15];
-        let target = Target { width: 25, rgb: &truth, depth: None, background: [0.0; 3] };
+        let target = Target { width: 25, rgb: &truth, depth: None, kept: None, background: [0.0; 3] };
         let l = loss(&constant_picture(x, 25 * 15), &target, &Exposure::default(), &LOSS());
         promise!(l.total.is_finite() && l.ssim <= 1.0 + 1e-5 && l.ssim >= -1.0, "{x} {y}: {}", l.ssim);
         promise!(l.gradient.iter().all(|p| p.rgb.iter().all(|g| g.is_finite())));
@@ -259,7 +259,7 @@ pub fn pearson_of_constant_depth_or_an_empty_mask_has_value_and_gradient_zero() 
 pub fn exposure_against_a_black_photograph_stays_finite() -> Outcome {
     let counted = Tally::default();
     let truth = vec![[0.0f32; 3]; 9 * 9];
-    let target = Target { width: 9, rgb: &truth, depth: None, background: [0.0; 3] };
+    let target = Target { width: 9, rgb: &truth, depth: None, kept: None, background: [0.0; 3] };
     for gain in [-80.0f32, 0.0, 5.0] {
         let exposure = Exposure { log_gain: [gain; 3], offset: [0.0; 3] };
         let l = loss(&constant_picture(0.0, 81), &target, &exposure, &LOSS());

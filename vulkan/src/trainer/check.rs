@@ -97,7 +97,7 @@ pub fn check_training(gpu: &Gpu, shape: KernelShape, steps: u32) -> Result<Train
     let (camera, rgb) = (Camera::<f64>::of(&v), photo.iter().map(|p| p.map(f64::from)).collect::<Vec<_>>());
     let mut check = TrainingCheck { steps, loss: f32::NAN, twin_loss: f64::NAN };
     for step in 0..steps {
-        let target = Target { width: 64, rgb: &rgb, depth: None, background: [0.0; 3] };
+        let target = Target { width: 64, rgb: &rgb, depth: None, kept: None, background: [0.0; 3] };
         check.loss = trainer.step()?.loss;
         check.twin_loss = twin.step(&camera, &target, settings.progress(step, 0.0)).loss.total;
     }

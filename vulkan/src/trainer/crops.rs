@@ -6,6 +6,7 @@ use super::slots::Picture;
 use super::{TrainError, Trainer};
 use image::RgbImage;
 use models::camera::{Intrinsics, View};
+use models::picture::mask::Mask;
 
 /// Where a crop lies in the picture it was cut out of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,12 +40,18 @@ impl TrainingCrop {
 }
 
 impl Trainer {
-    /// Takes in a crop of the picture of view `view`.
+    /// Takes in a crop of the picture of view `view`, of which the pixels count that `mask` keeps, where there is one.
     ///
     /// # Errors
     /// [`TrainError::TooManyCrops`]; [`TrainError::BadView`] when there is no such view, or the crop has no pixels, more than planned,
     /// or lies outside of its picture; [`TrainError::ViewFile`].
-    pub fn add_crop(&mut self, view: usize, image: &RgbImage, place: CropPlace) -> Result<(), TrainError> {
+    pub fn add_crop(
+        &mut self,
+        view: usize,
+        image: &RgbImage,
+        mask: Option<&Mask>,
+        place: CropPlace,
+    ) -> Result<(), TrainError> {
         let index = self.crops.len();
         if index >= self.plan.crops {
             return Err(TrainError::TooManyCrops { planned: self.plan.crops });
@@ -59,7 +66,7 @@ impl Trainer {
             return Err(TrainError::BadView { name: format!("view {view}"), why });
         }
         self.crops.push(TrainingCrop { view, place, width, height, last_loss: f32::INFINITY });
-        let slot = self.write_pixels(Picture::Crop(index), image);
+        let slot = self.write_pixels(Picture::Crop(index), image, mask);
         self.crop_sampler.forget();
         // A crop without its pixels is none.
         self.keep(slot, Picture::Crop(index)).inspect_err(|_| _ = self.crops.pop())

@@ -4,6 +4,11 @@ use super::slots::Picture;
 use super::{TrainError, Trainer};
 use image::RgbImage;
 use models::camera::{DepthPrior, Pose, PosedImage, View};
+use models::picture::mask::Mask;
+
+/// In place of a confidence: the pixel is left out of every comparison (`LEFT_OUT` of the shaders' frame.glsl). Confidences are
+/// 0 or above it.
+pub(crate) const LEFT_OUT: u8 = 1;
 
 /// What the trainer keeps of a view.
 pub(crate) struct TrainingView {
@@ -40,7 +45,8 @@ impl Trainer {
         view.intrinsics = view.intrinsics.resized(width, height);
         let adjust = super::pose::Adjust::default();
         self.views.push(TrainingView { view, width, height, depth_at: 0, last_loss: f32::INFINITY, adjust });
-        self.write_pixels(Picture::View(index), image);
+        let mask = picture.mask.as_ref().map(|mask| mask.resized(width, height));
+        self.write_pixels(Picture::View(index), image, mask.as_ref());
         self.sampler.forget();
         if let Err(e) = self.set_prior(index, prior) {
             // A view without its pixels is none.
@@ -51,11 +57,12 @@ impl Trainer {
     }
 
     /// Puts the pixels of a new picture into a slot; returns which.
-    pub(super) fn write_pixels(&mut self, picture: Picture, image: &RgbImage) -> usize {
+    pub(super) fn write_pixels(&mut self, picture: Picture, image: &RgbImage, mask: Option<&Mask>) -> usize {
         let slot = self.slot_for_new(picture);
         let section = self.pixels_in(slot, picture);
-        for (word, p) in self.arena.slice_mut::<u32>(section).iter_mut().zip(image.pixels()) {
-            *word = u32::from_le_bytes([p[0], p[1], p[2], 0]);
+        for (word, (x, y, p)) in self.arena.slice_mut::<u32>(section).iter_mut().zip(image.enumerate_pixels()) {
+            let left_out = mask.is_some_and(|mask| !mask.keeps(x, y));
+            *word = u32::from_le_bytes([p[0], p[1], p[2], if left_out { LEFT_OUT } else { 0 }]);
         }
         slot
     }
@@ -77,7 +84,7 @@ impl Trainer {
         let (colours, depths) = self.arena.slice_mut::<u32>(section).split_at_mut(pixels);
         let range = prior.and_then(depth_range);
         depths.fill(0);
-        for (i, colour) in colours.iter_mut().enumerate() {
+        for (i, colour) in colours.iter_mut().enumerate().filter(|(_, c)| **c >> 24 != u32::from(LEFT_OUT)) {
             let mut confidence = 0u8;
             if let (Some(prior), Some((low, high))) = (prior, range) {
                 let x = ((i as u32 % width) as f32 + 0.5) / width as f32 * prior.width as f32;
@@ -86,6 +93,7 @@ impl Trainer {
                     + (x as usize).min(prior.width as usize - 1);
                 if usable(prior, at) {
                     confidence = (prior.confidence[at].clamp(0.0, 1.0) * 255.0).round() as u8;
+                    confidence = if confidence == LEFT_OUT { 0 } else { confidence };
                     let quantum = ((prior.depth[at] - low) / (high - low) * 65535.0).round() as u32;
                     depths[i / 2] |= quantum << (16 * (i as u32 % 2));
                 }
@@ -129,6 +137,20 @@ impl Trainer {
             let [r, g, b, _] = pixels.next().unwrap_or_default();
             image::Rgb([r, g, b])
         }))
+    }
+
+    /// Which pixels of [`Self::view_image`] count; `None`: all.
+    ///
+    /// # Errors
+    /// As [`Self::view_image`].
+    pub fn view_mask(&mut self, index: usize) -> Result<Option<Mask>, TrainError> {
+        self.view_is_there(index)?;
+        let slot = self.resident(Picture::View(index))?;
+        let TrainingView { width, height, .. } = self.views[index];
+        let words = &self.arena.slice::<u32>(self.pixels_in(slot, Picture::View(index)))[..(width * height) as usize];
+        let left_out = |word: &u32| word >> 24 == u32::from(LEFT_OUT);
+        let mask = || Mask::from_fn(width, height, |x, y| !left_out(&words[(y * width + x) as usize]));
+        Ok(words.iter().any(left_out).then(mask))
     }
 
     pub(super) fn view_is_there(&self, index: usize) -> Result<(), TrainError> {

@@ -27,6 +27,8 @@ pub struct Target<'a, R> {
     pub rgb: &'a [[R; 3]],
     /// Estimated depth and its confidence, row-major, if there is any.
     pub depth: Option<(&'a [R], &'a [R])>,
+    /// Which pixels are compared, row-major; `None`: all. The others count as rendered right.
+    pub kept: Option<&'a [bool]>,
     /// Colour behind the scene in this step.
     pub background: [R; 3],
 }
@@ -58,14 +60,19 @@ pub fn loss<R: Real>(
     let n = picture.len();
     let gain = exposure.log_gain.map(|g| g.exp());
     let behind = |p: &Pixel<R>, c: usize| p.rgb[c] + p.transmittance * target.background[c];
+    let kept = |i: usize| target.kept.is_none_or(|kept| kept[i]);
     let mut out = Loss { pearson: R::ONE, gradient: vec![Pixel::default(); n], ..Loss::default() };
     let per_value = R::of(1.0 / (3.0 * n.max(1) as f64));
     for c in 0..3 {
         let x: Vec<R> = picture.iter().map(|p| gain[c] * behind(p, c) + exposure.offset[c]).collect();
-        let y: Vec<R> = target.rgb.iter().map(|t| t[c]).collect();
+        let y: Vec<R> = target.rgb.iter().enumerate().map(|(i, t)| if kept(i) { t[c] } else { x[i] }).collect();
         let (ssim, mut to_x) = ssim::ssim(&x, &y, target.width);
         out.ssim += ssim * R::of(1.0 / 3.0);
         for (i, g) in to_x.iter_mut().enumerate() {
+            if !kept(i) {
+                *g = R::ZERO;
+                continue;
+            }
             let difference = x[i] - y[i];
             out.l1 += difference.abs() * per_value;
             *g = -(*g) * R::of(f64::from(settings.ssim) / 3.0);

@@ -115,7 +115,9 @@ impl Initialiser {
                 (grid, count) = (Some(resolved), found);
             }
         }
-        let grid = grid.unwrap_or_else(|| own.into_owned());
+        let mut grid = grid.unwrap_or_else(|| own.into_owned());
+        // What other pictures know of the ground there does not make the picture's colours its own.
+        self.frames[i].leave_out(&mut grid);
         let consistency_ms = started.elapsed().as_secs_f64() * 1e3;
         let appearance = self.appearance.get(i).and_then(Option::as_ref);
         let samples = samples(

@@ -70,7 +70,7 @@ pub fn write(settings: &SimSettings, folder: &Path, stop: &AtomicBool) -> Result
         let lens = LensDescription::new(&intrinsics, config::lens::Distortion::default());
         let pose = models::camera::Pose { rotation: view.rotation, center: view.position };
         let path = path.strip_prefix(folder).unwrap_or(&path).to_string_lossy().into_owned();
-        shots.push(Shot { path, lens, pose });
+        shots.push(Shot { path, lens, pose, mask: None });
     }
     let written = shots.len();
     transforms::write(&folder.join("truth.json"), &Reconstruction { shots, origin: Some(flight.origin) })?;

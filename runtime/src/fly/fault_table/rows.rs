@@ -329,6 +329,7 @@ fn power_cut(out: &Path) {
             time_ns: 1,
             image: image::RgbImage::from_pixel(lens.width, lens.height, image::Rgb([90; 3])),
             view: View { intrinsics: lens, pose: Pose { rotation: glam::DQuat::IDENTITY, center } },
+            mask: None,
             sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [0.1; 3] },
         };
         let file = Picture::Rgb(posed.image.clone());
