@@ -79,11 +79,13 @@ impl Trainer {
         let d = divisor as f32;
         (lens.width, lens.height) = (width, height);
         (lens.fx, lens.fy, lens.cx, lens.cy) = (lens.fx / d, lens.fy / d, lens.cx / d, lens.cy / d);
+        // A pixel weighs the same whether its picture is looked at whole or in parts: Adam's moments know no difference.
+        let whole = (width * height) as f32;
         let ((x, width), (y, height)) = (Blocks::pixels(part.x, width), Blocks::pixels(part.y, height));
+        let share = (width * height) as f32 / whole;
         (lens.cx, lens.cy, lens.width, lens.height) = (lens.cx - x as f32, lens.cy - y as f32, width, height);
         let f = &mut *self.frame;
         f.look(&view);
-        let pixels = (width * height) as f32;
         let has_depth = depth_at != 0 && s.loss.depth > 0.0;
         let mut flags = flags_of(&s.skips);
         if s.loss.freeze_shape {
@@ -97,7 +99,7 @@ impl Trainer {
         let e = &resident.adjust.exposure;
         f.exposure_gain = std::array::from_fn(|i| e[i].exp() as f32);
         f.exposure_offset = std::array::from_fn(|i| e[i + 3] as f32);
-        (f.min_confidence, f.depth_weight) = (s.loss.depth_confidence, s.loss.depth);
+        (f.min_confidence, f.depth_weight) = (s.loss.depth_confidence, share * s.loss.depth);
         f.background = [0.0; 3];
         if s.regularise.background > 0.0 {
             let rng = self.sampler.rng();
@@ -117,7 +119,7 @@ impl Trainer {
         let bias = |beta: f32| (1.0 / (1.0 - f64::from(beta).powi(t as i32))) as f32;
         (f.first_bias, f.second_bias) = (decay * bias(s.adam.beta1), bias(s.adam.beta2));
         (f.step, f.seed) = (t, (s.seed ^ (s.seed >> 32)) as u32);
-        (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * pixels), s.loss.ssim / (3.0 * pixels));
+        (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * whole), s.loss.ssim / (3.0 * whole));
         (f.source_width, f.depth_offset) = (source_width, depth_at);
         (divisor, (y * source_width + x) * divisor)
     }

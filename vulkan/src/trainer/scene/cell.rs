@@ -92,6 +92,12 @@ impl Bounds {
         0.5 * (self.low + self.high).truncate()
     }
 
+    /// How far from a place on the ground the nearest of what the cell may show lies, metres.
+    pub fn ground_distance(&self, place: Vec2) -> f32 {
+        let (low, high) = (self.low.truncate() - self.reach, self.high.truncate() + self.reach);
+        place.distance(place.clamp(low, high.max(low)))
+    }
+
     /// The largest value of direction · p in the box.
     fn most(&self, direction: Vec3) -> f32 {
         (direction * self.low).max(direction * self.high).element_sum()
@@ -224,6 +230,16 @@ mod tests {
         let home = CellKey { level: 0, y: 2, x: -1 };
         assert!(grid.holds(home, [4.9, 15.1, 0.0], 5.0) && !grid.holds(home, [5.1, 25.0, 0.0], 1.0));
         assert!(!grid.holds(home, [f32::NAN, 25.0, 0.0], 1.0) && !grid.holds(home, [0.0, 25.0, 0.0], 5.1));
+    }
+
+    #[test]
+    fn a_large_gaussian_is_near_to_wherever_it_reaches() {
+        let mut bounds = Bounds::EMPTY;
+        bounds.add(&gaussian([10.0, 0.0, 0.0], 0.0));
+        bounds.add(&gaussian([14.0, 2.0, 0.0], 0.0));
+        let reach = reach_of(&gaussian([0.0; 3], 0.0));
+        assert_eq!([Vec2::new(12.0, 1.0), Vec2::new(14.0 + reach, 2.0)].map(|p| bounds.ground_distance(p)), [0.0; 2]);
+        assert!((bounds.ground_distance(Vec2::ZERO) - (10.0 - reach)).abs() < 1e-5);
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Which cells are on the device, for how long, and which parts of which pictures are trained meanwhile.
 //!
-//! A window begins with the block of a picture that was looked at least and takes the cells which the largest part around it sees;
-//! then, for as long as there is room, the cells that such parts of other pictures lack, and the nearest. What is trained are these
-//! parts, and of other pictures the rectangles that see no cell which is away meanwhile.
+//! A window begins with the block of a picture that was looked at least and takes the cells which a part around it sees, and the
+//! nearest for as long as there is room: the same ground, seen from many places. What is trained is that part, and of every
+//! picture the largest rectangle that sees no cell which is away meanwhile.
 
 use config::plan::Plan;
 use config::training::Strategy;
@@ -17,14 +17,14 @@ use crate::trainer::{TrainError, Trainer};
 
 /// Blocks of a picture.
 const BLOCKS: usize = SIDE as usize * SIDE as usize;
-/// A sixteenth of a picture is worth a step; what was planned always is.
+/// A sixteenth of a picture is worth a step; what the window began with always is.
 const LEAST_BLOCKS: u32 = 4;
-/// The chance of a block that nobody looked at yet.
-const UNSEEN: u64 = 1 << 20;
-/// Blocks from which a window looks for parts to plan besides the first.
-const MOST_TRIES: usize = 48;
-/// An eighth of a picture is worth cells that would not be there without it.
-const LEAST_PLANNED: u32 = 8;
+/// The chance of a block that was looked at least.
+const LEAST_SEEN: u64 = 1 << 20;
+/// How much the chance of a block shrinks with each look more than that, in powers of two.
+const SEEN_SHIFT: u32 = 3;
+/// The part that a window begins with sees such a share of what the device holds.
+const FIRST_SHARE: usize = 4;
 /// A block that shows nothing, or more than the device holds.
 const NEVER: u32 = u32::MAX;
 
@@ -35,8 +35,6 @@ struct Item {
     part: Blocks,
     /// Blocks in which something shows.
     weight: u32,
-    /// The window has its cells for this part's sake.
-    planned: bool,
 }
 
 /// The cells at work and what is trained with them.
@@ -49,6 +47,8 @@ pub(crate) struct Window {
     items: Vec<Item>,
     /// Nothing was trained yet: the part that the window began with comes first.
     first: bool,
+    /// The fewest looks at any block.
+    least_looks: u32,
     /// The step after which it ends.
     pub until: u32,
     /// Steps that looked at each block of each view.
@@ -64,8 +64,9 @@ impl Window {
             cells: Vec::with_capacity(plan.cells()),
             wanted: Vec::with_capacity(plan.cells()),
             held: 0,
-            items: Vec::with_capacity(views + crops + 1 + MOST_TRIES),
+            items: Vec::with_capacity(views + crops + 1),
             first: false,
+            least_looks: 0,
             until: 0,
             visits: vec![0; views * BLOCKS],
             sights: Vec::with_capacity(views + crops),
@@ -80,15 +81,14 @@ impl Window {
         self.visits.fill(0);
     }
 
-    /// How likely an item is chosen: by its blocks, each the less the oftener it was looked at; what was planned as if nobody had.
+    /// How likely an item is chosen: by its blocks, each the less the oftener it was looked at.
     fn chance(&self, item: &Item) -> u64 {
         let Picture::View(view) = item.picture else { return item.weight.into() };
-        if item.planned {
-            return UNSEEN * u64::from(item.weight);
-        }
         let visits = self.visits[view * BLOCKS..(view + 1) * BLOCKS].iter().enumerate();
         let part = visits.filter(|(block, visits)| item.part.mask() >> block & 1 == 1 && **visits != NEVER);
-        part.map(|(_, visits)| UNSEEN / (1 + u64::from(*visits))).sum()
+        let shift = |visits: u32| (SEEN_SHIFT * visits.saturating_sub(self.least_looks)).min(LEAST_SEEN.ilog2());
+        // A step on a large part is worth more than one on each of its blocks.
+        u64::from(item.part.count()) * part.map(|(_, visits)| LEAST_SEEN >> shift(*visits)).sum::<u64>()
     }
 
     /// The block of the first `views` views that was looked at least, one of several by chance; `None` when none can be.
@@ -149,7 +149,7 @@ impl Trainer {
         for item in of_kind() {
             chosen = *item;
             let chance = window.chance(item);
-            if drawn < chance {
+            if drawn < chance || window.first {
                 break;
             }
             drawn -= chance;
@@ -200,9 +200,9 @@ impl Trainer {
                 cells.iter().filter(shows).map(|c| c.count).sum::<usize>()
             };
             let mut needed = 0;
-            // Half of the room is left to parts that others lack, where half shows a part worth the name.
-            let fits = [(capacity / 2, LEAST_PLANNED), (capacity, 1)].into_iter().find_map(|(room, least)| {
-                parts_around(x, y).filter(|part| part.count() >= least).find(|part| {
+            // Most of the room is left to the ground around, which other pictures see from elsewhere.
+            let fits = [capacity / FIRST_SHARE, capacity].into_iter().find_map(|room| {
+                parts_around(x, y).find(|part| {
                     needed = seen(*part);
                     needed <= room
                 })
@@ -216,16 +216,11 @@ impl Trainer {
         };
         window.begin(cells.len());
         window.plan_part(cells, (view, part));
-        for _ in 0..MOST_TRIES {
-            let Some((view, x, y)) = window.least_visited(views, self.sampler.rng()) else { break };
-            let room = capacity - window.held;
-            let mut large = parts_around(x, y).filter(|part| part.count() >= LEAST_PLANNED);
-            if let Some(part) = large.find(|part| window.lacks(cells, (view, *part)) <= room) {
-                window.plan_part(cells, (view, part));
-            }
-        }
         window.fill_up(cells, capacity);
         window.choose_items(cells, views);
+        let blocks: u32 = window.items.iter().map(|item| item.part.count()).sum();
+        let (cells, parts) = (window.cells.len(), window.items.len());
+        tracing::debug!(cells, gaussians = window.held, parts, blocks, "window of cells");
         Ok(())
     }
 }
@@ -243,12 +238,6 @@ impl Window {
         self.held = 0;
     }
 
-    /// Gaussians of the cells that show in a part of a view and are not wanted yet.
-    fn lacks(&self, cells: &[Cell], (view, part): (usize, Blocks)) -> usize {
-        let lacking = |(c, wanted): &(&Cell, &bool)| !**wanted && shows_in(c, &self.sights[view], part);
-        cells.iter().zip(&self.wanted).filter(lacking).map(|(cell, _)| cell.count).sum()
-    }
-
     /// Wants the cells that show in a part of a view, which is then trained in this window.
     fn plan_part(&mut self, cells: &[Cell], (view, part): (usize, Blocks)) {
         for (wanted, cell) in self.wanted.iter_mut().zip(cells) {
@@ -257,7 +246,7 @@ impl Window {
                 self.held += cell.count;
             }
         }
-        self.items.push(Item { picture: Picture::View(view), part, weight: part.count(), planned: true });
+        self.items.push(Item { picture: Picture::View(view), part, weight: part.count() });
         self.look_at(view, part);
     }
 
@@ -268,7 +257,8 @@ impl Window {
         looked_at.for_each(|(_, visits)| *visits += 1);
     }
 
-    /// The nearest cells for as long as there is room.
+    /// The nearest cells for as long as there is room, by their nearest edge: a rectangle of a picture needs the large Gaussians, too,
+    /// that reach into it from afar.
     fn fill_up(&mut self, cells: &[Cell], capacity: usize) {
         let mut centre = Vec2::ZERO;
         for (cell, _) in cells.iter().zip(&self.wanted).filter(|(_, wanted)| **wanted) {
@@ -277,7 +267,7 @@ impl Window {
         centre /= self.held.max(1) as f32;
         self.by_distance.clear();
         for (i, cell) in cells.iter().enumerate().filter(|(i, c)| !self.wanted[*i] && c.count > 0) {
-            self.by_distance.push((cell.bounds.centre().distance_squared(centre), i as u32));
+            self.by_distance.push((cell.bounds.ground_distance(centre), i as u32));
         }
         self.by_distance.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         for (_, i) in &self.by_distance {
@@ -292,7 +282,7 @@ impl Window {
         self.cells.extend((0..cells.len() as u32).filter(|i| self.wanted[*i as usize]));
     }
 
-    /// Besides the parts planned, of every picture the largest rectangle that sees no cell which is away.
+    /// Besides the first part, of every picture the largest rectangle that sees no cell which is away.
     fn choose_items(&mut self, cells: &[Cell], views: usize) {
         for (i, sight) in self.sights.iter().enumerate() {
             let (mut free, mut shown) = (u64::MAX, 0);
@@ -312,10 +302,11 @@ impl Window {
             let Some(part) = part else { continue };
             let weight = (part.mask() & shown).count_ones();
             if weight > 0 {
-                self.items.push(Item { picture, part, weight, planned: false });
+                self.items.push(Item { picture, part, weight });
             }
         }
         self.first = true;
+        self.least_looks = self.visits[..views * BLOCKS].iter().copied().min().unwrap_or(0);
     }
 }
 
