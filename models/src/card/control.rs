@@ -13,6 +13,8 @@ use crate::ortho::crs::SurveyCrs;
 
 /// A hundred thousand marks at 160 bytes each.
 const LIMIT: u64 = 16 << 20;
+/// No survey marks more points: each row is compared with all points before it.
+const MOST_POINTS: usize = 4096;
 /// What a point measured with RTK is worth where the file does not say, horizontally and vertically, metres.
 const SIGMA_M: [f64; 2] = [0.03, 0.05];
 /// No survey is better than this or of use beyond that, metres.
@@ -65,6 +67,11 @@ pub fn read(path: &Path) -> Result<Vec<SurveyedPoint>, FormatError> {
         if let Some((_, point)) = known {
             point.marks.push(mark);
             continue;
+        }
+        if points.len() == MOST_POINTS {
+            return Err(bad(&format!(
+                "more than {MOST_POINTS} points; leave out those that these pictures do not show"
+            )));
         }
         let position = crs.geodetic(place).ok_or_else(|| bad("is outside of its reference system"))?;
         let name = cells.get(6).map_or_else(|| (points.len() + 1).to_string(), |name| (*name).to_owned());
@@ -126,5 +133,13 @@ mod tests {
             let error = read_text(text).unwrap_err().to_string();
             assert!(error.contains(expected) && !error.contains('\n'), "{text:?}: {error}");
         }
+    }
+
+    #[test]
+    fn a_list_of_more_points_than_any_survey_has_is_refused_in_one_line() {
+        let rows = |n: usize| (0..n).map(|i| format!("{} 46.0 400 1 2 a.jpg\n", i as f64 * 1e-3)).collect::<String>();
+        assert_eq!(read_text(&format!("EPSG:4326\n{}", rows(MOST_POINTS))).unwrap().len(), MOST_POINTS);
+        let error = read_text(&format!("EPSG:4326\n{}", rows(MOST_POINTS + 1))).unwrap_err().to_string();
+        assert!(error.contains("line 4098: more than 4096 points") && !error.contains('\n'), "{error}");
     }
 }

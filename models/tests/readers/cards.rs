@@ -8,7 +8,7 @@ use config::geodesy::Geodetic;
 use image::{ImageFormat, Rgb, RgbImage};
 use models::card::exposures::match_exposures;
 use models::card::write::{PIX4D, Tags};
-use models::card::{Card, CardOptions, dataflash, geotags};
+use models::card::{Card, CardOptions, control, dataflash, geotags};
 use models::picture;
 
 use crate::driver::{Read, Reader, Shell, Verdict, line, survive};
@@ -186,6 +186,29 @@ fn files_of_positions() {
                 tags.values().all(|t| {
                     let turned = t.attitude.is_none_or(|a| (a.rotation.length() - 1.0).abs() < 1e-6);
                     t.fix.position.is_valid() && t.fix.sigma_m.iter().all(|s| *s > 0.0) && turned
+                })
+            })
+        }),
+    });
+}
+
+#[test]
+fn lists_of_surveyed_points() {
+    let utm = "WGS84 UTM 17N\n333158.20\t3102916.18\t3\t2699.43\t1668.72\tDJI_0065.JPG\n\
+               333158.20 3102916.18 3 2706.86 1960.27 DJI_0066.JPG\n# a note\n";
+    let named = "EPSG:4326\n7.00001 46.0 400 1 2 a.jpg church 0.01 0.02\n7.00002,46.0,400,3,4,a.jpg\n";
+    let projected = "+proj=utm +zone=15 +datum=WGS84\n576700.5 5188000 198.3 10 20 IMG_1.JPG\n";
+    survive(&Reader {
+        name: "surveyed points",
+        seeds: [utm, named, projected].map(|s| s.as_bytes().to_vec()).into(),
+        text: true,
+        shell: None,
+        memory: (64 << 10, 64),
+        read: Read::File("gcp_list.txt", &|path| {
+            line(control::read(path), |points: Vec<control::SurveyedPoint>| {
+                points.iter().all(|p| {
+                    let marks = p.marks.iter().flat_map(|(_, at)| at).all(|v| v.is_finite());
+                    p.position.is_valid() && p.sigma_m.iter().all(|s| *s > 0.0) && marks && !p.marks.is_empty()
                 })
             })
         }),

@@ -8,6 +8,7 @@ use config::geodesy::Geodetic;
 use config::mission::CameraSettings;
 use hal::camera::Picture;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+use runtime::aggregate::register::edge::{Edges, Fitted};
 use runtime::kernels::cache;
 use runtime::keyframe_store::{KeyFrame, KeyframeStore};
 use runtime::keys;
@@ -17,7 +18,7 @@ use runtime::train_job::log;
 use runtime::upload::flight_number::FlightNumber;
 use vulkan::gpu::{DeviceLimits, GpuInfo};
 
-use crate::driver::{Read, Reader, Verdict, line, memory_folder, survive};
+use crate::driver::{Read, Reader, Shell, Verdict, line, memory_folder, survive};
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
 const LENS: Intrinsics = Intrinsics { width: 8, height: 6, fx: 8.0, fy: 8.0, cx: 4.0, cy: 3.0 };
@@ -222,6 +223,48 @@ fn exposures_of_a_flight_log() {
         read: Read::Bytes(&|bytes| {
             std::fs::write(&path, bytes).expect("written");
             line(log::exposures(&path), |found| found.iter().all(|e| e.fix.position.is_valid() && e.time_s.is_finite()))
+        }),
+    });
+}
+
+/// The name of a pair, and of its file.
+const PAIR: [u8; 32] = [7; 32];
+const PAIR_FILE: &str = "0707070707070707070707070707070707070707070707070707070707070707.edge";
+
+#[test]
+fn fits_of_pairs_of_models() {
+    let fitted = Fitted {
+        turn: [0.0, 0.0, 0.6, 0.8],
+        scale: 1.01,
+        shift: [1.0, -2.0, 0.5],
+        places: [[10.0, 20.0, 30.0]; 6],
+        points: [40, 50],
+        rms_m: [3.0, 0.1],
+    };
+    let disk = Disk::default();
+    let kept = |found: Option<Fitted>| {
+        let folder = tempfile::tempdir().expect("a folder");
+        Edges::open(&disk, folder.path()).put(&PAIR, found).expect("kept");
+        std::fs::read(folder.path().join(PAIR_FILE)).expect("there")
+    };
+    survive(&Reader {
+        name: "fits of pairs",
+        seeds: vec![kept(Some(fitted)), kept(None)],
+        text: false,
+        shell: Some(Shell {
+            open: |bytes| bytes[..bytes.len().saturating_sub(32)].to_vec(),
+            close: |mut content| {
+                content.extend_from_slice(blake3::hash(&content).as_bytes());
+                content
+            },
+        }),
+        memory: (64 << 10, 16),
+        read: Read::File(PAIR_FILE, &|path| {
+            let mut edges = Edges::open(&disk, path.parent().expect("a folder"));
+            match edges.get(&PAIR) {
+                Some(found) => Ok(found.is_none_or(|f| f.scale > 0.0 && f.shift.iter().all(|v| v.is_finite()))),
+                None => Err(edges.damaged.pop().unwrap_or_default()),
+            }
         }),
     });
 }
