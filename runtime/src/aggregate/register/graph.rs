@@ -15,6 +15,8 @@ const POSITION_M: f64 = 3.0;
 const TILT_RAD: f64 = 0.017;
 const HEADING_RAD: f64 = 0.05;
 const SCALE: f64 = 0.05;
+/// Telemetry is never so far off: an edge that says so is set aside at once, metres.
+const MOST_APART_M: f64 = 10_000.0;
 /// The width of the weighing shrinks by this factor (Yang et al. 2020).
 const SHRINK: f64 = 1.4;
 /// Steps of Gauss and Newton after the last change of the weights; angles are small.
@@ -89,34 +91,36 @@ impl State {
 
 /// Settles the graph.
 pub fn settle(nodes: &[Node], links: &[Link]) -> Settled {
+    let is_likely = |l: &Link| l.places.iter().all(|(a, b)| a.distance(*b) <= MOST_APART_M);
+    let likely: Vec<usize> = (0..links.len()).filter(|i| is_likely(&links[*i])).collect();
+    let used: Vec<Link> = likely.iter().map(|i| links[*i]).collect();
     let mut solver = Solver {
         nodes,
-        links,
+        links: &used,
         states: vec![State::START; nodes.len()],
-        weights: vec![1.0; links.len()],
-        levers: vec![[(DVec3::ZERO, DVec3::ZERO); 6]; links.len()],
+        weights: vec![1.0; used.len()],
+        levers: vec![[(DVec3::ZERO, DVec3::ZERO); 6]; used.len()],
     };
     solver.step();
-    let beyond = |s: &Solver<'_>, i: usize| s.apart2(i) / links[i].limit_m.powi(2);
-    let worst = (0..links.len()).map(|i| beyond(&solver, i)).fold(0.0, f64::max);
+    let beyond = |s: &Solver<'_>, i: usize| s.apart2(i) / used[i].limit_m.powi(2);
+    let worst = (0..used.len()).map(|i| beyond(&solver, i)).fold(0.0, f64::max);
     let mut width = 2.0 * worst;
     while width > 1.0 {
-        for i in 0..links.len() {
+        for i in 0..used.len() {
             solver.weights[i] = (width / (beyond(&solver, i) + width)).powi(2);
         }
         solver.step();
         width /= SHRINK;
     }
     for _ in 0..LAST_STEPS {
-        for i in 0..links.len() {
+        for i in 0..used.len() {
             solver.weights[i] = (1.0 / (beyond(&solver, i) + 1.0)).powi(2);
         }
         solver.step();
     }
-    Settled {
-        corrections: solver.states.iter().zip(nodes).map(|(s, n)| s.similarity(n)).collect(),
-        holds: solver.weights.iter().map(|w| *w >= SET_ASIDE).collect(),
-    }
+    let mut holds = vec![false; links.len()];
+    likely.iter().zip(&solver.weights).for_each(|(i, weight)| holds[*i] = *weight >= SET_ASIDE);
+    Settled { corrections: solver.states.iter().zip(nodes).map(|(s, n)| s.similarity(n)).collect(), holds }
 }
 
 struct Solver<'a> {

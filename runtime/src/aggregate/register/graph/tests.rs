@@ -116,3 +116,20 @@ fn a_thousand_aircraft_settle_in_seconds() {
     assert_eq!(settled.holds.iter().filter(|h| !**h).count(), 1);
     assert!(start.elapsed().as_secs() < 60, "{:?}", start.elapsed());
 }
+
+#[test]
+fn an_edge_beyond_all_telemetry_is_set_aside_at_once_and_moves_nothing() {
+    let mut field = Field::new(2, false);
+    let honest = field.links.len();
+    let without = settle(&field.nodes, &field.links);
+    for off in [1e5, 1e200, f64::NAN] {
+        field.links.truncate(honest);
+        field.link(0, 3, DVec3::splat(off));
+        let settled = settle(&field.nodes, &field.links);
+        assert_eq!(settled.holds, [vec![true; honest], vec![false]].concat());
+        for (i, node) in field.nodes.iter().enumerate() {
+            let at = |s: &Settled| s.corrections[i].apply(node.middle);
+            assert!(at(&settled).distance(at(&without)) < 1e-6, "{off}");
+        }
+    }
+}
