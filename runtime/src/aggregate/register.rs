@@ -2,7 +2,7 @@
 //! the same ground they can be brought together before they are cut and merged.
 //!
 //! Pairs whose ground overlaps are fitted onto each other, each pair once ([`fit`], [`edge`]), and one robust graph over all models
-//! then says where each one lies ([`graph`]). An aircraft that joins costs the fits to its neighbours; the graph over all of
+//! then says where each one lies (`graph`). An aircraft that joins costs the fits to its neighbours; the graph over all of
 //! them costs less than one fit.
 
 use std::collections::HashSet;
