@@ -4,6 +4,7 @@
 mod baselines;
 mod consistency;
 mod depth_frame;
+mod edges;
 mod fill;
 mod finish;
 mod frame_file;

@@ -17,6 +17,7 @@ use crate::onnx::picture::push_planes;
 
 use super::InitError;
 use super::depth_frame::{DepthFrame, DepthGrid};
+use super::edges;
 
 /// Floats that the embedded network's session holds per pixel of a picture while it runs, inputs and outputs included
 /// (measured: 53).
@@ -39,6 +40,8 @@ pub struct PosedNetwork {
 struct Lane {
     session: LazySession,
     planes: Vec<f32>,
+    /// Its windows carry a surface's depth over the edge.
+    grows_edges: bool,
 }
 
 /// One picture's depth to be made.
@@ -90,7 +93,11 @@ impl PosedNetwork {
     /// Of a network of contract `pair` with `poses = "given"` that takes `views` pictures.
     pub fn new(network: Arc<Network>, views: usize, threads: usize) -> Self {
         let (lanes, threads) = if network.is_embedded() { (threads.max(1), 1) } else { (1, threads) };
-        let lane = || Lane { session: LazySession::new(Arc::clone(&network), threads), planes: Vec::new() };
+        let lane = || Lane {
+            session: LazySession::new(Arc::clone(&network), threads),
+            planes: Vec::new(),
+            grows_edges: network.is_embedded(),
+        };
         Self { views, lanes: std::iter::repeat_with(lane).take(lanes).collect(), network }
     }
 
@@ -173,7 +180,10 @@ impl Lane {
         }
         let k_ref = [k.fx, 0.0, k.cx - 0.5, 0.0, k.fy, k.cy - 0.5, 0.0, 0.0, 1.0];
         let out = self.session.run((w, h), &[&self.planes, &projections, &request.range, &k_ref])?;
-        let (grid, non_finite) = DepthGrid::sampled(w as usize, h as usize, stride, &out[0].data, &out[1].data);
+        let (mut grid, non_finite) = DepthGrid::sampled(w as usize, h as usize, stride, &out[0].data, &out[1].data);
+        if self.grows_edges {
+            edges::follow_the_pictures(&mut grid, &edges::Pictures::new((w, h), &self.planes, &projections));
+        }
         let run_ms = started.elapsed().as_secs_f64() * 1e3 - (self.session.opening_ms() - opened);
         Ok(Made { grid, non_finite, run_ms })
     }

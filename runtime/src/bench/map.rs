@@ -1,6 +1,8 @@
 //! How true a map is: a simulated survey is trained, its orthophoto and heights are compared with what the ray-cast world
 //! shows from straight above, and with heights taken directly from the first Gaussians, the fused depth maps.
 
+mod picture;
+
 use std::path::Path;
 
 use glam::{DMat4, DVec2, DVec3, DVec4};
@@ -71,7 +73,8 @@ pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> 
     let (data, world) = (out.join("data"), world::world(seed));
     world::write_data_set(&data, seed, 1.0)?;
     let train = |name: &str, more: &[String]| {
-        let mut arguments = vec!["train".to_owned(), data.display().to_string(), "--seed".into(), seed.to_string()];
+        let mut arguments = ["train", &data.display().to_string(), "--fresh", "--seed"].map(str::to_owned).to_vec();
+        arguments.push(seed.to_string());
         arguments.extend_from_slice(more);
         let folder = out.join(name);
         child::run(&arguments, &folder, None)?.report(name)?;
@@ -91,6 +94,7 @@ pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> 
         let missing = all.iter().filter(|e| e.is_none()).count();
         HeightScores::of(&all.into_iter().flatten().collect::<Vec<f64>>(), missing)
     };
+    picture::write(&out.join("errors.png"), &compared, &level, origin)?;
     let (shift_px, squares) = compared.shift();
     let drawn = compared.drawn.iter().flatten().count();
     Ok(MapScores {
