@@ -31,6 +31,9 @@ table! {
         pub consistency: bool = true;
         /// Continue the ground where no second picture looks (the rim of the region); needs `consistency`.
         pub fill: bool = true;
+        /// Compare the pictures' light where their depths agree, and train on one light where it is uneven: exposure, white
+        /// balance and the lens's fall-off towards the corners.
+        pub light: bool = true;
         /// Depths of two views agree when they differ by less than this share.
         pub depth_tolerance: f32 = 0.005, in Limits::above(0.0).below(0.5);
         /// sᵍ: bring the Gaussians' extent to the scale of the poses (off only for the paper's ablation).

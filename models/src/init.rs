@@ -10,6 +10,7 @@ mod finish;
 mod frame_file;
 mod ground;
 mod initialiser;
+mod lighting;
 mod merge;
 mod pairs;
 mod posed;

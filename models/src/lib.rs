@@ -13,6 +13,7 @@ pub mod coverage;
 pub mod dataset;
 pub mod formats;
 pub mod init;
+pub mod light;
 pub mod metrics;
 mod morton;
 pub mod onnx;

@@ -2,6 +2,10 @@
 
 use rayon::prelude::*;
 
+mod colors;
+
+pub use colors::colors_fitted;
+
 /// Window of 3DGS's `ssim` (utils/loss_utils.py): 11 × 11, Gaussian with σ = 1.5.
 const WINDOW: usize = 11;
 const SIGMA: f64 = 1.5;

@@ -8,7 +8,8 @@ use models::baselines::{MeanColor, nearest_view, warp_over_ground};
 use models::camera::{PosedImage, View};
 use models::dataset::Dataset;
 use models::formats::write_atomic;
-use models::metrics::{psnr, ssim_where, to_f32, to_rgb8};
+use models::light::{Light, PictureLight};
+use models::metrics::{colors_fitted, psnr, ssim_where, to_f32, to_rgb8};
 use models::onnx::metric::PerceptualMetric;
 use serde::Serialize;
 use vulkan::trainer::{Rendering, Trainer};
@@ -26,6 +27,9 @@ pub struct ViewScore {
     pub name: String,
     /// dB, at most 100.
     pub psnr: f64,
+    /// dB with the rendering's colours fitted to the picture's: exposure and white balance, which no model can know of a picture
+    /// that it has not seen, are left out of it.
+    pub psnr_colors_fitted: f64,
     /// −1…1.
     pub ssim: f64,
     /// Distance by the user's metric, when there is one.
@@ -47,6 +51,8 @@ pub struct Perceptual {
 pub struct Scores {
     /// Mean PSNR, dB.
     pub psnr: f64,
+    /// Mean PSNR with colours fitted, dB.
+    pub psnr_colors_fitted: f64,
     /// Mean SSIM.
     pub ssim: f64,
     /// Mean of the user's metric, when there is one.
@@ -60,7 +66,13 @@ impl Scores {
     fn of(views: Vec<ViewScore>) -> Self {
         let n = views.len().max(1) as f64;
         let mean = |f: fn(&ViewScore) -> f64| views.iter().map(f).sum::<f64>() / n;
-        Self { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), perceptual: None, views }
+        Self {
+            psnr: mean(|v| v.psnr),
+            psnr_colors_fitted: mean(|v| v.psnr_colors_fitted),
+            ssim: mean(|v| v.ssim),
+            perceptual: None,
+            views,
+        }
     }
 
     fn with_metric(mut self, metric: Option<&PerceptualMetric>) -> Self {
@@ -82,10 +94,20 @@ pub struct BaselineScores {
     pub mean_color: Scores,
 }
 
+/// How a data set's pictures come into a model's frame and light.
+#[derive(Clone, Debug)]
+pub struct IntoModel {
+    /// Poses.
+    pub transfer: PoseTransfer,
+    /// The light of the pictures that the model was trained on; of others only their lens is known.
+    pub light: Light,
+}
+
 /// Renders and scores `frames` of `set`.
 ///
-/// Poses are the data set's, carried into the model's frame by `transfer`. The rendering is rounded to 8 bits first, so
-/// that the figures are those of the pictures that `save` receives (`<stem>.png`). `metric` is asked too, when given.
+/// Poses are the data set's, carried into the model's frame. The rendering is given the fall-off of the lens as far as it is known
+/// and rounded to 8 bits first, so that the figures are those of the pictures that `save` receives (`<stem>.png`).
+/// `metric` is asked too, when given.
 ///
 /// # Errors
 /// A picture cannot be read, the device or the metric fails, or `save` cannot be written to.
@@ -94,7 +116,7 @@ pub fn evaluate(
     set: &Dataset,
     frames: &[usize],
     scale: f64,
-    transfer: &PoseTransfer,
+    into: &IntoModel,
     mut metric: Option<&mut PerceptualMetric>,
     save: Option<&Path>,
 ) -> Result<Scores, JobError> {
@@ -102,11 +124,12 @@ pub fn evaluate(
     let mut scores = Vec::with_capacity(frames.len());
     for &i in frames {
         let truth = set.load(i, scale)?;
-        let view = View { intrinsics: truth.view.intrinsics, pose: transfer.apply(&truth.view.pose) };
+        let view = View { intrinsics: truth.view.intrinsics, pose: into.transfer.apply(&truth.view.pose) };
         trainer.render(&view, &mut rendering)?;
         let Some(mut picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
             return Err(JobError::RenderingSize(truth.name));
         };
+        PictureLight::default().change(&into.light.lens(), &mut picture, &view.intrinsics);
         if let Some(dir) = save {
             save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
         }
@@ -156,9 +179,11 @@ fn score(truth: &PosedImage, rgb: &[f32]) -> ViewScore {
         .map(|i| if kept(i / 3) { rgb.get(i).copied().unwrap_or(f32::NAN) } else { target[i] })
         .collect();
     let of = |values: &[f32]| -> Vec<f32> { (0..values.len()).filter(|i| kept(i / 3)).map(|i| values[i]).collect() };
+    let (seen, wanted) = (of(&shown), of(&target));
     ViewScore {
         name: truth.name.clone(),
-        psnr: psnr(&of(&shown), &of(&target)).min(PSNR_CAP),
+        psnr: psnr(&seen, &wanted).min(PSNR_CAP),
+        psnr_colors_fitted: psnr(&colors_fitted(&seen, &wanted), &wanted).min(PSNR_CAP),
         ssim: ssim_where(&shown, &target, k.width as usize, k.height as usize, kept),
         perceptual: None,
     }
@@ -211,6 +236,7 @@ mod tests {
         rgb.iter_mut().enumerate().filter(|(i, _)| i / 3 % 32 >= 20).for_each(|(_, v)| *v = 1.0 - *v);
         let score_of = |truth: &PosedImage| (score(truth, &rgb).psnr, score(truth, &rgb).ssim);
         assert_eq!(score_of(&masked), (PSNR_CAP, 1.0));
+        assert!(score(&masked, &rgb).psnr_colors_fitted > 80.0, "what is left out is not fitted to");
         let whole = score_of(&truth(None));
         assert!(whole.0 < 20.0 && whole.1 < 0.9, "{whole:?}");
         // An error of a tenth everywhere is 20 dB over whatever part is looked at.

@@ -25,7 +25,7 @@ use crate::engine::device::DeviceRequest;
 use crate::engine::source::Folder;
 use crate::engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
 use crate::error::JobError;
-use crate::evaluate;
+use crate::evaluate::{self, IntoModel};
 use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
@@ -381,8 +381,10 @@ impl TrainJob {
         }
         let from = Instant::now();
         let transfer = PoseTransfer::between(set, &engine.header().views);
-        let scores = evaluate::evaluate(engine.trainer(), set, &held_out, scale, &transfer, metric, None)?;
+        let into = IntoModel { transfer, light: engine.light().clone() };
+        let scores = evaluate::evaluate(engine.trainer(), set, &held_out, scale, &into, metric, None)?;
         (engine.report.psnr, engine.report.ssim) = (Some(scores.psnr), Some(scores.ssim));
+        engine.report.more.insert("psnr_colors_fitted".to_owned(), scores.psnr_colors_fitted.into());
         if let Some(p) = &scores.perceptual {
             engine.report.more.insert("perceptual".to_owned(), serde_json::to_value(p)?);
         }

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::cloud::GaussianCloud;
+use crate::light::Light;
 
 use super::pairs::SkippedPairs;
 
@@ -11,6 +12,8 @@ use super::pairs::SkippedPairs;
 pub struct Initialisation {
     /// The Gaussians, SH degree 0.
     pub cloud: GaussianCloud,
+    /// The pictures' light, where it is uneven: the Gaussians have the colours that it leaves when it is taken out.
+    pub light: Option<Light>,
     /// What happened.
     pub report: InitReport,
 }
@@ -40,6 +43,8 @@ pub struct InitReport {
     pub depth_m: [f32; 2],
     /// Depths claimed by the network that were not positive finite numbers.
     pub non_finite_depths: usize,
+    /// Median difference between pictures' colours of a place, natural logarithm, as stored and with their light taken out.
+    pub light: [f32; 2],
     /// Samples another view agrees with.
     pub supported: usize,
     /// Samples no other view confirms or denies.
@@ -72,6 +77,8 @@ pub struct InitReport {
     pub depth_ms: f64,
     /// Unposed networks: global alignment and scales of Σ (ICP, neighbours), within `depth_ms`.
     pub align_ms: f64,
+    /// Comparing the pictures' light.
+    pub light_ms: f64,
     /// Comparing depths between pictures, summed over threads.
     pub consistency_ms: f64,
     /// Samples and their covariances, summed over threads.

@@ -11,8 +11,9 @@ use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::engine::device::renderer;
+use crate::engine::light::of_model;
 use crate::error::JobError;
-use crate::evaluate::{Perceptual, Scores, evaluate, open_metric};
+use crate::evaluate::{IntoModel, Perceptual, Scores, evaluate, open_metric};
 use crate::report::{Comparison, ReportData};
 use crate::transfer::{PoseTransfer, stem};
 
@@ -34,19 +35,27 @@ pub struct Held {
 
 struct Opened {
     trainer: Trainer,
-    transfer: PoseTransfer,
+    into: IntoModel,
 }
 
 impl Opened {
-    fn new(path: &Path, set: &Dataset, size: (u32, u32), device: Option<&str>) -> Result<Self, JobError> {
+    /// `folder` knows the lens of the pictures that it is to be compared with.
+    fn new(
+        path: &Path,
+        folder: Option<&Path>,
+        set: &Dataset,
+        size: (u32, u32),
+        device: Option<&str>,
+    ) -> Result<Self, JobError> {
         let (header, cloud) = model::read(path)?;
         let trainer = renderer(device, &cloud, size.0, size.1)?;
-        Ok(Self { trainer, transfer: PoseTransfer::between(set, &header.views) })
+        let (transfer, light) = (PoseTransfer::between(set, &header.views), folder.map(of_model).unwrap_or_default());
+        Ok(Self { trainer, into: IntoModel { transfer, light } })
     }
 
     fn picture(&mut self, view: &View) -> Result<RgbImage, JobError> {
         let mut into = Rendering::default();
-        let view = View { intrinsics: view.intrinsics, pose: self.transfer.apply(&view.pose) };
+        let view = View { intrinsics: view.intrinsics, pose: self.into.transfer.apply(&view.pose) };
         self.trainer.render(&view, &mut into)?;
         Ok(to_rgb8(&into.rgb, into.width, into.height).unwrap_or_default())
     }
@@ -73,13 +82,13 @@ pub fn compare(
     let owned = by_nearest_training_view(set, &frames, locals)?;
     let mut held = Vec::new();
     for ((name, path), mine) in locals.iter().zip(&owned).filter(|(_, mine)| !mine.is_empty()) {
-        let mut own = Opened::new(path, set, size, device)?;
-        let local = evaluate(&mut own.trainer, set, mine, scale, &own.transfer, metric.as_mut(), None)?;
+        let mut own = Opened::new(path, path.parent(), set, size, device)?;
+        let local = evaluate(&mut own.trainer, set, mine, scale, &own.into, metric.as_mut(), None)?;
         let photograph = set.load(mine[mine.len() / 2], scale)?;
         let shown = own.picture(&photograph.view)?;
         drop(own);
-        let mut all = Opened::new(global, set, size, device)?;
-        let scores = evaluate(&mut all.trainer, set, mine, scale, &all.transfer, metric.as_mut(), None)?;
+        let mut all = Opened::new(global, path.parent(), set, size, device)?;
+        let scores = evaluate(&mut all.trainer, set, mine, scale, &all.into, metric.as_mut(), None)?;
         let pictures = [photograph.image.clone(), shown, all.picture(&photograph.view)?];
         held.push(Held { name: name.clone(), local, global: scores, pictures: Some((photograph.name, pictures)) });
     }

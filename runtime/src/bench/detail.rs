@@ -9,8 +9,9 @@ use serde::Serialize;
 
 use super::child;
 use crate::engine::device::renderer;
+use crate::engine::light::of_model;
 use crate::error::JobError;
-use crate::evaluate::{Scores, evaluate};
+use crate::evaluate::{IntoModel, Scores, evaluate};
 use crate::transfer::PoseTransfer;
 
 /// One way to train.
@@ -65,8 +66,8 @@ pub fn measure(
         let largest = frames.iter().map(|&i| set.frames[i].view.intrinsics).max_by_key(|k| k.pixels());
         let (width, height) = largest.map_or((1, 1), |k| (k.width, k.height));
         let mut trainer = renderer(None, &cloud, width, height)?;
-        let transfer = PoseTransfer::between(&set, &header.views);
-        let mut at = |scale: f64| evaluate(&mut trainer, &set, &frames, scale, &transfer, None, None);
+        let into = IntoModel { transfer: PoseTransfer::between(&set, &header.views), light: of_model(&folder) };
+        let mut at = |scale: f64| evaluate(&mut trainer, &set, &frames, scale, &into, None, None);
         all.push(DetailScores {
             crops: most,
             taken: report.more.get("crops").and_then(|n| n.as_u64()).unwrap_or(0),

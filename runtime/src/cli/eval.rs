@@ -12,7 +12,8 @@ use super::CliError;
 use super::plan::largest;
 use crate::cli::output::outln;
 use crate::engine::device::{map_renderer, renderer};
-use crate::evaluate::{BaselineScores, Scores, baselines, evaluate, heights, open_metric};
+use crate::engine::light::of_model;
+use crate::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
 use crate::ortho::{Map, MapRequest};
 use crate::transfer::{PoseTransfer, stem};
 
@@ -87,7 +88,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
     let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
     let transfer = PoseTransfer::between(&set, &header.views);
-    let scores = evaluate(&mut trainer, &set, &frames, args.scale, &transfer, metric.as_mut(), args.save.as_deref())?;
+    let light = of_model(args.model.parent().unwrap_or(Path::new(".")));
+    let into = IntoModel { transfer, light };
+    let scores = evaluate(&mut trainer, &set, &frames, args.scale, &into, metric.as_mut(), args.save.as_deref())?;
     let naive = match args.baselines {
         true => Some(baselines(&set, &training_frames(&set, &header, &frames)?, &frames, args.scale)?),
         false => None,
@@ -99,7 +102,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             steps: header.steps,
             split: &args.split,
             region: args.region.as_deref(),
-            poses_transferred: !transfer.is_identity(),
+            poses_transferred: !into.transfer.is_identity(),
             baselines: naive.as_ref(),
         };
         outln!("{}", serde_json::to_string(&answer).map_err(CliError::failed)?);
@@ -110,9 +113,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
             (Some(m), Some(d)) => format!("  {} {d:.4}", m.name()),
             _ => String::new(),
         };
-        outln!("{:<28} {:>7.3} dB  SSIM {:.4}{distance}", v.name, v.psnr, v.ssim);
+        outln!("{:<28} {}{distance}", v.name, figures(v.psnr, v.psnr_colors_fitted, v.ssim));
     }
-    let row = |what: &str, s: &Scores| outln!("{what:<28} {:>7.3} dB  SSIM {:.4}", s.psnr, s.ssim);
+    let row = |what: &str, s: &Scores| outln!("{what:<28} {}", figures(s.psnr, s.psnr_colors_fitted, s.ssim));
     row(&format!("mean of {} views", scores.views.len()), &scores);
     if let Some(p) = &scores.perceptual {
         outln!("{:<28} {:>7.4}", format!("mean {}", p.name), p.mean);
@@ -123,6 +126,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     outln!("{} Gaussians after {} steps", cloud.len(), header.steps);
     Ok(())
+}
+
+fn figures(psnr: f64, fitted: f64, ssim: f64) -> String {
+    format!("{psnr:>7.3} dB ({fitted:.3} with colours fitted)  SSIM {ssim:.4}")
 }
 
 fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {

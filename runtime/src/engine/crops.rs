@@ -37,6 +37,7 @@ impl Reconstruction {
             let name = self.views[i].0.clone();
             if let Some((whole, mask)) = source.whole(&name, scale)? {
                 size = whole.dimensions();
+                let whole = self.in_common_light(i, whole);
                 self.add_crops(i, &whole, mask.as_ref(), share)?;
             }
             progress.set(i as u64 + 1, || name);

@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use models::camera::{DepthPrior, View};
 use models::cloud::GaussianCloud;
 use models::init::{InitReport, Initialiser, from_sfm, random};
+use models::light::Light;
 
 use crate::console::Progress;
 use crate::error::JobError;
@@ -33,13 +34,15 @@ pub(super) struct FirstGaussians {
     pub cloud: GaussianCloud,
     /// Pictures that have a depth.
     pub with_depth: HashSet<String>,
+    /// The pictures' light, where it is uneven.
+    pub light: Option<Light>,
     /// Of the feed-forward network.
     pub report: Option<InitReport>,
 }
 
 impl From<GaussianCloud> for FirstGaussians {
     fn from(cloud: GaussianCloud) -> Self {
-        Self { cloud, with_depth: HashSet::new(), report: None }
+        Self { cloud, with_depth: HashSet::new(), light: None, report: None }
     }
 }
 
@@ -70,7 +73,7 @@ pub(super) fn feed_forward(
     })?;
     let (gaussians, maps) = (made.cloud.len(), with_depth.len());
     progress.finish(&format!("{gaussians} Gaussians of {maps} depth maps by {}", made.report.network));
-    Ok(Some(FirstGaussians { cloud: made.cloud, with_depth, report: Some(made.report) }))
+    Ok(Some(FirstGaussians { cloud: made.cloud, with_depth, light: made.light, report: Some(made.report) }))
 }
 
 /// The points themselves.

@@ -156,8 +156,9 @@ impl Reconstruct for Reconstruction {
         let clock = Instant::now();
         self.refine()?;
         let from = Instant::now();
-        let Some(fresh) = self.initialise(go_on)? else { return Ok(false) };
+        let Some(mut fresh) = self.initialise(go_on)? else { return Ok(false) };
         self.report.stage("init", from);
+        self.even_light(fresh.light.take())?;
         self.take_over(&fresh)?;
         let loaded = self.trainer.load(&self.cloud)?;
         self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);

@@ -139,6 +139,25 @@ impl Trainer {
         }))
     }
 
+    /// Replaces the colours of view `index`; mask and depth prior stay.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] when there is no such view, or `image` is of another size; [`TrainError::ViewFile`].
+    pub fn set_image(&mut self, index: usize, image: &RgbImage) -> Result<(), TrainError> {
+        self.view_is_there(index)?;
+        let TrainingView { width, height, .. } = self.views[index];
+        if image.dimensions() != (width, height) {
+            let why = "its new picture is of another size".to_owned();
+            return Err(TrainError::BadView { name: format!("view {index}"), why });
+        }
+        let slot = self.resident(Picture::View(index))?;
+        let section = self.pixels_in(slot, Picture::View(index));
+        for (word, p) in self.arena.slice_mut::<u32>(section).iter_mut().zip(image.pixels()) {
+            *word = (*word & 0xff00_0000) | u32::from_le_bytes([p[0], p[1], p[2], 0]);
+        }
+        self.keep(slot, Picture::View(index))
+    }
+
     /// Which pixels of [`Self::view_image`] count; `None`: all.
     ///
     /// # Errors

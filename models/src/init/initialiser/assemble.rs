@@ -10,11 +10,13 @@ use super::{Initialiser, VOXELS_PER_GAUSSIAN};
 use crate::camera::{DepthPrior, Pinhole, View};
 use crate::init::consistency::{ConsistencyCount, resolve};
 use crate::init::fill::continued;
+use crate::init::lighting::measure;
 use crate::init::merge::{Sample, VoxelMerge};
 use crate::init::pairs::{SkippedPairs, partners};
 use crate::init::report::Initialisation;
 use crate::init::samples::samples;
 use crate::init::{InitError, finish};
+use crate::light::{Light, PictureLight};
 
 /// Pictures that are checked at once, while as many others are being merged.
 pub(super) const AHEAD: usize = 2;
@@ -51,12 +53,19 @@ impl Initialiser {
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
         (report.consistency_ms, report.samples_ms, report.voxels_ms) = (0.0, 0.0, 0.0);
         let with_depth: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].has_depth()).collect();
+        let light = match self.settings.light {
+            true => self.measure_light(&views)?,
+            false => None,
+        };
         // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
         let mut waiting: Vec<Checked> = Vec::new();
         for next in with_depth.chunks(AHEAD).map(Some).chain([None]) {
             let this = &*self;
             let check = || -> Result<Vec<Checked>, InitError> {
-                let checked = next.unwrap_or(&[]).par_iter().map(|&i| this.check(i, &views, global_scale).transpose());
+                let checked = next
+                    .unwrap_or(&[])
+                    .par_iter()
+                    .map(|&i| this.check(i, &views, light.as_ref(), global_scale).transpose());
                 checked.flatten_iter().collect()
             };
             let sort = || {
@@ -92,22 +101,41 @@ impl Initialiser {
         report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
         let planned = self.planned_bytes(self.frames.len(), max_gaussians);
         self.report.planned_bytes = planned;
-        Ok(Initialisation { cloud, report: self.report.clone() })
+        Ok(Initialisation { cloud, light, report: self.report.clone() })
+    }
+
+    /// The pictures that see most of what picture `i` sees.
+    fn witnesses(&self, i: usize, views: &[View]) -> Vec<usize> {
+        let depth = self.typical_depth(i).unwrap_or(1.0);
+        let wide = InitSettings { covisible: WITNESSES, ..self.settings.clone() };
+        let others = partners(i, views, depth, &wide, &mut SkippedPairs::default());
+        others.into_iter().take(WITNESSES).map(|o| o.0).collect()
+    }
+
+    /// The pictures' light where it is uneven.
+    fn measure_light(&mut self, views: &[View]) -> Result<Option<Light>, InitError> {
+        let started = Instant::now();
+        let found = measure(&self.frames, |i| self.witnesses(i, views), self.settings.depth_tolerance)?;
+        self.report.light = [found.solved.before, found.solved.after];
+        self.report.light_ms = started.elapsed().as_secs_f64() * 1e3;
+        Ok(found.light)
     }
 
     /// The depths of picture `i` after comparison with the pictures that see the same ground, as samples and as a prior.
-    fn check(&self, i: usize, views: &[View], global_scale: f32) -> Result<Option<Checked>, InitError> {
+    fn check(
+        &self,
+        i: usize,
+        views: &[View],
+        light: Option<&Light>,
+        global_scale: f32,
+    ) -> Result<Option<Checked>, InitError> {
         let started = Instant::now();
         let Some(own) = self.frames[i].depth()? else { return Ok(None) };
         let range = self.known_range(i);
         let mut count = ConsistencyCount::default();
         let mut grid = None;
         if self.settings.consistency {
-            let depth = self.typical_depth(i).unwrap_or(1.0);
-            let wide = InitSettings { covisible: WITNESSES, ..self.settings.clone() };
-            let mut others = partners(i, views, depth, &wide, &mut SkippedPairs::default());
-            others.truncate(WITNESSES);
-            let others: Vec<usize> = others.into_iter().map(|o| o.0).collect();
+            let others = self.witnesses(i, views);
             let fill = range.filter(|_| self.settings.fill).and_then(|range| continued(&own, range));
             if let Some((resolved, found)) =
                 resolve(&self.frames, i, &others, self.settings.depth_tolerance, fill.as_deref())?
@@ -120,14 +148,12 @@ impl Initialiser {
         self.frames[i].leave_out(&mut grid);
         let consistency_ms = started.elapsed().as_secs_f64() * 1e3;
         let appearance = self.appearance.get(i).and_then(Option::as_ref);
-        let samples = samples(
-            &self.frames[i].view,
-            self.frames[i].image()?.as_ref(),
-            &grid,
-            appearance,
-            &self.settings,
-            global_scale,
-        );
+        let mut image = self.frames[i].image()?;
+        if let Some(light) = light {
+            let (own, lens) = (light.of(&self.frames[i].name), &self.frames[i].view.intrinsics);
+            own.change(&PictureLight::default(), image.to_mut(), lens);
+        }
+        let samples = samples(&self.frames[i].view, image.as_ref(), &grid, appearance, &self.settings, global_scale);
         let samples_ms = started.elapsed().as_secs_f64() * 1e3 - consistency_ms;
         let (width, height) = (grid.width as u32, grid.height as u32);
         let prior = DepthPrior { width, height, depth: grid.depth, confidence: grid.confidence };

@@ -1,0 +1,113 @@
+//! The light of the pictures, out of their depths: places that two pictures agree on, and the colours both have of them.
+
+use std::io;
+
+use rayon::prelude::*;
+
+use super::depth_frame::{DepthFrame, DepthGrid};
+use crate::camera::{Projector, Unprojector};
+use crate::light::{Light, Ratio, Solved, off_axis, solve};
+
+/// Places that a picture is compared with another at, at most.
+const PLACES: usize = 128;
+/// Confidence of a depth whose colour is compared.
+const SURE: f32 = 0.2;
+/// Half the side of the patch whose mean is compared, pixels of the network's picture: a misplaced texture averages out.
+const PATCH: i32 = 3;
+/// Means beyond these are clipped or noise.
+const USABLE: [f32; 2] = [10.0, 245.0];
+/// Light is uneven when it is more than noise: gains and fall-off together take this share off the differences…
+const EXPLAINED: f32 = 0.2;
+/// …and at the picture or place where they are largest reach this factor: less is not seen, and costs rounding.
+const LARGEST: f32 = 1.05;
+
+/// Compares picture `i` with each of `others`.
+pub(super) fn ratios(frames: &[DepthFrame], i: usize, others: &[usize], tolerance: f32) -> io::Result<Vec<Ratio>> {
+    let Some(own) = frames[i].depth()? else { return Ok(Vec::new()) };
+    let image = frames[i].image()?;
+    let unproject = Unprojector::new(&frames[i].view);
+    let sure: Vec<usize> = (0..own.depth.len()).filter(|k| own.confidence[*k] > SURE).collect();
+    let mut ratios = Vec::new();
+    for &j in others {
+        let Some(theirs) = frames[j].depth()? else { continue };
+        let their_image = frames[j].image()?;
+        let project = Projector::new(&frames[j].view);
+        let seen = |at: usize| -> Option<(f32, f32)> {
+            let (x, y) = own.pixel(at % own.width, at / own.width);
+            let (u, v, z) = project.project(unproject.at(x, y, own.depth[at]))?;
+            agrees(&theirs, (u, v, z), tolerance).then_some((u, v))
+        };
+        let both: Vec<(usize, (f32, f32))> = sure.iter().filter_map(|&at| Some((at, seen(at)?))).collect();
+        for (at, (u, v)) in both.iter().step_by(both.len().div_ceil(PLACES).max(1)) {
+            let (x, y) = own.pixel(at % own.width, at / own.width);
+            let (Some(here), Some(there)) = (patch(&image, x, y), patch(&their_image, *u, *v)) else { continue };
+            ratios.push(Ratio {
+                pictures: [i as u32, j as u32],
+                t2: [off_axis([x, y], &frames[i].view.intrinsics), off_axis([*u, *v], &frames[j].view.intrinsics)],
+                log: std::array::from_fn(|c| (here[c] / there[c]).ln()),
+            });
+        }
+    }
+    Ok(ratios)
+}
+
+fn agrees(grid: &DepthGrid, (u, v, z): (f32, f32, f32), tolerance: f32) -> bool {
+    let at = grid.index_at(u, v).filter(|k| grid.confidence[*k] > SURE);
+    at.is_some_and(|k| ((z - grid.depth[k]) / grid.depth[k]).abs() < tolerance)
+}
+
+/// Mean colour around a place, 0…255; `None` at the rim and where a channel is clipped or dark.
+fn patch(image: &image::RgbImage, x: f32, y: f32) -> Option<[f32; 3]> {
+    let (x, y) = (x as i32, y as i32);
+    let inside = |at: i32, size: u32| at >= PATCH && at + PATCH < size as i32;
+    if !(inside(x, image.width()) && inside(y, image.height())) {
+        return None;
+    }
+    let (mut sum, mut n) = ([0.0f32; 3], 0.0);
+    for v in y - PATCH..=y + PATCH {
+        for u in x - PATCH..=x + PATCH {
+            let p = image.get_pixel(u as u32, v as u32).0;
+            (0..3).for_each(|c| sum[c] += f32::from(p[c]));
+            n += 1.0;
+        }
+    }
+    let mean = sum.map(|s| s / n);
+    mean.iter().all(|m| (USABLE[0]..=USABLE[1]).contains(m)).then_some(mean)
+}
+
+/// What was found, and what is to be done about it.
+#[derive(Clone, Debug)]
+pub(super) struct Found {
+    pub solved: Solved,
+    /// `None`: even, and nothing is to be done.
+    pub light: Option<Light>,
+}
+
+/// The light of all pictures, each compared with those that `others` names.
+pub(super) fn measure(
+    frames: &[DepthFrame],
+    others: impl Fn(usize) -> Vec<usize> + Sync,
+    tolerance: f32,
+) -> io::Result<Found> {
+    let compared: io::Result<Vec<Vec<Ratio>>> =
+        (0..frames.len()).into_par_iter().map(|i| ratios(frames, i, &others(i), tolerance)).collect();
+    let mut all: Vec<Ratio> = compared?.into_iter().flatten().collect();
+    let solved = solve(frames.len(), &mut all);
+    let names = frames.iter().zip(&solved.gains);
+    let light = Light {
+        gains: names.filter_map(|(frame, gain)| Some((frame.name.clone(), (*gain)?))).collect(),
+        falloff: solved.falloff,
+        reach: solved.reach,
+    };
+    let none = crate::light::PictureLight::default();
+    let largest = light.gains.keys().map(|name| light.of(name).furthest(&none)).fold(1.0, f32::max);
+    let uneven = solved.after < (1.0 - EXPLAINED) * solved.before && largest >= LARGEST && light.is_usable();
+    tracing::info!(
+        "light: before {} after {} largest {largest} corner {} spread {:?}",
+        solved.before,
+        solved.after,
+        light.falloff_at(solved.reach),
+        light.gains.values().map(|g| g[1]).fold([f32::MAX, f32::MIN], |a, g| [a[0].min(g), a[1].max(g)])
+    );
+    Ok(Found { solved, light: uneven.then_some(light) })
+}
