@@ -71,6 +71,22 @@ impl GaussianCloud {
         }
     }
 
+    /// Colour of Gaussian `i` without what depends on the direction, red, green and blue, 0…1.
+    pub fn color(&self, i: usize) -> [f32; 3] {
+        let at = i * self.sh_stride();
+        std::array::from_fn(|c| 0.5 + SH_C0 * self.sh[at + c])
+    }
+
+    /// Multiplies all colours, from wherever they are seen.
+    pub fn multiply_colors(&mut self, factor: [f32; 3]) {
+        let stride = self.sh_stride();
+        for sh in self.sh.chunks_exact_mut(stride) {
+            (0..3).for_each(|c| sh[c] += 0.5 / SH_C0);
+            sh.iter_mut().enumerate().for_each(|(i, v)| *v *= factor[i % 3]);
+            (0..3).for_each(|c| sh[c] -= 0.5 / SH_C0);
+        }
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()

@@ -7,6 +7,7 @@ use models::camera::{Intrinsics, Pose, View};
 use models::cloud::{GaussianCloud, sh_coefficients};
 use models::formats::model::{self, ModelHeader};
 use models::formats::{FormatError, ply};
+use models::light::PictureLight;
 use proptest::prelude::*;
 
 fn header(views: usize) -> ModelHeader {
@@ -22,6 +23,7 @@ fn header(views: usize) -> ModelHeader {
         train_seconds: 12.5,
         seed: 7,
         finished: true,
+        lights: vec![PictureLight { gain: [0.2, -0.1, 0.0], falloff: [-0.3, 0.1, 0.0], reach: 0.9 }; views],
     }
 }
 
@@ -116,6 +118,24 @@ fn a_model_with_any_bit_flipped_or_any_byte_missing_is_refused() {
     assert!(matches!(model::read(&path), Err(FormatError::Damaged { .. })));
     std::fs::write(&path, &whole[..60]).unwrap();
     assert!(matches!(model::read(&path), Err(FormatError::Truncated { .. })));
+}
+
+#[test]
+fn a_model_of_before_pictures_had_a_light_is_read_as_one_of_even_light() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.dgtr");
+    let even = ModelHeader { lights: Vec::new(), ..header(2) };
+    model::write(&path, &even, &sample()).unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap());
+    bytes[12..16].copy_from_slice(&(length - 1).to_le_bytes());
+    assert_eq!(bytes.remove(28 + length as usize - 1), 0);
+    let hashed = bytes.len() - 32;
+    let hash = blake3::hash(&bytes[..hashed]);
+    bytes[hashed..].copy_from_slice(hash.as_bytes());
+    std::fs::write(&path, &bytes).unwrap();
+    let (head, cloud) = model::read(&path).unwrap();
+    assert!(head == even && cloud == sample());
 }
 
 #[test]
@@ -240,6 +260,9 @@ fn a_header_that_would_size_or_place_nonsense_is_refused_by_reader_and_writer() 
     refuse(view(|v| v.pose.rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0)), "v0.jpg");
     refuse(ModelHeader { region: vec![[0.0; 2]; 5000], ..good.clone() }, "5000 corners");
     refuse(ModelHeader { region: vec![[f64::NAN, 0.0]], ..good.clone() }, "region");
+    refuse(ModelHeader { lights: vec![good.lights[0]; 3], ..good.clone() }, "the light of 3 of 1 views");
+    let blinding = PictureLight { gain: [90.0; 3], ..good.lights[0] };
+    refuse(ModelHeader { lights: vec![blinding], ..good.clone() }, "the light of 1 of 1 views");
     let origin = Some(Geodetic { lat_deg: 91.0, lon_deg: 0.0, alt_m: 0.0 });
     refuse(ModelHeader { origin, ..good.clone() }, "origin");
 }

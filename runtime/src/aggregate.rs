@@ -13,6 +13,7 @@ use config::geodesy::Geodetic;
 use config::ground::GroundSettings;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
+use models::light::PictureLight;
 use vulkan::trainer::TrainError;
 
 use member::Member;
@@ -23,6 +24,7 @@ use register::{Registered, Registrar};
 pub mod compare;
 pub mod distil;
 pub mod frame;
+mod light;
 pub mod member;
 pub mod merge;
 pub mod region;
@@ -113,6 +115,8 @@ pub struct Outcome {
     pub registered: Registered,
     /// Why none could be; the models were then merged where their GPS put them.
     pub not_registered: Option<String>,
+    /// The largest factor between a model's colours and the common light; 1 where it was even.
+    pub light: f32,
     /// Regions in use, declared or derived.
     pub regions: Vec<Option<region::Region>>,
     /// Distillation, when it ran or found nothing to do.
@@ -155,6 +159,9 @@ pub fn run(
     }
     outcome.seconds.push(("register", start.elapsed().as_secs_f64()));
     let start = Instant::now();
+    outcome.light = light::unite(&mut members)?;
+    outcome.seconds.push(("light", start.elapsed().as_secs_f64()));
+    let start = Instant::now();
     let partition = region::Partition::new(&members);
     let mut merged = merge::merge(&members, &partition, settings.max_gaussians.unwrap_or(usize::MAX))?;
     outcome.seconds.push(("merge", start.elapsed().as_secs_f64()));
@@ -164,6 +171,7 @@ pub fn run(
         origin,
         views: members.iter().flat_map(|m| m.header.views.clone()).collect(),
         seed: settings.seed,
+        lights: lights(&members),
         ..Default::default()
     };
     outcome.models = members.iter().map(|m| (m.name().to_owned(), m.header.clone())).collect();
@@ -187,6 +195,19 @@ pub fn run(
     model::write(&outcome.path, &outcome.header, &merged.cloud)?;
     outcome.seconds.push(("write", start.elapsed().as_secs_f64()));
     Ok(outcome)
+}
+
+/// The lights of all views, in the order of the members; none where all of them are even.
+fn lights(members: &[Member]) -> Vec<PictureLight> {
+    if members.iter().all(|m| m.header.lights.is_empty()) {
+        return Vec::new();
+    }
+    let of = |m: &Member| -> Vec<PictureLight> {
+        let mut lights = m.header.lights.clone();
+        lights.resize(m.header.views.len(), PictureLight::default());
+        lights
+    };
+    members.iter().flat_map(of).collect()
 }
 
 /// Folder below `out` for what is known of pairs of models.

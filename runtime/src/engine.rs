@@ -19,7 +19,7 @@ use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::init::{Initialiser, most_frame_bytes};
-use models::light::{Light, PictureLight};
+use models::light::PictureLight;
 use models::onnx::depth::DepthNetwork;
 use models::refine::{RefineReport, Refiner};
 use vulkan::trainer::Trainer;
@@ -33,7 +33,7 @@ pub mod device;
 mod first_gaussians;
 mod follow;
 pub mod host;
-pub mod light;
+mod light;
 mod map;
 mod rebuild;
 mod reconstruct;
@@ -117,9 +117,9 @@ pub struct Reconstruction {
     built: Vec<View>,
     /// Views of the model that is continued.
     resumed: HashMap<String, View>,
-    /// What the pictures' light is known to be.
-    light: Light,
-    /// What of it is taken out of each view's picture already.
+    /// Lights of the model that is continued.
+    resumed_lights: HashMap<String, PictureLight>,
+    /// The light that is taken out of each view's picture already.
     taken_out: Vec<PictureLight>,
     /// Points of the scene known beforehand.
     points: Vec<Point>,
@@ -191,7 +191,7 @@ impl Reconstruction {
             unsolved: false,
             built: Vec::with_capacity(views),
             resumed: HashMap::new(),
-            light: Light::default(),
+            resumed_lights: HashMap::new(),
             taken_out: Vec::new(),
             points: Vec::new(),
             refined: None,
@@ -222,7 +222,8 @@ impl Reconstruction {
         self.train_s = told.unwrap_or(header.train_seconds);
         self.header.steps = header.steps;
         self.cloud = cloud;
-        self.light = light::of_model(out);
+        let names = header.views.iter().map(|(name, _)| name.clone());
+        self.resumed_lights = names.zip(header.lights).collect();
         self.resumed = header.views.into_iter().collect();
         if !self.settings.incremental {
             // Poses are those of the last checkpoint, and Gaussians are there: what is left to make are depth priors.

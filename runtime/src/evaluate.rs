@@ -7,8 +7,9 @@ pub mod heights;
 use models::baselines::{MeanColor, nearest_view, warp_over_ground};
 use models::camera::{PosedImage, View};
 use models::dataset::Dataset;
+use models::formats::model::ModelHeader;
 use models::formats::write_atomic;
-use models::light::{Light, PictureLight};
+use models::light::PictureLight;
 use models::metrics::{colors_fitted, psnr, ssim_where, to_f32, to_rgb8};
 use models::onnx::metric::PerceptualMetric;
 use serde::Serialize;
@@ -94,19 +95,35 @@ pub struct BaselineScores {
     pub mean_color: Scores,
 }
 
-/// How a data set's pictures come into a model's frame and light.
+/// How a data set's pictures come into a model's frame, and what light they are expected in.
 #[derive(Clone, Debug)]
 pub struct IntoModel {
     /// Poses.
     pub transfer: PoseTransfer,
-    /// The light of the pictures that the model was trained on; of others only their lens is known.
-    pub light: Light,
+    views: Vec<View>,
+    lights: Vec<PictureLight>,
+}
+
+impl IntoModel {
+    /// Of pictures of `set` into the model of `header`.
+    pub fn of(set: &Dataset, header: &ModelHeader) -> Self {
+        Self {
+            transfer: PoseTransfer::between(set, &header.views),
+            views: header.views.iter().map(|v| v.1).collect(),
+            lights: header.lights.clone(),
+        }
+    }
+
+    /// The light of a picture taken at `view` of the model's frame, as the pictures tell that the model was trained on.
+    fn light(&self, view: &View) -> PictureLight {
+        PictureLight::near(self.views.iter(), &self.lights, view)
+    }
 }
 
 /// Renders and scores `frames` of `set`.
 ///
-/// Poses are the data set's, carried into the model's frame. The rendering is given the fall-off of the lens as far as it is known
-/// and rounded to 8 bits first, so that the figures are those of the pictures that `save` receives (`<stem>.png`).
+/// Poses are the data set's, carried into the model's frame. The rendering is put into the light that is
+/// expected there and rounded to 8 bits first, so that the figures are those of the pictures that `save` receives (`<stem>.png`).
 /// `metric` is asked too, when given.
 ///
 /// # Errors
@@ -129,7 +146,7 @@ pub fn evaluate(
         let Some(mut picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
             return Err(JobError::RenderingSize(truth.name));
         };
-        PictureLight::default().change(&into.light.lens(), &mut picture, &view.intrinsics);
+        PictureLight::default().change(&into.light(&view), &mut picture, &view.intrinsics);
         if let Some(dir) = save {
             save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
         }

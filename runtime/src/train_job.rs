@@ -30,7 +30,6 @@ use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
 use crate::run_json::RunReport;
-use crate::transfer::PoseTransfer;
 use slices::{REST, Slices};
 
 mod card;
@@ -380,8 +379,7 @@ impl TrainJob {
             return Ok(());
         }
         let from = Instant::now();
-        let transfer = PoseTransfer::between(set, &engine.header().views);
-        let into = IntoModel { transfer, light: engine.light().clone() };
+        let into = IntoModel::of(set, engine.header());
         let scores = evaluate::evaluate(engine.trainer(), set, &held_out, scale, &into, metric, None)?;
         (engine.report.psnr, engine.report.ssim) = (Some(scores.psnr), Some(scores.ssim));
         engine.report.more.insert("psnr_colors_fitted".to_owned(), scores.psnr_colors_fitted.into());

@@ -23,6 +23,7 @@ use super::delivery::{self, Rounding};
 use super::{FormatError, write_atomic};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
+use crate::light::PictureLight;
 use hashing::Hashing;
 
 mod hashing;
@@ -34,7 +35,7 @@ const EXACT: u32 = 1;
 const ROUNDED: u32 = 2;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
-/// A header holds 100 bytes per view; this is room for 100,000 of them and long names.
+/// A header holds 130 bytes per view; this is room for 100,000 of them and long names.
 const MAX_HEADER: u64 = 64 << 20;
 /// Corners of a region taken, far more than any field has.
 const MAX_CORNERS: usize = 4096;
@@ -63,6 +64,8 @@ pub struct ModelHeader {
     pub seed: u64,
     /// Whether the job that writes this file had reached its goal; false in checkpoints.
     pub finished: bool,
+    /// The light of each training view's picture, in their order, which is not in the Gaussians; empty: it was even.
+    pub lights: Vec<PictureLight>,
 }
 
 /// Writes a model whole or not at all.
@@ -338,7 +341,10 @@ fn read_header_of(path: &Path, opened: &mut Opened) -> Result<Vec<u8>, FormatErr
 }
 
 fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
+    // Files of earlier versions end before the lights: an empty list of them is one byte.
+    let earlier = || postcard::from_bytes(&[bytes, &[0]].concat());
     let header: ModelHeader = postcard::from_bytes(bytes)
+        .or_else(|e| earlier().map_err(|_| e))
         .map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))?;
     check_header(path, &header)?;
     Ok(header)
@@ -350,6 +356,10 @@ fn check_header(path: &Path, header: &ModelHeader) -> Result<(), FormatError> {
     if let Some((name, view)) = header.views.iter().find(|(_, view)| !view.is_usable()) {
         let k = &view.intrinsics;
         return bad(format!("its view {name:?} of {} x {} pixels has no usable camera or pose", k.width, k.height));
+    }
+    let lights = header.lights.len();
+    if ![0, header.views.len()].contains(&lights) || !header.lights.iter().all(PictureLight::is_usable) {
+        return bad(format!("it states the light of {lights} of {} views, or one that cannot be", header.views.len()));
     }
     if header.region.len() > MAX_CORNERS || header.region.iter().flatten().any(|v| !v.is_finite()) {
         return bad(format!("its region has {} corners, or one that is not a number", header.region.len()));

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::depth_frame::{DepthFrame, DepthGrid};
 use crate::camera::{Projector, Unprojector};
-use crate::light::{Light, Ratio, Solved, off_axis, solve};
+use crate::light::{Light, PictureLight, Ratio, Solved, off_axis, solve};
 
 /// Places that a picture is compared with another at, at most.
 const PLACES: usize = 128;
@@ -99,15 +99,9 @@ pub(super) fn measure(
         falloff: solved.falloff,
         reach: solved.reach,
     };
-    let none = crate::light::PictureLight::default();
-    let largest = light.gains.keys().map(|name| light.of(name).furthest(&none)).fold(1.0, f32::max);
-    let uneven = solved.after < (1.0 - EXPLAINED) * solved.before && largest >= LARGEST && light.is_usable();
-    tracing::info!(
-        "light: before {} after {} largest {largest} corner {} spread {:?}",
-        solved.before,
-        solved.after,
-        light.falloff_at(solved.reach),
-        light.gains.values().map(|g| g[1]).fold([f32::MAX, f32::MIN], |a, g| [a[0].min(g), a[1].max(g)])
-    );
+    let lights = || frames.iter().map(|frame| light.of(&frame.name));
+    let largest = lights().map(|l| l.furthest(&PictureLight::default())).fold(1.0, f32::max);
+    let explained = solved.after < (1.0 - EXPLAINED) * solved.before;
+    let uneven = explained && largest >= LARGEST && lights().all(|l| l.is_usable());
     Ok(Found { solved, light: uneven.then_some(light) })
 }

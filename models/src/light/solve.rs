@@ -74,9 +74,11 @@ pub fn solve(pictures: usize, ratios: &mut [Ratio]) -> Solved {
     ratios.sort_by_key(|r| r.pictures);
     let reach = ratios.iter().flat_map(|r| r.t2).fold(0.0, f32::max);
     let mut solved = Solved { gains: vec![None; pictures], reach, ..Solved::default() };
-    if ratios.is_empty() || reach <= 0.0 {
+    if ratios.is_empty() {
         return solved;
     }
+    // Without a lens (colours of models) there is no fall-off.
+    let reach = if reach > 0.0 { reach } else { 1.0 };
     let mut x = vec![0.0; 3 * pictures + FALLOFF_TERMS];
     let mut residuals = vec![0.0f32; 3 * ratios.len()];
     let mut left = |x: &[f64]| {

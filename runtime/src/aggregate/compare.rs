@@ -11,11 +11,10 @@ use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::engine::device::renderer;
-use crate::engine::light::of_model;
 use crate::error::JobError;
 use crate::evaluate::{IntoModel, Perceptual, Scores, evaluate, open_metric};
 use crate::report::{Comparison, ReportData};
-use crate::transfer::{PoseTransfer, stem};
+use crate::transfer::stem;
 
 /// A global model this much worse than a local one on its own ground is worth a warning, dB.
 const WORTH_A_WARNING_DB: f64 = 0.3;
@@ -39,18 +38,10 @@ struct Opened {
 }
 
 impl Opened {
-    /// `folder` knows the lens of the pictures that it is to be compared with.
-    fn new(
-        path: &Path,
-        folder: Option<&Path>,
-        set: &Dataset,
-        size: (u32, u32),
-        device: Option<&str>,
-    ) -> Result<Self, JobError> {
+    fn new(path: &Path, set: &Dataset, size: (u32, u32), device: Option<&str>) -> Result<Self, JobError> {
         let (header, cloud) = model::read(path)?;
         let trainer = renderer(device, &cloud, size.0, size.1)?;
-        let (transfer, light) = (PoseTransfer::between(set, &header.views), folder.map(of_model).unwrap_or_default());
-        Ok(Self { trainer, into: IntoModel { transfer, light } })
+        Ok(Self { trainer, into: IntoModel::of(set, &header) })
     }
 
     fn picture(&mut self, view: &View) -> Result<RgbImage, JobError> {
@@ -82,12 +73,12 @@ pub fn compare(
     let owned = by_nearest_training_view(set, &frames, locals)?;
     let mut held = Vec::new();
     for ((name, path), mine) in locals.iter().zip(&owned).filter(|(_, mine)| !mine.is_empty()) {
-        let mut own = Opened::new(path, path.parent(), set, size, device)?;
+        let mut own = Opened::new(path, set, size, device)?;
         let local = evaluate(&mut own.trainer, set, mine, scale, &own.into, metric.as_mut(), None)?;
         let photograph = set.load(mine[mine.len() / 2], scale)?;
         let shown = own.picture(&photograph.view)?;
         drop(own);
-        let mut all = Opened::new(global, path.parent(), set, size, device)?;
+        let mut all = Opened::new(global, set, size, device)?;
         let scores = evaluate(&mut all.trainer, set, mine, scale, &all.into, metric.as_mut(), None)?;
         let pictures = [photograph.image.clone(), shown, all.picture(&photograph.view)?];
         held.push(Held { name: name.clone(), local, global: scores, pictures: Some((photograph.name, pictures)) });

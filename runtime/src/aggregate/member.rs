@@ -7,6 +7,7 @@ use config::geodesy::Geodetic;
 use glam::{DVec2, DVec3};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
+use models::light::PictureLight;
 
 use super::frame::{MAX_APART_M, Motion};
 use super::{AggregateError, LocalModel};
@@ -93,6 +94,8 @@ pub struct Member {
     origin: Option<Geodetic>,
     /// From the file's frame to the header's.
     motion: Motion,
+    /// Log gain of its colours over the common light's.
+    gain: [f32; 3],
 }
 
 impl Member {
@@ -105,6 +108,7 @@ impl Member {
             content: model.content,
             origin: model.header.origin,
             motion: Motion::NONE,
+            gain: [0.0; 3],
             path: model.path,
             header: model.header,
         }
@@ -132,6 +136,17 @@ impl Member {
     pub fn moved(&mut self, by: &Motion) {
         by.header(&mut self.header);
         self.motion = self.motion.then(by);
+    }
+
+    /// Its colours are `gain` (natural logarithm) over the common light's: that is taken out of its Gaussians when they are read, and
+    /// is the light of its pictures.
+    pub fn brought_into_common_light(&mut self, gain: [f32; 3]) {
+        let header = &mut self.header;
+        header.lights.resize(header.views.len(), PictureLight::default());
+        for c in 0..3 {
+            self.gain[c] += gain[c];
+            header.lights.iter_mut().for_each(|light| light.gain[c] += gain[c]);
+        }
     }
 
     /// From the frame of the file to the common one.
@@ -166,13 +181,16 @@ impl Member {
         self.motion.point(middle.extend(height_m))
     }
 
-    /// Its Gaussians in the common frame.
+    /// Its Gaussians in the common frame and light.
     ///
     /// # Errors
     /// The file cannot be read any more, or is another one by now.
     pub fn cloud(&self) -> Result<GaussianCloud, AggregateError> {
         let (_, mut cloud) = self.as_written()?;
         self.motion.cloud(&mut cloud);
+        if self.gain != [0.0; 3] {
+            cloud.multiply_colors(self.gain.map(|g| (-g).exp()));
+        }
         Ok(cloud)
     }
 

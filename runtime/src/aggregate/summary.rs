@@ -27,6 +27,7 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
     let r = &outcome.registered;
     let registered = serde_json::json!({ "pairs": r.pairs, "fitted": r.fitted, "models": r.models.len() });
     run.more.insert("registered".into(), registered);
+    run.more.insert("light".into(), outcome.light.into());
     if let Some(d) = &outcome.distilled {
         run.steps = d.steps.into();
         run.skip("views_without_seam", (d.views - d.used) as u64);

@@ -9,10 +9,8 @@ use serde::Serialize;
 
 use super::child;
 use crate::engine::device::renderer;
-use crate::engine::light::of_model;
 use crate::error::JobError;
 use crate::evaluate::{IntoModel, Scores, evaluate};
-use crate::transfer::PoseTransfer;
 
 /// One way to train.
 #[derive(Clone, Debug, Serialize)]
@@ -66,7 +64,7 @@ pub fn measure(
         let largest = frames.iter().map(|&i| set.frames[i].view.intrinsics).max_by_key(|k| k.pixels());
         let (width, height) = largest.map_or((1, 1), |k| (k.width, k.height));
         let mut trainer = renderer(None, &cloud, width, height)?;
-        let into = IntoModel { transfer: PoseTransfer::between(&set, &header.views), light: of_model(&folder) };
+        let into = IntoModel::of(&set, &header);
         let mut at = |scale: f64| evaluate(&mut trainer, &set, &frames, scale, &into, None, None);
         all.push(DetailScores {
             crops: most,

@@ -12,10 +12,9 @@ use super::CliError;
 use super::plan::largest;
 use crate::cli::output::outln;
 use crate::engine::device::{map_renderer, renderer};
-use crate::engine::light::of_model;
 use crate::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
 use crate::ortho::{Map, MapRequest};
-use crate::transfer::{PoseTransfer, stem};
+use crate::transfer::stem;
 
 /// Arguments of `dgtr eval`.
 #[derive(Debug, clap::Args)]
@@ -87,9 +86,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let (width, height) = largest(&set, &frames, args.scale)?;
     let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
     let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
-    let transfer = PoseTransfer::between(&set, &header.views);
-    let light = of_model(args.model.parent().unwrap_or(Path::new(".")));
-    let into = IntoModel { transfer, light };
+    let into = IntoModel::of(&set, &header);
     let scores = evaluate(&mut trainer, &set, &frames, args.scale, &into, metric.as_mut(), args.save.as_deref())?;
     let naive = match args.baselines {
         true => Some(baselines(&set, &training_frames(&set, &header, &frames)?, &frames, args.scale)?),

@@ -294,6 +294,7 @@ impl Reconstruct for Reconstruction {
         self.header.finished = finished;
         let views = self.views.iter().enumerate().take(self.built.len());
         self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), self.trainer.view_pose(i)?))).collect();
+        self.header.lights = self.lights(self.header.views.len());
         let path = model_path(out);
         model::write_checkpoint(&self.settings.disk, &path, &self.header, &self.cloud)?;
         self.report.stage("checkpoint", from);
