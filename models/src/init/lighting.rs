@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::depth_frame::{DepthFrame, DepthGrid};
 use crate::camera::{Projector, Unprojector};
-use crate::light::{Light, PictureLight, Ratio, Solved, off_axis, solve};
+use crate::light::{Light, Ratio, Solved, off_axis, solve};
 
 /// Places that a picture is compared with another at, at most.
 const PLACES: usize = 128;
@@ -16,10 +16,10 @@ const SURE: f32 = 0.2;
 const PATCH: i32 = 3;
 /// Means beyond these are clipped or noise.
 const USABLE: [f32; 2] = [10.0, 245.0];
-/// Light is uneven when it is more than noise: gains and fall-off together take this share off the differences…
-const EXPLAINED: f32 = 0.2;
-/// …and at the picture or place where they are largest reach this factor: less is not seen, and costs rounding.
-const LARGEST: f32 = 1.05;
+/// Light is uneven when this factor's logarithm is what gains and fall-off take off the differences of colours (their squares'
+/// difference). sheffield_cross, a camera on auto in even weather, has 0.06 and is better left: 0.10 dB are won with colours fitted,
+/// 0.17 lost without. The same pictures changed by 40 % have 0.32 and win 5.2 dB.
+const UNEVEN: f32 = 0.08;
 
 /// Compares picture `i` with each of `others`.
 pub(super) fn ratios(frames: &[DepthFrame], i: usize, others: &[usize], tolerance: f32) -> io::Result<Vec<Ratio>> {
@@ -99,9 +99,7 @@ pub(super) fn measure(
         falloff: solved.falloff,
         reach: solved.reach,
     };
-    let lights = || frames.iter().map(|frame| light.of(&frame.name));
-    let largest = lights().map(|l| l.furthest(&PictureLight::default())).fold(1.0, f32::max);
-    let explained = solved.after < (1.0 - EXPLAINED) * solved.before;
-    let uneven = explained && largest >= LARGEST && lights().all(|l| l.is_usable());
+    let taken_off = (solved.before.powi(2) - solved.after.powi(2)).max(0.0).sqrt();
+    let uneven = taken_off >= UNEVEN && frames.iter().all(|frame| light.of(&frame.name).is_usable());
     Ok(Found { solved, light: uneven.then_some(light) })
 }
