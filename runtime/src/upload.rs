@@ -28,6 +28,7 @@ pub mod store;
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
 mod storm;
+mod territory;
 #[cfg(test)]
 #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "bad links are the network's"))]
 pub(crate) mod testing;
@@ -36,6 +37,7 @@ pub mod transport;
 use config::error::{Error, ErrorKind};
 
 pub use offerer::{Offerer, OffererStatus};
+pub use territory::Territory;
 
 /// Whose models are offered, and in what name they are signed.
 #[derive(Clone)]
@@ -50,6 +52,8 @@ pub struct Source {
     pub flight_number: Option<PathBuf>,
     /// Where what is made for delivery is written.
     pub disk: Disk,
+    /// The ground it answers for; `None`: all.
+    pub territory: Option<Territory>,
 }
 
 impl Source {
@@ -67,14 +71,21 @@ impl Source {
             identity,
             flight_number,
             disk: Disk::default(),
+            territory: Territory::of(mission, aircraft),
         })
     }
 
     /// For tests of what does not depend on keys.
     #[cfg(test)]
     pub(crate) fn unsigned(mission: &str, aircraft: &str) -> Self {
-        let (mission, aircraft) = (mission.into(), aircraft.into());
-        Self { mission, aircraft, identity: Identity::unsigned(), flight_number: None, disk: Disk::default() }
+        Self {
+            mission: mission.into(),
+            aircraft: aircraft.into(),
+            identity: Identity::unsigned(),
+            flight_number: None,
+            disk: Disk::default(),
+            territory: None,
+        }
     }
 }
 

@@ -273,7 +273,14 @@ impl Aircraft {
         let received = at.join("out/received").join(&aircraft).join("model.dgtr");
         let flight_number = Some(at.join(format!("{aircraft}.flight")));
         let (mission_name, disk) = (mission.name.clone(), Default::default());
-        let source = Source { mission: mission_name, aircraft, identity: Identity::unsigned(), flight_number, disk };
+        let source = Source {
+            mission: mission_name,
+            aircraft,
+            identity: Identity::unsigned(),
+            flight_number,
+            disk,
+            territory: None,
+        };
         let offerer = Offerer::start(&mission.upload, source).expect("offerer");
         let [checkpoint, last] = [1.0, 2.0].map(|stage| local_model(at, number, stage));
         offerer.offer(&checkpoint);

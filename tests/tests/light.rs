@@ -79,5 +79,5 @@ fn pictures_of_uneven_light_cost_little_and_those_of_even_light_nothing() {
     let (said, _, with) = trained(dir.path(), "uneven", true);
     println!("even {best:.2} dB, uneven {without:.2} without and {with:.2} with its light taken out");
     assert!(said.contains("the light is uneven"), "{said}");
-    assert!(with > best - 0.5 && without < best - 2.0, "even {best}, without {without}, with {with}");
+    assert!(with > best - 0.2 && without < best - 0.7, "even {best}, without {without}, with {with}");
 }

@@ -20,6 +20,7 @@ use predict::Neighbours;
 use shape::{LOG_SCALES, ShapeSteps};
 use view_basis::ViewBasis;
 
+mod cells;
 mod coder;
 mod color;
 mod positions;
@@ -27,6 +28,7 @@ mod predict;
 mod shape;
 mod view_basis;
 
+pub use cells::{CodedCell, CodedCells, encode_cells};
 pub use coder::Garbled;
 
 /// Host memory that encoding takes at most per Gaussian of SH degree 3, the cloud that is encoded not counted (measured:
@@ -37,7 +39,7 @@ pub const ENCODED_BYTES: usize = 32;
 /// And at least, beyond [`FREE_GAUSSIANS`]: what is read is bounded by the size of its file. Real scenes take 6 to 12; the words
 /// of a scene that is more regular are filled up.
 const LEAST_BYTES: u64 = 2;
-/// Gaussians that any number of words may hold.
+/// Gaussians that any number of words may hold, of a cloud that is one piece.
 const FREE_GAUSSIANS: u64 = 1 << 10;
 
 /// Size classes at most; each is an octave.
@@ -89,6 +91,28 @@ impl Rounding {
     }
 }
 
+/// How a stream of words is laid out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// A cloud in one piece, as files of version 2 hold it.
+    Whole,
+    /// A cell among others: its grids lie in the frame of the scene and not in its own, so that what was rounded once comes back
+    /// as it is; its view basis is rounded, too.
+    Cell,
+}
+
+/// What an encoder takes from the whole cloud, so that a Gaussian is rounded the same in whichever cell it lies. It follows from
+/// rounded scales alone: a cloud that was rounded before gives the same.
+#[derive(Clone, Debug)]
+struct Scope {
+    /// The Gaussians that are kept.
+    rows: Vec<u32>,
+    /// Size classes, octaves, and the middle one.
+    low: f64,
+    high: f64,
+    middle: f64,
+}
+
 /// Gaussians of one size class in coding order.
 #[derive(Default)]
 struct Class {
@@ -111,41 +135,58 @@ struct Given<'a> {
     classes: Vec<Class>,
 }
 
-/// The words of the encoded cloud, and how many Gaussians they hold. Rows that are not valid are left out.
-///
-/// # Errors
-/// None in practice: what is encoded is what was rounded.
-pub fn encode(cloud: &GaussianCloud, views: &[View], rounding: &Rounding) -> Result<(Vec<u32>, usize), Garbled> {
-    let given = Given::new(cloud, views, *rounding);
-    let n = given.classes.iter().map(|c| c.rows.len()).sum();
-    let mut encoder = Encoder::new();
-    code(&mut encoder, n, cloud.sh_degree, Some(&given))?;
-    let mut words = encoder.finish();
-    if n as u64 > most_gaussians(4 * words.len() as u64) {
+/// The words of the cloud in one piece, and how many Gaussians they hold. Rows that are not valid are left out.
+#[cfg(test)]
+fn encode(cloud: &GaussianCloud, views: &[View], rounding: &Rounding) -> Result<(Vec<u32>, usize), Garbled> {
+    let scope = Scope::of(cloud, rounding);
+    let (mut words, n) = (encode_rows(cloud, views, rounding, &scope, &scope.rows, Form::Whole)?, scope.rows.len());
+    if n as u64 > most_gaussians(Form::Whole, 4 * words.len() as u64) {
         words.resize((n * LEAST_BYTES as usize).div_ceil(4), 0);
     }
     Ok((words, n))
 }
 
+/// The words of some rows of a cloud.
+fn encode_rows(
+    cloud: &GaussianCloud,
+    views: &[View],
+    rounding: &Rounding,
+    scope: &Scope,
+    rows: &[u32],
+    form: Form,
+) -> Result<Vec<u32>, Garbled> {
+    let given = Given::new(cloud, views, *rounding, scope, rows, form);
+    let mut encoder = Encoder::new();
+    code(&mut encoder, form, rows.len(), cloud.sh_degree, Some(&given))?;
+    Ok(encoder.finish())
+}
+
 /// Gaussians that so many bytes of words may hold.
-pub fn most_gaussians(bytes: u64) -> u64 {
-    (bytes / LEAST_BYTES).max(FREE_GAUSSIANS)
+pub fn most_gaussians(form: Form, bytes: u64) -> u64 {
+    let free = if form == Form::Whole { FREE_GAUSSIANS } else { 0 };
+    (bytes / LEAST_BYTES).max(free)
 }
 
 /// The cloud of `n` Gaussians in `words`. The caller bounds `n`.
 ///
 /// # Errors
 /// [`Garbled`] for words that no encoder wrote.
-pub fn decode(words: Vec<u32>, n: usize, sh_degree: u8) -> Result<GaussianCloud, Garbled> {
-    code(&mut Decoder::new(words), n, sh_degree, None)
+pub fn decode(form: Form, words: Vec<u32>, n: usize, sh_degree: u8) -> Result<GaussianCloud, Garbled> {
+    code(&mut Decoder::new(words), form, n, sh_degree, None)
 }
 
 /// Both directions.
-fn code(coder: &mut impl Coder, n: usize, sh_degree: u8, given: Option<&Given<'_>>) -> Result<GaussianCloud, Garbled> {
+fn code(
+    coder: &mut impl Coder,
+    form: Form,
+    n: usize,
+    sh_degree: u8,
+    given: Option<&Given<'_>>,
+) -> Result<GaussianCloud, Garbled> {
     let rounding = given.map_or_else(Rounding::default, |g| g.rounding);
     let shape = rounding.shape.code(coder)?;
     let color = rounding.color.code(coder)?;
-    let (places, rows) = places(coder, n, given)?;
+    let (places, rows) = places(coder, form, n, given)?;
     let means: Vec<Vec3> = places.iter().map(|p| p.mean).collect();
     let classes: Vec<u8> = places.iter().map(|p| p.class).collect();
     let neighbours = Neighbours::new(&means);
@@ -172,7 +213,7 @@ fn code(coder: &mut impl Coder, n: usize, sh_degree: u8, given: Option<&Given<'_
         Some(g) => ViewBasis::of(coefficients, &means, &weights, g.views),
         None => ViewBasis::of(coefficients, &[], &[], &[]),
     };
-    let basis = basis.code(coder)?;
+    let basis = basis.code(coder, form)?;
     let stride = 3 * (coefficients + 1);
     let columns: Option<Vec<f32>> = given.map(|g| {
         rows.iter().flat_map(|r| &g.cloud.sh[*r as usize * stride..(*r as usize + 1) * stride]).copied().collect()
@@ -197,7 +238,12 @@ struct Place {
 }
 
 /// Positions class by class, largest Gaussians first; gives them in the order of all that follows, with an encoder's rows.
-fn places(coder: &mut impl Coder, n: usize, given: Option<&Given<'_>>) -> Result<(Vec<Place>, Vec<u32>), Garbled> {
+fn places(
+    coder: &mut impl Coder,
+    form: Form,
+    n: usize,
+    given: Option<&Given<'_>>,
+) -> Result<(Vec<Place>, Vec<u32>), Garbled> {
     let bounds = given.map_or_else(|| Bounds::of(&[]), |g| g.bounds).code(coder)?;
     let classes = coder.bits(6, given.map_or(0, |g| g.classes.len() as u64))? as usize;
     let mut places: Vec<(u64, Place)> = Vec::with_capacity(n);
@@ -222,7 +268,7 @@ fn places(coder: &mut impl Coder, n: usize, given: Option<&Given<'_>>) -> Result
             }
             put(mean);
         }
-        let grid = bounds.grid(step);
+        let grid = bounds.grid(form, step);
         for cell in tree.code(coder, &own.cells, members as u32, grid.bits())? {
             put(grid.center(cell).as_vec3());
         }
@@ -241,17 +287,13 @@ fn places(coder: &mut impl Coder, n: usize, given: Option<&Given<'_>>) -> Result
     Ok((sorted, rows))
 }
 
-impl<'a> Given<'a> {
-    fn new(cloud: &'a GaussianCloud, views: &'a [View], rounding: Rounding) -> Self {
-        let axes = |i: usize| {
-            let mut s = cloud.log_scales[i].map(|v| f64::from(v).clamp(LOG_SCALES.0, LOG_SCALES.1));
-            s.sort_unstable_by(f64::total_cmp);
-            s
-        };
+impl Scope {
+    fn of(cloud: &GaussianCloud, rounding: &Rounding) -> Self {
         let mut rows: Vec<u32> = (0..cloud.len() as u32).filter(|i| cloud.is_valid(*i as usize)).collect();
         let seen = |i: u32| {
-            let [_, middle, large] = axes(i as usize);
-            (middle + large).exp() / (1.0 + (-f64::from(cloud.opacity_logits[i as usize])).exp())
+            let mut s = cloud.log_scales[i as usize].map(|v| f64::from(v).clamp(LOG_SCALES.0, LOG_SCALES.1));
+            s.sort_unstable_by(f64::total_cmp);
+            (s[1] + s[2]).exp() / (1.0 + (-f64::from(cloud.opacity_logits[i as usize])).exp())
         };
         let kept = (rows.len() as f64 * rounding.keep.clamp(0.0, 1.0)).ceil() as usize;
         if kept < rows.len() {
@@ -259,28 +301,50 @@ impl<'a> Given<'a> {
             rows.truncate(kept);
             rows.sort_unstable();
         }
-        let size = |i: u32| {
-            let [small, middle, _] = axes(i as usize);
-            (SMALLEST_SHARE * small + (1.0 - SMALLEST_SHARE) * middle) * std::f64::consts::LOG2_E
-        };
-        let mut sizes: Vec<f64> = rows.iter().map(|i| size(*i)).collect();
+        let mut sizes: Vec<f64> = rows.iter().map(|i| size(rounding, cloud.log_scales[*i as usize])).collect();
         sizes.sort_unstable_by(f64::total_cmp);
-        let at = |share: f64| sizes.get((share * sizes.len() as f64) as usize).or(sizes.last()).copied();
-        let (low, high) = (at(OUTERMOST).unwrap_or(0.0).round(), at(1.0 - OUTERMOST).unwrap_or(0.0).round());
-        let middle = at(0.5).unwrap_or(0.0);
-        let count = ((high - low) as usize + 1).min(MAX_CLASSES);
+        let at = |share: f64| sizes.get((share * sizes.len() as f64) as usize).or(sizes.last()).copied().unwrap_or(0.0);
+        let (low, high) = (at(OUTERMOST).round(), at(1.0 - OUTERMOST).round());
+        // Half octaves: a scene that goes on being trained keeps its grids.
+        let middle = (2.0 * at(0.5)).round() / 2.0;
+        Self { rows, low, high: high.min(low + MAX_CLASSES as f64 - 1.0), middle }
+    }
+}
+
+/// A Gaussian's size in octaves, as its rounded scales say it.
+fn size(rounding: &Rounding, log_scales: [f32; 3]) -> f64 {
+    let mut steps = rounding.shape.round_scales(log_scales);
+    steps.sort_unstable();
+    let [small, middle, _] = steps.map(f64::from);
+    (SMALLEST_SHARE * small + (1.0 - SMALLEST_SHARE) * middle) * rounding.shape.log_scale * std::f64::consts::LOG2_E
+}
+
+impl<'a> Given<'a> {
+    fn new(
+        cloud: &'a GaussianCloud,
+        views: &'a [View],
+        rounding: Rounding,
+        scope: &Scope,
+        rows: &[u32],
+        form: Form,
+    ) -> Self {
+        let class_of =
+            |row: &u32| size(&rounding, cloud.log_scales[*row as usize]).round().clamp(scope.low, scope.high);
+        let lowest = rows.iter().map(class_of).fold(scope.high, f64::min);
+        let highest = rows.iter().map(class_of).fold(lowest, f64::max);
+        let count = (highest - lowest) as usize + 1;
         let means: Vec<Vec3> = rows.iter().map(|i| Vec3::from(cloud.means[*i as usize])).collect();
         let bounds = Bounds::of(&means);
         let step = |class: usize| {
-            let octaves = middle + (low + class as f64 - middle) * rounding.position_power;
+            let octaves = scope.middle + (lowest + class as f64 - scope.middle) * rounding.position_power;
             f64::from((rounding.position * octaves.exp2()) as f32)
         };
         let mut members: Vec<Vec<(u64, u32)>> = vec![Vec::new(); count];
         let mut classes: Vec<Class> = (0..count).map(|c| Class { step: step(c), ..Class::default() }).collect();
         for (row, mean) in rows.iter().zip(&means) {
-            let class = ((size(*row).round() - low).max(0.0) as usize).min(count - 1);
+            let class = (class_of(row) - lowest) as usize;
             if bounds.holds(*mean) {
-                members[class].push((bounds.grid(classes[class].step).cell(*mean), *row));
+                members[class].push((bounds.grid(form, classes[class].step).cell(*mean), *row));
             } else {
                 classes[class].outliers.push(*mean);
                 classes[class].rows.push(*row);

@@ -6,6 +6,10 @@
 //! version 1, exact:   means 3N f32 · log scales 3N · rotations 4N (w x y z) · opacity logits N · sh N·D·3
 //! version 2, rounded: u32 words of the delivery encoding (`super::delivery`)
 //! BLAKE3 of everything before (32)
+//!
+//! version 3, in cells: side f32 · cells u32 · per cell, the most important first: level u8 · y i32 · x i32 · Gaussians u32 ·
+//!     words u32 · importance f32 · BLAKE3 of its words (32)
+//! BLAKE3 of everything before (32) · the cells' words, u32
 //! ```
 //!
 //! All little-endian. The magic's line ends betray a transfer as text, what is allocated follows from the fixed part and
@@ -19,28 +23,34 @@ use config::disk::Disk;
 use config::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
-use super::delivery::{self, Rounding};
+use super::delivery::{self, Form, Rounding};
 use super::{FormatError, write_atomic};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
 use crate::light::PictureLight;
+use celled::Cells;
+use columns::{read_words, triples, write_floats};
 use hashing::Hashing;
 
+mod celled;
+mod columns;
 mod hashing;
+
+pub use celled::{pieces, write_cells};
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.
 const EXACT: u32 = 1;
-/// The delivery encoding.
+/// The delivery encoding in one piece: read, no longer written.
 const ROUNDED: u32 = 2;
+/// The delivery encoding, cell by cell.
+const CELLED: u32 = 3;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 130 bytes per view; this is room for 100,000 of them and long names.
 const MAX_HEADER: u64 = 64 << 20;
 /// Corners of a region taken, far more than any field has.
 const MAX_CORNERS: usize = 4096;
-/// Floats moved at a time.
-const CHUNK: usize = 16 << 10;
 
 /// What a model file says about itself besides its Gaussians.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -115,18 +125,7 @@ pub fn write_rounded(
     cloud: &GaussianCloud,
     rounding: &Rounding,
 ) -> Result<usize, FormatError> {
-    let views: Vec<View> = header.views.iter().map(|(_, view)| *view).collect();
-    check_columns(path, cloud)?;
-    let garbled = |e| FormatError::invalid(path, format!("not written: {e}"));
-    let (words, n) = delivery::encode(cloud, &views, rounding).map_err(garbled)?;
-    let head = encode_header(path, header)?;
-    disk.replace(path, |file| {
-        let mut out = begin(file, ROUNDED, &head, n, cloud.sh_degree)?;
-        out.write_all(&words.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>())?;
-        finish(out)
-    })
-    .map_err(|e| FormatError::disk(path, e))?;
-    Ok(n)
+    write_cells(disk, path, header, cloud, rounding, &|_, _| true)
 }
 
 /// What fills the file of a model.
@@ -144,7 +143,7 @@ fn content<'a>(
         write_floats(&mut out, cloud.rotations.as_flattened())?;
         write_floats(&mut out, &cloud.opacity_logits)?;
         write_floats(&mut out, &cloud.sh)?;
-        finish(out)
+        finish(out).map(drop)
     })
 }
 
@@ -190,9 +189,10 @@ fn begin<'a>(
     Ok(out)
 }
 
-fn finish(out: Hashing<&mut dyn Write>) -> std::io::Result<()> {
+fn finish(out: Hashing<&mut dyn Write>) -> std::io::Result<&mut dyn Write> {
     let hash = out.hasher.finalize();
-    out.inner.write_all(hash.as_bytes())
+    out.inner.write_all(hash.as_bytes())?;
+    Ok(out.inner)
 }
 
 /// Reads and verifies a model. Gaussians that hold a number that is not finite are dropped and their number logged.
@@ -210,19 +210,21 @@ pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
 pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 32]), FormatError> {
     let mut opened = open(path)?;
     let header = read_header_of(path, &mut opened)?;
-    let Opened { mut input, count, sh_degree, words, .. } = opened;
+    let Opened { mut input, count, sh_degree, body, size, .. } = opened;
     let mut cloud = GaussianCloud { sh_degree, ..Default::default() };
     let failed = |e| FormatError::io(path, "reading", e);
-    let mut coded = Vec::new();
-    if let Some(words) = words {
-        coded = read_words(&mut input, words, u32::from_le_bytes).map_err(failed)?;
-    } else {
-        let mut column = |floats: usize| read_words(&mut input, floats, f32::from_le_bytes).map_err(failed);
-        cloud.means = triples(column(3 * count)?);
-        cloud.log_scales = triples(column(3 * count)?);
-        cloud.rotations = column(4 * count)?.as_chunks().0.to_vec();
-        cloud.opacity_logits = column(count)?;
-        cloud.sh = column(count * cloud.sh_stride())?;
+    let (mut coded, mut cells) = (Vec::new(), None);
+    match body {
+        Body::Words(words) => coded = read_words(&mut input, words, u32::from_le_bytes).map_err(failed)?,
+        Body::Cells => cells = Some(Cells::read(path, &mut input, count, size - FIXED - header.len() as u64)?),
+        Body::Columns => {
+            let mut column = |floats: usize| read_words(&mut input, floats, f32::from_le_bytes).map_err(failed);
+            cloud.means = triples(column(3 * count)?);
+            cloud.log_scales = triples(column(3 * count)?);
+            cloud.rotations = column(4 * count)?.as_chunks().0.to_vec();
+            cloud.opacity_logits = column(count)?;
+            cloud.sh = column(count * cloud.sh_stride())?;
+        }
     }
     let expected = input.hasher.finalize();
     let mut hash = [0; HASH as usize];
@@ -230,8 +232,11 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
     if expected != blake3::Hash::from_bytes(hash) {
         return Err(FormatError::Damaged { path: path.to_owned() });
     }
-    if words.is_some() {
-        cloud = delivery::decode(coded, count, sh_degree).map_err(|e| FormatError::invalid(path, e.to_string()))?;
+    if let Some(cells) = cells {
+        cells.decode(path, &mut input.inner, &mut cloud)?;
+    } else if body != Body::Columns {
+        cloud = delivery::decode(Form::Whole, coded, count, sh_degree)
+            .map_err(|e| FormatError::invalid(path, e.to_string()))?;
     }
     let header = decode_header(path, &header)?;
     let dropped = cloud.drop_invalid();
@@ -267,11 +272,22 @@ fn exact_bytes(sh_degree: u8) -> u64 {
 
 struct Opened {
     input: Hashing<BufReader<File>>,
+    size: u64,
     count: usize,
     sh_degree: u8,
     header_len: usize,
-    /// Words of the delivery encoding; `None`: exact columns.
-    words: Option<usize>,
+    body: Body,
+}
+
+/// How the Gaussians are there.
+#[derive(Clone, Copy, PartialEq)]
+enum Body {
+    /// As exact columns.
+    Columns,
+    /// In so many words of the delivery encoding.
+    Words(usize),
+    /// In the delivery encoding, cell by cell.
+    Cells,
 }
 
 fn open(path: &Path) -> Result<Opened, FormatError> {
@@ -289,9 +305,9 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
     }
     let word = |at: usize| u32::from_le_bytes([fixed[at], fixed[at + 1], fixed[at + 2], fixed[at + 3]]);
     let version = word(8);
-    if ![EXACT, ROUNDED].contains(&version) {
+    if ![EXACT, ROUNDED, CELLED].contains(&version) {
         let what = format!(
-            "model file version {version}; this dgtr reads versions {EXACT} and {ROUNDED}: use the dgtr that wrote it"
+            "model file version {version}; this dgtr reads versions {EXACT} to {CELLED}: use the dgtr that wrote it"
         );
         return Err(FormatError::invalid(path, what));
     }
@@ -306,20 +322,21 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
         return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size: header_len, limit });
     }
     let header_len = header_len as usize;
-    if version == ROUNDED {
+    if version != EXACT {
         let Some(coded) = size.checked_sub(FIXED + header_len as u64 + HASH) else {
             return Err(truncated("its header"));
         };
-        let limit = delivery::most_gaussians(coded);
+        let form = if version == ROUNDED { Form::Whole } else { Form::Cell };
+        let limit = delivery::most_gaussians(form, coded);
         if count > limit {
             let what = "its number of Gaussians";
             return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
         }
-        if coded % 4 != 0 {
+        let body = if version == ROUNDED { Body::Words(coded as usize / 4) } else { Body::Cells };
+        if version == ROUNDED && coded % 4 != 0 {
             return Err(truncated("its Gaussians"));
         }
-        let words = Some(coded as usize / 4);
-        return Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len, words });
+        return Ok(Opened { input, size, count: count as usize, sh_degree: degree as u8, header_len, body });
     }
     let expected =
         count.checked_mul(exact_bytes(degree as u8)).and_then(|c| c.checked_add(FIXED + header_len as u64 + HASH));
@@ -331,7 +348,7 @@ fn open(path: &Path) -> Result<Opened, FormatError> {
         }
         _ => return Err(truncated("its Gaussians")),
     }
-    Ok(Opened { input, count: count as usize, sh_degree: degree as u8, header_len, words: None })
+    Ok(Opened { input, size, count: count as usize, sh_degree: degree as u8, header_len, body: Body::Columns })
 }
 
 fn read_header_of(path: &Path, opened: &mut Opened) -> Result<Vec<u8>, FormatError> {
@@ -373,36 +390,16 @@ fn check_header(path: &Path, header: &ModelHeader) -> Result<(), FormatError> {
     Ok(())
 }
 
-fn triples(flat: Vec<f32>) -> Vec<[f32; 3]> {
-    flat.as_chunks().0.to_vec()
-}
-
-fn write_floats(out: &mut impl Write, values: &[f32]) -> std::io::Result<()> {
-    let mut buffer = Vec::with_capacity(4 * CHUNK.min(values.len()));
-    for chunk in values.chunks(CHUNK) {
-        buffer.clear();
-        buffer.extend(chunk.iter().flat_map(|v| v.to_le_bytes()));
-        out.write_all(&buffer)?;
-    }
-    Ok(())
-}
-
-fn read_words<T>(input: &mut impl Read, n: usize, word: fn([u8; 4]) -> T) -> std::io::Result<Vec<T>> {
-    let mut values = Vec::with_capacity(n);
-    let mut buffer = vec![0; 4 * CHUNK.min(n)];
-    while values.len() < n {
-        let bytes = &mut buffer[..4 * CHUNK.min(n - values.len())];
-        input.read_exact(bytes)?;
-        values.extend(bytes.as_chunks().0.iter().map(|b| word(*b)));
-    }
-    Ok(values)
-}
-
 #[cfg(test)]
 mod tests {
     #[test]
     fn the_page_on_formats_states_these_versions() {
-        let row = format!("| `.dgtr` model file | {} exact, {} rounded |", super::EXACT, super::ROUNDED);
+        let row = format!(
+            "| `.dgtr` model file | {} exact, {} rounded (read only), {} rounded in cells |",
+            super::EXACT,
+            super::ROUNDED,
+            super::CELLED
+        );
         assert!(include_str!("../../FORMATS.md").contains(&row), "{row}");
     }
 }

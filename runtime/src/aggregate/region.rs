@@ -30,6 +30,11 @@ pub struct Region {
 }
 
 impl Region {
+    /// A region of the mission.
+    pub fn declared(corners: Vec<DVec2>) -> Self {
+        Self { corners, declared: true, cameras: Vec::new() }
+    }
+
     /// The declared region of a model, or the hull of what its cameras look at on ground of this height. None when there is
     /// neither.
     pub fn of(header: &ModelHeader, ground: f64) -> Option<Self> {

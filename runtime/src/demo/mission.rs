@@ -44,6 +44,7 @@ seed = {seed}
 seconds = {seconds}
 
 [upload]
+encoding = "delivery"
 connect = ["tcp/127.0.0.1:{port}"]
 listen = ["tcp/127.0.0.1:{port}"]
 

@@ -4,9 +4,13 @@
 //! when it arrives, the chunk list must add up to the stated size, and the aircraft's signature covers every byte.
 //!
 //! ```text
-//! version u8 = 2 · mission · aircraft · flight · counter · finished · size · chunk bytes · model · chunks   (postcard)
+//! version u8 · mission · aircraft · flight · counter · finished · size · chunk bytes · model · chunks   (postcard)
+//! version 3: bytes of each chunk (postcard)
 //! Ed25519 signature of "dgtr offer\0" and everything before (64; absent in missions without keys)
 //! ```
+//!
+//! A model in cells is cut where its cells end (version 3), so that a cell that did not change is a chunk the ground has; its
+//! first chunk is its index, the others follow by importance. Any other file is cut evenly (version 2).
 
 use std::fs::File;
 use std::io::Read;
@@ -16,12 +20,17 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use config::upload::UploadSettings;
+use models::formats::model;
 
 use super::Source;
 use crate::keys::{Domain, Identity, SignatureBytes, SignatureError};
 
-/// Version of the wire format; another one is refused, not guessed at. 1 was unsigned and ordered by the wall clock.
-const VERSION: u8 = 2;
+/// Versions of the wire format; another one is refused, not guessed at. 1 was unsigned and ordered by the wall clock.
+const EVEN: u8 = 2;
+/// With chunks of different lengths.
+const PIECES: u8 = 3;
+/// A chunk's length takes so many bytes at most.
+const MAX_SIZE: u64 = 3;
 /// Longest mission or aircraft name on the wire (the mission file allows 32).
 const MAX_NAME: usize = 64;
 
@@ -56,12 +65,15 @@ pub struct Offer {
     pub finished: bool,
     /// Bytes of the model file.
     pub size: u64,
-    /// Bytes of every chunk but the last.
+    /// Bytes of every chunk but the last; where they differ, of the largest.
     pub chunk_bytes: u32,
     /// blake3 of the whole file.
     pub model: Hash,
     /// blake3 of each chunk, in file order.
     pub chunks: Vec<Hash>,
+    /// Bytes of each chunk where they differ.
+    #[serde(skip)]
+    sizes: Vec<u32>,
     /// The aircraft's signature of all the above.
     #[serde(skip)]
     pub signature: Option<SignatureBytes>,
@@ -74,7 +86,7 @@ pub enum OfferError {
     #[error("offer is damaged: {0}")]
     Damaged(String),
     /// Made by a different version of this program.
-    #[error("offer has format {0}, this program reads {VERSION}; update the older side")]
+    #[error("offer has format {0}, this program reads {EVEN} and {PIECES}; update the older side")]
     Version(u8),
     /// Another mission on the same link.
     #[error("offer belongs to mission {0:?}")]
@@ -110,13 +122,17 @@ pub fn is_safe_name(name: &str) -> bool {
 impl Offer {
     /// Most bytes an encoded offer can have under these settings.
     pub fn max_encoded(settings: &UploadSettings) -> u64 {
-        320 + 2 * MAX_NAME as u64 + 32 * settings.max_chunks()
+        320 + 2 * MAX_NAME as u64 + (32 + MAX_SIZE) * settings.max_chunks()
     }
 
     /// What is signed.
     fn signed_bytes(&self) -> Vec<u8> {
         // Plain integers, strings and byte arrays: serialising into a growing vector has no way to fail.
-        postcard::to_allocvec(self).unwrap_or_default()
+        let mut bytes = postcard::to_allocvec(self).unwrap_or_default();
+        if self.version == PIECES {
+            bytes.extend(postcard::to_allocvec(&self.sizes).unwrap_or_default());
+        }
+        bytes
     }
 
     /// Wire bytes.
@@ -141,12 +157,15 @@ impl Offer {
             return damaged("longer than any valid one");
         }
         match bytes.first() {
-            Some(&VERSION) => {}
+            Some(&(EVEN | PIECES)) => {}
             Some(&other) => return Err(OfferError::Version(other)),
             None => return damaged("empty"),
         }
-        let (mut offer, rest): (Self, _) =
-            postcard::take_from_bytes(bytes).map_err(|e| OfferError::Damaged(e.to_string()))?;
+        let unreadable = |e: postcard::Error| OfferError::Damaged(e.to_string());
+        let (mut offer, mut rest): (Self, _) = postcard::take_from_bytes(bytes).map_err(unreadable)?;
+        if offer.version == PIECES {
+            (offer.sizes, rest) = postcard::take_from_bytes(rest).map_err(unreadable)?;
+        }
         match SignatureBytes::try_from(rest) {
             Ok(signature) => offer.signature = Some(signature),
             Err(_) if rest.is_empty() => {}
@@ -163,10 +182,16 @@ impl Offer {
         if offer.size == 0 || !(kib.start() * 1024..=kib.end() * 1024).contains(&offer.chunk_bytes) {
             return damaged("size of model or chunk");
         }
-        if offer.chunks.len() as u64 != offer.size.div_ceil(u64::from(offer.chunk_bytes)) {
-            return damaged("number of chunks does not match the size");
-        }
-        Ok(offer)
+        let adds_up = match offer.version {
+            EVEN => offer.chunks.len() as u64 == offer.size.div_ceil(u64::from(offer.chunk_bytes)),
+            _ => {
+                offer.sizes.len() == offer.chunks.len()
+                    && offer.chunks.len() as u64 <= settings.max_chunks()
+                    && offer.sizes.iter().all(|n| (1..=offer.chunk_bytes).contains(n))
+                    && offer.sizes.iter().map(|n| u64::from(*n)).sum::<u64>() == offer.size
+            }
+        };
+        if adds_up { Ok(offer) } else { damaged("number of chunks does not match the size") }
     }
 
     /// Whether the offer concerns this mission, comes from one of its aircraft, and from nobody else.
@@ -188,8 +213,19 @@ impl Offer {
 
     /// Bytes of chunk `index`.
     pub fn chunk_len(&self, index: usize) -> u64 {
+        if self.version == PIECES {
+            return self.sizes.get(index).copied().unwrap_or(0).into();
+        }
         let chunk = u64::from(self.chunk_bytes);
         self.size.saturating_sub(index as u64 * chunk).min(chunk)
+    }
+
+    /// Where chunk `index` begins in the file.
+    pub fn chunk_start(&self, index: usize) -> u64 {
+        if self.version == PIECES {
+            return self.sizes.iter().take(index).map(|n| u64::from(*n)).sum();
+        }
+        index as u64 * u64::from(self.chunk_bytes)
     }
 }
 
@@ -224,20 +260,25 @@ impl OfferedModel {
             )));
         }
         let chunk_bytes = settings.chunk_bytes();
+        // What is no model in cells is cut evenly, whatever it is: the ground says what it thinks of it.
+        let pieces = model::pieces(path).ok().flatten().filter(|p| p.iter().sum::<u64>() == size);
+        let version = if pieces.is_some() { PIECES } else { EVEN };
+        let cut = |piece: u64| {
+            (0..piece.div_ceil(u64::from(chunk_bytes)))
+                .map(move |i| (piece - i * u64::from(chunk_bytes)).min(u64::from(chunk_bytes)) as u32)
+        };
+        let sizes: Vec<u32> = pieces.unwrap_or(vec![size]).into_iter().flat_map(cut).collect();
         let mut whole = blake3::Hasher::new();
-        let mut chunks = Vec::with_capacity(size.div_ceil(u64::from(chunk_bytes)) as usize);
+        let mut chunks = Vec::with_capacity(sizes.len());
         let mut buffer = vec![0; chunk_bytes as usize];
-        let mut left = size;
-        while left > 0 {
-            let take = left.min(u64::from(chunk_bytes)) as usize;
-            let chunk = &mut buffer[..take];
+        for take in &sizes {
+            let chunk = &mut buffer[..*take as usize];
             file.read_exact(chunk)?;
             whole.update(chunk);
             chunks.push(*blake3::hash(chunk).as_bytes());
-            left -= take as u64;
         }
         let offer = Offer {
-            version: VERSION,
+            version,
             mission: source.mission.clone(),
             aircraft: source.aircraft.clone(),
             order,
@@ -246,6 +287,7 @@ impl OfferedModel {
             chunk_bytes,
             model: *whole.finalize().as_bytes(),
             chunks,
+            sizes: if version == PIECES { sizes } else { Vec::new() },
             signature: None,
         };
         Ok(Self { offer, file }.signed(&source.identity))
@@ -271,7 +313,7 @@ impl OfferedModel {
     /// The model file cannot be read back.
     pub fn chunk(&self, index: usize) -> std::io::Result<Vec<u8>> {
         let mut bytes = vec![0; self.offer.chunk_len(index) as usize];
-        self.file.read_exact_at(&mut bytes, index as u64 * u64::from(self.offer.chunk_bytes))?;
+        self.file.read_exact_at(&mut bytes, self.offer.chunk_start(index))?;
         Ok(bytes)
     }
 
@@ -292,7 +334,7 @@ pub(super) mod testing {
         let (model, chunks) = ([counter as u8; 32], vec![[counter as u8; 32]]);
         let (size, chunk_bytes) = (100, 16 << 10);
         Offer {
-            version: VERSION,
+            version: EVEN,
             mission,
             aircraft,
             order,
@@ -301,6 +343,7 @@ pub(super) mod testing {
             chunk_bytes,
             model,
             chunks,
+            sizes: Vec::new(),
             signature: None,
         }
     }

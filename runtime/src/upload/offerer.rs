@@ -5,16 +5,16 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use config::disk::Disk;
 use config::upload::{Encoding, UploadSettings};
 use models::formats::{FormatError, delivery::Rounding, model};
+use models::ground_cell::{CellKey, Grid};
 
 use super::flight_number::FlightNumber;
 use super::folder::FolderOutlet;
 use super::offer::{OfferedModel, Order};
 use super::receipt::Delivery;
 use super::transport::{Outlet, TransportError};
-use super::{Source, UploadError};
+use super::{Source, UploadError, territory};
 
 /// A model that took so long to deliver keeps the next checkpoint back for so many times as long.
 const REST: f64 = 4.0;
@@ -262,7 +262,7 @@ impl Worker {
         let rounded = match self.settings.encoding {
             Encoding::Exact => None,
             // Rather the whole file than none: the disk may be too full for another.
-            Encoding::Delivery => write_delivery(&self.source.disk, path)
+            Encoding::Delivery => write_delivery(&self.source, path)
                 .inspect_err(|e| tracing::warn!("upload: {e}; the exact model is offered instead"))
                 .ok(),
         };
@@ -371,11 +371,15 @@ impl Worker {
     }
 }
 
-/// Writes the delivery encoding of a model beside it.
-fn write_delivery(disk: &Disk, path: &Path) -> Result<PathBuf, FormatError> {
+/// Writes the delivery encoding of a model beside it, without cells that are others' to deliver.
+fn write_delivery(source: &Source, path: &Path) -> Result<PathBuf, FormatError> {
     let (header, cloud) = model::read(path)?;
     let rounded = path.with_extension("delivery.dgtr");
-    model::write_rounded(disk, &rounded, &header, &cloud, &Rounding::default())?;
+    let margin = territory::margin(&header, cloud.middle()[2]);
+    // A model that does not lie in the mission's frame has no place among regions.
+    let territory = source.territory.as_ref().filter(|_| header.origin.is_some());
+    let wanted = |grid: Grid, key: CellKey| territory.is_none_or(|t| t.wants(grid, key, margin));
+    model::write_cells(&source.disk, &rounded, &header, &cloud, &Rounding::default(), &wanted)?;
     Ok(rounded)
 }
 

@@ -1,11 +1,14 @@
 //! What the ground has on disk of one aircraft: chunks as they arrive, then the verified model.
 //!
 //! `<dir>/chunk/<blake3>` survive a restart, so an interrupted transfer continues where it was; the finished model is
-//! `<dir>/model.dgtr` with the offer it came from beside it. The model is replaced by renaming only after every
-//! chunk and the whole have the promised hashes.
+//! `<dir>/model.dgtr` with the offer it came from beside it. Chunks of that model are not fetched again for the next one: a
+//! cell that did not change is taken from where it lies. The model is replaced by renaming only after every chunk and the whole
+//! have the promised hashes.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{Read, Write};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use config::disk::Disk;
@@ -28,6 +31,8 @@ pub struct Store {
     dir: PathBuf,
     /// The offer of the model that lies complete in `dir`.
     complete: Option<Offer>,
+    /// Its chunks, and their places in it.
+    held: HashMap<Hash, (u64, u64)>,
 }
 
 /// Why a model could not be put together.
@@ -75,11 +80,22 @@ fn io(path: &Path) -> impl FnOnce(std::io::Error) -> StoreError + '_ {
     move |source| StoreError::Io { path: path.display().to_string(), source }
 }
 
+/// The chunks of a model and their places in it: start and length.
+fn chunks_of(offer: &Offer) -> HashMap<Hash, (u64, u64)> {
+    let mut start = 0;
+    let place = |(i, hash): (usize, &Hash)| {
+        let from = start;
+        start += offer.chunk_len(i);
+        (*hash, (from, offer.chunk_len(i)))
+    };
+    offer.chunks.iter().enumerate().map(place).collect()
+}
+
 impl Store {
     /// Opens the folder of one aircraft, which is made when there is something to put into it, and remembers a model received
     /// earlier if it is still whole and its offer is still believed (keys may have changed since).
     pub fn open(disk: &Disk, dir: &Path, settings: &UploadSettings, admission: &Admission) -> Self {
-        let mut store = Self { disk: disk.clone(), dir: dir.into(), complete: None };
+        let mut store = Self { disk: disk.clone(), dir: dir.into(), complete: None, held: HashMap::new() };
         for folder in [dir, &dir.join("chunk")] {
             disk.sweep(folder);
         }
@@ -89,6 +105,7 @@ impl Store {
         };
         if let Some(model) = store.hash_of_model() {
             store.complete = [NOTE, NEXT_NOTE].into_iter().filter_map(note).find(|offer| offer.model == model);
+            store.held = store.complete.as_ref().map(chunks_of).unwrap_or_default();
             if store.complete.as_ref().is_some_and(|offer| offer.finished) {
                 // Nothing follows: what is left of the transfer was in the way of a kill or a power cut.
                 store.keep_only(None);
@@ -135,9 +152,22 @@ impl Store {
         (0..offer.chunks.len())
             .filter(|&i| seen.insert(offer.chunks[i]))
             .filter(|&i| {
-                !std::fs::metadata(self.chunk_path(&offer.chunks[i])).is_ok_and(|m| m.len() == offer.chunk_len(i))
+                let (hash, length) = (&offer.chunks[i], offer.chunk_len(i));
+                let is_held = self.held.get(hash).is_some_and(|(_, held)| *held == length);
+                !is_held && !std::fs::metadata(self.chunk_path(hash)).is_ok_and(|m| m.len() == length)
             })
             .collect()
+    }
+
+    /// The bytes of a chunk, out of the complete model or its own file, if they are what its hash says.
+    fn chunk(&self, hash: &Hash, length: u64) -> Option<Vec<u8>> {
+        let right = |bytes: &Vec<u8>| bytes.len() as u64 == length && blake3::hash(bytes).as_bytes() == hash;
+        let held = self.held.get(hash).filter(|(_, held)| *held == length).and_then(|(start, _)| {
+            let mut bytes = vec![0; length as usize];
+            File::open(self.model_path()).ok()?.read_exact_at(&mut bytes, *start).ok()?;
+            Some(bytes)
+        });
+        held.filter(right).or_else(|| read_bounded(&self.chunk_path(hash), length).ok().filter(right))
     }
 
     /// Keeps one chunk, whose hash has been checked.
@@ -160,19 +190,17 @@ impl Store {
         let mut wrong = None;
         let fill = |out: &mut dyn Write| {
             for (index, hash) in offer.chunks.iter().enumerate() {
-                let chunk = self.chunk_path(hash);
-                let bytes = read_bounded(&chunk, offer.chunk_len(index)).unwrap_or_default();
-                if bytes.len() as u64 != offer.chunk_len(index) || blake3::hash(&bytes).as_bytes() != hash {
+                let Some(bytes) = self.chunk(hash, offer.chunk_len(index)) else {
                     // Gone or unremovable: either way `missing` looks again.
-                    let _ = self.disk.remove(&chunk);
-                    wrong = Some(StoreError::Corrupt { aircraft: offer.aircraft.clone(), index });
+                    let _ = self.disk.remove(&self.chunk_path(hash));
+                    wrong = Some((StoreError::Corrupt { aircraft: offer.aircraft.clone(), index }, Some(*hash)));
                     return Err(std::io::ErrorKind::InvalidData.into());
-                }
+                };
                 whole.update(&bytes);
                 out.write_all(&bytes)?;
             }
             if whole.finalize().as_bytes() != &offer.model {
-                wrong = Some(StoreError::WrongWhole(offer.aircraft.clone()));
+                wrong = Some((StoreError::WrongWhole(offer.aircraft.clone()), None));
                 return Err(std::io::ErrorKind::InvalidData.into());
             }
             Ok(())
@@ -187,7 +215,8 @@ impl Store {
             }
         };
         let written = self.disk.replace_checked(&path, fill, check);
-        if let Some(wrong) = wrong {
+        if let Some((wrong, spoilt)) = wrong {
+            spoilt.map(|hash| self.held.remove(&hash));
             return Err(wrong);
         }
         written.map_err(|e| io(&path)(e.into()))??;
@@ -204,6 +233,7 @@ impl Store {
         self.write_note(NOTE, offer)?;
         // Left behind it vouches for the same model.
         let _ = self.disk.remove(&self.dir.join(NEXT_NOTE));
+        self.held = chunks_of(offer);
         self.complete = Some(offer.clone());
         Ok(())
     }

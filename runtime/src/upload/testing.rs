@@ -15,6 +15,21 @@ pub(crate) fn noise(n: usize, seed: u8) -> Vec<u8> {
     bytes
 }
 
+/// A model of 12,000 Gaussians in cells; `corner` is the colour of those in one corner.
+pub(crate) fn write_in_cells(path: &Path, corner: f32) {
+    let mut cloud = models::cloud::GaussianCloud::with_capacity(0, 12_000);
+    let mut dice = Dice(7);
+    for _ in 0..12_000 {
+        let mut metres = |side: u64| dice.roll(side * 1000) as f32 / 1000.0;
+        let place = [metres(100), metres(100), metres(4)];
+        let color = if place[0] > 80.0 && place[1] > 80.0 { corner } else { metres(1) };
+        cloud.push(place, [-2.0, -2.5, -3.0], [1.0, 0.0, 0.0, 0.0], 1.0, &[color; 3]);
+    }
+    let header = models::formats::model::ModelHeader::default();
+    models::formats::model::write_rounded(&Default::default(), path, &header, &cloud, &Default::default())
+        .expect("written");
+}
+
 /// Small and seeded (xorshift64).
 pub(crate) struct Dice(pub(crate) u64);
 

@@ -37,7 +37,14 @@ fn settings() -> UploadSettings {
 
 fn source() -> Source {
     let (mission, aircraft) = ("park".into(), "west".into());
-    Source { mission, aircraft, identity: Identity::unsigned(), flight_number: None, disk: Default::default() }
+    Source {
+        mission,
+        aircraft,
+        identity: Identity::unsigned(),
+        flight_number: None,
+        disk: Default::default(),
+        territory: None,
+    }
 }
 
 /// A model file of so many bytes, on offer.
@@ -48,13 +55,32 @@ fn offered(bytes: usize) -> OfferedModel {
     OfferedModel::open(&path, &settings(), &source(), Order { flight: 2, counter: 5 }, bytes > 100).expect("an offer")
 }
 
+/// A model of so many Gaussians in cells, on offer.
+fn offered_in_cells(n: usize) -> OfferedModel {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("m.dgtr");
+    let mut cloud = GaussianCloud::with_capacity(0, n);
+    for i in 0..n {
+        let place = [(i % 83) as f32, (i / 83) as f32, (i % 7) as f32];
+        cloud.push(place, [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 1.0, &[0.2; 3]);
+    }
+    let header = ModelHeader::default();
+    model::write_rounded(&Default::default(), &path, &header, &cloud, &Default::default()).expect("written");
+    OfferedModel::open(&path, &settings(), &source(), Order { flight: 2, counter: 5 }, true).expect("an offer")
+}
+
 #[test]
 fn offers() {
     let signed = [&offered(40_000).offer.encode()[..], &[7; 64]].concat();
     let known = ["west".to_owned()];
     survive(&Reader {
         name: "offer",
-        seeds: vec![offered(40_000).offer.encode(), offered(1).offer.encode(), signed],
+        seeds: vec![
+            offered(40_000).offer.encode(),
+            offered_in_cells(9000).offer.encode(),
+            offered(1).offer.encode(),
+            signed,
+        ],
         text: false,
         shell: None,
         memory: (4 << 10, 16),

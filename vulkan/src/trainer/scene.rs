@@ -15,10 +15,11 @@ mod window;
 
 pub(crate) use cell::Blocks;
 
-use cell::{Bounds, CellKey, Grid};
+use cell::Bounds;
 use config::plan::Plan;
 use config::training::TrainSettings;
 use models::cloud::GaussianCloud;
+use models::ground_cell::{CellKey, Grid};
 use store::{Chain, Store};
 use window::Window;
 

@@ -1,6 +1,7 @@
 //! Positions: a grid as fine as the Gaussians of one size class need, its occupied cells in Morton order as the counts of a
 //! binary tree. Which Gaussian is which costs nothing: they are a set.
 
+use super::Form;
 use super::coder::{Coder, Counts, Garbled};
 use glam::{DVec3, Vec3};
 
@@ -56,11 +57,14 @@ impl Bounds {
         inside.cmpge(DVec3::ZERO).all() && inside.cmplt(DVec3::ONE).all()
     }
 
-    /// A grid of cells of at least `step` metres.
-    pub fn grid(&self, step: f64) -> Grid {
-        let step = step.max(self.edge / f64::from((1u32 << AXIS_BITS) - 1));
-        let last = (self.edge / step) as u32;
-        Grid { bounds: *self, step, axis_bits: 32 - last.leading_zeros() }
+    /// A grid of cells of at least `step` metres. That of a cell begins at a multiple of its step, whatever the bounds are.
+    pub fn grid(&self, form: Form, step: f64) -> Grid {
+        // What lies before the corner takes one more.
+        let more = u32::from(form == Form::Cell);
+        let step = step.max(self.edge / f64::from((1u32 << AXIS_BITS) - 1 - more));
+        let corner = if more > 0 { (self.corner / step).floor() * step } else { self.corner };
+        let last = (self.edge / step) as u32 + more;
+        Grid { corner, step, axis_bits: 32 - last.leading_zeros() }
     }
 
     /// Where a position comes in the order that attributes are coded in.
@@ -73,7 +77,7 @@ impl Bounds {
 /// One size class's grid.
 #[derive(Clone, Copy, Debug)]
 pub struct Grid {
-    bounds: Bounds,
+    corner: DVec3,
     step: f64,
     axis_bits: u32,
 }
@@ -86,12 +90,12 @@ impl Grid {
 
     /// The Morton code of the cell that holds `mean`.
     pub fn cell(&self, mean: Vec3) -> u64 {
-        interleave(((mean.as_dvec3() - self.bounds.corner) / self.step).to_array().map(|v| v as u32))
+        interleave(((mean.as_dvec3() - self.corner) / self.step).to_array().map(|v| v as u32))
     }
 
     /// The middle of a cell.
     pub fn center(&self, cell: u64) -> DVec3 {
-        self.bounds.corner + (DVec3::from(separate(cell).map(f64::from)) + 0.5) * self.step
+        self.corner + (DVec3::from(separate(cell).map(f64::from)) + 0.5) * self.step
     }
 }
 

@@ -4,7 +4,7 @@ use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 
 /// Gaussians on a hilly ground, coloured by place, with a little of everything.
-fn ground(n: usize, degree: u8) -> GaussianCloud {
+pub(super) fn ground(n: usize, degree: u8) -> GaussianCloud {
     let mut rng = Pcg64::seed_from_u64(1);
     let mut cloud = GaussianCloud { sh_degree: degree, ..Default::default() };
     for _ in 0..n {
@@ -28,7 +28,7 @@ fn ground(n: usize, degree: u8) -> GaussianCloud {
 
 fn there_and_back(cloud: &GaussianCloud, rounding: &Rounding) -> GaussianCloud {
     let (words, n) = encode(cloud, &[], rounding).unwrap();
-    decode(words, n, cloud.sh_degree).unwrap()
+    decode(Form::Whole, words, n, cloud.sh_degree).unwrap()
 }
 
 /// The row of `cloud` nearest to each mean of `rounded`.
@@ -89,8 +89,8 @@ fn a_cloud_of_equal_gaussians_is_filled_up_to_what_its_reader_takes() {
         cloud.push([1.0, 2.0, 3.0], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 1.0, &[0.2; 3]);
     }
     let (words, n) = encode(&cloud, &[], &Rounding::default()).unwrap();
-    assert!(n as u64 <= most_gaussians(4 * words.len() as u64), "{n} Gaussians in {} words", words.len());
-    assert_eq!(decode(words, n, 0).unwrap().len(), n);
+    assert!(n as u64 <= most_gaussians(Form::Whole, 4 * words.len() as u64), "{n} Gaussians in {} words", words.len());
+    assert_eq!(decode(Form::Whole, words, n, 0).unwrap().len(), n);
 }
 
 #[test]
@@ -129,7 +129,7 @@ fn colours_are_truest_from_where_the_scene_was_seen_and_cost_no_more() {
     let rounding = Rounding { keep: 1.0, position: 0.01, ..Rounding::default() };
     let [seen, unseen] = [&views[..], &[]].map(|views| {
         let (words, n) = encode(&cloud, views, &rounding).unwrap();
-        (words.len(), error_from_above(&cloud, &decode(words, n, 3).unwrap()))
+        (words.len(), error_from_above(&cloud, &decode(Form::Whole, words, n, 3).unwrap()))
     });
     assert!(seen.1 < 0.5 * unseen.1, "squared error {} with views, {} without", seen.1, unseen.1);
     assert!(seen.0 < unseen.0, "{} words with views, {} without", seen.0, unseen.0);
@@ -173,7 +173,7 @@ fn garbled_words_are_refused_or_give_a_cloud_of_the_stated_size() {
             1 => damaged[rng.random_range(0..words.len())] ^= 1 << rng.random_range(0..32),
             _ => damaged.iter_mut().for_each(|w| *w = rng.random()),
         }
-        match decode(damaged, n, 1) {
+        match decode(Form::Whole, damaged, n, 1) {
             Ok(cloud) => assert_eq!(cloud.len(), n),
             Err(Garbled) => refused += 1,
         }

@@ -4,6 +4,7 @@
 //! Gaussian's colour, averaged over its views, is dc + mᵀc; how much it varies with the view is cᵀGc, so c is rounded in G's
 //! eigenvectors, each as finely as its eigenvalue asks.
 
+use super::Form;
 use super::coder::{Coder, Garbled};
 use crate::camera::View;
 use crate::cloud::sh_basis;
@@ -12,7 +13,7 @@ use glam::Vec3;
 /// SH coefficients above degree 0 at degree 3.
 pub const MOST: usize = 15;
 /// Pairs of Gaussians and views are counted for so many Gaussians at least.
-const SAMPLE: usize = 4096;
+const SAMPLE: usize = 1024;
 /// Added to the covariance: what no view saw may still be seen once.
 const UNSEEN: f64 = 0.003;
 /// Variance of a basis function over the sphere, 1/4π: what is assumed where there are no views.
@@ -20,6 +21,10 @@ const SPHERE: f64 = 0.079_577_47;
 /// A Gaussian counts as seen up to 5 % outside the picture, from 0.1 m on.
 const MARGIN: f32 = 1.05;
 const NEAR_M: f32 = 0.1;
+
+/// Bits of a component of an eigenvector in a cell, and its steps from 0 to 1.
+const VECTOR_BITS: u32 = 10;
+const VECTOR_STEPS: f32 = 511.0;
 
 /// Mean, eigenvectors (columns, falling eigenvalues) and eigenvalues, of `coefficients` basis functions.
 #[derive(Clone, Debug)]
@@ -79,15 +84,28 @@ impl ViewBasis {
         basis
     }
 
-    pub fn code(mut self, coder: &mut impl Coder) -> Result<Self, Garbled> {
+    pub fn code(mut self, coder: &mut impl Coder, form: Form) -> Result<Self, Garbled> {
         let n = self.coefficients;
-        let numbers = self.mean[..n].iter_mut().chain(self.values[..n].iter_mut());
-        for v in numbers.chain(self.vectors[..n].iter_mut().flat_map(|row| &mut row[..n])) {
-            *v = coder.f32(*v)?;
-            if !v.is_finite() {
-                return Err(Garbled);
+        let (mean, values) = (&mut self.mean[..n], &mut self.values[..n]);
+        let vectors = self.vectors[..n].iter_mut().flat_map(|row| &mut row[..n]);
+        match form {
+            Form::Whole => {
+                for v in mean.iter_mut().chain(values).chain(vectors) {
+                    *v = coder.f32(*v)?;
+                }
+            }
+            Form::Cell => {
+                for v in mean.iter_mut().chain(values) {
+                    // Half of a number's bits: sign, exponent and seven of its digits.
+                    *v = f32::from_bits((coder.bits(16, u64::from(v.to_bits() >> 16))? as u32) << 16);
+                }
+                for v in vectors {
+                    let step = ((*v + 1.0) * VECTOR_STEPS).round().clamp(0.0, 2.0 * VECTOR_STEPS);
+                    *v = coder.bits(VECTOR_BITS, step as u64)? as f32 / VECTOR_STEPS - 1.0;
+                }
             }
         }
-        if self.values[..n].iter().all(|v| *v > 0.0) { Ok(self) } else { Err(Garbled) }
+        let finite = self.mean[..n].iter().chain(self.vectors[..n].as_flattened()).all(|v| v.is_finite());
+        if finite && self.values[..n].iter().all(|v| *v > 0.0 && v.is_finite()) { Ok(self) } else { Err(Garbled) }
     }
 }

@@ -4,7 +4,7 @@ use super::*;
 
 #[test]
 fn the_page_on_formats_states_this_version() {
-    let row = format!("| offer of a model | {VERSION} |");
+    let row = format!("| offer of a model | {EVEN}; {PIECES} for models in cells |");
     assert!(include_str!("../../../../models/FORMATS.md").contains(&row), "{row}");
 }
 
@@ -28,15 +28,55 @@ fn an_offer_survives_the_wire() {
     assert_eq!(Offer::decode(&o.encode(), &settings()), Ok(o));
 }
 
+/// Of a model whose cells are its chunks.
+fn in_cells() -> OfferedModel {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let path = dir.path().join("m.dgtr");
+    crate::upload::testing::write_in_cells(&path, 0.2);
+    let order = Order { flight: 2, counter: 5 };
+    OfferedModel::open(&path, &settings(), &Source::unsigned("m", "a1"), order, true).expect("offer")
+}
+
+#[test]
+fn an_offer_of_cells_survives_the_wire_and_its_chunks_are_the_file() {
+    let model = in_cells();
+    let o = &model.offer;
+    assert!(o.version == PIECES && o.chunks.len() > 4, "{} chunks", o.chunks.len());
+    let chunks: Vec<u8> = (0..o.chunks.len()).flat_map(|i| model.chunk(i).expect("held")).collect();
+    assert_eq!(blake3::hash(&chunks).as_bytes(), &o.model);
+    assert_eq!(Offer::decode(&o.encode(), &settings()).as_ref(), Ok(o));
+}
+
+#[test]
+fn lies_about_the_lengths_of_cells_are_refused() {
+    let edit = |f: fn(&mut Offer)| {
+        let mut o = in_cells().offer;
+        f(&mut o);
+        Offer::decode(&o.encode(), &settings())
+    };
+    assert!(edit(|_| ()).is_ok());
+    for lie in [
+        |o: &mut Offer| o.sizes[1] += 1,
+        |o: &mut Offer| (o.sizes[1], o.sizes[2]) = (o.sizes[1] + o.sizes[2], 0),
+        |o: &mut Offer| o.sizes[1] = u32::MAX,
+        |o: &mut Offer| _ = o.sizes.pop(),
+        |o: &mut Offer| _ = o.chunks.pop(),
+        |o: &mut Offer| o.version = EVEN,
+    ] {
+        assert!(matches!(edit(lie), Err(OfferError::Damaged(_))));
+    }
+}
+
 #[test]
 fn every_truncated_offer_is_refused() {
-    let bytes = offer(40_000).encode();
-    for n in 0..bytes.len() {
-        assert!(Offer::decode(&bytes[..n], &settings()).is_err(), "{n} of {}", bytes.len());
-    }
-    // A signature may follow, and nothing else.
-    for more in (1..200).filter(|&n| n != 64) {
-        assert!(Offer::decode(&[&bytes[..], &vec![0; more]].concat(), &settings()).is_err());
+    for bytes in [offer(40_000).encode(), in_cells().offer.encode()] {
+        for n in 0..bytes.len() {
+            assert!(Offer::decode(&bytes[..n], &settings()).is_err(), "{n} of {}", bytes.len());
+        }
+        // A signature may follow, and nothing else.
+        for more in (1..200).filter(|&n| n != 64) {
+            assert!(Offer::decode(&[&bytes[..], &vec![0; more]].concat(), &settings()).is_err());
+        }
     }
 }
 

@@ -15,6 +15,7 @@ use crate::upload::testing::noise;
 use crate::upload::transport::TransportError;
 
 mod aircraft;
+mod cells;
 mod strangers;
 
 use aircraft::{Bench, Fake};

@@ -1,4 +1,4 @@
-//! Cells of ground: which one a Gaussian belongs to, and where in a picture a cell may show.
+//! Cells of ground on the device: how far a Gaussian reaches, and where in a picture a cell may show.
 
 use glam::{Vec2, Vec3};
 
@@ -6,20 +6,8 @@ use crate::constants::{ALPHA_MIN, LOW_PASS};
 use crate::layout::{FLAG_ORTHOGRAPHIC, Frame};
 use crate::trainer::parameters::Geometry;
 
-/// Cells of the coarsest level are 2^12 times as wide as those of the finest.
-const MOST_LEVEL: u8 = 12;
-/// Most that a Gaussian reaches beyond its cell, in sides of it: what is added around every cell wherever it may show.
-const MOST_REACH: f32 = 0.25;
 /// Rounding of the bounds below: a hundredth of a pixel, as `project` adds, and as much again.
 const ROUNDING_PX: f32 = 0.02;
-
-/// A square of ground: side · 2^level metres wide, the x-th to the east and the y-th to the north.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct CellKey {
-    pub level: u8,
-    pub y: i32,
-    pub x: i32,
-}
 
 /// How far from its mean a Gaussian is blended at most, metres: where its alpha falls below [`ALPHA_MIN`], were it opaque.
 pub(crate) fn reach_of(g: &Geometry) -> f32 {
@@ -30,41 +18,6 @@ pub(crate) fn reach_of(g: &Geometry) -> f32 {
 
 fn standard_deviations() -> f32 {
     (-2.0 * ALPHA_MIN.ln()).sqrt()
-}
-
-/// The squares of a scene.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Grid {
-    /// Metres of a cell of level 0.
-    pub side: f32,
-}
-
-impl Grid {
-    /// The cell under a mean, of the finest level that is wide enough for the Gaussian's reach: what is large does not make its
-    /// neighbours show in pictures that do not see them.
-    pub fn key(&self, mean: [f32; 3], reach: f32) -> CellKey {
-        let level = (0..MOST_LEVEL).find(|l| reach <= MOST_REACH * self.side_at(*l)).unwrap_or(MOST_LEVEL);
-        // Casts saturate: what lies beyond 2³¹ cells shares the last.
-        let index = |v: f32| (v / self.side_at(level)).floor() as i32;
-        CellKey { level, y: index(mean[1]), x: index(mean[0]) }
-    }
-
-    fn side_at(&self, level: u8) -> f32 {
-        self.side * f32::from(1u16 << level)
-    }
-
-    /// Whether a Gaussian still counts to `key`: within half a cell around it and not twice as large as it should be, so that
-    /// those on the border stay where they are.
-    pub fn holds(&self, key: CellKey, mean: [f32; 3], reach: f32) -> bool {
-        let side = self.side_at(key.level);
-        let within = |v: f32, index: i32| {
-            let from = index as f32 * side;
-            v >= from - 0.5 * side && v < from + 1.5 * side
-        };
-        within(mean[0], key.x)
-            && within(mean[1], key.y)
-            && (reach <= 2.0 * MOST_REACH * side || key.level == MOST_LEVEL)
-    }
 }
 
 /// Box around the means of a cell's Gaussians, and how far the widest reaches beyond.
@@ -213,6 +166,7 @@ impl Sight {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use models::ground_cell::{CellKey, Grid, MOST_LEVEL};
 
     fn gaussian(mean: [f32; 3], log_scale: f32) -> Geometry {
         let mut g: Geometry = bytemuck::Zeroable::zeroed();

@@ -1,0 +1,108 @@
+//! A cloud as cells of ground, each encoded on its own: what does not change keeps its words, whatever happens elsewhere.
+
+use std::collections::BTreeMap;
+
+use super::coder::Garbled;
+use super::{Form, LEAST_BYTES, Rounding, Scope, encode_rows};
+use crate::camera::View;
+use crate::cloud::GaussianCloud;
+use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
+
+/// Gaussians that a cell of the finest level should hold about: fewer cost more for each, more come back as one.
+const USUAL: f64 = 6000.0;
+/// Fewer than so many belong to the next level's cell.
+const LEAST: usize = 512;
+/// Standard deviations up to which a Gaussian is said to reach.
+const REACH: f32 = 3.0;
+/// Outermost share of the means, on each side, that does not count to the ground when cells are sized.
+const STRAY: usize = 20;
+/// Binary logarithms of the sides that cells may have, metres.
+const SIDES: (f64, f64) = (-10.0, 14.0);
+
+/// One cell's words.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CodedCell {
+    /// Which square of ground.
+    pub key: CellKey,
+    /// Gaussians in it.
+    pub count: u32,
+    /// Square metres that they cover, by opacity.
+    pub importance: f32,
+    /// Their delivery encoding.
+    pub words: Vec<u32>,
+}
+
+/// All cells of a cloud.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CodedCells {
+    /// The squares.
+    pub grid: Grid,
+    /// The most important first.
+    pub cells: Vec<CodedCell>,
+}
+
+/// Encodes the cells of a cloud that `wanted` asks for, the most important first. Rows that are not valid are left out.
+///
+/// # Errors
+/// None in practice: what is encoded is what was rounded.
+pub fn encode_cells(
+    cloud: &GaussianCloud,
+    views: &[View],
+    rounding: &Rounding,
+    wanted: &dyn Fn(Grid, CellKey) -> bool,
+) -> Result<CodedCells, Garbled> {
+    let scope = Scope::of(cloud, rounding);
+    let grid = grid_of(cloud, &scope.rows);
+    let mut cells = Vec::new();
+    for (key, rows) in split(grid, cloud, &scope.rows) {
+        if !wanted(grid, key) {
+            continue;
+        }
+        let mut words = encode_rows(cloud, views, rounding, &scope, &rows, Form::Cell)?;
+        words.resize(words.len().max((rows.len() * LEAST_BYTES as usize).div_ceil(4)), 0);
+        let importance = rows.iter().map(|i| cloud.covered_m2(*i as usize)).sum::<f64>() as f32;
+        cells.push(CodedCell { key, count: rows.len() as u32, importance, words });
+    }
+    cells.sort_by(|a, b| b.importance.total_cmp(&a.importance).then(a.key.cmp(&b.key)));
+    Ok(CodedCells { grid, cells })
+}
+
+/// Squares that hold about as many Gaussians as they should; a power of two, so that a scene that grows keeps them.
+fn grid_of(cloud: &GaussianCloud, rows: &[u32]) -> Grid {
+    let span = |axis: usize| {
+        let mut along: Vec<f32> = rows.iter().map(|i| cloud.means[*i as usize][axis]).collect();
+        along.sort_unstable_by(f32::total_cmp);
+        let out = along.len() / STRAY;
+        match (along.get(out), along.get(along.len().saturating_sub(1 + out))) {
+            (Some(low), Some(high)) => f64::from(high - low),
+            _ => 0.0,
+        }
+    };
+    let side = (span(0) * span(1) * USUAL / rows.len().max(1) as f64).sqrt();
+    Grid { side: side.log2().clamp(SIDES.0, SIDES.1).round().exp2() as f32 }
+}
+
+/// Rows by cell, in their order within it. Cells of few are part of the next level's.
+fn split(grid: Grid, cloud: &GaussianCloud, rows: &[u32]) -> BTreeMap<CellKey, Vec<u32>> {
+    let mut cells: BTreeMap<CellKey, Vec<u32>> = BTreeMap::new();
+    for row in rows {
+        let widest = cloud.log_scales[*row as usize].into_iter().fold(f32::NEG_INFINITY, f32::max);
+        let key = grid.key(cloud.means[*row as usize], REACH * widest.min(80.0).exp());
+        cells.entry(key).or_default().push(*row);
+    }
+    for level in 0..=MOST_LEVEL {
+        let few: Vec<CellKey> =
+            cells.iter().filter(|(k, r)| k.level == level && r.len() < LEAST).map(|(k, _)| *k).collect();
+        let last = CellKey { level: MOST_LEVEL, y: 0, x: 0 };
+        for key in few {
+            let rows = cells.remove(&key).unwrap_or_default();
+            let coarser = if level == MOST_LEVEL { last } else { key.parent() };
+            cells.entry(coarser).or_default().extend(rows);
+        }
+    }
+    cells.values_mut().for_each(|rows| rows.sort_unstable());
+    cells
+}
+
+#[cfg(test)]
+mod tests;
