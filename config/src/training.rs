@@ -54,6 +54,10 @@ table! {
         pub regularise: RegulariseSettings = RegulariseSettings::default();
         /// Work that is left out because it changes nothing.
         pub skips: SkipSettings = SkipSettings::default();
+        /// Last share of the schedule in which places, sizes, rotations and opacities are rounded as the delivery encoding rounds
+        /// them, and colours alone are trained: where the model is delivered rounded (`[upload] encoding`, `dgtr train
+        /// --for-delivery`).
+        pub rounded_share: f32 = 0.15, in Limits::within(0.0, 0.9);
         /// Optimise a 6-vector per view (rotation and translation of world → camera) together with the cloud.
         pub refine_poses: bool = false;
         /// Optimise six scalars per view: log gain and offset of each channel.

@@ -37,6 +37,7 @@ mod light;
 mod map;
 mod rebuild;
 mod reconstruct;
+mod rounding;
 pub mod source;
 
 use device::DeviceRequest;
@@ -128,6 +129,8 @@ pub struct Reconstruction {
     builds: u32,
     /// The build that the last map shows.
     mapped: u32,
+    /// The model has been rounded for delivery.
+    rounded: bool,
     /// Seconds of training over all continuations.
     train_s: f64,
     /// What was done and what it took.
@@ -197,6 +200,7 @@ impl Reconstruction {
             refined: None,
             builds: 0,
             mapped: 0,
+            rounded: false,
             train_s: 0.0,
             header,
             settings,

@@ -80,6 +80,8 @@ pub struct TrainJob {
     pub network: NetworkSettings,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
+    /// Whether the last share of training has values as the delivery encoding rounds them.
+    pub for_delivery: bool,
     /// Whether a model in `out` is ignored.
     pub fresh: bool,
     /// Whether the split `test` is scored at the end.
@@ -175,7 +177,7 @@ impl TrainJob {
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
             ahead: 0,
             ahead_in_memory: false,
-            delivers: false,
+            delivers: self.for_delivery,
             map: None,
             scale,
             network: self.network.clone(),

@@ -28,7 +28,7 @@ mod predict;
 mod shape;
 mod view_basis;
 
-pub use cells::{CodedCell, CodedCells, encode_cells};
+pub use cells::{CodedCell, CodedCells, encode_cells, round_shapes};
 pub use coder::Garbled;
 
 /// Host memory that encoding takes at most per Gaussian of SH degree 3, the cloud that is encoded not counted (measured:
@@ -78,6 +78,12 @@ impl Default for Rounding {
 }
 
 impl Rounding {
+    /// Of a cloud that [`round_shapes`] has rounded: nothing more is left out.
+    #[must_use]
+    pub fn whole(self) -> Self {
+        Self { keep: 1.0, ..self }
+    }
+
     /// Nearly twice as finely for a third more bytes: for scenes seen from near, whose Gaussians are large in the pictures (the
     /// same sweep over a model of fox).
     pub fn fine() -> Self {
@@ -172,17 +178,17 @@ pub fn most_gaussians(form: Form, bytes: u64) -> u64 {
 /// # Errors
 /// [`Garbled`] for words that no encoder wrote.
 pub fn decode(form: Form, words: Vec<u32>, n: usize, sh_degree: u8) -> Result<GaussianCloud, Garbled> {
-    code(&mut Decoder::new(words), form, n, sh_degree, None)
+    code(&mut Decoder::new(words), form, n, sh_degree, None).map(|(cloud, _)| cloud)
 }
 
-/// Both directions.
+/// Both directions: the cloud as a decoder has it, and an encoder's rows.
 fn code(
     coder: &mut impl Coder,
     form: Form,
     n: usize,
     sh_degree: u8,
     given: Option<&Given<'_>>,
-) -> Result<GaussianCloud, Garbled> {
+) -> Result<(GaussianCloud, Vec<u32>), Garbled> {
     let rounding = given.map_or_else(Rounding::default, |g| g.rounding);
     let shape = rounding.shape.code(coder)?;
     let color = rounding.color.code(coder)?;
@@ -221,14 +227,15 @@ fn code(
     let colors = Colors { steps: color, basis: &basis, neighbours: &neighbours, importance: &importance };
     let sh = colors.code(coder, columns.as_deref())?;
 
-    Ok(GaussianCloud {
+    let cloud = GaussianCloud {
         sh_degree,
         means: means.iter().map(|m| m.to_array()).collect(),
         log_scales: scales.into_iter().map(|s| shape.log_scales(s)).collect(),
         rotations,
         opacity_logits: opacities.into_iter().map(|o| shape.opacity_logit(o)).collect(),
         sh,
-    })
+    };
+    Ok((cloud, rows))
 }
 
 /// A Gaussian of which only position and size class are known.

@@ -85,6 +85,10 @@ pub struct Args {
     /// Take telemetry poses as they are.
     #[arg(long)]
     no_refine: bool,
+    /// Train the last share of the schedule with values as the delivery encoding rounds them ([training] rounded_share): for
+    /// models that go out by `dgtr export --to delivery --rounded`.
+    #[arg(long)]
+    for_delivery: bool,
     /// Optimiser steps; with neither --steps nor --seconds the recipe's own number.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
     steps: Option<u32>,
@@ -212,6 +216,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             Poses::Telemetry => PoseSource::Telemetry,
         },
         refine: !args.no_refine,
+        for_delivery: args.for_delivery,
         steps: args.steps,
         seconds,
         budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)).unwrap_or(512),

@@ -161,6 +161,7 @@ impl Reconstruct for Reconstruction {
         self.even_light(fresh.light.take())?;
         self.take_over(&fresh)?;
         let loaded = self.trainer.load(&self.cloud)?;
+        self.unround()?;
         self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
         self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
         let mut with_prior = 0;
@@ -230,11 +231,25 @@ impl Reconstruct for Reconstruction {
     ) -> Result<StopReason, JobError> {
         let _span = tracing::info_span!("train").entered();
         let from = Instant::now();
-        let before = self.trainer.elapsed_s();
-        let summary = self.trainer.run(budget, each)?;
+        let summary = loop {
+            let (part, before, mut is_due) = (self.rounded_from(), self.trainer.elapsed_s(), false);
+            let mut asked_to_stop = false;
+            let summary = self.trainer.run(budget, &mut |step| {
+                is_due = part.is_some_and(|from| (from..1.0).contains(&step.progress));
+                asked_to_stop = each(step).is_break();
+                if is_due || asked_to_stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            })?;
+            self.header.steps += u64::from(summary.steps);
+            self.report.steps += u64::from(summary.steps);
+            self.train_s += self.trainer.elapsed_s() - before;
+            if is_due {
+                self.round()?;
+            }
+            if !is_due || asked_to_stop {
+                break summary;
+            }
+        };
         self.report.stage("train", from);
-        self.header.steps += u64::from(summary.steps);
-        self.train_s += self.trainer.elapsed_s() - before;
         let c = summary.counters;
         for (name, count) in [
             ("culled", c.culled),
@@ -258,7 +273,6 @@ impl Reconstruct for Reconstruction {
         for (name, ms) in self.trainer.stage_ms() {
             self.report.stage_ms.insert(format!("device_{name}"), ms);
         }
-        self.report.steps += u64::from(summary.steps);
         self.report.gaussians = self.trainer.gaussians() as u64;
         Ok(summary.reason)
     }
@@ -306,83 +320,4 @@ impl Reconstruct for Reconstruction {
 }
 
 #[cfg(test)]
-mod tests {
-    use config::mission::NetworkSettings;
-    use glam::{DQuat, DVec3};
-    use models::camera::{Intrinsics, PoseSigma, View};
-    use models::formats::model::ModelHeader;
-    use vulkan::gpu::Gpu;
-
-    use super::*;
-    use crate::engine::device::DeviceRequest;
-    use crate::engine::{EngineSettings, InitKind};
-
-    fn picture(i: u32) -> PosedImage {
-        let intrinsics = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 16.0, cy: 12.0 };
-        // Straight down, side by side.
-        let center = DVec3::new(f64::from(i), 0.0, 20.0);
-        let pose = Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center };
-        PosedImage {
-            name: format!("{i}.png"),
-            time_ns: 0,
-            image: image::RgbImage::from_fn(32, 24, |x, y| image::Rgb([(8 * x) as u8, (10 * y) as u8, 90])),
-            view: View { intrinsics, pose },
-            mask: None,
-            sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
-        }
-    }
-
-    #[test]
-    fn giving_up_gaussians_does_not_start_the_schedule_anew() {
-        if Gpu::list().is_err() {
-            println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
-            return;
-        }
-        let settings = EngineSettings {
-            disk: Default::default(),
-            device: DeviceRequest {
-                device: None,
-                device_mib: 64,
-                size: (32, 24),
-                views: 3,
-                crops: 0,
-                view_slots: None,
-                folder: None,
-                max_gaussians: Some(300),
-                scene_gaussians: None,
-            },
-            host_mib: None,
-            camera_pixels: 32 * 24,
-            ahead: 0,
-            ahead_in_memory: false,
-            delivers: false,
-            map: None,
-            scale: 1.0,
-            network: NetworkSettings::default(),
-            training: Default::default(),
-            init: Default::default(),
-            refine: None,
-            start: InitKind::Random,
-            incremental: false,
-        };
-        let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
-        (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
-        assert!(engine.build(&|| true).expect("built"));
-        let budget = RunBudget { steps: Some(6), seconds: None };
-        let mut steps = 0;
-        let mut until = |engine: &mut Reconstruction, last: u32| {
-            let each = &mut |_: &StepReport| {
-                steps += 1;
-                if steps == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-            };
-            engine.train(&budget, each).expect("trains")
-        };
-        assert_eq!(until(&mut engine, 4), StopReason::Caller);
-        let before = engine.gaussians();
-        engine.shrink().expect("the device works");
-        assert!(engine.gaussians() < before && !engine.is_done(&budget));
-        assert_eq!(until(&mut engine, u32::MAX), StopReason::Schedule);
-        assert_eq!(steps, 6);
-        assert!(engine.is_done(&budget));
-    }
-}
+mod tests;

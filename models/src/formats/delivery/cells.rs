@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::coder::Garbled;
-use super::{Form, LEAST_BYTES, Rounding, Scope, encode_rows};
+use super::coder::{Encoder, Garbled};
+use super::{Form, Given, LEAST_BYTES, Rounding, Scope, code, encode_rows};
 use crate::camera::View;
 use crate::cloud::GaussianCloud;
 use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
@@ -65,6 +65,26 @@ pub fn encode_cells(
     }
     cells.sort_by(|a, b| b.importance.total_cmp(&a.importance).then(a.key.cmp(&b.key)));
     Ok(CodedCells { grid, cells })
+}
+
+/// The cloud with places, sizes, rotations and opacities as its cells will have them, and colours as they are; the faintest
+/// Gaussians are left out. Encoded with [`Rounding::whole`], places, sizes and opacities come back as they are.
+///
+/// # Errors
+/// None in practice, as [`encode_cells`].
+pub fn round_shapes(cloud: &GaussianCloud, rounding: &Rounding) -> Result<GaussianCloud, Garbled> {
+    let scope = Scope::of(cloud, rounding);
+    let stride = cloud.sh_stride();
+    let mut rounded = GaussianCloud::with_capacity(cloud.sh_degree, scope.rows.len());
+    for (_, rows) in split(grid_of(cloud, &scope.rows), cloud, &scope.rows) {
+        let given = Given::new(cloud, &[], *rounding, &scope, &rows, Form::Cell);
+        let (mut cell, rows) = code(&mut Encoder::new(), Form::Cell, rows.len(), cloud.sh_degree, Some(&given))?;
+        for (to, row) in cell.sh.chunks_exact_mut(stride).zip(rows) {
+            to.copy_from_slice(&cloud.sh[row as usize * stride..][..stride]);
+        }
+        rounded.extend(&cell);
+    }
+    Ok(rounded)
 }
 
 /// Squares that hold about as many Gaussians as they should; a power of two, so that a scene that grows keeps them.

@@ -45,6 +45,18 @@ fn what_was_rounded_once_keeps_its_place_size_and_opacity_when_it_is_rounded_aga
 }
 
 #[test]
+fn what_is_rounded_for_training_is_delivered_to_the_bit_with_its_own_colours() {
+    let cloud = ground(20_000, 1);
+    let rounded = round_shapes(&cloud, &Rounding::default()).unwrap();
+    assert_eq!(rounded.len(), 19_000);
+    assert!(shapes(&rounded) == shapes(&decoded(&coded(&rounded), 1)));
+    let mut colors: Vec<_> = cloud.sh.as_chunks::<12>().0.iter().map(|c| c.map(f32::to_bits)).collect();
+    colors.sort_unstable();
+    let own = |c: &[f32; 12]| colors.binary_search(&c.map(f32::to_bits)).is_ok();
+    assert!(rounded.sh.as_chunks().0.iter().all(own));
+}
+
+#[test]
 fn cells_that_did_not_change_keep_their_words_and_the_others_cost_only_themselves() {
     let mut cloud = ground(40_000, 1);
     let before = coded(&cloud);
