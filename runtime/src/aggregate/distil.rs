@@ -201,10 +201,10 @@ fn distil_in_stages(
         report.steps += trainer.run(&budget, &mut each)?.steps;
         let after = shown(trainer, lessons)?;
         let reached = closeness(&after);
-        let mut cloud = GaussianCloud::default();
-        trainer.snapshot(&mut cloud)?;
         // The trainer leaves out rows it cannot use; then sources and rows would no longer belong together.
-        if reached > best.0 && cloud.len() == merged.cloud.len() {
+        if reached > best.0 && trainer.gaussians() == merged.cloud.len() {
+            let mut cloud = best.1.take().unwrap_or_default();
+            trainer.snapshot(&mut cloud)?;
             best = (reached, Some(cloud), after);
         }
     }

@@ -211,6 +211,7 @@ impl Trainer {
     pub fn snapshot(&mut self, cloud: &mut GaussianCloud) -> Result<(), TrainError> {
         self.flush()?;
         clear(cloud, self.plan.sh_degree);
+        cloud.reserve_exact(self.gaussians());
         let (parameters, arena, plan) = (self.parameters, &self.arena, &self.plan);
         let mut record = std::mem::take(&mut self.record);
         let done = self.scene.each_record(self.gaussians, |from| match from {
