@@ -36,10 +36,9 @@ fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the
         let run = json_file(&out.join(aircraft).join("out/run.json"));
         assert_eq!(run["outcome"], "done");
         assert_eq!(run["device_bytes_planned"], run["device_bytes_peak"]);
-        // The last model, whole, and at most a few checkpoints before it.
-        let last = out.join(&model).metadata().expect("the model's file").len();
+        // The last model and a checkpoint or two before it, as cells of rounded values: less than the pictures they were made of.
         let sent = run["bytes_sent"].as_u64().expect("bytes_sent");
-        assert!((last..6 * last).contains(&sent), "{sent} bytes sent, the model takes {last}");
+        assert!((100_000..1_000_000).contains(&sent), "{sent} bytes sent");
     }
 }
 
