@@ -8,6 +8,7 @@ pub mod extent;
 pub mod files;
 pub mod georef;
 pub mod grid;
+pub mod height_raster;
 mod preview;
 
 pub use error::OrthoError;

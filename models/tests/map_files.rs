@@ -10,6 +10,7 @@ use glam::{DVec2, DVec3};
 use models::ortho::crs::Crs;
 use models::ortho::files::{MapFiles, NO_HEIGHT};
 use models::ortho::grid::{BLOCK, Block, Grid};
+use models::ortho::height_raster;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::tags::Tag;
 
@@ -89,6 +90,13 @@ fn another_program_reads_the_pixels_the_place_and_the_overviews() {
         }
         let side = columns.max(rows) >> overviews;
         assert!(overviews >= 1 && side <= BLOCK, "{overviews} overviews");
+    }
+    let points = height_raster::read(&folder.path().join("dsm.tif"), Some(ORIGIN), grid.bounds().unwrap()).unwrap();
+    assert!(points.len() as f64 > 0.9 * f64::min(covered as f64, 65_536.0), "{} points", points.len());
+    for point in points {
+        let at = grid.crs().to_map(point).unwrap();
+        let pixel = grid.pixel(at.truncate()).floor();
+        assert!((at.z - f64::from(height(pixel.x as u32, pixel.y as u32))).abs() < 1e-4, "{at} at {pixel}");
     }
     let world = std::fs::read_to_string(folder.path().join("ortho.tfw")).unwrap();
     let lines: Vec<f64> = world.lines().map(|l| l.parse().unwrap()).collect();

@@ -38,6 +38,15 @@ fn the_map_of_a_simulated_survey_is_true_and_better_than_its_depth_maps() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let heights: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!((heights["points"].as_u64(), heights["missing"].as_u64()), (Some(2), Some(1)));
+    // And against its own raster of heights: what other pixels and the other number of views leave between them.
+    let output = run(dir.path(), &["eval", model, "--heights", "map/dsm.tif", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let heights: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert!(heights["points"].as_u64() > Some(10_000), "{heights}");
+    assert!(
+        heights["median_abs_m"].as_f64() < Some(0.1) && heights["bias_m"].as_f64().is_some_and(|b| b.abs() < 0.1),
+        "{heights}"
+    );
 
     for (more, words) in [
         (&["--gsd", "0"][..], "must be positive"),

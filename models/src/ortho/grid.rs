@@ -96,6 +96,21 @@ impl Grid {
         [self.west, self.north]
     }
 
+    /// Lower and upper corner of the ground it covers, model metres east and north.
+    ///
+    /// # Errors
+    /// [`OrthoError::Outside`] where the projection has no answer.
+    pub fn bounds(&self) -> Result<[DVec2; 2], OrthoError> {
+        let [columns, rows] = self.size().map(f64::from);
+        let mut bounds = [DVec2::INFINITY, DVec2::NEG_INFINITY];
+        let ground = self.crs.to_map(DVec3::ZERO)?.z;
+        for corner in [(0.0, 0.0), (columns, 0.0), (0.0, rows), (columns, rows)] {
+            let at = self.crs.to_enu(self.place(corner.into()).extend(ground))?.truncate();
+            bounds = [bounds[0].min(at), bounds[1].max(at)];
+        }
+        Ok(bounds)
+    }
+
     /// All blocks, row by row from the north.
     pub fn blocks(&self) -> impl Iterator<Item = Block> + use<> {
         let [columns, rows] = self.size();

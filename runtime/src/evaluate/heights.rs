@@ -10,6 +10,7 @@ use models::formats::model::ModelHeader;
 use models::ortho::check_points;
 use models::ortho::files::NO_HEIGHT;
 use models::ortho::grid::{BLOCK, Block};
+use models::ortho::height_raster;
 use serde::Serialize;
 use vulkan::trainer::Trainer;
 
@@ -37,15 +38,17 @@ pub struct HeightScores {
     pub le90_m: f64,
 }
 
-/// The points of a reference in the model's frame: a file of surveyed points, or a data set's folder, whose triangulated
-/// points are carried along with its poses.
+/// The points of a reference in the model's frame: a file of surveyed points, a raster of heights where `map` has ground, or a data
+/// set's folder, whose triangulated points are carried along with its poses.
 ///
 /// # Errors
 /// The reference cannot be read or holds no point.
-pub fn reference(path: &Path, header: &ModelHeader) -> Result<Vec<DVec3>, JobError> {
+pub fn reference(path: &Path, header: &ModelHeader, map: &Map) -> Result<Vec<DVec3>, JobError> {
+    let is_raster = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("tif") || e.eq_ignore_ascii_case("tiff"));
     let points = match path.is_dir() {
-        false => check_points::read(path, header.origin)?,
         true => sparse_points(path, header)?,
+        false if is_raster => height_raster::read(path, header.origin, map.grid().bounds()?)?,
+        false => check_points::read(path, header.origin)?,
     };
     match points.is_empty() {
         true => Err(JobError::Request(format!("{}: holds no points to compare heights with", path.display()))),
