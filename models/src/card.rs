@@ -51,6 +51,8 @@ pub struct Card {
     pub origin: Option<Geodetic>,
     /// Surveyed points that were marked in pictures.
     pub control: Vec<control::SurveyedPoint>,
+    /// Others, that the result is measured against and that are not used for it.
+    pub check: Vec<control::SurveyedPoint>,
     /// One line per thing a user should know: what was left out and why, what contradicts the rest.
     pub notes: Vec<String>,
     /// Names with the extension of a picture that were found.
@@ -65,6 +67,8 @@ pub struct CardOptions {
     pub geotags: Option<PathBuf>,
     /// A file of surveyed points (`gcp_list.txt`); one of this name on the card is found without it.
     pub control: Option<PathBuf>,
+    /// A file of the same form, of points that the result is measured against.
+    pub check: Option<PathBuf>,
     /// Exposures out of a flight log, in order.
     pub exposures: Vec<Exposure>,
 }
@@ -102,6 +106,11 @@ impl Card {
             lines.push(control::summary(file, &points, &records));
             control.extend(points);
         }
+        let mut check = Vec::new();
+        if let Some(file) = &options.check {
+            check = control::read(file)?;
+            lines.push(control::summary(file, &check, &records));
+        }
         record::in_order(&mut records);
         if !records.iter().any(|r| r.fix.is_some()) {
             lines.push(format!(
@@ -110,12 +119,12 @@ impl Card {
             ));
             let pictures = priors::without_positions(&records);
             lines.extend(notes.lines());
-            return Ok(Self { pictures, origin: None, control, notes: lines, found });
+            return Ok(Self { pictures, origin: None, control, check, notes: lines, found });
         }
         vote::settle(&mut records, &mut notes);
         let origin = priors::origin(&records);
         let pictures = priors::of(&records, &EnuFrame::new(origin), &mut notes);
         lines.extend(notes.lines());
-        Ok(Self { pictures, origin: Some(origin), control, notes: lines, found })
+        Ok(Self { pictures, origin: Some(origin), control, check, notes: lines, found })
     }
 }

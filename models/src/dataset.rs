@@ -75,6 +75,8 @@ pub struct CardNotes {
     pub floats: bool,
     /// Surveyed points marked in pictures.
     pub control: Vec<SurveyedPoint>,
+    /// Others, that the result is measured against and that are not used for it.
+    pub check: Vec<SurveyedPoint>,
 }
 
 /// What the pictures of a card say of one of them.
@@ -129,6 +131,7 @@ impl Dataset {
             found: card.found,
             floats: card.origin.is_none(),
             control: card.control,
+            check: card.check,
         };
         let frames = card.pictures.into_iter().map(|p| {
             let size = p.lens.size.unwrap_or((1, 1));

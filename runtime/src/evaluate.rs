@@ -3,6 +3,7 @@
 use std::path::Path;
 
 pub mod heights;
+pub mod surveyed;
 
 use models::baselines::{MeanColor, nearest_view, warp_over_ground};
 use models::camera::{PosedImage, View};

@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(required_unless_present = "heights")]
     pub dataset: Option<PathBuf>,
     /// Instead: heights of the model's map (`dgtr ortho`) against a gcp_list.txt, a table of points (columns lat, lon, alt or
-    /// x, y, z), or the triangulated points of a data set's folder.
+    /// x, y, z), a raster of heights (GeoTIFF in a projected reference system), or the triangulated points of a data set's folder.
     #[arg(long, value_name = "REFERENCE", conflicts_with = "dataset")]
     pub heights: Option<PathBuf>,
     /// Which pictures (a list of split.json; without that file every 8th is `test`; `all` always works).
@@ -131,8 +131,8 @@ fn figures(psnr: f64, fitted: f64, ssim: f64) -> String {
 
 fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
     let (header, cloud) = model::read(&args.model)?;
-    let points = heights::reference(reference, &header)?;
     let map = Map::of(&header, &cloud, &MapRequest::default())?;
+    let points = heights::reference(reference, &header, &map)?;
     let mut trainer = map_renderer(args.device.as_deref(), &cloud)?;
     let scores = heights::compare(&map, &mut trainer, &points)?;
     if args.json {

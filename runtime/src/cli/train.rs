@@ -57,6 +57,9 @@ pub struct Args {
     /// Surveyed points marked in a card's pictures: gcp_list.txt of OpenDroneMap (found by that name without this).
     #[arg(long, value_name = "FILE")]
     gcp: Option<PathBuf>,
+    /// Other surveyed points, in a file of that form, that are not used: how far the finished model's renderings put them off.
+    #[arg(long, value_name = "FILE")]
+    check: Option<PathBuf>,
     /// The flight's log beside a card: MAVLink (.tlog) or ArduPilot (.BIN), matched to the pictures by order and time.
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
@@ -199,6 +202,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         card: CardOptions {
             geotags: args.geotags,
             control: args.gcp,
+            check: args.check,
             exposures: args.log.as_deref().map(log::exposures).transpose()?.unwrap_or_default(),
         },
         out: args.out,

@@ -15,6 +15,7 @@ use models::refine::Refiner;
 
 use crate::console::Progress;
 use crate::error::JobError;
+use crate::evaluate::surveyed;
 
 mod control;
 
@@ -214,7 +215,7 @@ fn refined(
         return Ok(None);
     }
     remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
-    refiner.set_control(control::points(set, &notes.control, scale));
+    refiner.set_control(surveyed::marked(set, &notes.control, scale));
     if notes.floats {
         let placed = refiner.bootstrap()?;
         tracing::info!(

@@ -1,29 +1,7 @@
-//! Surveyed points of a card, from the file's words to the refiner's, and what it made of them.
+//! What the refiner made of the surveyed points of a card.
 
-use config::geodesy::EnuFrame;
 use glam::DVec3;
-use models::card::control::SurveyedPoint;
-use models::dataset::{Dataset, scaled};
-use models::refine::{ControlPoint, ControlResidual};
-
-/// The points in the frame of the data set, or of the first of them where it has none, with their marks in pictures loaded at
-/// `scale`.
-pub(super) fn points(set: &Dataset, surveyed: &[SurveyedPoint], scale: f64) -> Vec<ControlPoint> {
-    let Some(origin) = set.origin.or(surveyed.first().map(|p| p.position)) else { return Vec::new() };
-    let frame = EnuFrame::new(origin);
-    let mark = |picture: &str, pixel: [f64; 2]| {
-        let frame = set.frames.iter().find(|f| f.name.to_lowercase() == picture)?;
-        let lens = scaled(&frame.view.intrinsics, scale).ok()?;
-        Some((frame.name.clone(), frame.loaded_pixel(pixel, (lens.width, lens.height))?))
-    };
-    let point = |p: &SurveyedPoint| ControlPoint {
-        name: p.name.clone(),
-        place: frame.to_enu(p.position),
-        sigma_m: DVec3::new(p.sigma_m[0], p.sigma_m[0], p.sigma_m[1]),
-        marks: p.marks.iter().filter_map(|(picture, pixel)| mark(picture, *pixel)).collect(),
-    };
-    surveyed.iter().map(point).collect()
-}
+use models::refine::ControlResidual;
 
 /// One line on how the points agree with the pictures; each that fewer than two pictures place, and the worst.
 pub(super) fn announce(residuals: &[ControlResidual]) {
