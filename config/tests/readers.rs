@@ -81,6 +81,7 @@ fn usable(mission: &Mission) -> bool {
         sh_degree: 3,
         delivered: 0,
         map: mission.map.disk_bytes(),
+        recording: 0,
     });
     let refusals = [
         mission.check_trust().err().map(|e| e.to_string()),

@@ -82,6 +82,8 @@ pub struct FlyOptions {
     pub watch: Watch,
     /// Takes what happens in the flight.
     pub recorder: Recorder,
+    /// Most bytes of its recording below `out`.
+    pub recording_bytes: u64,
 }
 
 /// How the job ended.
@@ -119,7 +121,7 @@ pub fn fly(
     supervisor.status("opening the device and the networks");
     let intrinsics = training_lens(mission);
     let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
-    let disk = planned_disk(mission, &options.out)?;
+    let disk = planned_disk(mission, &options.out, options.recording_bytes)?;
     let source = Source { disk: disk.clone(), ..source };
     let mut reconstruction = open(mission, aircraft, options, &disk)?;
     let store =
@@ -174,7 +176,7 @@ pub fn delivered_bytes(mission: &Mission) -> usize {
 }
 
 /// What a flight may take of the disk.
-fn disk_plan(mission: &Mission) -> DiskPlan {
+fn disk_plan(mission: &Mission, recording: u64) -> DiskPlan {
     let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
     // At least this much of the device's memory goes with every Gaussian: its floats, their two moments and gradient.
     let each = 16 * (11 + 3 * (u64::from(sh_degree) + 1).pow(2));
@@ -193,12 +195,13 @@ fn disk_plan(mission: &Mission) -> DiskPlan {
         sh_degree,
         delivered: delivered_bytes(mission),
         map: mission.map.disk_bytes(),
+        recording,
     })
 }
 
 /// The disk a flight writes to, bounded as the mission says; refused when not even a first model would fit.
-fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
-    let plan = disk_plan(mission);
+fn planned_disk(mission: &Mission, out: &Path, recording: u64) -> Result<Disk, JobError> {
+    let plan = disk_plan(mission, recording);
     let here = bytes_below(out);
     let free = resources::free_disk_bytes(out).map_or(u64::MAX, |free| free.saturating_add(here));
     let limit = mission.memory.disk_mib.map_or(u64::MAX, |mib| u64::from(mib) << 20);
@@ -208,8 +211,8 @@ fn planned_disk(mission: &Mission, out: &Path) -> Result<Disk, JobError> {
         let (room, total) = (room >> 20, plan.total_bytes >> 20);
         tracing::warn!("disk: {room} MiB for a flight that may take {total} MiB; see dgtr plan for what it is for");
     }
-    // Scratch files have no names: what is counted below `out` is the rest.
-    let rest = limit.saturating_sub(plan.scratch_bytes());
+    // What is counted below `out` is the rest.
+    let rest = limit.saturating_sub(plan.set_aside_bytes());
     Ok(Disk::new(Bounded::new(System, out, Arc::new(AtomicU64::new(rest)))))
 }
 

@@ -14,11 +14,20 @@ pub fn picture_bytes(width: u32, height: u32) -> u64 {
     3 * u64::from(width) * u64::from(height) + PICTURE_OVERHEAD
 }
 
-/// A model's header per view, and its fixed part.
-const MODEL_VIEW: u64 = 128;
+/// A model's header per view (lens, pose, light, name), and its fixed part.
+const MODEL_VIEW: u64 = 160;
 const MODEL_FIXED: u64 = 4 << 10;
 /// What is taken as a whole at the start.
 const SCRATCH: &str = "scratch";
+/// Written beside what the flight's own quota counts.
+const REPORTS: &str = "reports";
+const RECORDING: &str = "recording";
+/// `run.json`, coverage as raster and GeoJSON of 65,536 squares, the page with its curves and the squares once more; per key frame its
+/// line of the geotags and its outline on the page.
+const REPORTS_FIXED: u64 = 8 << 20;
+const REPORTS_VIEW: u64 = 512;
+/// The small picture of a map, as it lies on the page: 8 MiB as text.
+const REPORTS_MAP: u64 = 11 << 20;
 /// Two generations, and the one being written.
 const GENERATIONS: u64 = 3;
 
@@ -41,6 +50,8 @@ pub struct DiskRequest {
     pub delivered: usize,
     /// Bytes of the aircraft's map.
     pub map: u64,
+    /// Most bytes of a recording of the flight in the same folder.
+    pub recording: u64,
 }
 
 /// Bytes by what they are for; what a folder takes stays below.
@@ -86,17 +97,23 @@ impl DiskPlan {
             // The one on offer, and the one being written.
             ("delivery", 2 * delivered),
             ("map", r.map),
+            (REPORTS, REPORTS_FIXED + REPORTS_VIEW * frames + if r.map > 0 { REPORTS_MAP } else { 0 }),
+            (RECORDING, r.recording),
         ];
         Self {
             total_bytes: sections.iter().map(|s| s.1).sum(),
             sections,
-            min_bytes: r.scratch + MIN_KEY_FRAMES * (picture + GENERATIONS * LIST_ENTRY) + 2 * model(MIN_KEY_FRAMES),
+            // A recording that finds no room ends before the flight does.
+            min_bytes: r.scratch
+                + REPORTS_FIXED
+                + MIN_KEY_FRAMES * (picture + GENERATIONS * LIST_ENTRY)
+                + 2 * model(MIN_KEY_FRAMES),
         }
     }
 
-    /// Bytes of scratch files.
-    pub fn scratch_bytes(&self) -> u64 {
-        self.sections.iter().find(|s| s.0 == SCRATCH).map_or(0, |s| s.1)
+    /// Bytes that are set aside at the start: of files without a name, and of those that are written when all else is.
+    pub fn set_aside_bytes(&self) -> u64 {
+        self.sections.iter().filter(|s| [SCRATCH, REPORTS, RECORDING].contains(&s.0)).map(|s| s.1).sum()
     }
 
     /// Whether a flight can begin with `bytes` to write to; false when it can, but not to its planned end.
@@ -127,21 +144,26 @@ mod tests {
             sh_degree: 3,
             delivered: 0,
             map: 0,
+            recording: 0,
         };
         let plan = DiskPlan::new(&request);
-        // 128 pictures of 921,600 bytes, three models of 23.6 MB.
-        assert!((188 << 20..198 << 20).contains(&plan.total_bytes), "{}", plan.total_bytes);
+        // 128 pictures of 921,600 bytes, three models of 23.6 MB, reports.
+        assert!((196 << 20..206 << 20).contains(&plan.total_bytes), "{}", plan.total_bytes);
         assert_eq!(plan.fits(plan.total_bytes), Ok(true));
         assert_eq!(plan.fits(plan.total_bytes - 1), Ok(false));
         assert_eq!(plan.fits(plan.min_bytes), Ok(false));
         let said = plan.fits(plan.min_bytes - 1).map_err(|e| e.to_string()).unwrap_err();
         assert!(said.contains("memory.disk_mib") && said.lines().count() == 1, "{said}");
         let paged = DiskPlan::new(&DiskRequest { scratch: 1 << 28, ..request });
-        assert_eq!((paged.scratch_bytes(), paged.min_bytes - plan.min_bytes), (1 << 28, 1 << 28));
+        assert_eq!(paged.set_aside_bytes() - plan.set_aside_bytes(), 1 << 28);
+        assert_eq!(paged.min_bytes - plan.min_bytes, 1 << 28);
         assert_eq!(paged.total_bytes - plan.total_bytes, 1 << 28);
         let delivers = DiskPlan::new(&DiskRequest { delivered: 32, ..request });
         assert!(delivers.total_bytes >= plan.total_bytes + 2 * 32 * 100_000);
         let drawn = DiskPlan::new(&DiskRequest { map: 1 << 25, ..request });
-        assert_eq!(drawn.total_bytes - plan.total_bytes, 1 << 25);
+        assert_eq!(drawn.total_bytes - plan.total_bytes, (1 << 25) + REPORTS_MAP);
+        let recorded = DiskPlan::new(&DiskRequest { recording: 1 << 28, ..request });
+        assert_eq!((recorded.total_bytes - plan.total_bytes, recorded.min_bytes), (1 << 28, plan.min_bytes));
+        assert_eq!(recorded.set_aside_bytes() - plan.set_aside_bytes(), 1 << 28);
     }
 }

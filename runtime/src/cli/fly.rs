@@ -85,8 +85,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
     keep_scratch_in(&args.out);
     let recording = args.record.as_deref().map(|path| Recording::create(path, mission.origin)).transpose()?;
     let (recording, recorder) = recording.unzip();
-    let options =
-        FlyOptions { out: args.out.clone(), end, watch: watch.clone(), recorder: recorder.unwrap_or_default() };
+    let options = FlyOptions {
+        out: args.out.clone(),
+        end,
+        watch: watch.clone(),
+        recorder: recorder.unwrap_or_default(),
+        recording_bytes: args.record.as_deref().map_or(0, |path| Recording::most_bytes_below(path, &args.out)),
+    };
     let outcome = fly(&mission, &aircraft, &options, &interrupt, Supervisor::from_environment());
     // The file is complete when nobody has anything to add.
     drop((options, recording));

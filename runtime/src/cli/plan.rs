@@ -142,6 +142,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         sh_degree: plan.sh_degree,
         delivered: job.delivered,
         map: job.map.disk_bytes(),
+        recording: 0,
     });
     outln!("\n  on disk, for a flight:");
     for (name, bytes) in &disk.sections {

@@ -137,6 +137,13 @@ impl Recording {
         Self::bounded(path, origin, LIMIT)
     }
 
+    /// Most bytes that a recording at `path` takes of `folder`.
+    pub fn most_bytes_below(path: &Path, folder: &Path) -> u64 {
+        let of = |path: &Path| std::path::absolute(path).and_then(|p| p.parent().unwrap_or(&p).canonicalize()).ok();
+        let below = of(path).zip(folder.canonicalize().ok()).is_some_and(|(path, folder)| path.starts_with(folder));
+        if below { LIMIT } else { 0 }
+    }
+
     fn bounded(path: &Path, origin: Geodetic, limit: u64) -> Result<(Self, Recorder), RecordError> {
         let failed = |source| RecordError { path: path.into(), source };
         let file = BufWriter::new(File::create(path).map_err(failed)?);

@@ -101,3 +101,13 @@ fn a_recording_that_cannot_be_written_is_refused_at_the_start() {
     assert_eq!(refused.kind(), ErrorKind::Input);
     assert!(refused.to_string().contains("/nonexistent/flight.mcap"));
 }
+
+#[test]
+fn a_recording_in_the_flight_s_own_folder_is_part_of_its_disk_plan_and_another_is_not() {
+    let (own, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    std::fs::create_dir(own.path().join("log")).unwrap();
+    let most = |path: PathBuf| Recording::most_bytes_below(&path, own.path());
+    assert_eq!(most(own.path().join("flight.mcap")), LIMIT);
+    assert_eq!(most(own.path().join("log/../log/flight.mcap")), LIMIT);
+    assert_eq!((most(other.path().join("flight.mcap")), most(own.path().join("missing/flight.mcap"))), (0, 0));
+}
