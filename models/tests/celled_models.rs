@@ -33,7 +33,7 @@ fn a_file_in_cells_is_sent_in_pieces_that_are_its_cells() {
     };
     let before = write(&all);
     assert!(before.len() > 4, "{} pieces", before.len());
-    assert_eq!(model::read(&path).unwrap().1.len(), 19_000);
+    assert_eq!(model::read(&path).unwrap().1.len(), 20_000);
     let mut changed = all;
     (0..changed.len())
         .filter(|i| changed.means[*i][0] > 45.0 && changed.means[*i][1] > 45.0)

@@ -66,9 +66,6 @@ pub struct Args {
     /// With `--to delivery`: rounded more finely, for scenes seen from near; a third more bytes.
     #[arg(long)]
     pub fine: bool,
-    /// For delivery, of a model of `dgtr train --for-delivery`: its shapes are rounded already, nothing more is left out.
-    #[arg(long, conflicts_with = "fine")]
-    pub rounded: bool,
     /// With `--to html`: so many of the cameras as small pictures to jump to, evenly chosen; 0 needs no Vulkan device.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=i64::from(viewer::MAX_THUMBNAILS)))]
     pub thumbnails: Option<u16>,
@@ -129,7 +126,6 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     if args.format == Format::Delivery {
         let rounding = if args.fine { Rounding::fine() } else { Rounding::default() };
-        let rounding = if args.rounded { rounding.whole() } else { rounding };
         let n = model::write_rounded(&Disk::default(), &out, &header, &cloud, &rounding)?;
         outln!("{}: {n} Gaussians, SH degree {}", out.display(), cloud.sh_degree);
         return Ok(());

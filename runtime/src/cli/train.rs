@@ -89,7 +89,7 @@ pub struct Args {
     #[arg(long)]
     no_refine: bool,
     /// Train the last share of the schedule with values as the delivery encoding rounds them ([training] rounded_share): for
-    /// models that go out by `dgtr export --to delivery --rounded`.
+    /// models that go out by `dgtr export --to delivery`.
     #[arg(long)]
     for_delivery: bool,
     /// Optimiser steps; with neither --steps nor --seconds the recipe's own number.

@@ -21,7 +21,6 @@ impl Reconstruction {
     /// Rounds what gives a Gaussian its shape, as its delivery will, and trains colours alone from here on. The schedule goes on.
     pub(super) fn round(&mut self) -> Result<(), JobError> {
         self.trainer.snapshot(&mut self.cloud)?;
-        let before = self.cloud.len();
         self.cloud = delivery::round_shapes(&self.cloud, &Rounding::default())
             .map_err(|e| FormatError::Invalid { path: "the model".into(), what: format!("not rounded: {e}") })?;
         let (steps, seconds) = self.trainer.spent();
@@ -39,7 +38,7 @@ impl Reconstruction {
             ..rates
         })?;
         self.rounded = true;
-        tracing::info!("rounded for delivery: {} of {before} Gaussians stay, colours go on", self.cloud.len());
+        tracing::info!("rounded for delivery: colours go on");
         Ok(())
     }
 

@@ -379,9 +379,7 @@ fn write_delivery(source: &Source, path: &Path) -> Result<PathBuf, FormatError> 
     // A model that does not lie in the mission's frame has no place among regions.
     let territory = source.territory.as_ref().filter(|_| header.origin.is_some());
     let wanted = |grid: Grid, key: CellKey| territory.is_none_or(|t| t.wants(grid, key, margin));
-    // A finished model has been rounded by its training.
-    let rounding = if header.finished { Rounding::default().whole() } else { Rounding::default() };
-    model::write_cells(&source.disk, &rounded, &header, &cloud, &rounding, &wanted)?;
+    model::write_cells(&source.disk, &rounded, &header, &cloud, &Rounding::default(), &wanted)?;
     Ok(rounded)
 }
 

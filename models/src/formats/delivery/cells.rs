@@ -67,8 +67,8 @@ pub fn encode_cells(
     Ok(CodedCells { grid, cells })
 }
 
-/// The cloud with places, sizes, rotations and opacities as its cells will have them, and colours as they are; the faintest
-/// Gaussians are left out. Encoded with [`Rounding::whole`], places, sizes and opacities come back as they are.
+/// The cloud with places, sizes, rotations and opacities as its cells will have them, and colours as they are. Encoded with the same
+/// steps, places, sizes and opacities come back as they are.
 ///
 /// # Errors
 /// None in practice, as [`encode_cells`].
