@@ -37,13 +37,13 @@ pub fn fits_its_tags(path: &Path) -> Result<bool> {
         for _ in 0..u16_of(entries) {
             let mut entry = [0; 12];
             file.read_exact(&mut entry)?;
-            // TIFF 6.0, section 2: bytes of the types 1 to 12; 13 is an offset to another directory.
+            // TIFF 6.0, section 2: bytes of the types 1 to 12; 13 is an offset to another directory, 16 to 18 are BigTIFF's, which
+            // decoders take here, too.
             let size = match u16_of([entry[2], entry[3]]) {
-                1 | 2 | 6 | 7 => 1,
                 3 | 8 => 2,
                 4 | 9 | 11 | 13 => 4,
-                5 | 10 | 12 => 8,
-                _ => continue,
+                5 | 10 | 12 | 16..=18 => 8,
+                _ => 1,
             };
             if size * u64::from(u32_of([entry[4], entry[5], entry[6], entry[7]])) > length {
                 return Ok(false);
@@ -76,6 +76,9 @@ mod tests {
             (fits(&tiff(1)), fits(&tiff(100_000)), fits(&tiff(u32::MAX))),
             (Some(true), Some(false), Some(false))
         );
+        let mut long = tiff(100);
+        long[12] = 16;
+        assert_eq!(fits(&long), Some(false), "eight bytes for each of a hundred");
         let big = [&b"MM\0*"[..], &[0, 0, 0, 8, 0, 1, 1, 0x11, 0, 4, 0, 9, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]].concat();
         assert_eq!(fits(&big), Some(false));
         assert_eq!((fits(b"\xff\xd8\xff\xe0 a JPEG"), fits(b""), fits(&tiff(1)[..20])), (Some(true), Some(true), None));
