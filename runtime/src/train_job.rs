@@ -14,7 +14,6 @@ use config::plan::{Plan, WORKING_SIDE};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use hal::time::MonotonicClock;
-use models::camera::View;
 use models::card::CardOptions;
 use models::dataset::{Dataset, PoseSource, scaled};
 use models::formats::model::ModelHeader;
@@ -26,7 +25,7 @@ use crate::engine::device::DeviceRequest;
 use crate::engine::source::Folder;
 use crate::engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
 use crate::error::JobError;
-use crate::evaluate::{self, IntoModel, surveyed};
+use crate::evaluate::{self, IntoModel};
 use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
@@ -37,6 +36,7 @@ mod card;
 mod ground;
 pub mod log;
 mod slices;
+mod surveyed;
 
 /// Everything a training needs to know; see `dgtr train --help`.
 #[derive(Clone, Debug)]
@@ -113,26 +113,6 @@ pub struct Outcome {
     pub steps: u64,
     /// What `run.json` says.
     pub report: RunReport,
-}
-
-/// How far the model's renderings put a card's surveyed points off, those that held its poses and those that did not.
-fn measure_surveyed(engine: &mut Reconstruction, set: &Dataset, scale: f64) -> Result<(), JobError> {
-    let Some(notes) = &set.card else { return Ok(()) };
-    let view_of = |name: &str| {
-        let view = set.frames.iter().find(|f| f.name == name)?.view;
-        Some(View { intrinsics: scaled(&view.intrinsics, scale).ok()?, ..view })
-    };
-    for (what, key, points) in
-        [("ground control", "ground_control", &notes.control), ("check points", "check_points", &notes.check)]
-    {
-        if !points.is_empty() {
-            let points = surveyed::marked(set, points, scale);
-            let scores = surveyed::compare(engine.trainer(), &points, &view_of)?;
-            scores.announce(what);
-            engine.report.more.insert(key.to_owned(), serde_json::to_value(scores)?);
-        }
-    }
-    Ok(())
 }
 
 /// Size of the largest picture by area.
@@ -231,7 +211,7 @@ impl TrainJob {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
         if finished {
-            measure_surveyed(&mut engine, &set, picture_scale)?;
+            surveyed::measure(&mut engine, &set, picture_scale)?;
         }
         let steps = engine.header().steps;
         let covered = ground::coverage(engine.header(), engine.cloud(), self.coverage).filter(|_| finished);

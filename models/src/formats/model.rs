@@ -15,8 +15,7 @@
 //! All little-endian. The magic's line ends betray a transfer as text, what is allocated follows from the fixed part and
 //! the file's size, and the hash covers every byte.
 
-use std::fs::File;
-use std::io::{BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::path::Path;
 
 use config::disk::Disk;
@@ -31,10 +30,12 @@ use crate::light::PictureLight;
 use celled::Cells;
 use columns::{read_words, triples, write_floats};
 use hashing::Hashing;
+use opening::{Body, Opened, open, read_header_of};
 
 mod celled;
 mod columns;
 mod hashing;
+mod opening;
 
 pub use celled::{pieces, write_cells};
 
@@ -268,93 +269,6 @@ pub fn unpacked_bytes(path: &Path) -> Result<u64, FormatError> {
 /// Bytes of a Gaussian as exact columns.
 fn exact_bytes(sh_degree: u8) -> u64 {
     4 * (11 + 3 * sh_coefficients(sh_degree) as u64)
-}
-
-struct Opened {
-    input: Hashing<BufReader<File>>,
-    size: u64,
-    count: usize,
-    sh_degree: u8,
-    header_len: usize,
-    body: Body,
-}
-
-/// How the Gaussians are there.
-#[derive(Clone, Copy, PartialEq)]
-enum Body {
-    /// As exact columns.
-    Columns,
-    /// In so many words of the delivery encoding.
-    Words(usize),
-    /// In the delivery encoding, cell by cell.
-    Cells,
-}
-
-fn open(path: &Path) -> Result<Opened, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
-    let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
-    let mut input = Hashing { inner: BufReader::with_capacity(1 << 16, file), hasher: blake3::Hasher::new() };
-    let truncated = |what| FormatError::Truncated { path: path.to_owned(), at: size, what };
-    if size < FIXED {
-        return Err(truncated("its first 28 bytes"));
-    }
-    let mut fixed = [0; FIXED as usize];
-    input.read_exact(&mut fixed).map_err(|e| FormatError::io(path, "reading", e))?;
-    if fixed[..8] != MAGIC {
-        return Err(FormatError::invalid(path, "is not a dgtr model (its first bytes differ); give a .dgtr file"));
-    }
-    let word = |at: usize| u32::from_le_bytes([fixed[at], fixed[at + 1], fixed[at + 2], fixed[at + 3]]);
-    let version = word(8);
-    if ![EXACT, ROUNDED, CELLED].contains(&version) {
-        let what = format!(
-            "model file version {version}; this dgtr reads versions {EXACT} to {CELLED}: use the dgtr that wrote it"
-        );
-        return Err(FormatError::invalid(path, what));
-    }
-    let header_len = u64::from(word(12));
-    let count = u64::from(word(16)) | u64::from(word(20)) << 32;
-    let degree = word(24);
-    if degree > 3 {
-        return Err(FormatError::invalid(path, format!("SH degree {degree}; 0 to 3 is possible (damaged file?)")));
-    }
-    if header_len > MAX_HEADER {
-        let limit = MAX_HEADER;
-        return Err(FormatError::TooLarge { path: path.to_owned(), what: "its header", size: header_len, limit });
-    }
-    let header_len = header_len as usize;
-    if version != EXACT {
-        let Some(coded) = size.checked_sub(FIXED + header_len as u64 + HASH) else {
-            return Err(truncated("its header"));
-        };
-        let form = if version == ROUNDED { Form::Whole } else { Form::Cell };
-        let limit = delivery::most_gaussians(form, coded);
-        if count > limit {
-            let what = "its number of Gaussians";
-            return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
-        }
-        let body = if version == ROUNDED { Body::Words(coded as usize / 4) } else { Body::Cells };
-        if version == ROUNDED && coded % 4 != 0 {
-            return Err(truncated("its Gaussians"));
-        }
-        return Ok(Opened { input, size, count: count as usize, sh_degree: degree as u8, header_len, body });
-    }
-    let expected =
-        count.checked_mul(exact_bytes(degree as u8)).and_then(|c| c.checked_add(FIXED + header_len as u64 + HASH));
-    match expected {
-        Some(expected) if expected == size => {}
-        Some(expected) if expected < size => {
-            let what = format!("is {} bytes longer than its {count} Gaussians; copy it again", size - expected);
-            return Err(FormatError::invalid(path, what));
-        }
-        _ => return Err(truncated("its Gaussians")),
-    }
-    Ok(Opened { input, size, count: count as usize, sh_degree: degree as u8, header_len, body: Body::Columns })
-}
-
-fn read_header_of(path: &Path, opened: &mut Opened) -> Result<Vec<u8>, FormatError> {
-    let mut bytes = vec![0; opened.header_len];
-    opened.input.read_exact(&mut bytes).map_err(|e| FormatError::io(path, "reading", e))?;
-    Ok(bytes)
 }
 
 fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {

@@ -43,6 +43,8 @@ pub struct InitReport {
     pub depth_m: [f32; 2],
     /// Depths claimed by the network that were not positive finite numbers.
     pub non_finite_depths: usize,
+    /// Depths near steps that the pictures put on the surface behind.
+    pub moved_depths: usize,
     /// Median difference between pictures' colours of a place, natural logarithm, as stored and with their light taken out.
     pub light: [f32; 2],
     /// Samples another view agrees with.
