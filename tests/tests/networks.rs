@@ -154,6 +154,9 @@ fn a_trained_network_of_the_users_is_one_line_and_initialises_real_photographs()
     println!("before training: the user's {} dB, the embedded {} dB", own["psnr"], embedded["psnr"]);
     assert_eq!((&own["init"]["network"], &embedded["init"]["network"]), (&"itermvs".into(), &"plane-sweep".into()));
     assert_eq!(own["init"]["runs"], 5);
+    // Only the plane sweep's windows carry a depth over its edge.
+    assert_eq!(own["init"]["moved_depths"], 0);
+    assert!(embedded["init"]["moved_depths"].as_u64() > Some(0), "{embedded}");
     let psnr = |run: &Value| run["psnr"].as_f64().expect("psnr");
     assert!(psnr(&own) > 17.0, "{own}");
     assert!((psnr(&own) - psnr(&embedded)).abs() < 1.0, "{} against {}", psnr(&own), psnr(&embedded));

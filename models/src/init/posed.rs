@@ -183,10 +183,11 @@ impl Lane {
         let k_ref = [k.fx, 0.0, k.cx - 0.5, 0.0, k.fy, k.cy - 0.5, 0.0, 0.0, 1.0];
         let out = self.session.run((w, h), &[&self.planes, &projections, &request.range, &k_ref])?;
         let (mut grid, non_finite) = DepthGrid::sampled(w as usize, h as usize, stride, &out[0].data, &out[1].data);
-        let mut moved = 0;
-        if self.grows_edges {
-            moved = edges::follow_the_pictures(&mut grid, &edges::Pictures::new((w, h), &self.planes, &projections));
-        }
+        let moved = if self.grows_edges {
+            edges::follow_the_pictures(&mut grid, &edges::Pictures::new((w, h), &self.planes, &projections))
+        } else {
+            0
+        };
         let run_ms = started.elapsed().as_secs_f64() * 1e3 - (self.session.opening_ms() - opened);
         Ok(Made { grid, non_finite, moved, run_ms })
     }

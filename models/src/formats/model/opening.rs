@@ -29,7 +29,7 @@ pub(super) enum Body {
     Cells,
 }
 
-/// Opens a model and takes its fixed part; nothing is allocated yet.
+/// Opens a model and takes its fixed part; nothing is allocated yet for what it says.
 ///
 /// # Errors
 /// As [`super::read`], of what the fixed part and the file's size tell.
