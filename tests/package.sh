@@ -4,7 +4,7 @@
 # systemd of its own (systemd-nspawn).
 # Not part of .ci/run: it builds the release anew and loads a few hundred MB.
 #   tests/package.sh [--arch amd64|arm64] [--no-root] [--transcript FILE]
-# An arm64 package is built here with the std of its target and aarch64-linux-gnu-gcc; it is not started.
+# An arm64 package is built here with the std of its target and aarch64-linux-gnu-gcc; it is not started (tests/arm64.sh runs the program).
 # Wants: cargo install cargo-deb --locked; apt-get install lintian mmdebstrap systemd-container python3-pip (and gcc-aarch64-linux-gnu).
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -26,29 +26,18 @@ arm64) target=aarch64-unknown-linux-gnu machine=aarch64 ;;
 esac
 cross=()
 if [ "$arch" != "$(dpkg --print-architecture)" ]; then
+    # shellcheck source=package/cross.sh
+    . tests/package/cross.sh
     cross=(--target "$target")
-    export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
+    (cross_compiler "$target")
 fi
 
 made=target/package
 rm -rf "$made" && mkdir -p "$made"
 
-# ONNX Runtime of the target's architecture, out of its published Python package. 1.24.4 has no client of its makers' telemetry
-# in it; 1.32 has one (with libcurl and mbedTLS), although dgtr turns it off.
-python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --implementation cp \
-    --python-version 3.13 --abi cp313 --platform "manylinux_2_28_$machine" --platform "manylinux_2_27_$machine" \
-    --dest "$made/wheel" onnxruntime==1.24.4
-python3 - "$made" <<'PY'
-import glob, gzip, sys, zipfile
-made = sys.argv[1]
-wheel = zipfile.ZipFile(glob.glob(made + "/wheel/onnxruntime-*.whl")[0])
-library = next(n for n in wheel.namelist() if "/capi/libonnxruntime.so" in n)
-with open(made + "/libonnxruntime.so", "wb") as out:
-    out.write(wheel.read(library))
-notices = b"\n\n".join(wheel.read("onnxruntime/" + n) for n in ("LICENSE", "ThirdPartyNotices.txt"))
-with open(made + "/onnxruntime.txt.gz", "wb") as out:
-    out.write(gzip.compress(notices, 9, mtime=0))
-PY
+# shellcheck source=package/onnxruntime.sh
+. tests/package/onnxruntime.sh
+onnxruntime "$machine" "$made"
 
 # Names, licences and notices of every crate that may be linked in.
 cargo metadata --format-version 1 --locked --filter-platform "$target" --features runtime/v4l2 | python3 -c '
@@ -79,6 +68,7 @@ here=${CARGO_TARGET_DIR:-target}/release/dgtr
 manual() { rm -rf "$made/manual" && "$here" manual --out "$made/manual" "$@"; }
 cp "$here" "$made/dgtr-here" && here=$made/dgtr-here
 
+[ ${#cross[@]} = 0 ] || cross_compiler "$target"
 mkdir -p target/debian && rm -f target/debian/dgtr*_"$arch".deb
 manual
 cargo deb -p runtime "${cross[@]}" --locked --output target/debian/

@@ -14,6 +14,7 @@ pub mod dataset;
 pub mod formats;
 pub mod ground_cell;
 pub mod init;
+pub mod levels;
 pub mod light;
 pub mod metrics;
 mod morton;

@@ -7,6 +7,7 @@ pub mod device;
 pub mod figures;
 pub mod front;
 pub mod ground;
+pub mod levels;
 pub mod map;
 pub mod memory;
 pub mod skips;

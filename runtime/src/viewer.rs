@@ -4,7 +4,7 @@
 //! The viewer is not ours and not in the repository: `runtime/setup.sh` fetches the version that `viewer.pin` names.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -12,7 +12,8 @@ use config::error::{Error, ErrorKind};
 use models::camera::View;
 use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
-use models::formats::{FormatError, sog, write_atomic};
+use models::formats::sog::{self, streamed};
+use models::formats::{FormatError, write_atomic};
 use models::metrics::to_rgb8;
 use serde_json::{Value, json};
 use vulkan::trainer::Rendering;
@@ -50,7 +51,7 @@ pub enum ViewerError {
     #[error("{}: is not the file of {name}; delete its folder and run runtime/setup.sh --viewer", path.display())]
     Other {
         /// The file.
-        path: std::path::PathBuf,
+        path: PathBuf,
         /// Package and version.
         name: &'static str,
     },
@@ -96,21 +97,44 @@ pub fn write(
     let most = usize::from(request.thumbnails.unwrap_or(THUMBNAILS));
     let views = evenly(&header.views, most);
     let pictures = pictures(cloud, &views, request.device)?;
+    let scene = json!({ "shift": sog.shift, "pictures": pictures, "settings": settings(cloud, &views) });
+    page(path, header, &package, &scene, &STANDARD.encode(&sog.bytes))
+}
+
+/// Writes the page of a scene in levels of detail into its folder, as `index.html`; `coarsest` is its coarsest level. To be opened
+/// over HTTP: a page from a file may not fetch what lies beside it.
+///
+/// # Errors
+/// No viewer, the disk.
+pub fn write_streamed(
+    folder: &Path,
+    header: &ModelHeader,
+    coarsest: &GaussianCloud,
+    shift: [f32; 3],
+) -> Result<PathBuf, ViewerError> {
+    let package = Package::find()?;
+    let path = folder.join("index.html");
+    let settings = settings(coarsest, &[]);
+    let scene = json!({ "shift": shift, "pictures": [], "settings": settings, "streamed": streamed::INDEX });
+    page(&path, header, &package, &scene, "")?;
+    Ok(path)
+}
+
+/// Fills the page; `sog` is base64.
+fn page(path: &Path, header: &ModelHeader, package: &Package, scene: &Value, sog: &str) -> Result<(), ViewerError> {
     let name = path.file_stem().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
     let title = escape(if header.mission.is_empty() { &name } else { &header.mission });
     let place = match header.origin {
         Some(o) => format!("origin {:.6}°, {:.6}°, {:.1} m", o.lat_deg, o.lon_deg, o.alt_m),
         None => "in the scene's own metres".to_owned(),
     };
-    let scene = json!({ "shift": sog.shift, "pictures": pictures, "settings": settings(cloud, &views) });
     // "</script>" in a name would end the block.
     let scene = scene.to_string().replace('<', "\\u003c");
-    let sog = STANDARD.encode(&sog.bytes);
-    let overlay = |name| match name {
+    let part = |name| match name {
         "title" => Some(title.as_str()),
         "place" => Some(place.as_str()),
         "scene" => Some(scene.as_str()),
-        "sog" => Some(sog.as_str()),
+        "sog" => Some(sog),
         "viewer.js" => Some(package.script.as_str()),
         "viewer.css" => Some(package.style.as_str()),
         "licence" => Some(package.licence.as_str()),
@@ -118,7 +142,7 @@ pub fn write(
         "overlay.js" => Some(include_str!("viewer/overlay.js")),
         _ => None,
     };
-    Ok(write_atomic(path, |out| fill(out, include_str!("viewer/page.html"), overlay))?)
+    Ok(write_atomic(path, |out| fill(out, include_str!("viewer/page.html"), part))?)
 }
 
 /// Writes `page` with each `{{name}}` replaced.

@@ -15,7 +15,7 @@
 //! All little-endian. The magic's line ends betray a transfer as text, what is allocated follows from the fixed part and
 //! the file's size, and the hash covers every byte.
 
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::Path;
 
 use config::disk::Disk;
@@ -28,16 +28,19 @@ use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
 use crate::light::PictureLight;
 use celled::Cells;
+use chunks::compare;
 use columns::{read_words, triples, write_floats};
 use hashing::Hashing;
 use opening::{Body, Opened, open, read_header_of};
 
 mod celled;
+mod chunks;
 mod columns;
 mod hashing;
 mod opening;
 
 pub use celled::{pieces, write_cells};
+pub use chunks::{Chunks, write_chunks};
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.
@@ -227,14 +230,12 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
             cloud.sh = column(count * cloud.sh_stride())?;
         }
     }
-    let expected = input.hasher.finalize();
-    let mut hash = [0; HASH as usize];
-    input.inner.read_exact(&mut hash).map_err(failed)?;
-    if expected != blake3::Hash::from_bytes(hash) {
-        return Err(FormatError::Damaged { path: path.to_owned() });
-    }
+    let hash = compare(path, &mut input)?;
     if let Some(cells) = cells {
-        cells.decode(path, &mut input.inner, &mut cloud)?;
+        cells.each(path, &mut input.inner, sh_degree, &mut |cell| {
+            cloud.extend(&cell);
+            Ok::<(), FormatError>(())
+        })?;
     } else if body != Body::Columns {
         cloud = delivery::decode(Form::Whole, coded, count, sh_degree)
             .map_err(|e| FormatError::invalid(path, e.to_string()))?;

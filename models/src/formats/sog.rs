@@ -7,6 +7,7 @@
 //! is what the pictures are packed by. Source: PlayCanvas' "The SOG Format", and `splat-transform` where it is silent.
 
 use std::io::{Cursor, Write};
+use std::ops::Range;
 use std::path::Path;
 
 use glam::{Quat, Vec3};
@@ -23,8 +24,10 @@ use palette::Palette;
 
 mod codebook;
 mod palette;
+pub mod streamed;
 
 const VERSION: u32 = 2;
+const GENERATOR: &str = concat!("dgtr ", env!("CARGO_PKG_VERSION"));
 /// Most rows of the palette: a label is 16 bits.
 const MAX_PALETTE: usize = 1 << 16;
 /// Palette entries side by side in their picture.
@@ -103,21 +106,45 @@ pub fn write(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
 /// # Errors
 /// [`FormatError::Invalid`] for a cloud that is empty, has numbers that are not finite, or is larger than a picture can be.
 pub fn encode(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
+    // In whole metres, so that nobody reads meaning into digits.
+    let shift = cloud.middle().map(|v| v.round() + 0.0);
+    let failed = |e: std::io::Error| FormatError::io(path, "packing", e);
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in pack(path, cloud, &morton_order(cloud, 0..cloud.len()), shift)? {
+        let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+        zip.start_file(name, stored).map_err(|e| failed(e.into()))?;
+        zip.write_all(&bytes).map_err(failed)?;
+    }
+    let bytes = zip.finish().map_err(|e| failed(e.into()))?.into_inner();
+    Ok(Sog { bytes, shift, count: cloud.len() })
+}
+
+/// The files of a scene by name, `meta.json` last: the rows of `cloud` in `order`, their means less `shift`.
+///
+/// # Errors
+/// As [`encode`].
+fn pack(
+    path: &Path,
+    cloud: &GaussianCloud,
+    order: &[u32],
+    shift: [f32; 3],
+) -> Result<Vec<(&'static str, Vec<u8>)>, FormatError> {
     if cloud.is_empty() || !(0..cloud.len()).all(|i| cloud.is_valid(i)) {
         return Err(FormatError::invalid(
             path,
             "a SOG file needs Gaussians, with finite numbers only; train the model first",
         ));
     }
-    // In whole metres, so that nobody reads meaning into digits.
-    let shift = cloud.middle().map(|v| v.round() + 0.0);
-    let order = morton_order(cloud);
     let size = picture_size(order.len());
     if size.0.max(size.1) > MAX_SIDE {
         return Err(FormatError::invalid(path, "holds more Gaussians than a WebP picture has pixels; export to ply"));
     }
     let failed = |e: std::io::Error| FormatError::io(path, "packing", e);
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    let mut files = Vec::new();
+    let mut add = |name: &'static str, picture: Picture| {
+        files.push((name, picture.encode().map_err(failed)?));
+        Ok::<(), FormatError>(())
+    };
     let picture = |fill: &dyn Fn(usize) -> [u8; 4]| Picture::of(size, order.iter().map(|i| fill(*i as usize)));
 
     let means: Vec<[f32; 3]> = cloud.means.iter().map(|m| [0, 1, 2].map(|k| to_log(m[k] - shift[k]))).collect();
@@ -133,13 +160,13 @@ pub fn encode(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
         })
     };
     let byte_of_means = |b: usize| move |v: [[u8; 2]; 3]| [v[0][b], v[1][b], v[2][b], u8::MAX];
-    add(&mut zip, "means_l.webp", picture(&|i| byte_of_means(0)(fixed(i)))).map_err(failed)?;
-    add(&mut zip, "means_u.webp", picture(&|i| byte_of_means(1)(fixed(i)))).map_err(failed)?;
+    add("means_l.webp", picture(&|i| byte_of_means(0)(fixed(i))))?;
+    add("means_u.webp", picture(&|i| byte_of_means(1)(fixed(i))))?;
 
     let scales = Codebook::of(cloud.log_scales.iter().flatten().copied());
     let scale = |i: usize| cloud.log_scales[i].map(|v| scales.index(v));
-    add(&mut zip, "scales.webp", picture(&|i| opaque(scale(i)))).map_err(failed)?;
-    add(&mut zip, "quats.webp", picture(&|i| pack_rotation(cloud.rotations[i]))).map_err(failed)?;
+    add("scales.webp", picture(&|i| opaque(scale(i))))?;
+    add("quats.webp", picture(&|i| pack_rotation(cloud.rotations[i])))?;
 
     let stride = cloud.sh_stride();
     let plain = |i: usize| [0, 1, 2].map(|c| cloud.sh[i * stride + c]);
@@ -148,7 +175,7 @@ pub fn encode(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
         let [r, g, b] = plain(i).map(|v| colors.index(v));
         [r, g, b, (255.0 / (1.0 + (-cloud.opacity_logits[i]).exp())).round() as u8]
     };
-    add(&mut zip, "sh0.webp", picture(&color)).map_err(failed)?;
+    add("sh0.webp", picture(&color))?;
 
     let palette = (cloud.sh_degree > 0).then(|| {
         let row = |i: usize| &cloud.sh[i * stride + 3..(i + 1) * stride];
@@ -159,16 +186,16 @@ pub fn encode(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
         (palette, book)
     });
     if let Some((palette, book)) = &palette {
-        add(&mut zip, "shN_centroids.webp", entries(palette, book, cloud.sh_degree)).map_err(failed)?;
+        add("shN_centroids.webp", entries(palette, book, cloud.sh_degree))?;
         let label = |i: usize| {
             let [low, high, ..] = palette.labels[i].to_le_bytes();
             [low, high, 0, u8::MAX]
         };
-        add(&mut zip, "shN_labels.webp", picture(&label)).map_err(failed)?;
+        add("shN_labels.webp", picture(&label))?;
     }
     let meta = Meta {
         version: VERSION,
-        asset: Asset { generator: concat!("dgtr ", env!("CARGO_PKG_VERSION")) },
+        asset: Asset { generator: GENERATOR },
         count: order.len(),
         means: Means { mins, maxs, files: ["means_l.webp", "means_u.webp"] },
         scales: Coded { codebook: scales.values(), files: ["scales.webp"] },
@@ -181,18 +208,17 @@ pub fn encode(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
             files: ["shN_centroids.webp", "shN_labels.webp"],
         }),
     };
-    let meta = serde_json::to_vec(&meta).map_err(|e| failed(e.into()))?;
-    store(&mut zip, "meta.json", &meta).map_err(failed)?;
-    let bytes = zip.finish().map_err(|e| failed(e.into()))?.into_inner();
-    Ok(Sog { bytes, shift, count: order.len() })
+    files.push(("meta.json", serde_json::to_vec(&meta).map_err(|e| failed(e.into()))?));
+    Ok(files)
 }
 
 fn to_log(v: f32) -> f32 {
     v.signum() * v.abs().ln_1p()
 }
 
-fn morton_order(cloud: &GaussianCloud) -> Vec<u32> {
-    let (low, high) = cloud.means.iter().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), m| {
+/// `rows` in Morton order.
+fn morton_order(cloud: &GaussianCloud, rows: Range<usize>) -> Vec<u32> {
+    let (low, high) = cloud.means[rows.clone()].iter().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), m| {
         (low.min(Vec3::from_array(*m)), high.max(Vec3::from_array(*m)))
     });
     let cell = ((high - low) / ((1u32 << BITS) - 1) as f32).max(Vec3::splat(f32::MIN_POSITIVE));
@@ -200,7 +226,7 @@ fn morton_order(cloud: &GaussianCloud) -> Vec<u32> {
         let at = (Vec3::from_array(cloud.means[i as usize]) - low) / cell;
         morton(at.x as u32, at.y as u32, at.z as u32)
     };
-    let mut order: Vec<(u64, u32)> = (0..cloud.len() as u32).map(|i| (key(i), i)).collect();
+    let mut order: Vec<(u64, u32)> = rows.map(|i| (key(i as u32), i as u32)).collect();
     order.sort_unstable();
     order.into_iter().map(|(_, i)| i).collect()
 }
@@ -266,13 +292,4 @@ impl Picture {
         let (with, without) = (with?, without?);
         Ok(if with.len() < without.len() { with } else { without })
     }
-}
-
-fn add(zip: &mut ZipWriter<Cursor<Vec<u8>>>, name: &str, picture: Picture) -> std::io::Result<()> {
-    store(zip, name, &picture.encode()?)
-}
-
-fn store(zip: &mut ZipWriter<Cursor<Vec<u8>>>, name: &str, bytes: &[u8]) -> std::io::Result<()> {
-    zip.start_file(name, SimpleFileOptions::default().compression_method(CompressionMethod::Stored))?;
-    zip.write_all(bytes)
 }

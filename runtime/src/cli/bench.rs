@@ -3,6 +3,7 @@
 mod detail;
 mod device;
 mod ground;
+mod levels;
 mod map;
 mod memory;
 mod skips;
@@ -33,6 +34,8 @@ enum Command {
     Device(device::Args),
     /// A ground station of many simulated aircraft: seconds for each, memory, how well they meet.
     Ground(ground::Args),
+    /// Levels of detail: how many Gaussians each has, and what it shows from its own distance against the whole scene.
+    Levels(levels::Args),
     /// Planned against measured bytes, and quality, across memory budgets.
     Memory(memory::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
@@ -68,6 +71,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Detail(args) => detail::run(args),
         Command::Device(args) => device::run(args),
         Command::Ground(args) => ground::run(args),
+        Command::Levels(args) => levels::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),

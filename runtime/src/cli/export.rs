@@ -10,9 +10,10 @@ use models::cloud::{GaussianCloud, SH_C0};
 use models::dataset::Dataset;
 use models::formats::colmap::Point;
 use models::formats::delivery::Rounding;
-use models::formats::model::ModelHeader;
+use models::formats::model::{Chunks, ModelHeader};
 use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use models::formats::{colmap, gltf, model, opensfm, ply, sog, spz, transforms};
+use models::levels;
 use models::ortho::georef::{FROM_Y_UP, Georef, shifted};
 
 use super::CliError;
@@ -32,6 +33,8 @@ pub enum Format {
     Gltf,
     /// A page with the scene and its viewer inside: opens by double click, without a network.
     Html,
+    /// A folder with levels of detail that a viewer streams (PlayCanvas' streamed SOG) and a page that shows them: a scene of any size.
+    Streamed,
     /// Rounded and entropy-coded .dgtr, about a thirtieth of the exact one: what an aircraft delivers.
     Delivery,
     /// Poses, lenses and Gaussians' centres as a COLMAP model, binary, in a folder.
@@ -60,7 +63,7 @@ pub struct Args {
     /// Where to write; default: beside the model, with the format's extension or name.
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// With `--to ply|spz|sog|gltf|html`: leave out colours of a higher degree (0: the same colour from every side).
+    /// With `--to ply|spz|sog|gltf|html|streamed`: leave out colours of a higher degree (0: the same colour from every side).
     #[arg(long, value_name = "0-3", value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: Option<u8>,
     /// With `--to delivery`: rounded more finely, for scenes seen from near; a third more bytes.
@@ -84,7 +87,11 @@ impl Args {
         let of_html = self.format == Format::Html;
         let misplaced = [
             (self.fine && self.format != Format::Delivery, "--fine", "delivery"),
-            (self.sh_degree.is_some() && !self.format.is_scene(), "--sh-degree", "ply, spz, sog, gltf and html"),
+            (
+                self.sh_degree.is_some() && !self.format.is_scene() && self.format != Format::Streamed,
+                "--sh-degree",
+                "ply, spz, sog, gltf, html and streamed",
+            ),
             (self.thumbnails.is_some() && !of_html, "--thumbnails", "html"),
             (self.device.is_some() && !of_html, "--device", "html"),
         ];
@@ -101,6 +108,7 @@ impl Args {
             Format::Sog => self.model.with_extension("sog"),
             Format::Gltf => self.model.with_extension("glb"),
             Format::Html => self.model.with_extension("html"),
+            Format::Streamed => self.model.with_extension("streamed"),
             Format::Delivery => self.model.with_extension("delivery.dgtr"),
             Format::Colmap => self.model.with_file_name("colmap"),
             Format::Nerfstudio => self.model.with_file_name("cameras.json"),
@@ -115,11 +123,14 @@ impl Args {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     args.check()?;
-    let (header, mut cloud) = model::read(&args.model)?;
     let out = args.out.clone().unwrap_or_else(|| args.default_out());
     if out == args.model {
         return Err(CliError::input(format!("{}: would overwrite the model; give another --out", out.display())));
     }
+    if args.format == Format::Streamed {
+        return streamed(&args, &out);
+    }
+    let (header, mut cloud) = model::read(&args.model)?;
     if args.format.is_scene() {
         cloud.lower_sh_degree(args.sh_degree.unwrap_or(cloud.sh_degree));
         return scene(&args, &out, &header, &cloud);
@@ -173,6 +184,36 @@ fn scene(args: &Args, out: &Path, header: &ModelHeader, cloud: &GaussianCloud) -
     };
     georef.write(out)?;
     outln!("{}: {} Gaussians, SH degree {}", out.display(), cloud.len(), cloud.sh_degree);
+    Ok(())
+}
+
+/// Levels of detail in a folder, never more than a part of the scene in memory, and the page that shows them.
+fn streamed(args: &Args, out: &Path) -> Result<(), CliError> {
+    let model = Chunks::open(&args.model)?;
+    let written = levels::write(&model, out, args.sh_degree.unwrap_or(model.sh_degree))?;
+    if written.strays + written.non_finite > 0 {
+        tracing::warn!(
+            "{} Gaussians far from everything else and {} that are not finite were left out",
+            written.strays,
+            written.non_finite
+        );
+    }
+    let georef = Georef::new(
+        out,
+        model.header.origin,
+        shifted(written.shift.map(f64::from)),
+        DVec3::from_array(written.shift.map(f64::from)),
+    )?;
+    georef.write(out)?;
+    let sides = std::iter::once("as trained".to_owned()).chain(written.voxels_m.iter().map(|v| format!("{v:.3} m")));
+    for (level, (side, n)) in sides.zip(&written.counts).enumerate() {
+        outln!("level {level}: {n} Gaussians, {side}");
+    }
+    match viewer::write_streamed(out, &model.header, &written.coarsest, written.shift) {
+        Ok(page) => outln!("{}: {} leaves; to be opened over HTTP", page.display(), written.leaves),
+        // The levels are for other viewers, too.
+        Err(e) => tracing::warn!("no page: {e}"),
+    }
     Ok(())
 }
 

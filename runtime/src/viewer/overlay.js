@@ -2,15 +2,21 @@
 // world is x east, y up, z south in metres; east, north, up is what people read.
 
 const scene = JSON.parse(document.getElementById('dgtr-scene').textContent);
-const packed = Uint8Array.from(atob(document.getElementById('dgtr-sog').textContent), (c) => c.charCodeAt(0));
 const byId = (id) => document.getElementById(id);
+// A scene in levels of detail lies beside the page and comes piece by piece; all others are inside.
+const streamed = scene.streamed;
+const packed = streamed ? null : Uint8Array.from(atob(byId('dgtr-sog').textContent), (c) => c.charCodeAt(0));
+if (streamed && location.protocol === 'file:') {
+    document.body.textContent = 'This scene is streamed: open it by HTTP, for instance "python3 -m http.server" in its folder.';
+    throw new Error('a streamed scene needs HTTP');
+}
 
 const viewer = await createViewer({
     container: byId('dgtr-viewer'),
     settings: scene.settings,
-    contentUrl: 'scene.sog',
-    contentFilename: 'scene.sog',
-    contents: Promise.resolve(new Response(packed)),
+    ...(streamed
+        ? { contentUrl: streamed, contentFilename: streamed }
+        : { contentUrl: 'scene.sog', contentFilename: 'scene.sog', contents: Promise.resolve(new Response(packed)) }),
     renderer: 'webgl', // every laptop has it, and nothing differs between machines
     noanim: true
 });
@@ -30,7 +36,8 @@ viewer.resetCamera();
 
 const camera = viewer.app.root.findComponent('camera');
 const canvas = viewer.app.graphicsDevice.canvas;
-const splats = await unpack(packed);
+const splats = packed && (await unpack(packed));
+byId('dgtr-measure').hidden = !splats; // it looks along a ray through all Gaussians
 
 // The camera now: place and axes (right, up, back) in east, north, up; tangents of half the view.
 function look() {

@@ -134,22 +134,26 @@ impl Cells {
         }
     }
 
-    /// Adds the Gaussians of all cells to `cloud`.
-    pub fn decode(
+    /// Gives the Gaussians of each cell to `each`.
+    ///
+    /// # Errors
+    /// A damaged cell, the operating system's, and those of `each`.
+    pub fn each<E: From<FormatError>>(
         self,
         path: &Path,
         input: &mut BufReader<File>,
-        cloud: &mut GaussianCloud,
-    ) -> Result<(), FormatError> {
+        sh_degree: u8,
+        each: &mut dyn FnMut(GaussianCloud) -> Result<(), E>,
+    ) -> Result<(), E> {
         for entry in self.0 {
             let mut hashing = Hashing { inner: &mut *input, hasher: blake3::Hasher::new() };
             let words = read_words(&mut hashing, entry.words as usize, u32::from_le_bytes);
             let words = words.map_err(|e| FormatError::io(path, "reading", e))?;
             if hashing.hasher.finalize() != blake3::Hash::from_bytes(entry.hash) {
-                return Err(FormatError::Damaged { path: path.to_owned() });
+                return Err(FormatError::Damaged { path: path.to_owned() }.into());
             }
-            let cell = delivery::decode(Form::Cell, words, entry.count as usize, cloud.sh_degree);
-            cloud.extend(&cell.map_err(|e| FormatError::invalid(path, e.to_string()))?);
+            let cell = delivery::decode(Form::Cell, words, entry.count as usize, sh_degree);
+            each(cell.map_err(|e| FormatError::invalid(path, e.to_string()))?)?;
         }
         Ok(())
     }

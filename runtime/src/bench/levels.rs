@@ -1,0 +1,149 @@
+//! Levels of detail of a scene: their sizes, and how far each is from the whole scene where it takes its place.
+
+use std::ops::Range;
+use std::path::Path;
+use std::time::Instant;
+
+use glam::{DMat3, DQuat, DVec3};
+use models::camera::{Intrinsics, Pose, View};
+use models::cloud::{GaussianCloud, SH_C0};
+use models::formats::FormatError;
+use models::formats::model::{Chunks, ModelHeader, write_chunks};
+use models::{levels, metrics};
+use serde::Serialize;
+use vulkan::trainer::Rendering;
+
+use crate::engine::device::renderer;
+use crate::error::JobError;
+
+/// Pictures that levels are compared in, and their focal length, pixels.
+const SIZE: [u32; 2] = [640, 480];
+const FOCAL: f64 = 1000.0;
+/// How steeply they look down, degrees below the horizon.
+const DOWN_DEG: [f64; 3] = [90.0, 60.0, 40.0];
+/// Largest scene that is drawn whole to compare with.
+pub const MOST_COMPARED: usize = 2_000_000;
+/// Metres between neighbours of the made-up ground.
+const SPACING_M: f64 = 0.25;
+
+/// One level.
+#[derive(Clone, Debug, Serialize)]
+pub struct Level {
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Side of its voxels, metres; 0 for the finest, which is the model.
+    pub voxel_m: f64,
+    /// Where such a voxel is a pixel wide, metres.
+    pub distance_m: f64,
+    /// Mean PSNR against the whole scene seen from there, dB; `None` where that was not drawn.
+    pub psnr: Option<f64>,
+}
+
+/// All levels of a scene, and what they took.
+#[derive(Clone, Debug, Serialize)]
+pub struct Levels {
+    /// The finest first.
+    pub levels: Vec<Level>,
+    /// Leaves of ground.
+    pub leaves: usize,
+    /// Seconds until they were written.
+    pub seconds: f64,
+    /// Name of the device that drew them; empty where none did.
+    pub device: String,
+}
+
+/// Writes a made-up scene of `gaussians`: hilly ground with fields, seen by nobody yet; the same number, the same scene.
+///
+/// # Errors
+/// The operating system's.
+pub fn write_scene(path: &Path, gaussians: usize) -> Result<(), FormatError> {
+    let side = (gaussians as f64).sqrt().ceil() as usize;
+    let rows = |range: Range<usize>| {
+        let mut cloud = GaussianCloud::with_capacity(0, range.len());
+        for i in range {
+            let (x, y) = (SPACING_M * (i % side) as f64, SPACING_M * (i / side) as f64);
+            let hills = 6.0 * ((x / 90.0).sin() + (y / 70.0).cos());
+            let field = ((x / 37.0).floor() + 3.0 * (y / 23.0).floor()).rem_euclid(5.0);
+            let furrow = 0.06 * (x * 1.7 + y * 0.6).sin();
+            let rgb =
+                [0.30 + 0.08 * field, 0.42 + 0.05 * (4.0 - field), 0.25].map(|v| (v + furrow - 0.5) / f64::from(SH_C0));
+            cloud.push(
+                [x, y, hills].map(|v| v as f32),
+                [0.55 * SPACING_M, 0.55 * SPACING_M, 0.02].map(|v| v.ln() as f32),
+                [1.0, 0.0, 0.0, 0.0],
+                3.0,
+                &rgb.map(|v| v as f32),
+            );
+        }
+        cloud
+    };
+    write_chunks(path, &ModelHeader { mission: "levels".into(), ..Default::default() }, gaussians, 0, &rows)
+}
+
+/// Writes the levels of `model` into `folder` and compares each, as it is before it is packed, with the whole scene.
+///
+/// # Errors
+/// As `dgtr export --to streamed`; no device.
+pub fn measure(model: &Path, folder: &Path, device: Option<&str>) -> Result<Levels, JobError> {
+    let start = Instant::now();
+    let chunks = Chunks::open(model)?;
+    let written = levels::write(&chunks, folder, chunks.sh_degree)?;
+    let seconds = start.elapsed().as_secs_f64();
+    let sides = std::iter::once(0.0).chain(written.voxels_m.iter().copied());
+    let mut all = Levels {
+        levels: sides
+            .zip(&written.counts)
+            .map(|(voxel_m, n)| Level { gaussians: *n, voxel_m, distance_m: FOCAL * voxel_m, psnr: None })
+            .collect(),
+        leaves: written.leaves,
+        seconds,
+        device: String::new(),
+    };
+    if chunks.count > MOST_COMPARED {
+        return Ok(all);
+    }
+    let mut whole = GaussianCloud::with_capacity(chunks.sh_degree, chunks.count);
+    chunks.each(&mut |cloud| {
+        whole.extend(cloud);
+        Ok::<(), FormatError>(())
+    })?;
+    let views: Vec<Vec<View>> = all.levels.iter().map(|l| views(&whole, l.distance_m)).collect();
+    let mut draw = |cloud: &GaussianCloud, views: &[View]| {
+        let mut trainer = renderer(device, cloud, SIZE[0], SIZE[1])?;
+        all.device.clone_from(&trainer.gpu().info().name);
+        let drawn = views.iter().map(|view| {
+            let mut picture = Rendering::default();
+            trainer.render(view, &mut picture)?;
+            Ok(picture.rgb)
+        });
+        drawn.collect::<Result<Vec<_>, JobError>>()
+    };
+    let expected = draw(&whole, &views.concat())?;
+    let per_level = expected.chunks(DOWN_DEG.len()).collect::<Vec<_>>();
+    let divided = levels::of(whole, &written.voxels_m);
+    let mut figures = Vec::new();
+    for number in 1..divided.len() {
+        let shown = draw(&divided[number], &views[number])?;
+        let psnr = shown.iter().zip(per_level[number]).map(|(a, b)| metrics::psnr(a, b));
+        figures.push(psnr.sum::<f64>() / DOWN_DEG.len() as f64);
+    }
+    all.levels[1..].iter_mut().zip(figures).for_each(|(level, psnr)| level.psnr = Some(psnr));
+    Ok(all)
+}
+
+/// Cameras around the middle of a scene, so far from it.
+fn views(cloud: &GaussianCloud, distance: f64) -> Vec<View> {
+    let middle = DVec3::from_array(cloud.middle().map(f64::from));
+    let [width, height] = SIZE;
+    let half = [width, height].map(|n| n as f32 / 2.0);
+    let intrinsics = Intrinsics { width, height, fx: FOCAL as f32, fy: FOCAL as f32, cx: half[0], cy: half[1] };
+    let view = |down: f64| {
+        let (sin, cos) = down.to_radians().sin_cos();
+        // From the south: x to the east, the picture's upper edge to the north.
+        let forward = DVec3::new(0.0, cos, -sin);
+        let below = DVec3::new(0.0, -sin, -cos);
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(DVec3::X, below, forward));
+        View { intrinsics, pose: Pose { rotation, center: middle - distance * forward } }
+    };
+    DOWN_DEG.map(view).to_vec()
+}
