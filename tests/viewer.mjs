@@ -1,8 +1,8 @@
-// Opens a page of `dgtr export --to html` in headless Chromium as a double click would: file://, no network, WebGL 2 in software, no
+// Opens a page of `dgtr export --to html` (or, by its http:// address, one of `--to streamed`) in headless Chromium as a double click would: file://, no network, WebGL 2 in software, no
 // WebGPU. Drives it as a person would, with the mouse, and says what it saw as JSON. No packages: the browser's own protocol over a pipe.
 //   node viewer.mjs CHROMIUM PAGE.html FOLDER STEPS.json
 // Steps: {"camera": N} clicks the picture of camera N; {"click": [x, y]} clicks the scene; {"measure": true} the button;
-// {"shot": "NAME"} takes a picture into FOLDER/NAME.png. What the panel says is noted after each step.
+// {"wheel": N} turns the wheel by N notches (away: positive); {"shot": "NAME"} takes a picture into FOLDER/NAME.png. What the panel says is noted after each step.
 import { spawn } from 'node:child_process';
 import { mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { tmpdir } from 'node:os';
@@ -83,6 +83,12 @@ async function step(what) {
         await until(`${rests} > ${before}`, 180);
         await pause(500);
     }
+    for (let n = 0; n < Math.abs(what.wheel ?? 0); n++) {
+        const at = { x: 640, y: 400, deltaX: 0, deltaY: 120 * Math.sign(what.wheel) };
+        await send('Input.dispatchMouseEvent', { ...at, type: 'mouseWheel' });
+        await pause(100);
+    }
+    if (what.wheel) await pause(8000); // what is nearer or farther now comes in
     if (what.measure) await clickOn('#dgtr-measure');
     if (what.click) await click(...what.click);
     await pause(300);
@@ -106,7 +112,7 @@ try {
     for (const domain of ['Runtime', 'Log', 'Network', 'Page']) await send(`${domain}.enable`);
     await send('Emulation.setDeviceMetricsOverride', { width: 1280, height: 800, deviceScaleFactor: 1, mobile: false });
     const start = Date.now();
-    await send('Page.navigate', { url: pathToFileURL(resolve(page)).href });
+    await send('Page.navigate', { url: page.startsWith('http:') ? page : pathToFileURL(resolve(page)).href });
     await until('document.body?.dataset.rest > 0', 180);
     seen.seconds = (Date.now() - start) / 1000;
     seen.webgpu = await evaluate("'gpu' in navigator && navigator.gpu ? (async () => !!(await navigator.gpu.requestAdapter()))() : false");

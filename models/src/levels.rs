@@ -1,7 +1,7 @@
 //! Levels of detail: a scene of any size as something that viewers stream.
 //!
 //! Each level has one Gaussian for every voxel in which the one below has several, merged, never picked (`merge`): a quarter of a surface's Gaussians, or less
-//! of what lies in layers. Voxels double from level to level, so that a level stands for the one below where a voxel is as small as a
+//! of what lies in layers. Voxels double, at least, from level to level; a level stands for the one below where a voxel is as small as a
 //! pixel. The scene is sorted into leaves of ground in a file (`scratch`), and each leaf is divided into levels on its own: memory does not grow with
 //! the scene, only the index does, by some hundred bytes a leaf.
 
@@ -20,8 +20,15 @@ mod scratch;
 
 pub use merge::coarser;
 
-/// Side of the voxels of level 1, in usual distances between neighbours: four to one on a surface.
-const FIRST_VOXEL: f64 = 2.0;
+/// Side of a level's voxels, in those of the level below or in usual distances between neighbours: four to one on a surface.
+const WIDER: f64 = 2.0;
+/// A level has so many times fewer Gaussians than the one below.
+const THINNED: f64 = 3.5;
+/// Sides that are tried for it, and how they grow.
+const MOST_TRIES: usize = 12;
+const GROWTH: f64 = 1.25;
+/// Leaves that they are tried with.
+const SAMPLED_LEAVES: usize = 4;
 /// Gaussians that the coarsest level may have about: what a viewer loads before anything else.
 const COARSEST: f64 = 30_000.0;
 /// Levels at most, the finest among them.
@@ -48,11 +55,28 @@ pub struct Report {
     pub coarsest: GaussianCloud,
 }
 
-/// Sides of the voxels of the levels above the finest, for a scene of so many Gaussians so far apart.
-pub fn voxels_m(count: u64, spacing_m: f64) -> Vec<f64> {
-    // Each level has a quarter of the one below.
-    let above = (count as f64 / COARSEST).max(1.0).log(4.0).ceil() as usize;
-    (0..above.clamp(1, MAX_LEVELS - 1)).map(|l| FIRST_VOXEL * spacing_m * f64::powi(2.0, l as i32)).collect()
+/// Sides of the voxels of the levels above the finest, for a scene of `count` Gaussians so far apart on the ground: each the first
+/// of growing sides with which `sample`, some of its leaves, is thinned enough. Where Gaussians lie above each other, in trees
+/// and on walls, they are farther apart than on the ground.
+fn voxels_m(count: u64, spacing_m: f64, mut sample: GaussianCloud) -> Vec<f64> {
+    let above = (count as f64 / COARSEST).max(1.0).log(THINNED).ceil() as usize;
+    let mut sides = Vec::new();
+    let mut side = spacing_m;
+    for _ in 0..above.clamp(1, MAX_LEVELS - 1) {
+        side *= WIDER;
+        let enough = (sample.len() as f64 / THINNED).ceil() as usize;
+        let mut level = coarser(&sample, side);
+        for _ in 0..MOST_TRIES {
+            if level.len() <= enough {
+                break;
+            }
+            side *= GROWTH;
+            level = coarser(&sample, side);
+        }
+        sides.push(side);
+        sample = level;
+    }
+    sides
 }
 
 /// All levels of a cloud, the finest first.
@@ -111,7 +135,12 @@ pub fn write(model: &Chunks, folder: &Path, sh_degree: u8) -> Result<Report, For
     })?;
     let mut sorted = scratch.finish().map_err(scratch_failed)?;
 
-    let voxels_m = voxels_m(leaves.counts.iter().map(|n| u64::from(*n)).sum(), spacing_m);
+    let mut some = GaussianCloud::with_capacity(degree, 0);
+    for k in 0..SAMPLED_LEAVES {
+        let leaf = (2 * k + 1) * leaves.counts.len() / (2 * SAMPLED_LEAVES);
+        some.extend(&sorted.read(leaf).map_err(scratch_failed)?);
+    }
+    let voxels_m = voxels_m(leaves.counts.iter().map(|n| u64::from(*n)).sum(), spacing_m, some);
     let mut writer = Writer::create(folder, voxels_m.len() + 1, degree, shift)?;
     let mut coarsest = GaussianCloud::with_capacity(degree, 0);
     for leaf in 0..leaves.counts.len() {

@@ -123,7 +123,7 @@ fn every_leaf_has_its_gaussians_at_every_level_where_the_index_says() {
     assert_eq!((report.strays, report.non_finite, report.counts[0]), (1, 0, 160_000));
     assert!(report.leaves > 4 && report.counts.len() >= 3, "{:?}", report.counts);
     let thinned = report.counts.windows(2).map(|n| n[0] as f64 / n[1] as f64);
-    assert!(thinned.clone().all(|r| (2.0..8.0).contains(&r)), "{:?}", thinned.collect::<Vec<_>>());
+    assert!(thinned.clone().all(|r| (3.0..8.0).contains(&r)), "{:?}", thinned.collect::<Vec<_>>());
 
     let meta: Value = serde_json::from_slice(&std::fs::read(out.join("lod-meta.json")).unwrap()).unwrap();
     assert_eq!((&meta["version"], &meta["lodLevels"]), (&1.into(), &report.counts.len().into()));

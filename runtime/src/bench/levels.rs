@@ -19,6 +19,10 @@ use crate::error::JobError;
 /// Pictures that levels are compared in, and their focal length, pixels.
 const SIZE: [u32; 2] = [640, 480];
 const FOCAL: f64 = 1000.0;
+/// The whole scene is drawn so many times larger and averaged: what is smaller than a pixel is drawn larger than it is.
+const FINER: u32 = 4;
+/// From where a voxel is a pixel, a half and a quarter of one.
+pub const FARTHER: [f64; 3] = [1.0, 2.0, 4.0];
 /// How steeply they look down, degrees below the horizon.
 const DOWN_DEG: [f64; 3] = [90.0, 60.0, 40.0];
 /// Largest scene that is drawn whole to compare with.
@@ -35,8 +39,8 @@ pub struct Level {
     pub voxel_m: f64,
     /// Where such a voxel is a pixel wide, metres.
     pub distance_m: f64,
-    /// Mean PSNR against the whole scene seen from there, dB; `None` where that was not drawn.
-    pub psnr: Option<f64>,
+    /// Mean PSNR against the whole scene seen from [`FARTHER`] times there, dB; empty where that was not drawn.
+    pub psnr: Vec<f64>,
 }
 
 /// All levels of a scene, and what they took.
@@ -93,7 +97,7 @@ pub fn measure(model: &Path, folder: &Path, device: Option<&str>) -> Result<Leve
     let mut all = Levels {
         levels: sides
             .zip(&written.counts)
-            .map(|(voxel_m, n)| Level { gaussians: *n, voxel_m, distance_m: FOCAL * voxel_m, psnr: None })
+            .map(|(voxel_m, n)| Level { gaussians: *n, voxel_m, distance_m: FOCAL * voxel_m, psnr: Vec::new() })
             .collect(),
         leaves: written.leaves,
         seconds,
@@ -107,28 +111,65 @@ pub fn measure(model: &Path, folder: &Path, device: Option<&str>) -> Result<Leve
         whole.extend(cloud);
         Ok::<(), FormatError>(())
     })?;
-    let views: Vec<Vec<View>> = all.levels.iter().map(|l| views(&whole, l.distance_m)).collect();
-    let mut draw = |cloud: &GaussianCloud, views: &[View]| {
+    let distances = all.levels[1..].iter().map(|l| FARTHER.map(|f| f * l.distance_m)).collect::<Vec<_>>();
+    let views: Vec<Vec<View>> = distances.iter().map(|d| d.iter().flat_map(|d| views(&whole, *d)).collect()).collect();
+    let finer: Vec<View> = views.concat().iter().map(finer).collect();
+    let mut draw = |cloud: &GaussianCloud, views: &[View], keep: fn(&Rendering) -> Rendering| {
+        // Larger pictures are drawn in windows of this size.
         let mut trainer = renderer(device, cloud, SIZE[0], SIZE[1])?;
         all.device.clone_from(&trainer.gpu().info().name);
+        let mut picture = Rendering::default();
         let drawn = views.iter().map(|view| {
-            let mut picture = Rendering::default();
             trainer.render(view, &mut picture)?;
-            Ok(picture.rgb)
+            Ok(keep(&picture))
         });
         drawn.collect::<Result<Vec<_>, JobError>>()
     };
-    let expected = draw(&whole, &views.concat())?;
-    let per_level = expected.chunks(DOWN_DEG.len()).collect::<Vec<_>>();
+    let expected = draw(&whole, &finer, averaged)?;
     let divided = levels::of(whole, &written.voxels_m);
     let mut figures = Vec::new();
-    for number in 1..divided.len() {
-        let shown = draw(&divided[number], &views[number])?;
-        let psnr = shown.iter().zip(per_level[number]).map(|(a, b)| metrics::psnr(a, b));
-        figures.push(psnr.sum::<f64>() / DOWN_DEG.len() as f64);
+    for (number, views) in views.iter().enumerate() {
+        let shown = draw(&divided[number + 1], views, Rendering::clone)?;
+        let psnr: Vec<f64> =
+            shown.iter().zip(&expected[number * views.len()..]).map(|(l, w)| psnr_of_scene(l, w)).collect();
+        figures.push(psnr.chunks(DOWN_DEG.len()).map(|p| p.iter().sum::<f64>() / p.len() as f64).collect());
     }
-    all.levels[1..].iter_mut().zip(figures).for_each(|(level, psnr)| level.psnr = Some(psnr));
+    all.levels[1..].iter_mut().zip(figures).for_each(|(level, psnr)| level.psnr = psnr);
     Ok(all)
+}
+
+fn finer(view: &View) -> View {
+    let k = &view.intrinsics;
+    View { intrinsics: k.resized(FINER * k.width, FINER * k.height), pose: view.pose }
+}
+
+/// A picture of [`finer`]'s size at the size of the levels' pictures.
+fn averaged(large: &Rendering) -> Rendering {
+    let (width, height) = (large.width / FINER, large.height / FINER);
+    let mut small = Rendering { width, height, ..Rendering::default() };
+    let share = 1.0 / (FINER * FINER) as f32;
+    let mean = |column: &[f32], channels: u32, x: u32, y: u32, c: u32| {
+        let at = |i: u32| (channels * ((y * FINER + i / FINER) * large.width + x * FINER + i % FINER) + c) as usize;
+        share * (0..FINER * FINER).map(|i| column[at(i)]).sum::<f32>()
+    };
+    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+        small.rgb.extend([0, 1, 2].map(|c| mean(&large.rgb, 3, x, y, c)));
+        small.transmittance.push(mean(&large.transmittance, 1, x, y, 0));
+    }
+    small
+}
+
+/// PSNR over the pixels that the whole scene covers: from afar most of a picture is nothing, on which all
+/// levels agree.
+fn psnr_of_scene(level: &Rendering, whole: &Rendering) -> f64 {
+    let covered = |i: &usize| whole.transmittance[*i] < 0.5;
+    let of = |r: &Rendering| {
+        (0..whole.transmittance.len())
+            .filter(covered)
+            .flat_map(|i| r.rgb[3 * i..3 * i + 3].to_vec())
+            .collect::<Vec<_>>()
+    };
+    metrics::psnr(&of(level), &of(whole))
 }
 
 /// Cameras around the middle of a scene, so far from it.

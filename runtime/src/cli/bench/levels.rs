@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::bench::figures::{markdown, short, write_json};
-use crate::bench::levels::{MOST_COMPARED, measure, write_scene};
+use crate::bench::levels::{FARTHER, MOST_COMPARED, measure, write_scene};
 use crate::cli::CliError;
 use crate::cli::output::outln;
 use crate::error::JobError;
@@ -44,23 +44,28 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let all = measure(&model, &args.out.join("streamed"), args.device.as_deref())?;
     let rows = all.levels.iter().enumerate().map(|(number, level)| {
-        vec![
-            number.to_string(),
-            level.gaussians.to_string(),
-            format!("{:.2}", level.voxel_m),
-            short(level.distance_m),
-            level.psnr.map_or_else(|| "–".to_owned(), |psnr| format!("{psnr:.2}")),
-        ]
+        vec![number.to_string(), level.gaussians.to_string(), format!("{:.2}", level.voxel_m), short(level.distance_m)]
+            .into_iter()
+            .chain(
+                FARTHER
+                    .iter()
+                    .enumerate()
+                    .map(|(k, _)| level.psnr.get(k).map_or_else(|| "–".to_owned(), |p| format!("{p:.2}"))),
+            )
+            .collect()
     });
+    let farther = FARTHER.map(|f| format!("dB from {f} ×"));
+
     let table = Table {
-        title: "Levels of detail against the whole scene from the distance where a voxel is a pixel".into(),
+        title: "Levels of detail against the whole scene, from the distance where a voxel is a pixel and farther"
+            .into(),
         note: format!(
             "{} leaves, written in {} s; drawn on {}, scenes of up to {MOST_COMPARED} Gaussians.",
             all.leaves,
             short(all.seconds),
             if all.device.is_empty() { "nothing" } else { &all.device },
         ),
-        head: ["level", "Gaussians", "voxel, m", "distance, m", "PSNR, dB"].map(str::to_owned).to_vec(),
+        head: ["level", "Gaussians", "voxel, m", "distance, m"].map(str::to_owned).into_iter().chain(farther).collect(),
         rows: rows.collect(),
     };
     outln!("{}", markdown(&table));
