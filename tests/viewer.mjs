@@ -1,4 +1,4 @@
-// Opens a page of `dgtr export --to html` (or, by its http:// address, one of `--to streamed`) in headless Chromium as a double click would: file://, no network, WebGL 2 in software, no
+// Opens a page of `dgtr export --to html` (or, by its http:// address, one of `--to streamed`) in headless Chromium as a double click would: file://, no network but this machine's, WebGL 2 in software, no
 // WebGPU. Drives it as a person would, with the mouse, and says what it saw as JSON. No packages: the browser's own protocol over a pipe.
 //   node viewer.mjs CHROMIUM PAGE.html FOLDER STEPS.json
 // Steps: {"camera": N} clicks the picture of camera N; {"click": [x, y]} clicks the scene; {"measure": true} the button;
@@ -13,7 +13,7 @@ const [chromium, page, folder, steps] = process.argv.slice(2);
 const profile = mkdtempSync(join(tmpdir(), 'dgtr-viewer-'));
 const browser = spawn(chromium, [
     '--headless=new', '--no-sandbox', '--remote-debugging-pipe', `--user-data-dir=${profile}`, '--window-size=1280,800',
-    '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--disable-features=WebGPU', '--host-resolver-rules=MAP * ~NOTFOUND',
+    '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--disable-features=WebGPU', '--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1',
     '--no-first-run', '--disable-background-networking', '--disable-component-update', 'about:blank'
 ], { stdio: ['ignore', 'ignore', 'ignore', 'pipe', 'pipe'] });
 

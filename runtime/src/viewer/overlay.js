@@ -57,7 +57,10 @@ function pick(px, py) {
     const ray = [0, 1, 2].map((k) => x * view.right[k] + y * view.up[k] - view.back[k]);
     const length = Math.hypot(...ray);
     const to = ray.map((v) => v / length);
-    const distance = halfLight(splats, view.at.map((v, k) => v - scene.shift[k]), to);
+    const from = view.at.map((v, k) => v - scene.shift[k]);
+    // A streamed scene is never here as a whole: the level ground through its middle stands for it.
+    const level = -from[2] / to[2] > 0 ? -from[2] / to[2] : null;
+    const distance = splats ? halfLight(splats, from, to) : level;
     return distance === null ? null : view.at.map((v, k) => v + distance * to[k]);
 }
 
