@@ -98,7 +98,7 @@ pub fn write(
     let views = evenly(&header.views, most);
     let pictures = pictures(cloud, &views, request.device)?;
     let scene = json!({ "shift": sog.shift, "pictures": pictures, "settings": settings(cloud, &views) });
-    page(path, header, &package, &scene, &STANDARD.encode(&sog.bytes))
+    page(path, &title_of(header, path), header, &package, &scene, &STANDARD.encode(&sog.bytes))
 }
 
 /// Writes the page of a scene in levels of detail into its folder, as `index.html`; `coarsest` is its coarsest level. To be opened
@@ -116,14 +116,25 @@ pub fn write_streamed(
     let path = folder.join("index.html");
     let settings = settings(coarsest, &[]);
     let scene = json!({ "shift": shift, "pictures": [], "settings": settings, "streamed": streamed::INDEX });
-    page(&path, header, &package, &scene, "")?;
+    page(&path, &title_of(header, folder), header, &package, &scene, "")?;
     Ok(path)
 }
 
-/// Fills the page; `sog` is base64.
-fn page(path: &Path, header: &ModelHeader, package: &Package, scene: &Value, sog: &str) -> Result<(), ViewerError> {
+/// The mission's name, or that of what is written.
+fn title_of(header: &ModelHeader, path: &Path) -> String {
     let name = path.file_stem().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-    let title = escape(if header.mission.is_empty() { &name } else { &header.mission });
+    escape(if header.mission.is_empty() { &name } else { &header.mission })
+}
+
+/// Fills the page; `sog` is base64.
+fn page(
+    path: &Path,
+    title: &str,
+    header: &ModelHeader,
+    package: &Package,
+    scene: &Value,
+    sog: &str,
+) -> Result<(), ViewerError> {
     let place = match header.origin {
         Some(o) => format!("origin {:.6}°, {:.6}°, {:.1} m", o.lat_deg, o.lon_deg, o.alt_m),
         None => "in the scene's own metres".to_owned(),
@@ -131,7 +142,7 @@ fn page(path: &Path, header: &ModelHeader, package: &Package, scene: &Value, sog
     // "</script>" in a name would end the block.
     let scene = scene.to_string().replace('<', "\\u003c");
     let part = |name| match name {
-        "title" => Some(title.as_str()),
+        "title" => Some(title),
         "place" => Some(place.as_str()),
         "scene" => Some(scene.as_str()),
         "sog" => Some(sog),
