@@ -135,7 +135,8 @@ fn registration(outcome: &Outcome, data: &mut ReportData) {
             neighbours += &format!(" and {} more", m.neighbours.len() - NEIGHBOURS_SHOWN);
         }
         let metres = |v: f64| format!("{v:.2} m");
-        vec![m.name.clone(), neighbours, metres(m.moved_m), format!("{:.2}°", m.turned_deg), metres(m.rms_m)]
+        let scale = format!("{:+.2} %", 100.0 * (m.scale - 1.0));
+        vec![m.name.clone(), neighbours, metres(m.moved_m), format!("{:.2}°", m.turned_deg), scale, metres(m.rms_m)]
     };
     data.tables.push(Table {
         title: "Registration".into(),
@@ -145,7 +146,7 @@ fn registration(outcome: &Outcome, data: &mut ReportData) {
             count(r.pairs as u64),
             count(r.fitted as u64)
         ),
-        head: ["", "fitted onto", "moved by", "turned by", "neighbours' points apart"].map(String::from).to_vec(),
+        head: ["", "fitted onto", "moved by", "turned by", "larger by", "neighbours' points apart"].map(String::from).to_vec(),
         rows: r.models.iter().map(row).collect(),
     });
 }
