@@ -26,8 +26,6 @@ table! {
         pub seam_m: f32 = 8.0, in Limits::above(0.0);
         /// Share of the Gaussians a view sees that must lie in a seam for the view to take part in distillation.
         pub seam_share: f32 = 0.02, in Limits::within(0.0, 1.0);
-        /// Distil on every view, not only on those that see a seam.
-        pub all_views: bool = false;
         /// Distil on views half-way between neighbouring training views, too: on its training views alone the union would
         /// learn its teachers' mistakes by heart.
         pub between_views: bool = true;
