@@ -100,8 +100,9 @@ impl Settings {
         let metric = self.metric.as_deref().or(metric);
         let device = self.device.as_deref();
         let held = compare(&set, "test", self.compare_scale, locals, &outcome.path, metric, device)?;
-        let figures =
-            held.iter().map(|h| (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global })));
+        let figures = held.iter().map(|h| {
+            (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global, "near_border": h.near_border }))
+        });
         if let Some(p) = perceptual(&held) {
             run.more.insert("perceptual".into(), serde_json::to_value(p).map_err(CliError::failed)?);
         }
