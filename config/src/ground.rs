@@ -22,7 +22,7 @@ table! {
         /// Size of the distillation pictures relative to the training pictures.
         pub scale: f32 = 1.0, in Limits::above(0.0).up_to(1.0),
             from "Fed3DGS uses 0.25; sheffield_cross at 0.5 SSIM 0.800, at 1 SSIM 0.811";
-        /// Width of the band along a border between two regions that counts as seam.
+        /// Side of the cells of ground that are distilled: those in which Gaussians of two aircraft meet, and those that touch one.
         pub seam_m: f32 = 8.0, in Limits::above(0.0);
         /// Share of the Gaussians a view sees that must lie in a seam for the view to take part in distillation.
         pub seam_share: f32 = 0.02, in Limits::within(0.0, 1.0);
