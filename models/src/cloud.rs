@@ -177,6 +177,29 @@ impl GaussianCloud {
         n - to
     }
 
+    /// The rows of these numbers, as a cloud of their own.
+    pub fn rows(&self, rows: &[u32]) -> Self {
+        let mut of = Self::with_capacity(self.sh_degree, rows.len());
+        let stride = self.sh_stride();
+        for i in rows.iter().map(|i| *i as usize) {
+            let sh = &self.sh[i * stride..(i + 1) * stride];
+            of.push(self.means[i], self.log_scales[i], self.rotations[i], self.opacity_logits[i], sh);
+        }
+        of
+    }
+
+    /// Row `i` becomes row `from` of another cloud; of its SH what this cloud has room for.
+    pub fn set_row(&mut self, i: usize, other: &Self, from: usize) {
+        self.means[i] = other.means[from];
+        self.log_scales[i] = other.log_scales[from];
+        self.rotations[i] = other.rotations[from];
+        self.opacity_logits[i] = other.opacity_logits[from];
+        let (own, theirs) = (self.sh_stride(), other.sh_stride());
+        let both = own.min(theirs);
+        self.sh[i * own..i * own + both].copy_from_slice(&other.sh[from * theirs..from * theirs + both]);
+        self.sh[i * own + both..(i + 1) * own].fill(0.0);
+    }
+
     /// Drops every row that is not [valid](Self::is_valid); returns how many.
     pub fn drop_invalid(&mut self) -> usize {
         let valid: Vec<bool> = (0..self.len()).map(|i| self.is_valid(i)).collect();
@@ -269,6 +292,22 @@ mod tests {
         assert_eq!((a.sh_degree, &a.sh), (1, &head(0).chain(head(27)).collect::<Vec<_>>()));
         a.lower_sh_degree(3);
         assert_eq!(a.sh_degree, 1, "nothing is made up");
+    }
+
+    #[test]
+    fn rows_are_taken_out_and_put_back_where_they_were() {
+        let mut all = one(1.0, 1);
+        (2..6).for_each(|v| all.extend(&one(v as f32, 1)));
+        let mut part = all.rows(&[3, 1]);
+        assert_eq!(part.means, vec![[4.0; 3], [2.0; 3]]);
+        assert_eq!(part.sh[..12], [4.0; 12]);
+        part.extend(&one(7.0, 0));
+        let before = all.clone();
+        all.set_row(0, &part, 1);
+        all.set_row(4, &one(9.0, 0), 0);
+        assert_eq!((all.means[0], all.opacity_logits[0], all.sh[..12].to_vec()), ([2.0; 3], 2.0, vec![2.0; 12]));
+        assert_eq!(all.sh[48..], [9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!((&all.means[1..4], &all.sh[12..48]), (&before.means[1..4], &before.sh[12..48]));
     }
 
     #[test]

@@ -24,7 +24,7 @@ use register::{Registered, Registrar};
 pub mod compare;
 pub mod distil;
 pub mod frame;
-mod light;
+pub mod light;
 pub mod member;
 pub mod merge;
 pub mod region;
@@ -115,8 +115,8 @@ pub struct Outcome {
     pub registered: Registered,
     /// Why none could be; the models were then merged where their GPS put them.
     pub not_registered: Option<String>,
-    /// The largest factor between a model's colours and the common light; 1 where it was even.
-    pub light: f32,
+    /// How far the models' light was apart.
+    pub light: light::Light,
     /// Regions in use, declared or derived.
     pub regions: Vec<Option<region::Region>>,
     /// Distillation, when it ran or found nothing to do.

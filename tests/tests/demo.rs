@@ -22,6 +22,9 @@ fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the
     for file in ["report.html", "mission.toml", "ground/out/global.dgtr", "west/out/model.dgtr", "east/out/run.json"] {
         assert!(out.join(file).is_file(), "{file} is missing:\n{text}");
     }
+    let ground = json_file(&out.join("ground/out/run.json"));
+    let cells = |what: &str| ground["distilled_cells"][what].as_u64().expect("cells");
+    assert!(cells("accepted") > 0 && cells("accepted") <= cells("met"), "distillation is worth its seconds: {ground}");
     for aircraft in ["west", "east"] {
         let truth = format!("{aircraft}/truth");
         let model = format!("{aircraft}/out/model.dgtr");
@@ -32,7 +35,8 @@ fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the
         // Fifteen seconds on a busy machine are few steps; the initialisation alone is well above both guesses.
         assert!(psnr(&own) > psnr(&naive["ground_warp"]) + 0.5, "{aircraft}: {own}");
         assert!(psnr(&own) > psnr(&naive["mean_color"]) + 4.0, "{aircraft}: {own}");
-        assert!(psnr(&global) > psnr(&own) - 0.5, "{aircraft}: {global}\n{own}");
+        // What merging costs an aircraft on its own views: it was up to a decibel.
+        assert!(psnr(&global) > psnr(&own) - 0.1, "{aircraft}: {global}\n{own}");
         let run = json_file(&out.join(aircraft).join("out/run.json"));
         assert_eq!(run["outcome"], "done");
         assert_eq!(run["device_bytes_planned"], run["device_bytes_peak"]);

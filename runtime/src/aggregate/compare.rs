@@ -10,6 +10,8 @@ use models::formats::model;
 use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, Trainer};
 
+use super::region::Region;
+
 use crate::engine::device::renderer;
 use crate::error::JobError;
 use crate::evaluate::{IntoModel, Perceptual, Scores, evaluate, open_metric};
@@ -18,6 +20,9 @@ use crate::transfer::stem;
 
 /// A global model this much worse than a local one on its own ground is worth a warning, dB.
 const WORTH_A_WARNING_DB: f64 = 0.3;
+
+/// Pictures taken no farther from another aircraft's region show its ground, metres.
+const NEAR_BORDER_M: f64 = 10.0;
 
 /// One aircraft's held-out pictures: its own model's figures and the global one's on the same pictures.
 #[derive(Clone, Debug)]
@@ -28,6 +33,8 @@ pub struct Held {
     pub local: Scores,
     /// The global model on the same pictures.
     pub global: Scores,
+    /// Of those taken near another aircraft's region: how many, and the mean PSNR of the own and of the global model, dB.
+    pub near_border: Option<(usize, [f64; 2])>,
     /// One picture: photograph, local, global.
     pub pictures: Option<(String, [RgbImage; 3])>,
 }
@@ -71,8 +78,12 @@ pub fn compare(
     let size = set.load(*first, scale)?.image.dimensions();
     let mut metric = open_metric(metric, size)?;
     let owned = by_nearest_training_view(set, &frames, locals)?;
+    let headers =
+        locals.iter().map(|(_, path)| model::read_header(path).map(|h| h.0)).collect::<Result<Vec<_>, _>>()?;
+    // Ground at the height of the origin is near enough for the hull of what cameras look at.
+    let regions: Vec<_> = headers.iter().map(|h| Region::of(h, 0.0)).collect();
     let mut held = Vec::new();
-    for ((name, path), mine) in locals.iter().zip(&owned).filter(|(_, mine)| !mine.is_empty()) {
+    for (m, ((name, path), mine)) in locals.iter().zip(&owned).enumerate().filter(|(_, (_, mine))| !mine.is_empty()) {
         let mut own = Opened::new(path, set, size, device)?;
         let local = evaluate(&mut own.trainer, set, mine, scale, &own.into, metric.as_mut(), None)?;
         let photograph = set.load(mine[mine.len() / 2], scale)?;
@@ -81,9 +92,29 @@ pub fn compare(
         let mut all = Opened::new(global, set, size, device)?;
         let scores = evaluate(&mut all.trainer, set, mine, scale, &all.into, metric.as_mut(), None)?;
         let pictures = [photograph.image.clone(), shown, all.picture(&photograph.view)?];
-        held.push(Held { name: name.clone(), local, global: scores, pictures: Some((photograph.name, pictures)) });
+        let near: Vec<bool> =
+            mine.iter().map(|i| is_near_border(set.frames[*i].view.pose.center, m, &regions)).collect();
+        let near_border = near_border(&local, &scores, &near);
+        let pictures = Some((photograph.name, pictures));
+        held.push(Held { name: name.clone(), local, global: scores, near_border, pictures });
     }
     Ok(held)
+}
+
+/// Whether a camera of model `own` is in or beside another model's region.
+fn is_near_border(camera: glam::DVec3, own: usize, regions: &[Option<Region>]) -> bool {
+    let others = regions.iter().enumerate().filter(|(m, _)| *m != own).filter_map(|(_, r)| r.as_ref());
+    others.into_iter().any(|r| r.distance(camera.truncate()) <= NEAR_BORDER_M)
+}
+
+/// Number and mean PSNR of the pictures that are near.
+fn near_border(local: &Scores, global: &Scores, near: &[bool]) -> Option<(usize, [f64; 2])> {
+    let count = near.iter().filter(|n| **n).count();
+    let mean = |scores: &Scores| {
+        let of_near = scores.views.iter().zip(near).filter(|(_, near)| **near);
+        of_near.map(|(v, _)| v.psnr).sum::<f64>() / count as f64
+    };
+    (count > 0).then(|| (count, [mean(local), mean(global)]))
 }
 
 fn by_nearest_training_view(
@@ -140,15 +171,24 @@ pub fn add_to(data: &mut ReportData, held: Vec<Held>) {
             ));
         }
         let row = [h.local.psnr, h.global.psnr].map(|v| format!("{v:.2}"));
-        let row = [vec![h.name.clone(), h.local.views.len().to_string()], row.to_vec()].concat();
+        let near = h.near_border.map_or_else(
+            || ["0", "–", "–"].map(String::from),
+            |(count, [own, global])| [count.to_string(), format!("{own:.2}"), format!("{global:.2}")],
+        );
+        let row = [vec![h.name.clone(), h.local.views.len().to_string()], row.to_vec(), near.to_vec()].concat();
         match data.tables.iter_mut().find(|t| t.title == TABLE) {
             Some(table) => table.rows.push(row),
             None => data.tables.insert(
                 0,
                 crate::report::Table {
                     title: TABLE.into(),
-                    note: "Each picture counts for the aircraft with the nearest training view.".into(),
-                    head: ["", "pictures", "own model, dB", "global model, dB"].map(String::from).to_vec(),
+                    note: format!(
+                        "Each picture counts for the aircraft with the nearest training view; the last three columns are of those \
+                         taken within {NEAR_BORDER_M:.0} m of another aircraft's region."
+                    ),
+                    head: ["", "pictures", "own model, dB", "global model, dB", "near a border", "own model, dB", "global model, dB"]
+                        .map(String::from)
+                        .to_vec(),
                     rows: vec![row],
                 },
             ),
@@ -164,3 +204,30 @@ pub fn add_to(data: &mut ReportData, held: Vec<Held>) {
 }
 
 const TABLE: &str = "Held-out pictures";
+
+#[cfg(test)]
+mod tests {
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+    use crate::evaluate::ViewScore;
+
+    #[test]
+    fn pictures_near_a_border_are_those_in_or_beside_anothers_region() {
+        let square = |x: f64| [[x, 0.0], [x + 50.0, 0.0], [x + 50.0, 50.0], [x, 50.0]].map(DVec2::from).to_vec();
+        let regions = [Some(Region::declared(square(0.0))), Some(Region::declared(square(50.0))), None];
+        let near = |x: f64, own| is_near_border(DVec3::new(x, 20.0, 40.0), own, &regions);
+        assert_eq!([near(10.0, 0), near(39.0, 0), near(41.0, 0), near(60.0, 0)], [false, false, true, true]);
+        assert_eq!([near(55.0, 1), near(65.0, 1)], [true, false]);
+    }
+
+    #[test]
+    fn their_figures_are_the_means_of_those_alone() {
+        let view =
+            |psnr| ViewScore { name: String::new(), psnr, psnr_colors_fitted: psnr, ssim: 1.0, perceptual: None };
+        let scores = |of: [f64; 3]| Scores { views: of.map(view).to_vec(), ..Scores::default() };
+        let (local, global) = (scores([20.0, 30.0, 40.0]), scores([21.0, 32.0, 43.0]));
+        assert_eq!(near_border(&local, &global, &[true, false, true]), Some((2, [30.0, 32.0])));
+        assert_eq!(near_border(&local, &global, &[false; 3]), None);
+    }
+}

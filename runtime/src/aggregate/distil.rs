@@ -2,8 +2,10 @@
 //! views, and the union is trained on these pictures with L1 and SSIM.
 //!
 //! A teacher looking through its own training cameras shows very nearly its photographs, neighbouring ground included,
-//! so no photograph has to leave the aircraft. Only views that see a seam take part; elsewhere union and teacher are
-//! the same Gaussians. The number and the identity of the Gaussians stay as they are but for those that end up transparent.
+//! so no photograph has to leave the aircraft. Only cells of ground where regions meet are trained, and only pixels that show them
+//! are looked at; their surroundings are drawn with them and do not move. Some views are kept back: a cell is taken over only where
+//! it comes closer to what its teachers show in those. The number and the identity of the Gaussians stay as they are
+//! but for those that end up transparent.
 
 use std::ops::ControlFlow;
 use std::time::Instant;
@@ -11,9 +13,8 @@ use std::time::Instant;
 use config::ground::GroundSettings;
 use config::training::{RateSettings, Strategy, TrainSettings};
 use image::RgbImage;
-use models::camera::{Intrinsics, PoseSigma, PosedImage, View};
+use models::camera::Intrinsics;
 use models::cloud::GaussianCloud;
-use models::metrics;
 use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::AggregateError;
@@ -21,15 +22,17 @@ use super::member::Member;
 use super::merge::{Merged, opacity};
 use super::seam::Seams;
 use crate::engine::device::DeviceRequest;
+use lesson::{Errors, Lesson, choose, draw, psnr};
+
+mod lesson;
 
 /// Views of each aircraft kept as pictures for the report, and of all of them.
 const SAMPLES_PER_MODEL: usize = 1;
 const MOST_SAMPLES: usize = 32;
-/// Stages of training, each at `STAGE_FACTOR` times the rates of the one before.
-const STAGES: u32 = 3;
-const STAGE_FACTOR: f32 = 0.25;
 /// Rates of means, scales and rotations beside those of colours and opacities.
 const SHAPE_FACTOR: f32 = 0.1;
+/// Where cells are more than the device holds, so large a share of them is tried next.
+const FEWER: f64 = 0.75;
 
 /// One view before and after, for the report.
 #[derive(Clone, Debug)]
@@ -55,19 +58,23 @@ pub struct Distilled {
     pub views: usize,
     /// Those that see a seam and took part.
     pub used: usize,
+    /// Those of them that were kept back from training.
+    pub kept_back: usize,
+    /// Cells of ground where regions meet.
+    pub cells: usize,
+    /// Those that are closer to their teachers now and were taken over.
+    pub accepted: usize,
+    /// Cells that did not fit into the memory plan and stayed as they were merged.
+    pub over_plan: usize,
     /// Share of the Gaussians that lie in a seam.
     pub seam_share: f64,
     /// Steps taken.
     pub steps: u32,
-    /// Per model: mean PSNR of the union against the teacher over the views that took part, before and after; None
-    /// where none did.
+    /// Per model: PSNR of the union against the teacher where the views kept back show seams, before and after; None where none
+    /// did.
     pub agreement: Vec<Option<[f64; 2]>>,
-    /// No distilled model was closer to the teachers than the union, which was kept.
-    pub reverted: bool,
     /// Transparent Gaussians removed at the end.
     pub pruned: usize,
-    /// Gaussians given up to stay within the memory plan.
-    pub over_plan: usize,
     /// Name of the device; empty when none was needed.
     pub device: String,
     /// Bytes planned and allocated on it.
@@ -78,19 +85,10 @@ pub struct Distilled {
     pub samples: Vec<Sample>,
 }
 
-/// A view that takes part, with the picture its teacher drew.
-struct Lesson {
-    model: usize,
-    name: String,
-    view: View,
-    share: f64,
-    /// 8 bits: what the trainer keeps of a picture anyway.
-    target: RgbImage,
-}
-
 /// The recipe: the trainer's, without everything that adds, moves or discards Gaussians.
-fn recipe(settings: &GroundSettings, sh_degree: u8, steps: u32) -> TrainSettings {
-    let mut t = TrainSettings { seed: settings.seed, steps, ..Default::default() };
+fn recipe(settings: &GroundSettings, sh_degree: u8) -> TrainSettings {
+    let mut t = TrainSettings { seed: settings.seed, ..Default::default() };
+    t.rates = rates(settings.rate);
     t.loss.depth = 0.0;
     t.density.strategy = Strategy::None;
     t.regularise.noise = 0.0;
@@ -100,115 +98,6 @@ fn recipe(settings: &GroundSettings, sh_degree: u8, steps: u32) -> TrainSettings
     t.sh.degree = sh_degree;
     t.sh.raise_at = [0.0; 3];
     t
-}
-
-/// Distils in place.
-///
-/// # Errors
-/// No device, or a memory plan that does not fit; `merged` is then what it was, within the plan.
-pub fn distil(
-    members: &[Member],
-    merged: &mut Merged,
-    settings: &GroundSettings,
-    go_on: &dyn Fn() -> bool,
-) -> Result<Distilled, AggregateError> {
-    let seams = Seams::find(merged, settings.seam_m);
-    let (mut lessons, views) = choose(members, &seams, settings);
-    let mut report =
-        Distilled { views, seam_share: seams.share, agreement: vec![None; members.len()], ..Default::default() };
-    if lessons.is_empty() || merged.cloud.is_empty() || settings.epochs == 0 {
-        return Ok(report);
-    }
-    report.used = lessons.len();
-    let largest = members.iter().map(|m| m.gaussians).max().unwrap_or(0).max(merged.cloud.len());
-    let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);
-    let request = DeviceRequest {
-        device: settings.device.clone(),
-        device_mib: settings.device_mib,
-        size: (side(|k| k.width), side(|k| k.height)),
-        views: lessons.len(),
-        crops: 0,
-        // Their targets are in the host's memory anyway.
-        view_slots: Some(lessons.len() as u32),
-        folder: None,
-        max_gaussians: Some(largest),
-        scene_gaussians: None,
-    };
-    let steps = settings.epochs.saturating_mul(lessons.len() as u32);
-    let mut trainer: Trainer = request.open::<AggregateError>(&recipe(settings, merged.cloud.sh_degree, steps))?;
-    report.over_plan = merged.keep_most_important(trainer.plan().gaussians);
-    report.device = trainer.gpu().info().name.clone();
-    report.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
-
-    let start = Instant::now();
-    for (m, member) in members.iter().enumerate() {
-        if lessons.iter().any(|l| l.model == m) {
-            trainer.load(&member.cloud()?)?;
-            for lesson in lessons.iter_mut().filter(|l| l.model == m) {
-                lesson.target = render(&mut trainer, &lesson.view)?;
-            }
-        }
-    }
-    report.seconds[0] = start.elapsed().as_secs_f64();
-
-    trainer.load(&merged.cloud)?;
-    let before = shown(&mut trainer, &lessons)?;
-    let start = Instant::now();
-    for lesson in &lessons {
-        trainer.add_view(&lesson.picture(), None)?;
-    }
-    let (best, after) = distil_in_stages(&mut trainer, merged, &lessons, &before, settings, &mut report, go_on)?;
-    report.seconds[1] = start.elapsed().as_secs_f64();
-    report.agreement = agreement(members.len(), &lessons, &before, &after);
-    report.reverted = best.is_none();
-    if let Some(cloud) = best {
-        merged.cloud = cloud;
-    }
-    let visible: Vec<bool> = merged.cloud.opacity_logits.iter().map(|&l| opacity(l) > settings.prune_opacity).collect();
-    report.pruned = merged.retain(|i| visible[i]);
-    report.samples = samples(members.len(), &lessons, &before, &after);
-    Ok(report)
-}
-
-/// Trains in stages of falling rates, each from the best state so far, and returns the state closest to the teachers with
-/// its pictures; None when no stage came closer than the union itself.
-///
-/// Adam starts without a memory of gradients and moves everything by its rate at first. How far that may be depends on how
-/// good the models are: coarse ones gain from a rate that would spoil fine ones, so the rate is found by trying.
-fn distil_in_stages(
-    trainer: &mut Trainer,
-    merged: &Merged,
-    lessons: &[Lesson],
-    before: &[RgbImage],
-    settings: &GroundSettings,
-    report: &mut Distilled,
-    go_on: &dyn Fn() -> bool,
-) -> Result<(Option<GaussianCloud>, Vec<RgbImage>), AggregateError> {
-    let closeness = |shown: &[RgbImage]| lessons.iter().zip(shown).map(|(l, s)| psnr(&l.target, s)).sum::<f64>();
-    let mut best = (closeness(before), None, before.to_vec());
-    let steps = (settings.epochs.saturating_mul(lessons.len() as u32)).div_ceil(STAGES);
-    let start = Instant::now();
-    for stage in 0..STAGES {
-        let left = settings.seconds.map(|s| (s - start.elapsed().as_secs_f64()) / f64::from(STAGES - stage));
-        if !go_on() || left.is_some_and(|s| s <= 0.0) {
-            break;
-        }
-        trainer.load(best.1.as_ref().unwrap_or(&merged.cloud))?;
-        let factor = STAGE_FACTOR.powi(stage as i32) * settings.rate;
-        trainer.set_rates(&rates(factor))?;
-        let budget = RunBudget { steps: Some(steps), seconds: left };
-        let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
-        report.steps += trainer.run(&budget, &mut each)?.steps;
-        let after = shown(trainer, lessons)?;
-        let reached = closeness(&after);
-        // The trainer leaves out rows it cannot use; then sources and rows would no longer belong together.
-        if reached > best.0 && trainer.gaussians() == merged.cloud.len() {
-            let mut cloud = best.1.take().unwrap_or_default();
-            trainer.snapshot(&mut cloud)?;
-            best = (reached, Some(cloud), after);
-        }
-    }
-    Ok((best.1, best.2))
 }
 
 /// The trainer's learning rates times `factor`.
@@ -233,107 +122,212 @@ fn rates(factor: f32) -> RateSettings {
     r
 }
 
-/// The views that take part, without their pictures yet, and the number of views there are.
-fn choose(members: &[Member], seams: &Seams, settings: &GroundSettings) -> (Vec<Lesson>, usize) {
-    let (mut lessons, mut views) = (Vec::new(), 0);
-    for (m, model) in members.iter().enumerate() {
-        let between = if settings.between_views { between(&model.header.views) } else { Vec::new() };
-        for (name, view) in model.header.views.iter().chain(&between) {
-            views += 1;
-            let share = seams.seen_by(view);
-            let sees = share > 0.0 && share >= f64::from(settings.seam_share);
-            if sees || settings.all_views {
-                let view = View { intrinsics: scaled(&view.intrinsics, settings.scale), pose: view.pose };
-                lessons.push(Lesson { model: m, name: name.clone(), view, share, target: RgbImage::new(0, 0) });
+/// Distils in place.
+///
+/// # Errors
+/// No device, or a memory plan that does not fit; `merged` is then what it was.
+pub fn distil(
+    members: &[Member],
+    merged: &mut Merged,
+    settings: &GroundSettings,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Distilled, AggregateError> {
+    let mut seams = Seams::find(merged, settings.seam_m);
+    let (mut lessons, views) = choose(members, &seams, settings);
+    let mut report = Distilled {
+        views,
+        used: lessons.len(),
+        cells: seams.cells.len(),
+        seam_share: seams.share,
+        agreement: vec![None; members.len()],
+        ..Default::default()
+    };
+    if lessons.is_empty() || settings.epochs == 0 {
+        report.used = 0;
+        return Ok(report);
+    }
+    let mut rows = seams.with_halo(merged);
+    let mut trainer = open(members, &lessons, rows.len(), merged.cloud.sh_degree, settings)?;
+    while rows.len() > trainer.plan().gaussians && !seams.cells.is_empty() {
+        seams.keep((seams.cells.len() as f64 * FEWER) as usize);
+        rows = seams.with_halo(merged);
+    }
+    report.over_plan = report.cells - seams.cells.len();
+    report.device = trainer.gpu().info().name.clone();
+    report.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
+
+    let start = Instant::now();
+    for (m, member) in members.iter().enumerate() {
+        if lessons.iter().any(|l| l.model == m) {
+            trainer.load(&member.cloud()?)?;
+            for lesson in lessons.iter_mut().filter(|l| l.model == m) {
+                lesson.ask(&mut trainer, &seams)?;
             }
         }
     }
-    (lessons, views)
-}
-
-/// A view half-way from each view to its nearest neighbour, turned like the view itself; each pair once.
-fn between(views: &[(String, View)]) -> Vec<(String, View)> {
-    let mut made: Vec<(usize, usize)> = Vec::new();
-    for (i, (_, view)) in views.iter().enumerate() {
-        let apart = |j: &usize| views[*j].1.pose.center.distance(view.pose.center);
-        let nearest = (0..views.len()).filter(|&j| j != i).min_by(|a, b| apart(a).total_cmp(&apart(b)));
-        if let Some(j) = nearest
-            && !made.contains(&(j, i))
-        {
-            made.push((i, j));
-        }
+    lessons.retain(Lesson::is_worth_it);
+    report.used = lessons.len();
+    report.seconds[0] = start.elapsed().as_secs_f64();
+    let (kept_back, taught): (Vec<Lesson>, Vec<Lesson>) = lessons.into_iter().partition(|l| l.is_kept_back);
+    report.kept_back = kept_back.len();
+    let part = merged.cloud.rows(&rows);
+    // Rows that the trainer leaves out would no longer be those of the union.
+    let is_whole = (0..part.len()).all(|i| part.is_valid(i));
+    if taught.is_empty() || kept_back.is_empty() || !is_whole || part.is_empty() {
+        return Ok(report);
     }
-    let half_way = |(i, j): (usize, usize)| {
-        let (a, b) = (&views[i], &views[j]);
-        let mut view = a.1;
-        view.pose.center = 0.5 * (a.1.pose.center + b.1.pose.center);
-        (format!("{} – {}", a.0, b.0), view)
-    };
-    made.into_iter().map(half_way).collect()
-}
 
-fn scaled(k: &Intrinsics, scale: f32) -> Intrinsics {
-    let side = |n: u32| ((n as f32 * scale).round() as u32).max(1);
-    k.resized(side(k.width), side(k.height))
-}
+    let start = Instant::now();
+    trainer.load(&part)?;
+    let before = Shown::of(&mut trainer, &kept_back, members.len(), seams.cells.len())?;
+    for lesson in &taught {
+        trainer.add_view(&lesson.picture(), None)?;
+    }
+    let of_row: Vec<Option<u16>> = part.means.iter().map(|mean| seams.index_of(mean)).collect();
+    trainer.hold(|row| of_row[row].is_none());
+    let steps = settings.epochs.saturating_mul(taught.len() as u32);
+    let budget = RunBudget { steps: Some(steps), seconds: settings.seconds };
+    let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
+    report.steps = trainer.run(&budget, &mut each)?.steps;
+    let mut trained = GaussianCloud::default();
+    trainer.snapshot(&mut trained)?;
+    let learnt = Shown::of(&mut trainer, &kept_back, members.len(), seams.cells.len())?;
+    let accepted = closer(&before.errors(), &learnt.errors());
 
-impl Lesson {
-    fn picture(&self) -> PosedImage {
-        PosedImage {
-            name: self.name.clone(),
-            time_ns: 0,
-            image: self.target.clone(),
-            view: self.view,
-            mask: None,
-            sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
+    // A cell beside one that was not taken over is another surrounding than it was trained in: what is taken over is asked again.
+    let takes = |row: usize| of_row[row].is_some_and(|cell| accepted[usize::from(cell)]);
+    let mixed = mixed(&part, &trained, takes);
+    trainer.load(&mixed)?;
+    let after = Shown::of(&mut trainer, &kept_back, members.len(), seams.cells.len())?;
+    let psnr = |shown: &Shown| shown.errors().psnr(|_| true);
+    let holds = psnr(&after) > psnr(&before);
+    report.seconds[1] = start.elapsed().as_secs_f64();
+    let after = if holds { &after } else { &before };
+    let of_model = |m: usize| Some([before.of_model[m].psnr(|_| true)?, after.of_model[m].psnr(|_| true)?]);
+    report.agreement = (0..members.len()).map(of_model).collect();
+    report.samples = samples(members.len(), &kept_back, &before, after);
+    if holds {
+        report.accepted = accepted.iter().filter(|a| **a).count();
+        let mut visible = vec![true; merged.cloud.len()];
+        for (i, row) in rows.iter().enumerate().filter(|(i, _)| takes(*i)) {
+            merged.cloud.set_row(*row as usize, &mixed, i);
+            visible[*row as usize] = opacity(mixed.opacity_logits[i]) > settings.prune_opacity;
         }
+        report.pruned = merged.retain(|i| visible[i]);
+    }
+    Ok(report)
+}
+
+/// The trainer: room for the largest model and for what is trained, and for the lessons.
+fn open(
+    members: &[Member],
+    lessons: &[Lesson],
+    rows: usize,
+    sh_degree: u8,
+    settings: &GroundSettings,
+) -> Result<Trainer, AggregateError> {
+    let largest = members.iter().map(|m| m.gaussians).max().unwrap_or(0).max(rows);
+    let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);
+    let request = DeviceRequest {
+        device: settings.device.clone(),
+        device_mib: settings.device_mib,
+        size: (side(|k| k.width), side(|k| k.height)),
+        views: lessons.len(),
+        crops: 0,
+        // Their targets are in the host's memory anyway.
+        view_slots: Some(lessons.len() as u32),
+        folder: None,
+        max_gaussians: Some(largest),
+        scene_gaussians: None,
+    };
+    request.open::<AggregateError>(&recipe(settings, sh_degree))
+}
+
+/// What the views kept back show.
+struct Shown {
+    pictures: Vec<RgbImage>,
+    /// How far that is from what the teachers show.
+    of_model: Vec<Errors>,
+}
+
+impl Shown {
+    fn of(trainer: &mut Trainer, lessons: &[Lesson], models: usize, cells: usize) -> Result<Self, AggregateError> {
+        let mut this =
+            Self { pictures: Vec::with_capacity(lessons.len()), of_model: vec![Errors::none(cells); models] };
+        let mut drawn = Rendering::default();
+        for lesson in lessons {
+            let picture = draw(trainer, &lesson.view, &mut drawn)?;
+            lesson.errors(&picture, &mut this.of_model[lesson.model]);
+            this.pictures.push(picture);
+        }
+        Ok(this)
+    }
+
+    /// Of all teachers together.
+    fn errors(&self) -> Errors {
+        let mut sum = Errors::none(self.of_model.first().map_or(0, |e| e.0.len()));
+        for of_model in &self.of_model {
+            sum.0.iter_mut().zip(&of_model.0).for_each(|(s, e)| *s = [s[0] + e[0], s[1] + e[1]]);
+        }
+        sum
     }
 }
 
-fn render(trainer: &mut Trainer, view: &View) -> Result<RgbImage, AggregateError> {
-    let mut into = Rendering::default();
-    trainer.render(view, &mut into)?;
-    // The renderer fills exactly the size it was asked for.
-    Ok(metrics::to_rgb8(&into.rgb, into.width, into.height).unwrap_or_default())
+/// Per cell: whether it came closer to its teachers.
+fn closer(before: &Errors, after: &Errors) -> Vec<bool> {
+    before.0.iter().zip(&after.0).map(|(b, a)| a[0] < b[0]).collect()
 }
 
-fn shown(trainer: &mut Trainer, lessons: &[Lesson]) -> Result<Vec<RgbImage>, AggregateError> {
-    lessons.iter().map(|l| render(trainer, &l.view)).collect()
-}
-
-fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
-    // Equal pictures are as close as 8 bits can tell, not infinitely close.
-    metrics::psnr(&metrics::to_f32(a), &metrics::to_f32(b)).min(60.0)
-}
-
-fn agreement(models: usize, lessons: &[Lesson], before: &[RgbImage], after: &[RgbImage]) -> Vec<Option<[f64; 2]>> {
-    let of = |m: usize| {
-        let mine: Vec<usize> = (0..lessons.len()).filter(|&i| lessons[i].model == m).collect();
-        let mean = |shown: &[RgbImage]| {
-            mine.iter().map(|&i| psnr(&lessons[i].target, &shown[i])).sum::<f64>() / mine.len() as f64
-        };
-        (!mine.is_empty()).then(|| [mean(before), mean(after)])
-    };
-    (0..models).map(of).collect()
+/// `untouched` with the rows of `trained` for which `takes` says so.
+fn mixed(untouched: &GaussianCloud, trained: &GaussianCloud, takes: impl Fn(usize) -> bool) -> GaussianCloud {
+    let mut mixed = untouched.clone();
+    (0..mixed.len()).filter(|row| takes(*row)).for_each(|row| mixed.set_row(row, trained, row));
+    mixed
 }
 
 /// The views with the most seam in them, of as many aircraft as the report can show.
-fn samples(models: usize, lessons: &[Lesson], before: &[RgbImage], after: &[RgbImage]) -> Vec<Sample> {
+fn samples(models: usize, lessons: &[Lesson], before: &Shown, after: &Shown) -> Vec<Sample> {
     let mut samples = Vec::new();
     for m in 0..models {
         let mut mine: Vec<usize> = (0..lessons.len()).filter(|&i| lessons[i].model == m).collect();
         mine.sort_by(|&a, &b| lessons[b].share.total_cmp(&lessons[a].share));
-        samples.extend(mine.iter().take(SAMPLES_PER_MODEL).map(|&i| Sample {
-            name: lessons[i].name.clone(),
-            model: m,
-            teacher: lessons[i].target.clone(),
-            merged: before[i].clone(),
-            global: after[i].clone(),
-            psnr: [psnr(&lessons[i].target, &before[i]), psnr(&lessons[i].target, &after[i])],
+        samples.extend(mine.iter().take(SAMPLES_PER_MODEL).map(|&i| {
+            let [merged, global] = [before, after].map(|shown| shown.pictures[i].clone());
+            let teacher = lessons[i].target.clone();
+            let psnr = [&merged, &global].map(|shown| psnr(&teacher, shown));
+            Sample { name: lessons[i].name.clone(), model: m, teacher, merged, global, psnr }
         }));
         if samples.len() >= MOST_SAMPLES {
             break;
         }
     }
     samples
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::aggregate::testing::carpet;
+
+    #[test]
+    fn only_cells_that_came_closer_are_taken_over() {
+        let before = Errors(vec![[300.0, 3.0], [300.0, 3.0], [300.0, 3.0], [0.0, 0.0]]);
+        let after = Errors(vec![[299.0, 3.0], [301.0, 3.0], [300.0, 3.0], [0.0, 0.0]]);
+        let accepted = closer(&before, &after);
+        assert_eq!(accepted, [true, false, false, false], "worse, equal and unseen ones are not");
+        let untouched = carpet([0.0, 0.0], [4.0, 1.0], 1.0);
+        let mut trained = untouched.clone();
+        trained.opacity_logits.iter_mut().for_each(|o| *o += 1.0);
+        let taken = mixed(&untouched, &trained, |row| accepted[row]);
+        assert_eq!(taken.opacity_logits, [4.0, 3.0, 3.0, 3.0]);
+        assert_eq!(taken.means, untouched.means);
+    }
+
+    #[test]
+    fn what_seams_are_off_is_measured_where_they_are() {
+        let errors = Errors(vec![[3.0 * 255.0 * 255.0, 300.0], [0.0, 600.0], [1.0, 0.0]]);
+        assert!(errors.psnr(|c| c == 0).is_some_and(|db| (db - 20.0).abs() < 1e-9));
+        assert_eq!(errors.psnr(|c| c == 1), Some(60.0));
+        assert_eq!(errors.psnr(|_| false), None);
+    }
 }

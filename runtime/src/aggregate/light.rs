@@ -25,13 +25,28 @@ const EVEN: f32 = 0.01;
 
 type Cubes = HashMap<[i32; 3], [f32; 3]>;
 
-/// Finds the gain of each model and has it taken out of its Gaussians; the largest factor that was, 1 where light was even.
+/// How far the models' light was apart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Light {
+    /// The largest factor that was taken out of a model, 1 where light was even.
+    pub largest: f32,
+    /// Median factor between the colours that two models have of the same place, before and after: what a border shows.
+    pub step: [f32; 2],
+}
+
+impl Default for Light {
+    fn default() -> Self {
+        Self { largest: 1.0, step: [1.0; 2] }
+    }
+}
+
+/// Finds the gain of each model and has it taken out of its Gaussians.
 ///
 /// # Errors
 /// A model's file cannot be read any more.
-pub fn unite(members: &mut [Member]) -> Result<f32, AggregateError> {
+pub fn unite(members: &mut [Member]) -> Result<Light, AggregateError> {
     if members.len() < 2 {
-        return Ok(1.0);
+        return Ok(Light::default());
     }
     let longest = members.iter().map(|m| m.bounds().span().max_element()).fold(0.0, f64::max);
     let edge = (longest * EDGE_SHARE).clamp(EDGE_M[0], EDGE_M[1]) as f32;
@@ -48,15 +63,16 @@ pub fn unite(members: &mut [Member]) -> Result<f32, AggregateError> {
     }
     let solved = solve(members.len(), &mut ratios);
     let largest = solved.gains.iter().flatten().flatten().fold(0.0f32, |most, g| most.max(g.abs()));
+    let step = solved.before.exp();
     if largest < EVEN {
-        return Ok(1.0);
+        return Ok(Light { largest: 1.0, step: [step; 2] });
     }
     for (member, gain) in members.iter_mut().zip(&solved.gains) {
         if let Some(gain) = gain {
             member.brought_into_common_light(*gain);
         }
     }
-    Ok(largest.exp())
+    Ok(Light { largest: largest.exp(), step: [step, solved.after.exp()] })
 }
 
 /// Colours of the cubes of `edge` that `cloud` fills, thinned out alike in all models.
@@ -119,15 +135,20 @@ mod tests {
             members.push(written(dir.path(), &local));
         }
         let before = members[1].cloud().expect("read");
-        let most = unite(&mut members).expect("united");
-        assert!((most - 1.3).abs() < 0.02, "{most}");
+        let light = unite(&mut members).expect("united");
+        assert!((light.largest - 1.3).abs() < 0.02, "{light:?}");
+        assert!(light.step[0] > 1.08 && light.step[1] < 1.01, "{light:?}");
         let after = members[1].cloud().expect("read");
         for c in 0..3 {
             let ratio = after.color(777)[c] / before.color(777)[c];
             assert!((ratio * factor[c] - 1.0).abs() < 0.02, "channel {c}: {ratio}");
             assert!((members[1].header.lights[0].gain[c] - factor[c].ln()).abs() < 0.02);
         }
-        assert_eq!(unite(&mut members).expect("united"), 1.0, "one light now");
+        let again = unite(&mut members).expect("united");
+        assert!(
+            again.largest == 1.0 && again.step[0] == again.step[1] && again.step[0] < 1.01,
+            "one light now: {again:?}"
+        );
     }
 
     #[test]
@@ -136,12 +157,12 @@ mod tests {
         let carpets = [carpet([0.0, 0.0], [40.0, 40.0], 0.25), carpet([500.0, 0.0], [540.0, 40.0], 0.25)];
         let [near, far] = carpets.map(|cloud| model("m", &[], cloud));
         let mut same = [written(dir.path(), &near), written(dir.path(), &near)];
-        assert_eq!(unite(&mut same).expect("united"), 1.0);
+        assert_eq!(unite(&mut same).expect("united"), Light::default());
         let mut dark = far;
         dark.path = "dark".into();
         dark.cloud.multiply_colors([0.5; 3]);
         let mut apart = [written(dir.path(), &near), written(dir.path(), &dark)];
-        assert_eq!(unite(&mut apart).expect("united"), 1.0);
+        assert_eq!(unite(&mut apart).expect("united"), Light::default());
         let even = |m: &Member| m.header.lights.iter().all(|l| *l == PictureLight::default());
         assert!(same.iter().chain(&apart).all(even));
     }

@@ -27,7 +27,8 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
     let r = &outcome.registered;
     let registered = serde_json::json!({ "pairs": r.pairs, "fitted": r.fitted, "models": r.models.len() });
     run.more.insert("registered".into(), registered);
-    run.more.insert("light".into(), outcome.light.into());
+    run.more.insert("light".into(), outcome.light.largest.into());
+    run.more.insert("color_step".into(), serde_json::json!(outcome.light.step));
     if let Some(d) = &outcome.distilled {
         run.steps = d.steps.into();
         run.skip("views_without_seam", (d.views - d.used) as u64);
@@ -35,7 +36,10 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
         run.device = d.device.clone();
         [run.device_bytes_planned, run.device_bytes_peak] = d.device_bytes;
         run.more.insert("seam_share".into(), d.seam_share.into());
-        run.more.insert("distillation_reverted".into(), d.reverted.into());
+        let cells = serde_json::json!({
+            "met": d.cells, "accepted": d.accepted, "over_plan": d.over_plan, "views_kept_back": d.kept_back
+        });
+        run.more.insert("distilled_cells".into(), cells);
     }
     let names = outcome.models.iter().map(|m| m.0.as_str());
     let models: Vec<serde_json::Value> = names
@@ -99,6 +103,15 @@ pub fn report(outcome: &Outcome) -> ReportData {
     data
 }
 
+/// What two models' colours of the same place differ by.
+fn color_step(outcome: &Outcome) -> String {
+    let percent = outcome.light.step.map(|factor| format!("{:.1} %", 100.0 * (factor - 1.0)));
+    format!(
+        "Colours that two aircraft's models have of the same place differ by {} (median) as they came and by {} in one light.",
+        percent[0], percent[1]
+    )
+}
+
 fn merge_table(outcome: &Outcome) -> Table {
     let head = ["", "Gaussians", "own region", "fill holes", "left to neighbours", "over budget", "before", "after"];
     let row = |(i, (name, _)): (usize, &(String, _))| {
@@ -110,10 +123,12 @@ fn merge_table(outcome: &Outcome) -> Table {
     };
     Table {
         title: "Merging".into(),
-        note:
-            "Each piece of ground is taken from the aircraft that answers for it. Before and after distillation: how \
-               closely the union shows what the aircraft's own model shows, over the training views that see a seam."
-                .into(),
+        note: format!(
+            "Each piece of ground is taken from the aircraft that answers for it. Before and after distillation: how closely the \
+             union shows what the aircraft's own model shows, where views that were kept back from it show the cells in which \
+             regions meet. {}",
+            color_step(outcome)
+        ),
         head: head.map(String::from).to_vec(),
         rows: outcome.models.iter().enumerate().map(row).collect(),
     }
@@ -135,7 +150,8 @@ fn registration(outcome: &Outcome, data: &mut ReportData) {
             neighbours += &format!(" and {} more", m.neighbours.len() - NEIGHBOURS_SHOWN);
         }
         let metres = |v: f64| format!("{v:.2} m");
-        vec![m.name.clone(), neighbours, metres(m.moved_m), format!("{:.2}°", m.turned_deg), metres(m.rms_m)]
+        let scale = format!("{:+.2} %", 100.0 * (m.scale - 1.0));
+        vec![m.name.clone(), neighbours, metres(m.moved_m), format!("{:.2}°", m.turned_deg), scale, metres(m.rms_m)]
     };
     data.tables.push(Table {
         title: "Registration".into(),
@@ -145,7 +161,7 @@ fn registration(outcome: &Outcome, data: &mut ReportData) {
             count(r.pairs as u64),
             count(r.fitted as u64)
         ),
-        head: ["", "fitted onto", "moved by", "turned by", "neighbours' points apart"].map(String::from).to_vec(),
+        head: ["", "fitted onto", "moved by", "turned by", "larger by", "neighbours' points apart"].map(String::from).to_vec(),
         rows: r.models.iter().map(row).collect(),
     });
 }
@@ -162,13 +178,12 @@ fn distillation(outcome: &Outcome, data: &mut ReportData) {
     let Some(d) = &outcome.distilled else { return };
     data.skipped.push(("views that see no seam, not distilled".into(), (d.views - d.used) as u64));
     data.skipped.push(("Gaussians that ended up transparent".into(), d.pruned as u64));
+    data.skipped.push(("cells of seams that distillation did not bring closer".into(), (d.cells - d.accepted) as u64));
     if d.over_plan > 0 {
-        let lost = count(d.over_plan as u64);
-        data.warnings
-            .push(format!("{lost} Gaussians had to go to stay within ground.device_mib; raise it to keep them"));
-    }
-    if d.reverted {
-        data.warnings.push("Distillation did not bring the model closer to the aircraft's own; it was undone.".into());
+        let cells = count(d.over_plan as u64);
+        data.warnings.push(format!(
+            "{cells} cells of seams were not distilled to stay within ground.device_mib; raise it to mend them"
+        ));
     }
     for s in &d.samples {
         data.comparisons.push(Comparison {

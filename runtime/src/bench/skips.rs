@@ -80,7 +80,7 @@ pub const NOT_SWITCHED: [(&str, &str); 4] = [
     ),
     (
         "distillation only where regions meet",
-        "the ground's: `dgtr aggregate --all-views` does it everywhere, its run.json has seconds and PSNR",
+        "the ground's: elsewhere the union is the teacher itself; run.json counts views and cells",
     ),
     (
         "converged views rested",

@@ -52,9 +52,6 @@ pub struct Settings {
     /// Learning rates relative to training.
     #[arg(long)]
     pub rate: Option<f32>,
-    /// Distil on every view, not only where regions meet.
-    #[arg(long)]
-    pub all_views: bool,
     /// Vulkan device by (part of) its name.
     #[arg(long)]
     pub device: Option<String>,
@@ -84,7 +81,6 @@ impl Settings {
         to.seconds = self.seconds.or(to.seconds);
         to.scale = self.scale.unwrap_or(to.scale);
         to.rate = self.rate.unwrap_or(to.rate);
-        to.all_views |= self.all_views;
         to.device = self.device.clone().or(to.device.take());
         to.seed = self.seed.unwrap_or(to.seed);
         Ok(to.check()?)
@@ -104,8 +100,9 @@ impl Settings {
         let metric = self.metric.as_deref().or(metric);
         let device = self.device.as_deref();
         let held = compare(&set, "test", self.compare_scale, locals, &outcome.path, metric, device)?;
-        let figures =
-            held.iter().map(|h| (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global })));
+        let figures = held.iter().map(|h| {
+            (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global, "near_border": h.near_border }))
+        });
         if let Some(p) = perceptual(&held) {
             run.more.insert("perceptual".into(), serde_json::to_value(p).map_err(CliError::failed)?);
         }

@@ -4,6 +4,10 @@ use half::f16;
 
 use crate::arena::{Arena, Section};
 
+/// A second moment that holds a number where it is: its root is 1e15, gradients are below 1, and it decays by less than half of its
+/// digits in 30,000 steps. Small enough that bias correction at the first step does not overflow.
+pub(crate) const HEAVY: f32 = 1e30;
+
 /// Where one of the two lies, and in how many bits.
 #[derive(Clone, Copy)]
 pub(crate) struct ShMoments {
@@ -25,6 +29,15 @@ impl ShMoments {
     pub fn forget(&self, arena: &mut Arena, index: usize) {
         let bytes = self.bytes_each();
         arena.slice_mut::<u8>(self.section)[index * bytes..(index + 1) * bytes].fill(0);
+    }
+
+    /// Makes a second moment of Gaussian `index` so large that no gradient moves it.
+    pub fn fill(&self, arena: &mut Arena, index: usize) {
+        let (at, columns) = (index * self.columns * 4, self.columns * 4);
+        match self.half {
+            true => arena.slice_mut::<u16>(self.section)[at..at + columns].fill(f16::MAX.to_bits()),
+            false => arena.slice_mut::<f32>(self.section)[at..at + columns].fill(HEAVY),
+        }
     }
 
     pub fn copy(&self, arena: &mut Arena, from: usize, to: usize) {

@@ -1,6 +1,6 @@
 //! Gaussians in and out of the arena: the only place that knows how their parameters lie in memory.
 
-use super::moments::ShMoments;
+use super::moments::{HEAVY, ShMoments};
 use super::{TrainError, Trainer, state};
 use crate::arena::{Arena, Section};
 use config::plan::Plan;
@@ -25,6 +25,10 @@ pub(crate) struct Geometry {
 impl Geometry {
     fn forget(&mut self) {
         (self.first, self.second) = ([[0.0; 4]; 3], [[0.0; 4]; 3]);
+    }
+
+    fn hold(&mut self) {
+        self.second = [[HEAVY; 4]; 3];
     }
 
     pub fn is_finite(&self) -> bool {
@@ -143,6 +147,12 @@ impl Parameters {
         }
     }
 
+    /// Holds Gaussian `index` where it is.
+    fn hold(&self, arena: &mut Arena, index: usize) {
+        self.geometry_mut(arena)[index].hold();
+        self.sh_second.fill(arena, index);
+    }
+
     /// Forgets the moments of Gaussian `index`.
     pub fn forget(&self, arena: &mut Arena, index: usize) {
         self.geometry_mut(arena)[index].forget();
@@ -202,6 +212,16 @@ impl Trainer {
         }
         self.restart();
         Ok(report)
+    }
+
+    /// Holds the Gaussians just loaded for which `is_held(row of the cloud)` says so: they are drawn and blended, and the others are
+    /// trained as if they could not move. Adam does it, by second moments that no gradient comes near: what is held moves by
+    /// less than rounding shows, but for numbers that are nearly zero. Until the next [`Trainer::load`]; only for a scene that is
+    /// on the device as a whole, of which no row was left out.
+    pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
+        for index in (0..self.gaussians).filter(|i| is_held(*i)) {
+            self.parameters.hold(&mut self.arena, index);
+        }
     }
 
     /// Writes the present parameters to `cloud`, reusing its memory.

@@ -17,7 +17,7 @@ use crate::aggregate::frame::Motion;
 use crate::aggregate::member::Member;
 
 /// Begins every file; another number when fits are made in another way.
-const MAGIC: [u8; 8] = *b"dgtredg1";
+const MAGIC: [u8; 8] = *b"dgtredg2";
 /// What follows the name of a pair.
 const SUFFIX: &str = "edge";
 /// Longest file taken.

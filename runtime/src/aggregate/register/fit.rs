@@ -38,8 +38,8 @@ const MOST_TRIED: usize = 500;
 /// Motions beyond these are taken for a mistake: GPS is not that wrong.
 const MOST_METRES: f64 = 15.0;
 const MOST_DEGREES: f64 = 6.0;
-/// Nor a scale that nobody measured so far from 1.
-const MOST_SCALE: f64 = 1.2;
+/// Nor a scale so far from 1: where GPS measured it, and where nobody did.
+const MOST_SCALE: [f64; 2] = [1.03, 1.2];
 
 /// A renderer and what it holds.
 struct Stage {
@@ -206,7 +206,8 @@ fn lift(view: &View, rendering: &Rendering, [x, y]: [f32; 2]) -> Option<DVec3> {
 }
 
 /// The motion of pairs (from, to) by iterated trimming: the shift that most of them agree on first, then least squares over what
-/// agrees. Without a free scale it is rigid: where both scales come from the same kind of GPS it keeps both.
+/// agrees. Scales are compared, too: that of a small flight is known from GPS to no better than parts of a thousand, which over
+/// the length of a border are pixels.
 fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
     if pairs.len() < LEAST_POINTS {
         return None;
@@ -230,10 +231,7 @@ fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
         }
         let (from, to): (Vec<DVec3>, Vec<DVec3>) = kept.iter().copied().unzip();
         let by = umeyama(&from, &to, None).ok()?;
-        let scale = if has_free_scale { by.scale } else { 1.0 };
-        let n = kept.len() as f64;
-        let translation = to.iter().sum::<DVec3>() / n - scale * (by.rotation * (from.iter().sum::<DVec3>() / n));
-        motion = Motion::of(Similarity { scale, rotation: by.rotation, translation });
+        motion = Motion::of(by);
     }
     let rms = |f: &dyn Fn(&DVec3) -> DVec3| {
         (kept.iter().map(|(q, p)| f(q).distance_squared(*p)).sum::<f64>() / kept.len() as f64).sqrt()
@@ -243,7 +241,7 @@ fn fitted(pairs: &[(DVec3, DVec3)], has_free_scale: bool) -> Option<Fitted> {
     let Similarity { scale, rotation, translation } = *motion.similarity();
     let plausible = motion.point(middle).distance(middle) <= MOST_METRES
         && motion.angle().to_degrees() <= MOST_DEGREES
-        && scale.max(1.0 / scale) <= MOST_SCALE
+        && scale.max(1.0 / scale) <= MOST_SCALE[usize::from(has_free_scale)]
         && rms_m[1] < rms_m[0];
     plausible.then(|| Fitted {
         turn: rotation.to_array(),
@@ -328,10 +326,13 @@ mod tests {
     }
 
     #[test]
-    fn a_scale_is_fitted_only_where_it_is_free() {
-        let truth = Motion::of(Similarity { scale: 1.05, rotation: DQuat::IDENTITY, translation: DVec3::X });
-        assert!((fitted(&pairs(200, &truth, 0), true).expect("fits").scale - 1.05).abs() < 1e-9);
-        assert_eq!(fitted(&pairs(200, &truth, 0), false).expect("fits").scale, 1.0);
+    fn a_scale_is_fitted_within_what_it_may_be_wrong_by() {
+        let truth = |scale| Motion::of(Similarity { scale, rotation: DQuat::IDENTITY, translation: DVec3::X });
+        let scale = |of: f64, is_free| fitted(&pairs(200, &truth(of), 0), is_free).map(|f| f.scale);
+        for (of, is_free) in [(1.05, true), (0.998, true), (1.002, false), (0.998, false)] {
+            assert!(scale(of, is_free).is_some_and(|s| (s - of).abs() < 1e-9), "{of}");
+        }
+        assert_eq!(scale(1.05, false), None, "no GPS is wrong by that");
     }
 
     #[test]

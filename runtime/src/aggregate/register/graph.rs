@@ -1,7 +1,7 @@
 //! The pose graph of all models: where each lies so that neighbours agree as well as they can, and none leaves where its
 //! telemetry puts it without need.
 //!
-//! A model's correction is position, heading, tilt and, where it is not known, scale, about the middle of its ground. An edge is
+//! A model's correction is position, heading, tilt and scale, about the middle of its ground. An edge is
 //! six places that two models show ([`Link`]). One false edge must not bend the scene: edges are weighed by Geman and McClure's
 //! function, whose width shrinks from where every edge counts to where only those that agree do (graduated non-convexity, Yang
 //! et al. 2020). The linear systems are solved by conjugate gradients, block by block: time and memory grow as the edges do.
@@ -9,12 +9,11 @@
 use glam::{DQuat, DVec3};
 use models::align::similarity::Similarity;
 
-/// What telemetry is worth, one standard deviation: position, tilt and heading, scale.
+/// What telemetry is worth, one standard deviation: position, tilt and heading.
 /// Position as in [`config`]'s GPS priors without RTK.
 const POSITION_M: f64 = 3.0;
 const TILT_RAD: f64 = 0.017;
 const HEADING_RAD: f64 = 0.05;
-const SCALE: f64 = 0.05;
 /// Telemetry is never so far off: an edge that says so is set aside at once, metres.
 const MOST_APART_M: f64 = 10_000.0;
 /// The width of the weighing shrinks by this factor (Yang et al. 2020).
@@ -32,8 +31,8 @@ const SET_ASIDE: f64 = 0.25;
 pub struct Node {
     /// About what it turns.
     pub middle: DVec3,
-    /// Its size is not known from telemetry.
-    pub has_free_scale: bool,
+    /// What its size is known to from telemetry, one standard deviation, as a share.
+    pub scale_sigma: f64,
 }
 
 /// What two models show in common: places as the first has them and as the second has them.
@@ -148,12 +147,11 @@ impl Solver<'_> {
         self.weights[link] / (6.0 * self.links[link].sigma_m.powi(2))
     }
 
-    /// 1/σ² of what telemetry says; a scale that is known does not move.
+    /// 1/σ² of what telemetry says.
     fn prior(&self, node: usize) -> Block {
         let per = |sigma: f64| 1.0 / (sigma * sigma);
         let (p, t, h) = (per(POSITION_M), per(TILT_RAD), per(HEADING_RAD));
-        let scale = if self.nodes[node].has_free_scale { per(SCALE) } else { 1.0 };
-        [p, p, p, t, t, h, scale]
+        [p, p, p, t, t, h, per(self.nodes[node].scale_sigma)]
     }
 
     /// One step of Gauss and Newton.
@@ -170,8 +168,8 @@ impl Solver<'_> {
                 let (a, b) = (l.a, l.b);
                 let apart = self.nodes[a].middle + self.states[a].shift + *ya
                     - (self.nodes[b].middle + self.states[b].shift + *yb);
-                self.push(&mut gradient[a], *ya, -w * apart, a);
-                self.push(&mut gradient[b], *yb, w * apart, b);
+                Self::push(&mut gradient[a], *ya, -w * apart);
+                Self::push(&mut gradient[b], *yb, w * apart);
             }
         }
         for (i, g) in gradient.iter_mut().enumerate() {
@@ -185,19 +183,17 @@ impl Solver<'_> {
     }
 
     /// Adds what a pull on a place with this lever does to a node's block.
-    fn push(&self, block: &mut Block, lever: DVec3, pull: DVec3, node: usize) {
+    fn push(block: &mut Block, lever: DVec3, pull: DVec3) {
         let torque = lever.cross(pull);
-        let stretch = if self.nodes[node].has_free_scale { lever.dot(pull) } else { 0.0 };
-        let add = [pull.x, pull.y, pull.z, torque.x, torque.y, torque.z, stretch];
+        let add = [pull.x, pull.y, pull.z, torque.x, torque.y, torque.z, lever.dot(pull)];
         (0..7).for_each(|k| block[k] += add[k]);
     }
 
     /// How a place with this lever moves when its node's block does.
-    fn moved(&self, block: &Block, lever: DVec3, node: usize) -> DVec3 {
-        let stretch = if self.nodes[node].has_free_scale { block[6] } else { 0.0 };
+    fn moved(block: &Block, lever: DVec3) -> DVec3 {
         DVec3::new(block[0], block[1], block[2])
             + DVec3::new(block[3], block[4], block[5]).cross(lever)
-            + stretch * lever
+            + block[6] * lever
     }
 
     /// The matrix of the normal equations times `x`.
@@ -209,9 +205,9 @@ impl Solver<'_> {
         for (i, l) in self.links.iter().enumerate() {
             let w = self.weight(i);
             for (ya, yb) in &self.levers[i] {
-                let u = w * (self.moved(&x[l.a], *ya, l.a) - self.moved(&x[l.b], *yb, l.b));
-                self.push(&mut into[l.a], *ya, u, l.a);
-                self.push(&mut into[l.b], *yb, -u, l.b);
+                let u = w * (Self::moved(&x[l.a], *ya) - Self::moved(&x[l.b], *yb));
+                Self::push(&mut into[l.a], *ya, u);
+                Self::push(&mut into[l.b], *yb, -u);
             }
         }
     }
@@ -231,7 +227,7 @@ impl Solver<'_> {
                     for column in 0..7 {
                         let unit: Block = std::array::from_fn(|k| f64::from(u8::from(k == column)));
                         let mut pulled = [0.0; 7];
-                        self.push(&mut pulled, lever, w * self.moved(&unit, lever, node), node);
+                        Self::push(&mut pulled, lever, w * Self::moved(&unit, lever));
                         (0..7).for_each(|row| blocks[node][row][column] += pulled[row]);
                     }
                 }

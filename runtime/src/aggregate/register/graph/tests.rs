@@ -2,6 +2,9 @@
 
 use super::*;
 
+/// As of a model whose origin is known.
+const BY_GPS: f64 = 0.005;
+
 /// Models in a square field, each off by its own error, and links between neighbours that see the truth.
 struct Field {
     side: usize,
@@ -16,11 +19,12 @@ fn wobble(i: usize, k: usize) -> f64 {
 }
 
 impl Field {
-    fn new(side: usize, has_free_scale: bool) -> Self {
+    /// Scales are wrong by up to 0.6 times what they are known to.
+    fn new(side: usize, scale_sigma: f64) -> Self {
         let middle = |i: usize| DVec3::new((i % side) as f64 * 100.0, (i / side) as f64 * 100.0, 0.0);
-        let nodes: Vec<Node> = (0..side * side).map(|i| Node { middle: middle(i), has_free_scale }).collect();
+        let nodes: Vec<Node> = (0..side * side).map(|i| Node { middle: middle(i), scale_sigma }).collect();
         let errors = (0..side * side).map(|i| {
-            let scale = if has_free_scale { 1.0 + 0.03 * wobble(i, 6) } else { 1.0 };
+            let scale = 1.0 + 0.6 * scale_sigma * wobble(i, 6);
             let rotation = DQuat::from_rotation_z(0.05 * wobble(i, 3)) * DQuat::from_rotation_x(0.01 * wobble(i, 4));
             let shift = DVec3::new(wobble(i, 0), wobble(i, 1), wobble(i, 2)) * 3.0;
             Similarity { scale, rotation, translation: middle(i) + shift - scale * (rotation * middle(i)) }
@@ -58,7 +62,7 @@ impl Field {
 
 #[test]
 fn loops_close_to_millimetres_and_telemetry_holds_the_whole() {
-    let field = Field::new(6, false);
+    let field = Field::new(6, BY_GPS);
     let settled = settle(&field.nodes, &field.links);
     assert!(settled.holds.iter().all(|h| *h));
     let gap = field.worst_gap(&settled, field.links.len());
@@ -67,12 +71,11 @@ fn loops_close_to_millimetres_and_telemetry_holds_the_whole() {
     let moved = |i: usize| settled.corrections[i].apply(field.errors[i].apply(field.nodes[i].middle));
     let off: DVec3 = (0..36).map(|i| moved(i) - field.nodes[i].middle).sum::<DVec3>() / 36.0;
     assert!(off.length() < 1.2, "{off}");
-    assert!(settled.corrections.iter().all(|c| c.scale == 1.0));
 }
 
 #[test]
 fn one_false_edge_is_set_aside_and_bends_nothing() {
-    let mut field = Field::new(6, false);
+    let mut field = Field::new(6, BY_GPS);
     let honest = field.links.len();
     let without = settle(&field.nodes, &field.links);
     for (a, b) in [(14, 15), (0, field.side), (7, 21)] {
@@ -90,27 +93,46 @@ fn one_false_edge_is_set_aside_and_bends_nothing() {
 
 #[test]
 fn a_model_without_neighbours_stays_where_its_telemetry_puts_it() {
-    let mut field = Field::new(3, false);
+    let mut field = Field::new(3, BY_GPS);
     field.links.retain(|l| l.a != 8 && l.b != 8);
     let settled = settle(&field.nodes, &field.links);
     assert!(settled.corrections[8].apply(field.nodes[8].middle).distance(field.nodes[8].middle) < 1e-9);
     assert!(settle(&[], &[]).corrections.is_empty());
 }
 
+/// GPS leaves the size of a small flight uncertain by parts of a thousand: rigid motions alone left neighbours apart by half a
+/// pixel at the ends of their border.
 #[test]
-fn a_scale_that_is_free_is_found() {
-    let field = Field::new(4, true);
+fn scales_are_brought_together_whether_gps_measured_them_or_nobody_did() {
+    for (scale_sigma, most) in [(BY_GPS, 1e-3), (0.05, 4e-3)] {
+        let field = Field::new(4, scale_sigma);
+        let settled = settle(&field.nodes, &field.links);
+        assert!(field.worst_gap(&settled, field.links.len()) < 0.05);
+        let scales: Vec<f64> = field.errors.iter().zip(&settled.corrections).map(|(e, c)| e.scale * c.scale).collect();
+        let spread =
+            |of: &[f64]| of.iter().fold(f64::MIN, |h, s| h.max(*s)) - of.iter().fold(f64::MAX, |l, s| l.min(*s));
+        let wrong: Vec<f64> = field.errors.iter().map(|e| e.scale).collect();
+        assert!(spread(&wrong) > 4.0 * most && spread(&scales) < most, "{wrong:?} {scales:?}");
+    }
+}
+
+#[test]
+fn a_scale_without_neighbours_stays_what_gps_says() {
+    let field = Field::new(3, BY_GPS);
+    let alone = settle(&field.nodes, &[]);
+    assert!(alone.corrections.iter().all(|c| c.scale == 1.0));
+    // Of all together only telemetry says how large they are.
     let settled = settle(&field.nodes, &field.links);
-    assert!(field.worst_gap(&settled, field.links.len()) < 0.05);
-    let scales: Vec<f64> = field.errors.iter().zip(&settled.corrections).map(|(e, c)| e.scale * c.scale).collect();
-    let (low, high) = scales.iter().fold((f64::MAX, 0.0f64), |(l, h), s| (l.min(*s), h.max(*s)));
-    assert!(high - low < 0.004, "{scales:?}");
+    let mean = |of: &dyn Fn(usize) -> f64| (0..9).map(of).sum::<f64>() / 9.0;
+    let (wrong, left) =
+        (mean(&|i| field.errors[i].scale), mean(&|i| field.errors[i].scale * settled.corrections[i].scale));
+    assert!((left - wrong).abs() < 5e-4, "{wrong} {left}");
 }
 
 #[test]
 fn of_a_thousand_aircraft_one_false_edge_is_found_and_neighbours_meet() {
     // Where nothing is optimised a tenth of them take as long.
-    let mut field = Field::new(if cfg!(debug_assertions) { 10 } else { 32 }, false);
+    let mut field = Field::new(if cfg!(debug_assertions) { 10 } else { 32 }, BY_GPS);
     let honest = field.links.len();
     field.link(50, 51, DVec3::new(7.0, -5.0, 1.0));
     let settled = settle(&field.nodes, &field.links);
@@ -122,7 +144,7 @@ fn of_a_thousand_aircraft_one_false_edge_is_found_and_neighbours_meet() {
 
 #[test]
 fn an_edge_beyond_all_telemetry_is_set_aside_at_once_and_moves_nothing() {
-    let mut field = Field::new(2, false);
+    let mut field = Field::new(2, BY_GPS);
     let honest = field.links.len();
     let without = settle(&field.nodes, &field.links);
     for off in [1e5, 1e200, f64::NAN] {

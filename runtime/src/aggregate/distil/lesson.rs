@@ -1,0 +1,180 @@
+//! What is to be learnt: the parts of an aircraft's views that show seams, as the aircraft's own model draws them.
+
+use image::RgbImage;
+use models::camera::{Intrinsics, PoseSigma, PosedImage, View};
+use models::metrics::{self, to_rgb8};
+use models::picture::mask::Mask;
+use vulkan::trainer::{Rendering, Trainer};
+
+use config::ground::GroundSettings;
+
+use crate::aggregate::AggregateError;
+use crate::aggregate::member::Member;
+use crate::aggregate::seam::Seams;
+
+/// Of so many lessons of an aircraft one is kept back from training.
+const KEEP_BACK: usize = 4;
+/// A model vouches for what it shows where less than this much light passes through it.
+const CLEAR: f32 = 0.3;
+/// A pixel that shows no seam.
+const NO_CELL: u16 = u16::MAX;
+
+/// The part of a view that shows seams, with the picture its teacher drew.
+pub struct Lesson {
+    /// Index of the model whose view it is.
+    pub model: usize,
+    pub name: String,
+    pub view: View,
+    /// Share of the Gaussians in the whole view that lie in a seam.
+    pub share: f64,
+    /// Asked at the end only.
+    pub is_kept_back: bool,
+    /// 8 bits: what the trainer keeps of a picture anyway.
+    pub target: RgbImage,
+    /// Cell that each pixel shows.
+    cells: Vec<u16>,
+}
+
+/// The lessons, without their pictures yet, and the number of views there are.
+pub fn choose(members: &[Member], seams: &Seams, settings: &GroundSettings) -> (Vec<Lesson>, usize) {
+    let (mut lessons, mut views) = (Vec::new(), 0);
+    for (m, model) in members.iter().enumerate() {
+        let between = if settings.between_views { between(&model.header.views) } else { Vec::new() };
+        let mut of_model = 0;
+        for (name, view) in model.header.views.iter().chain(&between) {
+            views += 1;
+            let share = seams.seen_by(view);
+            let view = View { intrinsics: scaled(&view.intrinsics, settings.scale), pose: view.pose };
+            let window = if share >= f64::from(settings.seam_share) { seams.window(&view) } else { None };
+            if let Some(window) = window {
+                let is_kept_back = of_model % KEEP_BACK == 1;
+                of_model += 1;
+                let (view, target) = (part(&view, window), RgbImage::new(0, 0));
+                lessons.push(Lesson {
+                    model: m,
+                    name: name.clone(),
+                    view,
+                    share,
+                    is_kept_back,
+                    target,
+                    cells: Vec::new(),
+                });
+            }
+        }
+    }
+    (lessons, views)
+}
+
+/// A view half-way from each view to its nearest neighbour, turned like the view itself; each pair once.
+fn between(views: &[(String, View)]) -> Vec<(String, View)> {
+    let mut made: Vec<(usize, usize)> = Vec::new();
+    for (i, (_, view)) in views.iter().enumerate() {
+        let apart = |j: &usize| views[*j].1.pose.center.distance(view.pose.center);
+        let nearest = (0..views.len()).filter(|&j| j != i).min_by(|a, b| apart(a).total_cmp(&apart(b)));
+        if let Some(j) = nearest
+            && !made.contains(&(j, i))
+        {
+            made.push((i, j));
+        }
+    }
+    let half_way = |(i, j): (usize, usize)| {
+        let (a, b) = (&views[i], &views[j]);
+        let mut view = a.1;
+        view.pose.center = 0.5 * (a.1.pose.center + b.1.pose.center);
+        (format!("{} – {}", a.0, b.0), view)
+    };
+    made.into_iter().map(half_way).collect()
+}
+
+fn scaled(k: &Intrinsics, scale: f32) -> Intrinsics {
+    let side = |n: u32| ((n as f32 * scale).round() as u32).max(1);
+    k.resized(side(k.width), side(k.height))
+}
+
+fn part(view: &View, [left, top, right, bottom]: [u32; 4]) -> View {
+    let k = view.intrinsics;
+    let (width, height) = (right - left, bottom - top);
+    let lens = Intrinsics { width, height, cx: k.cx - left as f32, cy: k.cy - top as f32, ..k };
+    View { intrinsics: lens, pose: view.pose }
+}
+
+impl Lesson {
+    /// Has the teacher on `trainer` draw the picture and say which pixels show which cell.
+    pub fn ask(&mut self, trainer: &mut Trainer, seams: &Seams) -> Result<(), AggregateError> {
+        let mut drawn = Rendering::default();
+        self.target = draw(trainer, &self.view, &mut drawn)?;
+        let k = &self.view.intrinsics;
+        let shows = |i: usize| {
+            let opaque = 1.0 - drawn.transmittance[i];
+            if opaque < 1.0 - CLEAR {
+                return NO_CELL;
+            }
+            let (x, y) = ((i as u32 % k.width) as f32 + 0.5, (i as u32 / k.width) as f32 + 0.5);
+            // Blended depth is weighted by opacity; the surface lies at the mean.
+            let depth = drawn.depth[i] / opaque;
+            let p = glam::Vec3::new((x - k.cx) / k.fx * depth, (y - k.cy) / k.fy * depth, depth).as_dvec3();
+            let p = self.view.pose.rotation * p + self.view.pose.center;
+            seams.index_of(&p.as_vec3().to_array()).unwrap_or(NO_CELL)
+        };
+        self.cells = (0..drawn.transmittance.len()).map(shows).collect();
+        Ok(())
+    }
+
+    /// Whether any pixel shows a seam.
+    pub fn is_worth_it(&self) -> bool {
+        self.cells.iter().any(|c| *c != NO_CELL)
+    }
+
+    /// As the trainer takes it: only pixels that show seams count.
+    pub fn picture(&self) -> PosedImage {
+        let shows = |x: u32, y: u32| self.cells[(y * self.target.width() + x) as usize] != NO_CELL;
+        PosedImage {
+            name: self.name.clone(),
+            time_ns: 0,
+            image: self.target.clone(),
+            view: self.view,
+            mask: Some(Mask::from_fn(self.target.width(), self.target.height(), shows)),
+            sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
+        }
+    }
+
+    /// What a picture of this view is off the teacher's, cell by cell.
+    pub fn errors(&self, shown: &RgbImage, into: &mut Errors) {
+        for ((cell, a), b) in self.cells.iter().zip(shown.pixels()).zip(self.target.pixels()) {
+            if let Some(of_cell) = into.0.get_mut(usize::from(*cell)) {
+                of_cell[0] += (0..3).map(|c| (f64::from(a.0[c]) - f64::from(b.0[c])).powi(2)).sum::<f64>();
+                of_cell[1] += 3.0;
+            }
+        }
+    }
+}
+
+/// Squared differences of 8-bit values and their number, per cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Errors(pub Vec<[f64; 2]>);
+
+impl Errors {
+    /// Of nothing yet.
+    pub fn none(cells: usize) -> Self {
+        Self(vec![[0.0; 2]; cells])
+    }
+
+    /// Over the cells for which `counts` says so: PSNR, dB; None without a pixel. Equal pictures are as close as 8 bits can tell.
+    pub fn psnr(&self, counts: impl Fn(usize) -> bool) -> Option<f64> {
+        let [sum, n] =
+            (0..self.0.len()).filter(|c| counts(*c)).fold([0.0; 2], |[s, n], c| [s + self.0[c][0], n + self.0[c][1]]);
+        (n > 0.0).then(|| (10.0 * (255.0 * 255.0 * n / sum.max(f64::MIN_POSITIVE)).log10()).min(60.0))
+    }
+}
+
+/// Draws what a trainer holds.
+pub fn draw(trainer: &mut Trainer, view: &View, into: &mut Rendering) -> Result<RgbImage, AggregateError> {
+    trainer.render(view, into)?;
+    // The renderer fills exactly the size it was asked for.
+    Ok(to_rgb8(&into.rgb, into.width, into.height).unwrap_or_default())
+}
+
+/// PSNR of two pictures, dB.
+pub fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
+    metrics::psnr(&metrics::to_f32(a), &metrics::to_f32(b)).min(60.0)
+}
