@@ -2,7 +2,7 @@
 //! the same bits with each (`tests/shapes.rs`); only the time differs, and [`calibration`](crate::calibration) measures
 //! which is the fastest.
 
-use crate::constants::TILE_HEIGHT;
+use crate::constants::RUNS;
 use crate::gpu::GpuInfo;
 use std::fmt;
 
@@ -18,7 +18,7 @@ pub struct KernelShape {
     pub share_lanes: u32,
     /// Tiles of a workgroup: the blend and its gradient.
     pub tiles: u32,
-    /// Lanes that share a tile: 1, with all its pixels in registers, or one per row.
+    /// Lanes that share a tile: 1, with all its pixels in registers, or one per run of it.
     pub tile_lanes: u32,
     /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
     pub fetched: u32,
@@ -57,8 +57,8 @@ impl KernelShape {
         let standard = Self::standard(info).tiles;
         let mut all: Vec<_> = candidates(&TILES, standard, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
         if info.shuffles {
-            for tiles in candidates(&TILES, 0, TILE_HEIGHT, info) {
-                all.extend([1, TILE_HEIGHT].map(|fetched| (tiles, TILE_HEIGHT, fetched)));
+            for tiles in candidates(&TILES, 0, RUNS, info) {
+                all.extend([1, RUNS].map(|fetched| (tiles, RUNS, fetched)));
             }
         }
         all
@@ -67,10 +67,10 @@ impl KernelShape {
     /// Whether the kernels are written for this shape and the device can run it.
     pub fn fits(&self, info: &GpuInfo) -> bool {
         let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && TILES.contains(&self.tiles);
-        let rows = self.tile_lanes == 1 || (self.tile_lanes == TILE_HEIGHT && info.shuffles);
+        let runs = self.tile_lanes == 1 || (self.tile_lanes == RUNS && info.shuffles);
         let fetched = self.fetched == 1 || self.fetched == self.tile_lanes;
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
-        sizes && rows && fetched && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
+        sizes && runs && fetched && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
     }
 
     /// Lanes of its largest workgroup.
@@ -136,16 +136,16 @@ mod tests {
     fn several_lanes_per_tile_are_tried_only_where_lanes_can_read_each_other() {
         assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1), (16, 1, 1), (32, 1, 1)]);
         let pi5 = device(false, 16, 256);
-        let staged = [(8, 4, 1), (8, 4, 4), (16, 4, 1), (16, 4, 4), (32, 4, 1), (32, 4, 4)];
+        let staged = [(8, 8, 1), (8, 8, 8), (16, 8, 1), (16, 8, 8), (32, 8, 1), (32, 8, 8)];
         assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1), (32, 1, 1)], &staged[..]].concat());
-        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[2..]].concat());
-        let rows = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 4, fetched: 4 };
-        assert!(rows.fits(&pi5) && !rows.fits(&device(false, 8, 256)));
-        assert!(!KernelShape { tile_lanes: 2, ..rows }.fits(&pi5));
-        assert!(!KernelShape { fetched: 2, ..rows }.fits(&pi5));
-        assert!(!KernelShape { tile_lanes: 1, ..rows }.fits(&pi5), "nobody to fetch for");
-        assert!(!KernelShape { share_lanes: 16, ..rows }.fits(&pi5));
-        assert_eq!(rows.to_string(), "64x32x32x8x4x4");
+        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[..]].concat());
+        let runs = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 8, fetched: 8 };
+        assert!(runs.fits(&pi5) && !runs.fits(&device(false, 8, 256)));
+        assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
+        assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
+        assert!(!KernelShape { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
+        assert!(!KernelShape { share_lanes: 16, ..runs }.fits(&pi5));
+        assert_eq!(runs.to_string(), "64x32x32x8x8x8");
     }
 
     #[test]
