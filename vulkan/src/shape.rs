@@ -35,7 +35,11 @@ impl KernelShape {
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
         let few = if info.is_cpu { 8 } else { 32 };
-        Self { wide: 64, narrow: few, share_lanes: 1, tiles: few, tile_lanes: 1, fetched: 1 }
+        // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 6/5, Adreno
+        // 49/49 and nothing (tests/data/boards.md).
+        let runs = info.shuffles && !info.is_cpu && 8 * RUNS <= info.limits.workgroup_lanes;
+        let (tiles, tile_lanes) = if runs { (8, RUNS) } else { (few, 1) };
+        Self { wide: 64, narrow: few, share_lanes: 1, tiles, tile_lanes, fetched: 1 }
     }
 
     /// Sizes of wide workgroups that this device can run and that fill its subgroups, the standard one among them.
@@ -54,8 +58,8 @@ impl KernelShape {
     /// Tiles of a workgroup, lanes of a tile and Gaussians they fetch at once, under the same conditions; those with one
     /// lane per tile first.
     pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32, u32)> {
-        let standard = Self::standard(info).tiles;
-        let mut all: Vec<_> = candidates(&TILES, standard, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
+        let usual = if info.is_cpu { 8 } else { 32 };
+        let mut all: Vec<_> = candidates(&TILES, usual, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
         if info.shuffles {
             for tiles in candidates(&TILES, 0, RUNS, info) {
                 all.extend([1, RUNS].map(|fetched| (tiles, RUNS, fetched)));
@@ -146,6 +150,20 @@ mod tests {
         assert!(!KernelShape { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
         assert!(!KernelShape { share_lanes: 16, ..runs }.fits(&pi5));
         assert_eq!(runs.to_string(), "64x32x32x8x8x8");
+    }
+
+    #[test]
+    fn a_gpu_whose_lanes_read_each_other_begins_with_a_lane_per_run_and_a_processor_with_one_per_tile() {
+        let lanes = |info: &GpuInfo| (KernelShape::standard(info).tiles, KernelShape::standard(info).tile_lanes);
+        assert_eq!(lanes(&device(false, 16, 256)), (8, RUNS));
+        assert_eq!(lanes(&device(false, 4, 256)), (32, 1), "no shuffles");
+        assert_eq!(lanes(&device(true, 16, 1024)), (8, 1));
+        for info in [device(false, 16, 64), device(false, 16, 256), device(true, 8, 1024), device(false, 64, 128)] {
+            assert!(KernelShape::standard(&info).fits(&info));
+            let listed = KernelShape::tile_candidates(&info);
+            let KernelShape { tiles, tile_lanes, fetched, .. } = KernelShape::standard(&info);
+            assert!(listed.contains(&(tiles, tile_lanes, fetched)), "{info:?}");
+        }
     }
 
     #[test]
