@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxROWSxFETCHED` such as `64x8x1x8x1x1`.
+/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxRUNSxFETCHED` such as `64x8x1x8x1x1`.
 pub const VARIABLE: &str = "DGTR_KERNELS";
 
 /// Who decides.
@@ -15,7 +15,7 @@ pub enum KernelChoice {
     Calibrated,
     /// `default`: the built-in sizes; nothing is measured, nothing is read or written.
     Standard,
-    /// `WIDExNARROWxSHARExTILESxROWSxFETCHED`: these.
+    /// `WIDExNARROWxSHARExTILESxRUNSxFETCHED`: these.
     Fixed {
         /// Lanes of a workgroup of the plain loops over Gaussians or pixels.
         wide: u32,
@@ -25,7 +25,7 @@ pub enum KernelChoice {
         share_lanes: u32,
         /// Tiles of a workgroup of the blend.
         tiles: u32,
-        /// Lanes that blend a tile: 1, or 4.
+        /// Lanes that blend a tile: 1, or 8.
         tile_lanes: u32,
         /// Gaussians that the lanes of a tile fetch at once: 1, or `tile_lanes`.
         fetched: u32,
@@ -34,7 +34,7 @@ pub enum KernelChoice {
 
 /// A value that is none of the three.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxROWSxFETCHED (such as 64x8x1x8x1x1)")]
+#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxRUNSxFETCHED (such as 64x8x1x8x1x1)")]
 pub struct KernelChoiceError(String);
 
 impl FromStr for KernelChoice {
@@ -82,8 +82,8 @@ mod tests {
         assert_eq!("".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("auto".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("default".parse(), Ok(KernelChoice::Standard));
-        let fixed = KernelChoice::Fixed { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4, fetched: 1 };
-        assert_eq!("128x16x16x8x4x1".parse(), Ok(fixed));
+        let fixed = KernelChoice::Fixed { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 1 };
+        assert_eq!("128x16x16x8x8x1".parse(), Ok(fixed));
         let bad = "off 64 64x8 64x8x1x8x1 64x8x1x8x1x x8x1x8x1x1 64x-8x1x8x1x1 99999999999x8x1x8x1x1 64x8x1x8x1x1x1";
         for bad in bad.split(' ') {
             let refused = bad.parse::<KernelChoice>().unwrap_err().to_string();

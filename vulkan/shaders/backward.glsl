@@ -5,28 +5,44 @@
 layout(std430, set = 0, binding = 1) readonly buffer Starts { uint starts[]; };
 TEXELS(vec4, 11, image)
 TEXELS(vec4, 12, image_gradient)
-layout(std430, set = 0, binding = 2) writeonly buffer Slots { vec4 slots[]; };
+// What a slot holds: q and its first moments, total weight; second moments, depth; colour. Each number stored costs llvmpipe
+// as much as a dozen operations: none is stored that nobody reads.
+struct Slot {
+    vec4 line;
+#ifdef DEPTH
+    vec4 square;
+#define STORED_SQUARE(square) square
+#else
+    vec3 square;
+#define STORED_SQUARE(square) square.xyz
+#endif
+    vec3 colour;
+};
+layout(std430, set = 0, binding = 2) writeonly buffer Slots { Slot slots[]; };
 
 const int AT_ONCE = 16;
 
 void main() {
+    // Before any branch, as in blend.glsl.
+    bool to_the_end = (frame.flags & FLAG_NO_EARLY_END) != 0u;
+    float thaw = (frame.flags & FLAG_FREEZE_SHAPE) != 0u ? 0.0 : 1.0;
     uint t = tile_of_lane();
     if (t >= push.last) return;
     uint base = starts[push.first], first = starts[t] - base, end = starts[t + 1u] - base;
-    int own_row = row_of_lane();
-    ivec2 corner_pixel = tile_origin(t), origin = corner_pixel + ivec2(0, own_row);
-    vec2 corner = vec2(corner_pixel) + 0.5;
+    int own_run = run_of_lane();
+    ivec2 origin = tile_origin(t);
+    vec2 corner = vec2(origin) + 0.5;
     float T[PIXELS];
     float behind[PIXELS];        // dL/d(pixel) · what is still to come
     vec3 gradient[PIXELS];
 #ifdef DEPTH
     float depth_behind[PIXELS], depth_gradient[PIXELS];
-    float thaw = (frame.flags & FLAG_FREEZE_SHAPE) != 0u ? 0.0 : 1.0;
 #endif
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
-        bool inside = pixel_inside(origin, k);
+        ivec2 p = origin + pixel_of(own_run, k);
+        bool inside = pixel_inside(p);
         uint at = 0u;
-        if (inside) at = pixel_index(origin, k);
+        if (inside) at = pixel_index(p);
         T[k] = inside ? 1.0 : -1.0;
         vec4 g = FETCH(image_gradient, int(at)), c = FETCH(image, int(at));
         gradient[k] = g.xyz;
@@ -42,24 +58,28 @@ void main() {
     WHILE (i < end && live) {
         uint slot = 0u;
         float most = -1.0;
-        // What a slot holds: q and its first moments, total weight; second moments, depth; colour.
-        vec4 line = vec4(0.0), square = vec4(0.0), colour = vec4(0.0);
+        // `precise`: two runs of a row share a factor, which a compiler would take out of their sum.
+        precise vec4 line = vec4(0.0), square = vec4(0.0);
+        precise vec3 colour = vec3(0.0);
         IF (i < end && live) {
             Splat splat = next_splat(i, first, end, held);
             vec4 s0 = splat.s0, s1 = splat.s1, s2 = splat.s2;
             slot = splat.slot;
-            vec2 d = corner - s0.xy;
-            [[unroll]] for (int y = 0; y < ROWS; y++) {
-                float dy = d.y + float(own_row + y), along = s1.y * dy, rest = fma(s1.z * dy, dy, s0.w);
-                float row = 0.0, row_x = 0.0, row_xx = 0.0, row_total = 0.0, row_depth = 0.0;
-                vec3 row_colour = vec3(0.0);
+            float bend = exp2(2.0 * s1.x);
+            [[unroll]] for (int run = 0; run < OWN_RUNS; run++) {
+                ivec2 place = run_origin(own_run + run);
+                precise vec2 off = corner - s0.xy + vec2(place);
+                float dx0 = off.x, dy = off.y;
+                vec4 values = run_of(dx0, dy, s0, s1, bend);
+                // Sums over the run of q, of q times x and x² (x from the run's first pixel), of weight, depth and colour.
+                vec3 sums = vec3(0.0), run_colour = vec3(0.0);
+                float total = 0.0, depth = 0.0;
 #ifdef DEPTH
                 float shape = 0.0, shape_x = 0.0;
 #endif
-                [[unroll]] for (int x = 0; x < TILE_WIDTH; x++) {
-                    int k = y * TILE_WIDTH + x;
-                    float dx = d.x + float(x);
-                    float raw = exp2(min(fma(dx, fma(s1.x, dx, along), rest), s0.w));
+                [[unroll]] for (int x = 0; x < RUN; x++) {
+                    int k = run * RUN + x;
+                    float raw = values[x];
                     float alpha = min(raw, ALPHA_MAX);
                     alpha = alpha >= ALPHA_MIN ? alpha : 0.0;
                     float weight = alpha * T[k];
@@ -67,60 +87,65 @@ void main() {
                     bool taken = next >= TRANSMITTANCE_MIN;
                     weight = taken ? weight : 0.0;
                     // alpha/(1-alpha), only where alpha itself follows the parameters.
-                    float odds = taken && raw <= ALPHA_MAX ? alpha / (1.0 - alpha) : 0.0;
-                    float own = raw <= ALPHA_MAX ? weight : 0.0;
+                    bool follows = raw <= ALPHA_MAX;
+                    float odds = taken && follows ? alpha / (1.0 - alpha) : 0.0;
+                    float own = follows ? weight : 0.0;
                     T[k] = taken ? next : -abs(T[k]);
-                    float value = dot(s2.xyz, gradient[k]);
-                    behind[k] -= weight * value;
-                    float term = own * value - odds * behind[k];
-                    row_colour += weight * gradient[k];
+                    float value = fma(s2.z, gradient[k].z, fma(s2.y, gradient[k].y, s2.x * gradient[k].x));
+                    behind[k] = fma(-weight, value, behind[k]);
+                    float term = fma(own, value, -(odds * behind[k]));
+                    run_colour = fma(vec3(weight), gradient[k], run_colour);
 #ifdef DEPTH
                     float z_value = s0.z * depth_gradient[k];
-                    depth_behind[k] -= weight * z_value;
-                    float z_term = own * z_value - odds * depth_behind[k];
-                    row_depth += weight * depth_gradient[k];
-                    float shape_term = term + thaw * z_term;
+                    depth_behind[k] = fma(-weight, z_value, depth_behind[k]);
+                    float z_term = fma(own, z_value, -(odds * depth_behind[k]));
+                    depth = fma(weight, depth_gradient[k], depth);
+                    float shape_term = fma(thaw, z_term, term);
                     term += z_term;
                     shape += shape_term;
-                    shape_x += shape_term * dx;
-                    row_xx += shape_term * dx * dx;
+                    shape_x = fma(shape_term, float(x), shape_x);
+                    sums = vec3(sums.x + term, fma(term, float(x), sums.y), fma(shape_term, float(x * x), sums.z));
 #else
-                    row_xx += term * dx * dx;
+                    sums = vec3(sums.x + term, fma(term, float(x), sums.y), fma(term, float(x * x), sums.z));
 #endif
-                    row += term;
-                    row_x += term * dx;
-                    row_total += weight;
+                    total += weight;
                     most = max(most, T[k]);
                 }
+                // From the run's first pixel to the Gaussian's centre.
+                float run_x = fma(dx0, sums.x, sums.y);
 #ifndef DEPTH
-                float shape = row, shape_x = row_x;
+                float shape = sums.x, shape_x = sums.y;
 #endif
-                line += vec4(row, row_x, row * dy, row_total);
-                square += vec4(row_xx, shape_x * dy, shape * dy * dy, row_depth);
-                colour += vec4(row_colour, 0.0);
+                float moved = fma(dx0, shape, shape_x);
+                float run_xx = fma(dx0, moved + shape_x, sums.z);
+                line += vec4(sums.x, run_x, sums.x * dy, total);
+                square += vec4(run_xx, moved * dy, shape * dy * dy, depth);
+                colour += run_colour;
             }
         }
         line = sum_of_tile(line);
         square = sum_of_tile(square);
-        colour = sum_of_tile(colour);
+        colour = sum_of_tile(vec4(colour, 0.0)).xyz;
         IF (i < end && live) {
-#ifdef LANE_PER_ROW
-            if (own_row < 3) slots[slot + uint(own_row)] = own_row == 0 ? line : own_row == 1 ? square : colour;
+#ifdef LANE_PER_RUN
+            if (own_run == 0) slots[slot].line = line;
+            if (own_run == 1) slots[slot].square = STORED_SQUARE(square);
+            if (own_run == 2) slots[slot].colour = colour;
 #else
-            slots[slot] = line;
-            slots[slot + 1u] = square;
-            slots[slot + 2u] = colour;
+            slots[slot].line = line;
+            slots[slot].square = STORED_SQUARE(square);
+            slots[slot].colour = colour;
 #endif
             i++;
         }
-        live = most_of_tile(most) > 0.0 || (frame.flags & FLAG_NO_EARLY_END) != 0u;
+        live = most_of_tile(most) > 0.0 || to_the_end;
     }
     // Slots behind an opaque tile: a total of zero says that the other two vectors were not written. Many in a turn,
     // because llvmpipe ends the loops of an invocation after 65,535 turns in all.
     for (; i < end; i += uint(AT_ONCE * LANES)) {
         [[unroll]] for (int j = 0; j < AT_ONCE; j++) {
-            uint at = i + uint(j * LANES + own_row);
-            if (at < end) slots[FETCH(instances, int(at)).y * 3u] = vec4(0.0);
+            uint at = i + uint(j * LANES + own_run);
+            if (at < end) slots[FETCH(instances, int(at)).y].line = vec4(0.0);
         }
     }
 }

@@ -13,10 +13,15 @@ layout(std430, set = 0, binding = 2) writeonly buffer StripSums { LossSums strip
 layout(std430, set = 0, binding = 3) readonly buffer StatusWords { Status status; };
 
 void main() {
+    // Before any branch, as in ssim_rows.comp.
+    vec3 gain = frame.exposure_gain, offset = frame.exposure_offset, depth_line = vec3(0.0);
+    float l1_weight = frame.l1_weight, ssim_weight = frame.ssim_weight, min_confidence = frame.min_confidence;
+    vec3 line = vec3(status.depth_by_prior, status.depth_by_rendered, status.depth_constant);
+    depth_line = (frame.flags & FLAG_DEPTH) != 0u ? line : depth_line;
     uint width = frame.size.x, i = gl_GlobalInvocationID.x;
     int height = int(frame.size.y);
     if (i >= width * uint((height + STRIP - 1) / STRIP)) return;
-    uint column = i % width, pixels = frame.size.x * frame.size.y;
+    uint column = i % width, pixels = width * uint(height);
     int y0 = int(i / width) * STRIP;
     vec3 by_mean[STRIP], by_square[STRIP], by_product[STRIP];
     [[unroll]] for (int o = 0; o < STRIP; o++) {
@@ -31,37 +36,33 @@ void main() {
             v = y >= 0 && y < height ? v : vec3(0.0);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
                 if (abs(j - o) <= RADIUS) {
-                    by_mean[o][c] += tap(j - o) * v.x;
-                    by_square[o][c] += tap(j - o) * v.y;
-                    by_product[o][c] += tap(j - o) * v.z;
+                    by_mean[o][c] = fma(tap(j - o), v.x, by_mean[o][c]);
+                    by_square[o][c] = fma(tap(j - o), v.y, by_square[o][c]);
+                    by_product[o][c] = fma(tap(j - o), v.z, by_product[o][c]);
                 }
             }
         }
     }
     vec3 gain_gradient = vec3(0.0), offset_gradient = vec3(0.0);
     float l1 = 0.0;
-    vec3 depth_line = vec3(0.0);
-    if ((frame.flags & FLAG_DEPTH) != 0u) {
-        depth_line = vec3(status.depth_by_prior, status.depth_by_rendered, status.depth_constant);
-    }
     [[unroll]] for (int o = 0; o < STRIP; o++) {
         if (y0 + o < height) {
             uint at = uint(y0 + o) * width + column;
             vec4 raw = FETCH(image, int(at));
             uvec2 wanted = FETCH(target, int(at)).xy;
             vec4 y = unpackUnorm4x8(wanted.x);
-            vec3 x = raw.xyz * frame.exposure_gain + frame.exposure_offset;
+            vec3 x = raw.xyz * gain + offset;
             bool compared = !left_out(wanted.x);
             vec3 d = compared ? x - y.xyz : vec3(0.0);
             l1 += abs(d.x) + abs(d.y) + abs(d.z);
-            vec3 g = frame.l1_weight * sign(d)
-                - frame.ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
+            vec3 g = l1_weight * sign(d)
+                - ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
             g = compared ? g : vec3(0.0);
             offset_gradient += g;
-            g *= frame.exposure_gain;
+            g *= gain;
             gain_gradient += g * raw.xyz; // by the logarithm of the gain
             float depth = 0.0;
-            if (compared && y.w > 0.0 && y.w >= frame.min_confidence) {
+            if (compared && y.w > 0.0 && y.w >= min_confidence) {
                 depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
             }
             image_gradient[at] = vec4(g, depth);

@@ -5,13 +5,14 @@
 #include "window.glsl"
 
 TEXELS(vec4, 9, adjoint)
-layout(std430, set = 0, binding = 1) writeonly buffer Blurred { vec4 blurred[]; };
+layout(std430, set = 0, binding = 1) writeonly buffer Blurred { Texel blurred[]; };
 
 void main() {
-    uint strips = (frame.size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
-    if (i >= strips * frame.size.y) return;
-    int width = int(frame.size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
-    uint pixels = frame.size.x * frame.size.y;
+    uvec2 size = frame.size;
+    uint strips = (size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
+    if (i >= strips * size.y) return;
+    int width = int(size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
+    uint pixels = size.x * size.y;
     [[unroll]] for (uint c = 0u; c < 3u; c++) {
         vec3 sum[STRIP];
         [[unroll]] for (int o = 0; o < STRIP; o++) sum[o] = vec3(0.0);
@@ -20,11 +21,11 @@ void main() {
             vec3 v = FETCH(adjoint, int(c * pixels) + row * width + clamp(x, 0, width - 1)).xyz;
             v = x >= 0 && x < width ? v : vec3(0.0);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
-                if (abs(j - o) <= RADIUS) sum[o] += tap(j - o) * v;
+                if (abs(j - o) <= RADIUS) sum[o] = fma(vec3(tap(j - o)), v, sum[o]);
             }
         }
         [[unroll]] for (int o = 0; o < STRIP; o++) {
-            if (x0 + o < width) blurred[c * pixels + uint(row * width + x0 + o)] = vec4(sum[o], 0.0);
+            if (x0 + o < width) blurred[c * pixels + uint(row * width + x0 + o)].value = sum[o];
         }
     }
 }

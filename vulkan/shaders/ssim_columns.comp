@@ -6,14 +6,14 @@
 #include "window.glsl"
 
 TEXELS(vec4, 9, moments)
-layout(std430, set = 0, binding = 1) writeonly buffer Adjoint { vec4 adjoint[]; };
+layout(std430, set = 0, binding = 1) writeonly buffer Adjoint { Texel adjoint[]; };
 layout(std430, set = 0, binding = 2) writeonly buffer StripSums { LossSums strip_sums[]; };
 
 void main() {
     uint width = frame.size.x, i = gl_GlobalInvocationID.x;
     int height = int(frame.size.y);
     if (i >= width * uint((height + STRIP - 1) / STRIP)) return;
-    uint column = i % width, pixels = frame.size.x * frame.size.y;
+    uint column = i % width, pixels = width * uint(height);
     int y0 = int(i / width) * STRIP;
     float total = 0.0;
     [[unroll]] for (uint c = 0u; c < 3u; c++) {
@@ -24,7 +24,7 @@ void main() {
             vec4 v = FETCH(moments, int(c * pixels + column) + clamp(y, 0, height - 1) * int(width));
             v = y >= 0 && y < height ? v : vec4(0.0);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
-                if (abs(j - o) <= RADIUS) sum[o] += tap(j - o) * v;
+                if (abs(j - o) <= RADIUS) sum[o] = fma(vec4(tap(j - o)), v, sum[o]);
             }
         }
         [[unroll]] for (int o = 0; o < STRIP; o++) {
@@ -37,7 +37,7 @@ void main() {
             float r1 = 1.0 / b1, r2 = 1.0 / b2, both = r1 * r2, s = a1 * a2 * both;
             vec3 d = vec3(2.0 * mb * (a2 - a1) * both + 2.0 * ma * s * (r2 - r1), -s * r2, 2.0 * a1 * both);
             if (y0 + o < height) {
-                adjoint[c * pixels + uint(y0 + o) * width + column] = vec4(d, 0.0);
+                adjoint[c * pixels + uint(y0 + o) * width + column].value = d;
                 total += s;
             }
         }

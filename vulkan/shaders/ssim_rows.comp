@@ -10,10 +10,13 @@ TEXELS(uvec2, 10, target)
 layout(std430, set = 0, binding = 1) writeonly buffer Moments { vec4 moments[]; };
 
 void main() {
-    uint strips = (frame.size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
-    if (i >= strips * frame.size.y) return;
-    int width = int(frame.size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
-    uint pixels = frame.size.x * frame.size.y;
+    // Uniforms before any branch: behind one, llvmpipe gathers them lane by lane.
+    vec3 gain = frame.exposure_gain, offset = frame.exposure_offset;
+    uvec2 size = frame.size;
+    uint strips = (size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
+    if (i >= strips * size.y) return;
+    int width = int(size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
+    uint pixels = size.x * size.y;
     vec4 sum[3 * STRIP];
     [[unroll]] for (int k = 0; k < 3 * STRIP; k++) sum[k] = vec4(0.0);
     [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
@@ -22,7 +25,7 @@ void main() {
         vec3 a = vec3(0.0), b = vec3(0.0);
         // Fetched in any case, from inside the row: cheaper than a branch.
         int at = row * width + clamp(x, 0, width - 1);
-        vec3 shown = FETCH(image, at).xyz * frame.exposure_gain + frame.exposure_offset;
+        vec3 shown = FETCH(image, at).xyz * gain + offset;
         uint texel = FETCH(target, at).x;
         vec3 wanted = left_out(texel) ? shown : unpackUnorm4x8(texel).xyz;
         a = inside ? shown : a;
@@ -30,7 +33,7 @@ void main() {
         [[unroll]] for (int c = 0; c < 3; c++) {
             vec4 v = vec4(a[c], b[c], fma(a[c], a[c], b[c] * b[c]), a[c] * b[c]);
             [[unroll]] for (int o = 0; o < STRIP; o++) {
-                if (abs(j - o) <= RADIUS) sum[c * STRIP + o] += tap(j - o) * v;
+                if (abs(j - o) <= RADIUS) sum[c * STRIP + o] = fma(vec4(tap(j - o)), v, sum[c * STRIP + o]);
             }
         }
     }

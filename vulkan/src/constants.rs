@@ -36,10 +36,18 @@ pub const ADAM_BETA1: f32 = 0.9;
 pub const ADAM_BETA2: f32 = 0.999;
 /// Adam's ε (3DGS).
 pub const ADAM_EPSILON: f32 = 1.0e-15;
-/// Width of a tile in pixels: one shader invocation blends one tile.
-pub const TILE_WIDTH: u32 = 4;
+/// Width of a tile in pixels. One shader invocation blends one tile, or a run of it. On lavapipe a step of fox with 10,756
+/// Gaussians took 90 ms of processor time with tiles of 4×4, 72 with 8×4 and 64 with 8×8; with ten times the Gaussians 206,
+/// 195 and 195 (what each instance costs against what each pixel of a larger tile does).
+pub const TILE_WIDTH: u32 = 8;
 /// Height of a tile in pixels.
 pub const TILE_HEIGHT: u32 = 4;
+/// Neighbouring pixels of a tile that are summed first; a lane's share where several blend a tile.
+pub const RUN: u32 = 4;
+/// Tiles across and down of a block: the order in which a whole window is blended.
+pub const BLOCK: [u32; 2] = [2, 4];
+/// Runs of a tile.
+pub const RUNS: u32 = TILE_WIDTH * TILE_HEIGHT / RUN;
 /// Real spherical harmonics: Y₀₀.
 pub const SH_C0: f32 = 0.282_094_79;
 /// Degree 1.

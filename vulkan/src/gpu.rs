@@ -26,7 +26,7 @@ pub struct GpuInfo {
     pub is_integrated: bool,
     /// Invocations that run in lockstep.
     pub subgroup_size: u32,
-    /// Whether a kernel's lanes can read each other's registers (shuffle and vote, at least four lanes in lockstep).
+    /// Whether a kernel's lanes can read each other's registers (shuffle and vote, at least eight lanes in lockstep).
     pub shuffles: bool,
     /// Bytes of the largest device-local heap.
     pub heap_bytes: u64,
@@ -256,7 +256,7 @@ fn devices(instance: &Instance) -> Result<Vec<Found>, GpuError> {
             is_cpu: p.device_type == vk::PhysicalDeviceType::CPU,
             is_integrated: p.device_type == vk::PhysicalDeviceType::INTEGRATED_GPU,
             subgroup_size: subgroup.subgroup_size,
-            shuffles: subgroup.subgroup_size >= 4
+            shuffles: subgroup.subgroup_size >= crate::constants::RUNS
                 && subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE)
                 && subgroup.supported_operations.contains(SHUFFLES),
             heap_bytes: heaps.map(|h| h.size).max().unwrap_or(0),

@@ -12,7 +12,7 @@ pub(crate) enum Group {
     Sort,
     /// Kernels that walk the tiles of Gaussians, dispatched over the same shares: one lane per share, or a workgroup.
     Walk,
-    /// Blending kernels, dispatched over tiles: one lane per tile, or one per row of it.
+    /// Blending kernels, dispatched over tiles: one lane per tile, or one per run of it.
     Tiles,
     /// Exactly [`SCAN_LANES`], one per digit or share of the tiles.
     Scan,
@@ -66,7 +66,7 @@ macro_rules! spirv {
         }
     };
     (more_lanes Tiles $file:literal $texels:tt) => {
-        Some(spirv!($file "_rows" $texels))
+        Some(spirv!($file "_runs" $texels))
     };
     (more_lanes Sort $file:literal $texels:tt) => {
         Some(spirv!($file "_group" $texels))

@@ -2,7 +2,7 @@
 //! the same bits with each (`tests/shapes.rs`); only the time differs, and [`calibration`](crate::calibration) measures
 //! which is the fastest.
 
-use crate::constants::TILE_HEIGHT;
+use crate::constants::RUNS;
 use crate::gpu::GpuInfo;
 use std::fmt;
 
@@ -18,7 +18,7 @@ pub struct KernelShape {
     pub share_lanes: u32,
     /// Tiles of a workgroup: the blend and its gradient.
     pub tiles: u32,
-    /// Lanes that share a tile: 1, with all its pixels in registers, or one per row.
+    /// Lanes that share a tile: 1, with all its pixels in registers, or one per run of it.
     pub tile_lanes: u32,
     /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
     pub fetched: u32,
@@ -35,7 +35,11 @@ impl KernelShape {
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
         let few = if info.is_cpu { 8 } else { 32 };
-        Self { wide: 64, narrow: few, share_lanes: 1, tiles: few, tile_lanes: 1, fetched: 1 }
+        // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 6/5, Adreno
+        // 49/49 and nothing (tests/data/boards.md).
+        let runs = info.shuffles && !info.is_cpu && 8 * RUNS <= info.limits.workgroup_lanes;
+        let (tiles, tile_lanes) = if runs { (8, RUNS) } else { (few, 1) };
+        Self { wide: 64, narrow: few, share_lanes: 1, tiles, tile_lanes, fetched: 1 }
     }
 
     /// Sizes of wide workgroups that this device can run and that fill its subgroups, the standard one among them.
@@ -54,11 +58,11 @@ impl KernelShape {
     /// Tiles of a workgroup, lanes of a tile and Gaussians they fetch at once, under the same conditions; those with one
     /// lane per tile first.
     pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32, u32)> {
-        let standard = Self::standard(info).tiles;
-        let mut all: Vec<_> = candidates(&TILES, standard, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
+        let usual = if info.is_cpu { 8 } else { 32 };
+        let mut all: Vec<_> = candidates(&TILES, usual, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
         if info.shuffles {
-            for tiles in candidates(&TILES, 0, TILE_HEIGHT, info) {
-                all.extend([1, TILE_HEIGHT].map(|fetched| (tiles, TILE_HEIGHT, fetched)));
+            for tiles in candidates(&TILES, 0, RUNS, info) {
+                all.extend([1, RUNS].map(|fetched| (tiles, RUNS, fetched)));
             }
         }
         all
@@ -67,10 +71,10 @@ impl KernelShape {
     /// Whether the kernels are written for this shape and the device can run it.
     pub fn fits(&self, info: &GpuInfo) -> bool {
         let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && TILES.contains(&self.tiles);
-        let rows = self.tile_lanes == 1 || (self.tile_lanes == TILE_HEIGHT && info.shuffles);
+        let runs = self.tile_lanes == 1 || (self.tile_lanes == RUNS && info.shuffles);
         let fetched = self.fetched == 1 || self.fetched == self.tile_lanes;
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
-        sizes && rows && fetched && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
+        sizes && runs && fetched && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
     }
 
     /// Lanes of its largest workgroup.
@@ -136,16 +140,30 @@ mod tests {
     fn several_lanes_per_tile_are_tried_only_where_lanes_can_read_each_other() {
         assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1), (16, 1, 1), (32, 1, 1)]);
         let pi5 = device(false, 16, 256);
-        let staged = [(8, 4, 1), (8, 4, 4), (16, 4, 1), (16, 4, 4), (32, 4, 1), (32, 4, 4)];
+        let staged = [(8, 8, 1), (8, 8, 8), (16, 8, 1), (16, 8, 8), (32, 8, 1), (32, 8, 8)];
         assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1), (32, 1, 1)], &staged[..]].concat());
-        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[2..]].concat());
-        let rows = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 4, fetched: 4 };
-        assert!(rows.fits(&pi5) && !rows.fits(&device(false, 8, 256)));
-        assert!(!KernelShape { tile_lanes: 2, ..rows }.fits(&pi5));
-        assert!(!KernelShape { fetched: 2, ..rows }.fits(&pi5));
-        assert!(!KernelShape { tile_lanes: 1, ..rows }.fits(&pi5), "nobody to fetch for");
-        assert!(!KernelShape { share_lanes: 16, ..rows }.fits(&pi5));
-        assert_eq!(rows.to_string(), "64x32x32x8x4x4");
+        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[..]].concat());
+        let runs = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 8, fetched: 8 };
+        assert!(runs.fits(&pi5) && !runs.fits(&device(false, 8, 256)));
+        assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
+        assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
+        assert!(!KernelShape { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
+        assert!(!KernelShape { share_lanes: 16, ..runs }.fits(&pi5));
+        assert_eq!(runs.to_string(), "64x32x32x8x8x8");
+    }
+
+    #[test]
+    fn a_gpu_whose_lanes_read_each_other_begins_with_a_lane_per_run_and_a_processor_with_one_per_tile() {
+        let lanes = |info: &GpuInfo| (KernelShape::standard(info).tiles, KernelShape::standard(info).tile_lanes);
+        assert_eq!(lanes(&device(false, 16, 256)), (8, RUNS));
+        assert_eq!(lanes(&device(false, 4, 256)), (32, 1), "no shuffles");
+        assert_eq!(lanes(&device(true, 16, 1024)), (8, 1));
+        for info in [device(false, 16, 64), device(false, 16, 256), device(true, 8, 1024), device(false, 64, 128)] {
+            assert!(KernelShape::standard(&info).fits(&info));
+            let listed = KernelShape::tile_candidates(&info);
+            let KernelShape { tiles, tile_lanes, fetched, .. } = KernelShape::standard(&info);
+            assert!(listed.contains(&(tiles, tile_lanes, fetched)), "{info:?}");
+        }
     }
 
     #[test]

@@ -30,6 +30,9 @@ fn shaders_and_twins_share_every_constant() {
         ("PEARSON_EPSILON", c::PEARSON_EPSILON),
         ("TILE_WIDTH", c::TILE_WIDTH as f32),
         ("TILE_HEIGHT", c::TILE_HEIGHT as f32),
+        ("RUN", c::RUN as f32),
+        ("BLOCK_WIDTH", c::BLOCK[0] as f32),
+        ("BLOCK_HEIGHT", c::BLOCK[1] as f32),
         ("SH_C0", c::SH_C0),
         ("SH_C1", c::SH_C1),
     ];
@@ -43,6 +46,8 @@ fn shaders_and_twins_share_every_constant() {
         }
         assert_eq!(glsl(name).len(), values.len(), "{name}");
     }
-    assert_eq!(u64::from(c::TILE_WIDTH), config::plan::TILE_SIDE);
-    assert_eq!(u64::from(c::TILE_HEIGHT), config::plan::TILE_SIDE);
+    assert_eq!(
+        (u64::from(c::TILE_WIDTH), u64::from(c::TILE_HEIGHT)),
+        (config::plan::TILE_WIDTH, config::plan::TILE_HEIGHT)
+    );
 }

@@ -16,8 +16,8 @@ fn every_tile_of_every_giant_is_counted_and_emitted() {
         Ok(gpu) => gpu,
         Err(e) => return println!("skipped: {e}"),
     };
-    // 2,000 Gaussians that cover all 1,600 tiles: 100,000 instances per sorting lane.
-    let (side, count) = (160, 2000);
+    // 3,000 Gaussians that cover all 800 tiles: 75,000 instances per sorting lane.
+    let (side, count) = (160, 3000);
     let v = view(side, side);
     let mut cloud = GaussianCloud::with_capacity(0, count);
     for i in 0..count {
@@ -40,7 +40,7 @@ fn every_tile_of_every_giant_is_counted_and_emitted() {
         t.load(&cloud).unwrap();
         t.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
         let report = t.step().unwrap();
-        assert_eq!(report.instances, count as u64 * u64::from(side / 4) * u64::from(side / 4));
+        assert_eq!(report.instances, count as u64 * u64::from(side / 8) * u64::from(side / 4));
         let mut after = GaussianCloud::default();
         t.snapshot(&mut after).unwrap();
         pictures.push((report.loss.to_bits(), after));

@@ -72,7 +72,7 @@ pub const SKIPS: &[Skip] = &[
 pub const NOT_SWITCHED: [(&str, &str); 4] = [
     (
         "subgroup or sub-tile rejection",
-        "a lane blends a whole 4×4 tile in registers: there is nothing smaller to reject",
+        "a lane blends a whole tile of 8×4 pixels in registers: there is nothing smaller to reject",
     ),
     (
         "networks not loaded when not needed",

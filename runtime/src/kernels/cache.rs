@@ -173,7 +173,7 @@ pub(crate) mod tests {
     use vulkan::gpu::DeviceLimits;
 
     const SHAPE: KernelShape =
-        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 4, fetched: 4 };
+        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 8 };
     const OTHER: KernelShape =
         KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
 

@@ -180,7 +180,7 @@ pub fn a_tile_with_more_gaussians_than_a_loop_may_turn_leaves_those_behind_alone
     let (v, n) = (view(256, 256), 70_000);
     let c = crowded_tile(&v, n);
     let (_, after, report) = trained(gpu, &c, &v, 1 << 17, 3)?;
-    promise_eq!((report.instances, report.bands), (n as u64 - 4 + 4 * 64 * 64, 1));
+    promise_eq!((report.instances, report.bands), (n as u64 - 4 + 4 * 32 * 64, 1));
     let moved = (4..n).filter(|i| after.means[*i] != c.means[*i] || after.sh[3 * i] != c.sh[3 * i]).count();
     promise_eq!(moved, 0, "Gaussians that nobody sees and yet move");
     promise!(after.sh[0] != c.sh[0], "the first one does not learn");
@@ -192,7 +192,7 @@ pub fn a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin() -> Out
     let mut counted = Tally::default();
     let (v, n) = (view(256, 256), 70_000);
     let got = counted.ask(&crowded_tile(&v, n), &v, &photo(1, &v), &Default::default());
-    promise_eq!(got.instances, n - 4 + 4 * 64 * 64);
+    promise_eq!(got.instances, n - 4 + 4 * 32 * 64);
     let mut gradients = got.gradient.gaussians;
     let moved = gradients[4..].iter_mut().filter_map(|g| (0..PARAMETERS).find(|k| *g.parameter(*k) != 0.0)).count();
     promise_eq!(moved, 0, "Gaussians that nobody sees and yet would move");
@@ -205,8 +205,8 @@ pub fn a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin() -> Out
 fn wide_scene() -> (GaussianCloud, View, Vec<[f32; 3]>) {
     let mut c = GaussianCloud::with_capacity(0, 1);
     c.push([0.1, 0.2, 5.0], [1.5; 3], [1.0, 0.0, 0.0, 0.0], 0.3, &[grey(0.7); 3]);
-    let photo = (0..1100 * 1024).map(|i| if i < 1100 * 900 { [1.0; 3] } else { [0.0; 3] }).collect();
-    (c, view(1100, 1024), photo)
+    let photo = (0..2200 * 1024).map(|i| if i < 2200 * 900 { [1.0; 3] } else { [0.0; 3] }).collect();
+    (c, view(2200, 1024), photo)
 }
 
 /// Its gradient is that of f64: colour and opacity, in 32 bits.
@@ -236,7 +236,7 @@ pub fn a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient(gp
     let (c, v, photo) = wide_scene();
     let request = PlanRequest {
         device_mib: 256,
-        width: 1100,
+        width: 2200,
         height: 1024,
         views: 1,
         sh_degree: 0,
@@ -256,7 +256,7 @@ pub fn a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient(gp
 /// learn what they learn alone, and those behind do not move. Up to half an hour on two cores.
 pub fn more_instances_than_thirty_two_bits_count(gpu: &Gpu) -> Outcome {
     let mut counted = Tally::default();
-    let (v, n, tiles) = (view(1448, 1448), 32_800, 362 * 362);
+    let (v, n, tiles) = (view(1448, 1448), 65_600, 181 * 362);
     let mut c = GaussianCloud::with_capacity(0, n);
     for i in 0..n {
         let (z, logit) = if i < 4 { (2.0, 80.0) } else { (3.0 + 1e-5 * i as f32, 0.0) };

@@ -68,7 +68,7 @@ impl Trainer {
     pub(super) fn record_blend(&self, recording: &Recording<'_>, band: Band) {
         let push = Push { first: band.first, last: band.last, ..Push::default() };
         let blend = if self.frame.has(FLAG_ORTHOGRAPHIC) { Kernel::RasteriseMedian } else { Kernel::Rasterise };
-        recording.run(blend, (band.last - band.first) as usize, push);
+        recording.run(blend, self.frame.places(band), push);
     }
 
     /// Reads the counts and cuts the tiles into bands. Counting is done again with twice the rounds for as long as some

@@ -1,6 +1,7 @@
 //! How a camera fills the uniform block of a step.
 
-use crate::constants::{FRUSTUM_MARGIN, NEAR, TILE_HEIGHT, TILE_WIDTH};
+use super::bands::Band;
+use crate::constants::{BLOCK, FRUSTUM_MARGIN, NEAR, TILE_HEIGHT, TILE_WIDTH};
 use crate::layout::{
     FLAG_KEEP_FAINT, FLAG_KEEP_OUTSIDE, FLAG_NO_EARLY_END, FLAG_ORTHOGRAPHIC, FLAG_WHOLE_BOXES, Frame,
 };
@@ -94,6 +95,14 @@ impl Frame {
         self.window = [window.columns, window.rows];
         self.region_origin = origin;
         self.region = [width.min(self.size[0] - origin[0]), height.min(self.size[1] - origin[1])];
+    }
+
+    /// Places in the order in which the tiles of `band` are blended: whole blocks of the whole window, or tiles in rows
+    /// (`shaders/tile.glsl`).
+    pub fn places(&self, band: Band) -> usize {
+        let [across, down] = [0, 1].map(|k| self.window[k].next_multiple_of(BLOCK[k]));
+        let whole = band.first == 0 && band.last == self.tiles();
+        if whole { (across * down) as usize } else { (band.last - band.first) as usize }
     }
 
     /// Tiles of the window.

@@ -3,6 +3,7 @@
 use super::frame::Window;
 use super::views::is_usable;
 use super::{TrainError, Trainer};
+use crate::constants::TILE_HEIGHT;
 use crate::layout::Frame;
 use models::camera::{OrthographicView, View};
 
@@ -97,7 +98,7 @@ impl Trainer {
     }
 
     fn rows_per_window(&self, whole: &Window, width: u32) -> Result<u32, TrainError> {
-        let by_pixels = self.plan.pixels as u64 / (u64::from(width) * config::plan::TILE_SIDE);
+        let by_pixels = self.plan.pixels as u64 / (u64::from(width) * u64::from(TILE_HEIGHT));
         let by_tiles = self.plan.tiles as u64 / u64::from(whole.columns);
         // A picture no higher than planned may end inside its last row of tiles.
         if u64::from(width) * u64::from(self.frame.size[1]) <= self.plan.pixels as u64 && by_tiles >= whole.rows.into()

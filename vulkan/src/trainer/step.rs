@@ -176,7 +176,7 @@ impl Trainer {
                 self.record_emit(&r, *band, single);
             }
             let push = Push { first: band.first, last: band.last, mode: u32::from(i > 0), pass: 0 };
-            r.run(backward, (band.last - band.first) as usize, push);
+            r.run(backward, self.frame.places(*band), push);
             r.run(Kernel::Reduce, visible, push);
         }
         r.run(Kernel::Optimise, lanes, Push { mode: u32::from(self.gradients_only), ..Push::default() });

@@ -1,11 +1,10 @@
 #version 450
-// The blend with the median depth, four lanes per tile; see blend.glsl.
+// The blend's gradient for colour alone, a lane per run of a tile; see backward.glsl.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-#define LANE_PER_ROW
-#define MEDIAN_DEPTH
+#define LANE_PER_RUN
 
 #include "frame.glsl"
 #include "tile.glsl"
-#include "blend.glsl"
+#include "backward.glsl"

@@ -1,9 +1,10 @@
 #version 450
-// The blend's gradient for colour alone, four lanes per tile; see backward.glsl.
+// The blend's gradient for colour and depth, a lane per run of a tile; see backward.glsl.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-#define LANE_PER_ROW
+#define LANE_PER_RUN
+#define DEPTH
 
 #include "frame.glsl"
 #include "tile.glsl"

@@ -1,9 +1,10 @@
 #version 450
-// The blend, four lanes per tile; see blend.glsl.
+// The blend with the median depth, a lane per run of a tile; see blend.glsl.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-#define LANE_PER_ROW
+#define LANE_PER_RUN
+#define MEDIAN_DEPTH
 
 #include "frame.glsl"
 #include "tile.glsl"
