@@ -71,6 +71,18 @@ impl GaussianCloud {
         }
     }
 
+    /// The same with its memory taken from the system at once: what is planned for a flight cannot be refused in the midst of it.
+    pub fn with_memory(sh_degree: u8, capacity: usize) -> Self {
+        let mut cloud = Self::with_capacity(sh_degree, capacity);
+        cloud.means.resize(capacity, [1.0; 3]);
+        cloud.log_scales.resize(capacity, [1.0; 3]);
+        cloud.rotations.resize(capacity, [1.0; 4]);
+        cloud.opacity_logits.resize(capacity, 1.0);
+        cloud.sh.resize(capacity * cloud.sh_stride(), 1.0);
+        cloud.retain(|_| false);
+        cloud
+    }
+
     /// Colour of Gaussian `i` without what depends on the direction, red, green and blue, 0…1.
     pub fn color(&self, i: usize) -> [f32; 3] {
         let at = i * self.sh_stride();

@@ -7,7 +7,6 @@ mod depth_frame;
 mod edges;
 mod fill;
 mod finish;
-mod frame_file;
 mod ground;
 mod initialiser;
 mod lighting;
@@ -25,7 +24,7 @@ pub use baselines::{from_sfm, random};
 pub use initialiser::{Initialiser, most_frame_bytes};
 pub use pairs::SkippedPairs;
 pub use range::mutual_matches;
-pub use report::{InitReport, Initialisation};
+pub use report::{Growth, InitReport, Initialisation};
 
 use config::error::{Error, ErrorKind};
 

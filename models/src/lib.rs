@@ -12,6 +12,7 @@ pub mod cloud;
 pub mod coverage;
 pub mod dataset;
 pub mod formats;
+mod frame_file;
 pub mod ground_cell;
 pub mod init;
 pub mod levels;

@@ -39,6 +39,11 @@ impl Light {
         PictureLight { gain, falloff: self.falloff, reach: self.reach }
     }
 
+    /// Log of what the lens passes at t².
+    pub fn lens_at(&self, t2: f32) -> f32 {
+        PictureLight { gain: [0.0; 3], falloff: self.falloff, reach: self.reach }.at(t2)[0]
+    }
+
     /// Log of what the lens passes at the reach.
     pub fn corner(&self) -> f32 {
         self.of("").at(self.reach)[0]

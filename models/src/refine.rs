@@ -20,7 +20,9 @@ mod level;
 mod linking;
 mod matching;
 mod motion;
+mod near;
 mod overlap;
+mod part;
 mod photometric;
 mod problem;
 mod radial;
@@ -38,9 +40,10 @@ mod upright;
 
 pub use bootstrap::BootstrapReport;
 pub use control::ControlPoint;
-pub use report::{AddReport, ControlResidual, RefineReport, RefinedPoint, SharedEstimate};
+pub use report::{AddReport, ControlResidual, NearReport, RefineReport, RefinedPoint, SharedEstimate};
 
 use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
+use crate::frame_file::FrameFile;
 use crate::onnx::OnnxError;
 use crate::onnx::features::{FeatureNetwork, Features};
 use config::error::ErrorKind;
@@ -54,6 +57,8 @@ use keyframe::{DESCRIPTOR, KeyFrame};
 use linking::Pair;
 use problem::Shared;
 use std::collections::HashMap;
+use std::fs::File;
+use std::sync::Arc;
 use std::time::Instant;
 use thiserror::Error;
 use tracks::Union;
@@ -109,6 +114,8 @@ pub struct Refiner {
     networks: Option<[FeatureNetwork; 2]>,
     frames: Vec<KeyFrame>,
     by_name: HashMap<String, u32>,
+    /// Where descriptors and grey values of the key frames are kept when not in memory.
+    file: Option<Arc<FrameFile>>,
     union: Union,
     pairs: Vec<Pair>,
     shared: Shared,
@@ -117,6 +124,11 @@ pub struct Refiner {
     grounds: Vec<Option<f64>>,
     pair_grounds: Vec<f64>,
     points: Vec<RefinedPoint>,
+    /// Those that the last look at what was new gave.
+    recent: Vec<RefinedPoint>,
+    /// Key frames and pairs that there were at the last solve.
+    solved_frames: usize,
+    solved_pairs: usize,
     solves: u32,
     /// The poses are pictures' alone: nothing says where, how large and which way the scene is.
     floating: bool,
@@ -149,6 +161,7 @@ impl Refiner {
             settings: settings.clone(),
             networks: None,
             frames: Vec::with_capacity(settings.max_keyframes),
+            file: None,
             by_name: HashMap::with_capacity(settings.max_keyframes),
             union: Union::with_capacity(settings.max_keyframes * settings.max_features),
             pairs: Vec::new(),
@@ -157,6 +170,9 @@ impl Refiner {
             grounds: Vec::with_capacity(settings.max_keyframes),
             pair_grounds: Vec::new(),
             points: Vec::new(),
+            recent: Vec::new(),
+            solved_frames: 0,
+            solved_pairs: 0,
             solves: 0,
             floating: false,
             control: Vec::new(),
@@ -164,6 +180,12 @@ impl Refiner {
             fixed: false,
             totals: RefineReport::default(),
         })
+    }
+
+    /// Keeps what is large of the key frames in `file`, which is empty, instead of in memory: bit for bit the same. Call it before
+    /// the first of them; the file takes [`RefineSettings::kept_bytes`] for each.
+    pub fn keep_frames_in(&mut self, file: File) {
+        self.file = Some(FrameFile::new(file));
     }
 
     /// Takes a key frame: extracts features and links it to the frames before it. Of the picture only the grey
@@ -280,6 +302,11 @@ impl Refiner {
         &self.points
     }
 
+    /// Points of the key frames that the last [`Refiner::solve_near`] placed; none after a [`Refiner::solve`].
+    pub fn recent_points(&self) -> &[RefinedPoint] {
+        &self.recent
+    }
+
     /// Telemetry pose of any other picture of the same flight, with the shared errors taken out; `velocity` in
     /// m/s, zero when unknown.
     pub fn correct(&self, telemetry: &Pose, velocity: DVec3) -> Pose {
@@ -288,11 +315,7 @@ impl Refiner {
 
     /// Bytes held for key frames, tracks and points.
     pub fn bytes(&self) -> usize {
-        let frames: usize = self
-            .frames
-            .iter()
-            .map(|f| f.descriptors.len() + f.keypoints.len() * 20 + f.grey.as_ref().map_or(0, Grey::bytes))
-            .sum();
+        let frames: usize = self.frames.iter().map(KeyFrame::bytes).sum();
         frames
             + self.union.bytes()
             + std::mem::size_of_val(self.points.as_slice())

@@ -233,6 +233,7 @@ fn caps_hold_and_what_they_leave_out_is_counted() {
         max_keyframes: 10,
         max_features: 300,
         max_tracks: 100,
+        tracks_per_keyframe: 0,
         max_observations: 500,
         ..Default::default()
     };

@@ -27,11 +27,13 @@ use vulkan::trainer::Trainer;
 use crate::error::JobError;
 use crate::run_json::RunReport;
 
+mod budget;
 mod carry;
 mod crops;
 pub mod device;
 mod first_gaussians;
 mod follow;
+mod growth;
 pub mod host;
 mod light;
 mod map;
@@ -47,14 +49,29 @@ use host::{HostPlan, HostRequest};
 pub use reconstruct::Reconstruct;
 pub use source::PictureSource;
 
-/// Pictures and depths that wait for the initialiser in memory, bytes; more of them wait in a file.
+/// Pictures and depths that wait for the initialiser in memory, bytes, and as many of what matching keeps of them; more of either wait
+/// in a file.
 const FRAMES_IN_MEMORY: u64 = 256 << 20;
 
-/// Bytes of the scratch files of a job: views and cells that find no room on the device, and what waits for the initialiser.
-pub fn scratch_bytes(request: &PlanRequest, init: &InitSettings, network: &NetworkSettings) -> u64 {
+/// Bytes of the file of what waits: none while it fits into memory.
+fn waiting_bytes(views: u64, each: u64) -> u64 {
+    Some(views * each).filter(|waiting| *waiting > FRAMES_IN_MEMORY).unwrap_or(0)
+}
+
+/// Bytes of the scratch files of a job: views and cells that find no room on the device, what waits for the initialiser, and what
+/// matching keeps.
+pub fn scratch_bytes(
+    request: &PlanRequest,
+    init: &InitSettings,
+    network: &NetworkSettings,
+    refine: Option<&RefineSettings>,
+) -> u64 {
     let each = most_frame_bytes(init, (request.width, request.height), network.pair.is_some());
-    let waiting = u64::from(request.views) * each;
-    request.view_file_bytes() + request.scene_file_bytes() + if waiting > FRAMES_IN_MEMORY { waiting } else { 0 }
+    let waiting = |each: u64| waiting_bytes(request.views.into(), each);
+    request.view_file_bytes()
+        + request.scene_file_bytes()
+        + waiting(each)
+        + refine.map_or(0, |refine| waiting(refine.kept_bytes()))
 }
 
 /// What the engine needs to know before the first picture.
@@ -110,11 +127,19 @@ pub struct Reconstruction {
     cloud: GaussianCloud,
     /// Key frames with lens and pose as they are known now, in the order of the trainer's views.
     views: Vec<(String, View)>,
+    /// Number of each by its name.
+    index: HashMap<String, usize>,
     /// How many of them the initialiser has.
     initialised: usize,
     /// Key frames were tied to others since the poses were last solved.
     unsolved: bool,
-    /// Views as they were at the last build.
+    /// Pictures still come.
+    flying: bool,
+    /// What was added to the model since it was built.
+    growing: growth::Growing,
+    /// Typical depth of the pictures, metres.
+    depth_m: f32,
+    /// Views as the Gaussians know them.
     built: Vec<View>,
     /// Views of the model that is continued.
     resumed: HashMap<String, View>,
@@ -158,11 +183,15 @@ impl Reconstruction {
             InitKind::SparsePoints | InitKind::Random => None,
         };
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
-        if let Some(initialiser) = &mut initialiser {
-            let waiting = views as u64 * initialiser.frame_bytes_at(settings.device.size);
-            if waiting > FRAMES_IN_MEMORY {
-                initialiser.keep_frames_in(settings.device.scratch(waiting)?);
-            }
+        if let Some(initialiser) = &mut initialiser
+            && let waiting @ 1.. = waiting_bytes(views as u64, initialiser.frame_bytes_at(settings.device.size))
+        {
+            initialiser.keep_frames_in(settings.device.scratch(waiting)?);
+        }
+        let mut refiner: Option<Refiner> = refiner.transpose()?;
+        let matched = settings.refine.as_ref().map_or(0, |refine| waiting_bytes(views as u64, refine.kept_bytes()));
+        if let (Some(refiner), 1..) = (&mut refiner, matched) {
+            refiner.keep_frames_in(settings.device.scratch(matched)?);
         }
         let mut report = RunReport::new(command);
         let host = HostPlan::new(&HostRequest {
@@ -172,6 +201,7 @@ impl Reconstruction {
                 .as_ref()
                 .map_or(0, |i| i.planned_bytes_at(settings.device.size, views, trainer.plan().scene)),
             refine: settings.refine.as_ref(),
+            refine_in_file: matched > 0,
             camera_pixels: settings.camera_pixels,
             ahead: settings.ahead as u64,
             ahead_in_memory: settings.ahead_in_memory,
@@ -184,12 +214,16 @@ impl Reconstruction {
         report.seed = header.seed;
         (report.device_bytes_planned, report.device_bytes_peak) = (trainer.plan().total_bytes, trainer.device_bytes());
         Ok(Self {
-            refiner: refiner.transpose()?,
+            refiner,
             initialiser,
             depth,
-            cloud: GaussianCloud::with_capacity(settings.training.sh.degree, trainer.plan().scene),
+            cloud: GaussianCloud::with_memory(settings.training.sh.degree, trainer.plan().scene),
             trainer,
             views: Vec::with_capacity(views),
+            index: HashMap::with_capacity(views),
+            flying: settings.incremental,
+            growing: growth::Growing::default(),
+            depth_m: 0.0,
             initialised: 0,
             unsolved: false,
             built: Vec::with_capacity(views),
@@ -289,6 +323,7 @@ impl Reconstruction {
             }
         }
         self.refined = Some(solved);
+        self.growing.all_placed(self.views.len());
         self.report.stage("refine", from);
         Ok(())
     }
@@ -312,7 +347,6 @@ impl Reconstruction {
     /// Gaussians and depth priors of all key frames; `None` when `go_on` said no.
     fn initialise(&mut self, go_on: &dyn Fn() -> bool) -> Result<Option<FirstGaussians>, JobError> {
         let _span = tracing::info_span!("initialise").entered();
-        let capacity = self.trainer.plan().scene;
         if let Some(refiner) = &self.refiner {
             self.points = refiner.sparse_points().iter().map(|p| (p.position, p.color)).collect();
         }
@@ -321,8 +355,11 @@ impl Reconstruction {
             initialiser.hint_points(self.points.iter().map(|p| p.0.map(|v| v as f32)));
         }
         self.initialise_waiting(self.views.len())?;
+        let share = (self.flying && self.can_grow()).then(|| self.share());
+        let capacity = self.trainer.plan().scene;
         if let Some(initialiser) = &mut self.initialiser {
-            let index: HashMap<&str, usize> = self.views.iter().enumerate().map(|(i, v)| (v.0.as_str(), i)).collect();
+            let capacity = share.map_or(capacity, |share| share.of(initialiser.ground_m2()));
+            let index = &self.index;
             let (trainer, own_network) = (&mut self.trainer, self.depth.is_some());
             let mut failed = Ok(());
             let mut prior = |name: &str, depth: DepthPrior| {

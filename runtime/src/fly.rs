@@ -166,8 +166,27 @@ pub fn fly(
         }
     }
     let mut end = job.land(&mut capture, &counters, interrupt)?;
+    if let Some(waits) = waits(capture.waited_s()) {
+        end.reconstruction.report.more.insert("picture_to_model_s".into(), waits);
+    }
     end.reconstruction.report.skip("key_frames_without_room_on_disk", capture.without_room());
     Ok(outcome(ended, counters, end, interrupt, &options.watch))
+}
+
+/// How long pictures took into the model, in all and hundred by hundred; `None` where there were none.
+fn waits(waited_s: &[f64]) -> Option<serde_json::Value> {
+    let at = |part: &[f64], share: f64| {
+        let mut sorted = part.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        sorted[((sorted.len() - 1) as f64 * share).round() as usize]
+    };
+    let hundreds: Vec<f64> = waited_s.chunks(100).map(|part| at(part, 0.5)).collect();
+    (!waited_s.is_empty()).then(|| {
+        serde_json::json!({
+            "pictures": waited_s.len(), "median": at(waited_s, 0.5), "p90": at(waited_s, 0.9), "most": at(waited_s, 1.0),
+            "median_by_hundred": hundreds,
+        })
+    })
 }
 
 /// Most bytes of a Gaussian as it is delivered; 0: models are sent as they are.
@@ -190,7 +209,7 @@ fn disk_plan(mission: &Mission, recording: u64) -> DiskPlan {
         width,
         height,
         key_frames: mission.keyframes.max,
-        scratch: scratch_bytes(&request, &mission.init, &mission.network),
+        scratch: scratch_bytes(&request, &mission.init, &mission.network, Some(&mission.refine)),
         gaussians,
         sh_degree,
         delivered: delivered_bytes(mission),

@@ -13,6 +13,7 @@ mod density;
 mod error;
 pub(crate) mod frame;
 mod gradient;
+mod grow;
 mod moments;
 mod parameters;
 mod pose;
@@ -29,6 +30,7 @@ pub use check::{PlanFit, TrainingCheck, check_device, check_plan, check_training
 pub use crops::CropPlace;
 pub use error::TrainError;
 pub use gradient::ViewGradients;
+pub use grow::{Fate, Trained};
 pub use parameters::LoadReport;
 pub use render::Rendering;
 pub use run::{Counters, RunBudget, StepReport, StopReason, TrainSummary};
@@ -101,6 +103,8 @@ pub struct Trainer {
     elapsed_s: f64,
     /// Steps and seconds that earlier processes spent on the same schedule.
     before: (u32, f64),
+    /// Steps and seconds at which the schedule began anew.
+    since: (u32, f64),
     counters: Counters,
 }
 
@@ -179,6 +183,7 @@ impl Trainer {
             timed_every: TIMED_EVERY,
             elapsed_s: 0.0,
             before: (0, 0.0),
+            since: (0, 0.0),
             counters: Counters::default(),
             settings: settings.clone(),
         })
@@ -188,9 +193,10 @@ impl Trainer {
     fn restart(&mut self) {
         self.steps = 0;
         self.elapsed_s = 0.0;
-        self.before = (0, 0.0);
+        (self.before, self.since) = ((0, 0.0), (0, 0.0));
         self.flushed = true;
         self.deferred.reset();
+        self.sampler.look_at_newest(false);
         self.sampler.reset();
         self.crop_sampler.reset();
         self.strategy = self.settings.density.resolve(self.gaussians(), self.plan.scene);
@@ -259,7 +265,8 @@ impl Trainer {
 
     /// Steps and seconds spent on the schedule, earlier processes' included.
     pub fn spent(&self) -> (u32, f64) {
-        (self.before.0.saturating_add(self.steps), self.before.1 + self.elapsed_s)
+        let (steps, seconds) = (self.steps - self.since.0, self.elapsed_s - self.since.1);
+        (self.before.0.saturating_add(steps), self.before.1 + seconds)
     }
 
     /// How much of the schedule is over, 0…1.

@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use image::RgbImage;
 
-use super::frame_file::{AsBytes, FrameFile, Kept};
 use crate::camera::{Projector, Unprojector, View};
+use crate::frame_file::{AsBytes, FrameFile, Kept};
 use crate::picture::mask::Mask;
 
 /// Depth of one picture on a grid of every `stride`-th pixel.

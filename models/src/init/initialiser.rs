@@ -2,6 +2,7 @@
 //! network, resolve conflicts, merge into the budget. Works while flying: pictures come one by one, poses may be
 //! refined afterwards, and only depths whose geometry really changed are made again.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
@@ -12,6 +13,8 @@ use config::settings::SettingError;
 use rayon::prelude::*;
 
 use crate::camera::{DepthPrior, Pose, PosedImage, View};
+use crate::frame_file::FrameFile;
+use crate::light::Light;
 use crate::onnx::features::{FeatureNetwork, Features};
 use crate::onnx::manifest::{Contract, Poses};
 use crate::onnx::network::{LazySession, Network};
@@ -19,15 +22,16 @@ use crate::onnx::picture::{center_crop, center_window, resized};
 use crate::onnx::session::check_library;
 
 use super::InitError;
-use super::depth_frame::{DepthFrame, shift};
-use super::frame_file::FrameFile;
-use super::pairs::{Relation, SkippedPairs, partners, relate};
-use super::posed::{PosedNetwork, Request};
+use super::depth_frame::DepthFrame;
+use super::pairs::{SkippedPairs, partners};
+use super::posed::PosedNetwork;
 use super::range::DepthRange;
 use super::report::{InitReport, Initialisation};
 use super::unposed::{Appearance, PairNetwork};
 
 mod assemble;
+mod depths;
+mod growth;
 mod memory;
 mod unposed_pairs;
 
@@ -87,6 +91,12 @@ pub struct Initialiser {
     /// What an unposed network says about each picture's Gaussians.
     appearance: Vec<Option<Appearance>>,
     report: InitReport,
+    /// Number of each picture.
+    by_name: HashMap<String, usize>,
+    /// Pictures whose samples are in what was made last.
+    fused: usize,
+    /// The pictures' light, as measured last.
+    light: Option<Light>,
 }
 
 impl Initialiser {
@@ -133,6 +143,9 @@ impl Initialiser {
             ranges: Vec::new(),
             appearance: Vec::new(),
             report,
+            by_name: HashMap::new(),
+            fused: 0,
+            light: None,
         })
     }
 
@@ -198,6 +211,7 @@ impl Initialiser {
             }
         });
         let view = View { intrinsics, pose: picture.view.pose };
+        self.by_name.insert(picture.name.clone(), self.frames.len());
         self.frames.push(DepthFrame::new(picture.name.clone(), image, view, self.file.as_ref())?.masked(mask));
         self.report.pictures = self.frames.len();
         self.report.add_ms += started.elapsed().as_secs_f64() * 1e3;
@@ -206,8 +220,8 @@ impl Initialiser {
 
     /// Replaces the pose of a picture after refinement; unknown names are ignored (their picture was no key frame).
     pub fn update_pose(&mut self, name: &str, pose: &Pose) {
-        if let Some(frame) = self.frames.iter_mut().find(|f| f.name == name) {
-            frame.view.pose = *pose;
+        if let Some(i) = self.by_name.get(name) {
+            self.frames[*i].view.pose = *pose;
         }
     }
 
@@ -252,7 +266,7 @@ impl Initialiser {
         self.ranges = views.par_iter().map(|v| self.settings.depth_m.or_else(|| self.range.of(v))).collect();
         for i in 0..views.len() {
             if let Some(depth) = self.typical_depth(i) {
-                partners(i, &views, depth, &self.settings, &mut self.report.skipped);
+                partners((i, &views[i]), &views, depth, &self.settings, &mut self.report.skipped);
             }
         }
         match self.pairs {
@@ -267,7 +281,13 @@ impl Initialiser {
         if !self.frames.iter().any(DepthFrame::has_depth) {
             return Err(InitError::NoDepth { pictures: self.frames.len(), skipped: self.report.skipped.total() });
         }
-        self.assemble(max_gaussians, prior)
+        self.light = match self.settings.light {
+            true => self.measure_light()?,
+            false => None,
+        };
+        self.fused = self.frames.len();
+        let all: Vec<usize> = (0..self.frames.len()).collect();
+        self.assemble(&all, max_gaussians, prior)
     }
 
     fn measure_range(&mut self) -> Result<(), InitError> {
@@ -310,69 +330,15 @@ impl Initialiser {
     }
 
     fn sources_of(&self, i: usize, depth: f64) -> Vec<(usize, f64)> {
-        let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
-        let mut best = partners(i, &views, depth, &self.settings, &mut SkippedPairs::default());
+        let mut best = partners(
+            (i, &self.frames[i].view),
+            self.frames.iter().map(|f| &f.view),
+            depth,
+            &self.settings,
+            &mut SkippedPairs::default(),
+        );
         best.truncate(self.pairs.sources());
         best
-    }
-
-    fn is_stale(&self, i: usize) -> bool {
-        let frame = &self.frames[i];
-        let (Some(as_view), Some(depth)) = (&frame.made_as, self.typical_depth(i)) else { return true };
-        let moved = frame
-            .made_with
-            .iter()
-            .any(|(s, old)| shift(&frame.view, &self.frames[*s].view, as_view, old, depth as f32) > STALE_PX);
-        let quality = |list: &mut dyn Iterator<Item = View>| -> f64 {
-            list.map(|v| match relate(&frame.view, &v, depth, &self.settings) {
-                Relation::Good(score) => score,
-                Relation::Bad(_) => 0.0,
-            })
-            .sum()
-        };
-        let now = quality(&mut frame.made_with.iter().map(|(s, _)| self.frames[*s].view));
-        let best: f64 = self.sources_of(i, depth).iter().map(|s| s.1).sum();
-        moved || best > 1.5 * now
-    }
-
-    /// Makes the depths of the given pictures, several at once.
-    fn make_depths(&mut self, wanted: &[usize]) -> Result<(), InitError> {
-        let mut chosen = Vec::with_capacity(wanted.len());
-        for &i in wanted {
-            let Some(range) = self.known_range(i) else {
-                return Err(InitError::NoRange { points: self.range.len() });
-            };
-            chosen.push((i, range, self.sources_of(i, middle(range))));
-        }
-        let Pairs::Posed(network) = &mut self.pairs else { return Ok(()) };
-        let frames = &self.frames;
-        let requests: Vec<Request<'_>> = chosen
-            .iter()
-            .filter(|(_, _, sources)| !sources.is_empty())
-            .map(|(i, range, sources)| Request {
-                reference: &frames[*i],
-                sources: sources.iter().map(|s| &frames[s.0]).collect(),
-                range: *range,
-            })
-            .collect();
-        let mut made = network.run_all(&requests, self.settings.stride as usize)?.into_iter();
-        self.report.open_ms = network.opening_ms();
-        for (i, range, sources) in chosen {
-            let made_with = sources.iter().map(|s| (s.0, self.frames[s.0].view)).collect();
-            let made = if sources.is_empty() { None } else { made.next() };
-            if let Some(made) = &made {
-                self.report.non_finite_depths += made.non_finite;
-                self.report.moved_depths += made.moved;
-                self.report.runs += 1;
-                self.report.run_ms += made.run_ms;
-                self.report.searched(range);
-            }
-            let frame = &mut self.frames[i];
-            frame.set_depth(made.map(|m| m.grid))?;
-            frame.made_with = made_with;
-            frame.made_as = Some(frame.view);
-        }
-        Ok(())
     }
 }
 

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::depth_frame::{DepthFrame, DepthGrid};
 use crate::camera::{Projector, Unprojector};
-use crate::light::{Light, Ratio, Solved, off_axis, solve};
+use crate::light::{Light, PictureLight, Ratio, Solved, off_axis, solve};
 
 /// Places that a picture is compared with another at, at most.
 const PLACES: usize = 128;
@@ -49,6 +49,35 @@ pub(super) fn ratios(frames: &[DepthFrame], i: usize, others: &[usize], toleranc
         }
     }
     Ok(ratios)
+}
+
+/// The gain of picture `i`, by those of `others` in `light`: the median of what their places in common say, if there are enough of
+/// them.
+pub(super) fn gain_of(
+    frames: &[DepthFrame],
+    i: usize,
+    others: &[usize],
+    light: &Light,
+    tolerance: f32,
+) -> io::Result<Option<[f32; 3]>> {
+    let ratios = ratios(frames, i, others, tolerance)?;
+    if ratios.len() < PLACES / 4 {
+        return Ok(None);
+    }
+    let falloff = |t2: f32| light.lens_at(t2);
+    let gain = std::array::from_fn(|c| {
+        let mut all: Vec<f32> = ratios
+            .iter()
+            .map(|r| {
+                let theirs = light.of(&frames[r.pictures[1] as usize].name).gain[c];
+                r.log[c] - falloff(r.t2[0]) + falloff(r.t2[1]) + theirs
+            })
+            .collect();
+        let middle = all.len() / 2;
+        *all.select_nth_unstable_by(middle, f32::total_cmp).1
+    });
+    let usable = PictureLight { gain, ..light.of("") }.is_usable();
+    Ok(usable.then_some(gain))
 }
 
 fn agrees(grid: &DepthGrid, (u, v, z): (f32, f32, f32), tolerance: f32) -> bool {

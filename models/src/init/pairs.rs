@@ -103,20 +103,20 @@ pub fn overlap(reference: &View, source: &View, depth: f64) -> f64 {
     seen as f64 / (COLUMNS * ROWS) as f64
 }
 
-/// The best partners of picture `i` among `views`, best first: neighbours within the window and other co-visible
-/// ones alike. Faults of window neighbours are counted in `skipped` (each pair once, from its first picture).
-pub fn partners(
-    i: usize,
-    views: &[View],
+/// The best partners of picture `i`, taken at `own`, among all `views`, best first: neighbours within the window and other
+/// co-visible ones alike. Faults of window neighbours are counted in `skipped` (each pair once, from its first picture).
+pub fn partners<'a>(
+    (i, own): (usize, &View),
+    views: impl IntoIterator<Item = &'a View>,
     depth: f64,
     settings: &InitSettings,
     skipped: &mut SkippedPairs,
 ) -> Vec<(usize, f64)> {
     let mut good: Vec<(usize, f64)> = Vec::new();
     let mut others: Vec<(usize, f64)> = Vec::new();
-    for j in (0..views.len()).filter(|&j| j != i) {
+    for (j, other) in views.into_iter().enumerate().filter(|(j, _)| *j != i) {
         let in_window = i.abs_diff(j) <= settings.window;
-        match relate(&views[i], &views[j], depth, settings) {
+        match relate(own, other, depth, settings) {
             Relation::Good(score) if in_window => good.push((j, score)),
             Relation::Good(score) => others.push((j, score)),
             Relation::Bad(fault) if in_window && j > i => skipped.count(fault),
@@ -148,8 +148,9 @@ mod tests {
         // Hovering, hovering, a step, then far away.
         let views = [nadir(0.0), nadir(0.1), nadir(15.0), nadir(500.0)];
         let mut skipped = SkippedPairs::default();
-        let found: Vec<Vec<usize>> =
-            (0..4).map(|i| partners(i, &views, 60.0, &settings, &mut skipped).iter().map(|p| p.0).collect()).collect();
+        let found: Vec<Vec<usize>> = (0..4)
+            .map(|i| partners((i, &views[i]), &views, 60.0, &settings, &mut skipped).iter().map(|p| p.0).collect())
+            .collect();
         assert_eq!(found, vec![vec![2], vec![2], vec![0, 1], vec![]]);
         assert_eq!(skipped, SkippedPairs { no_baseline: 1, too_wide: 2, too_oblique: 0, no_overlap: 0 });
     }

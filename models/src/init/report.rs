@@ -18,6 +18,17 @@ pub struct Initialisation {
     pub report: InitReport,
 }
 
+/// What a growth in flight looked at; nothing in it grows with the pictures before.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Growth {
+    /// Depth maps made: of new pictures, and anew of those beside them.
+    pub depths: usize,
+    /// Earlier pictures beside the new ones.
+    pub compared: usize,
+    /// Ground that the pictures with new depths show, m².
+    pub ground_m2: f64,
+}
+
 /// Counts and times; milliseconds are wall time.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct InitReport {

@@ -199,7 +199,7 @@ mod tests {
     #[test]
     fn a_scene_at_one_point_and_none_at_all_have_an_answer() {
         assert!(Ground::around(&mut []).is_none());
-        let counts = counted(&vec![[3.0, 4.0, 5.0]; 10]);
+        let counts = counted(&[[3.0, 4.0, 5.0]; 10]);
         assert!(counts.spacing_m() > 0.0);
         assert_eq!(counts.leaves().counts, [10]);
     }

@@ -148,7 +148,10 @@ mod tests {
     use super::*;
     use crate::cloud::SH_C0;
 
-    fn cloud(rows: &[([f32; 3], [f32; 3], [f32; 4], f32)]) -> GaussianCloud {
+    /// Mean, standard deviations, rotation, logit of the opacity.
+    type Row = ([f32; 3], [f32; 3], [f32; 4], f32);
+
+    fn cloud(rows: &[Row]) -> GaussianCloud {
         let mut cloud = GaussianCloud::with_capacity(0, rows.len());
         rows.iter().for_each(|(m, s, q, o)| cloud.push(*m, s.map(f32::ln), *q, *o, &[m[0], 0.5, 0.0]));
         cloud

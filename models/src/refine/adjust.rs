@@ -87,7 +87,7 @@ pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
     equations.fill(problem, loss, 0.0);
     problem.free = free;
     std::array::from_fn(|k| {
-        let mut unit = Step { frames: vec![FrameVec::zeros(); problem.poses.len()], shared: SharedVec::zeros() };
+        let mut unit = Step { frames: vec![FrameVec::zeros(); problem.moving], shared: SharedVec::zeros() };
         unit.shared[k] = 1.0;
         equations.solve(&unit).map_or(f64::INFINITY, |x| x.shared[k].max(0.0).sqrt())
     })
@@ -122,6 +122,7 @@ mod tests {
             rotation_weight: DVec3::splat(12.0),
         });
         let mut problem = Problem {
+            moving: 3,
             intrinsics: vec![LENS; 3],
             poses: (0..3).map(pose).collect(),
             priors: priors.collect(),

@@ -32,12 +32,15 @@ impl Refiner {
                 }
             }
         }
-        for i in 0..self.frames.len() {
-            let error = so3::log(self.world_error(i)).length();
-            let frame = &mut self.frames[i];
-            let sigma = frame.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b));
-            frame.rotation_refused = frame.pairs > 0 && error > REFUSE.max(5.0 * f64::from(sigma));
-        }
+        (0..self.frames.len()).for_each(|i| self.doubt_rotation(i));
+    }
+
+    /// Notes whether the telemetry rotation of frame `i` can be right.
+    pub(super) fn doubt_rotation(&mut self, i: usize) {
+        let error = so3::log(self.world_error(i)).length();
+        let frame = &mut self.frames[i];
+        let sigma = frame.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b));
+        frame.rotation_refused = frame.pairs > 0 && error > REFUSE.max(5.0 * f64::from(sigma));
     }
 
     /// World rotation that would bring frame `i` to its telemetry.

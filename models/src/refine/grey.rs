@@ -1,8 +1,11 @@
 //! What is kept of a key frame's picture: one byte per pixel at the size the network saw.
 
+use std::borrow::Cow;
+
 use glam::DVec2;
 use image::{RgbImage, imageops};
 
+use crate::frame_file::AsBytes;
 use crate::picture::mask::Mask;
 
 /// Grey value of a pixel that a mask leaves out.
@@ -12,6 +15,7 @@ const LEFT_OUT: u8 = 0;
 const MARGIN: i32 = 8;
 
 /// Luma of a key frame.
+#[derive(Clone)]
 pub(crate) struct Grey {
     width: i32,
     height: i32,
@@ -43,10 +47,6 @@ impl Grey {
             masked: mask.is_some(),
             scale,
         }
-    }
-
-    pub fn bytes(&self) -> usize {
-        self.data.len()
     }
 
     /// The picture in grey: what the network makes of colours is nearly the same.
@@ -85,6 +85,29 @@ impl Grey {
         let top = f64::from(d[i]) * (1.0 - u) + f64::from(d[i + 1]) * u;
         let low = f64::from(d[i + w]) * (1.0 - u) + f64::from(d[i + w + 1]) * u;
         Some(top * (1.0 - v) + low * v)
+    }
+}
+
+/// Width, height, whether some of it is left out, scale.
+type Shape = (i32, i32, bool, DVec2);
+
+impl AsBytes for Grey {
+    type Shape = Shape;
+
+    fn shape(&self) -> Shape {
+        (self.width, self.height, self.masked, self.scale)
+    }
+
+    fn to_bytes(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(&self.data)
+    }
+
+    fn byte_count((width, height, ..): Shape) -> usize {
+        width as usize * height as usize
+    }
+
+    fn from_bytes((width, height, masked, scale): Shape, data: Vec<u8>) -> Self {
+        Self { width, height, data, masked, scale }
     }
 }
 

@@ -1,10 +1,12 @@
 //! How a key frame is taken in: what is refused, its features, and its first links.
 
 use super::grey::Grey;
-use super::keyframe::KeyFrame;
+use super::keyframe::{Descriptors, KeyFrame};
 use super::{AddReport, RefineError, Refiner, upright};
 use crate::camera::{Pose, PoseSigma, PosedImage, View};
+use crate::frame_file::Kept;
 use crate::onnx::features::Features;
+use glam::DVec3;
 use image::RgbImage;
 use std::time::Instant;
 
@@ -78,6 +80,7 @@ impl Refiner {
             time_ns,
             intrinsics: view.intrinsics,
             prior,
+            velocity: DVec3::ZERO,
             sigma: *sigma,
             pose: self.expect(&prior),
             // Beyond these, guided search is no guide any more.
@@ -95,7 +98,7 @@ impl Refiner {
             colors: Vec::new(),
             settled: Vec::new(),
             grey: None,
-            descriptors: Vec::new(),
+            descriptors: Kept::Memory(Descriptors::default()),
             first_node: self.union.grow(0, 0),
         });
     }
@@ -111,7 +114,7 @@ impl Refiner {
         let newest = self.frames.len().saturating_sub(1) as u32;
         let (focal, radial) = (self.shared.log_focal.exp(), self.shared.radial);
         let Some(frame) = self.frames.last_mut() else { return };
-        frame.describe(features, turns, self.settings.max_features, (focal, &radial));
+        frame.describe(features, turns, self.settings.max_features, (focal, &radial), self.file.as_ref());
         let (first, count) = (frame.first_node, frame.seen.len());
         report.features = count;
         frame.colors = frame
@@ -124,7 +127,12 @@ impl Refiner {
                 None => [128; 3],
             })
             .collect();
-        frame.grey = picture.map(|p| Grey::new(&p.image, p.mask.as_ref(), self.settings.feature_side));
+        let grey = |p: &PosedImage| Grey::new(&p.image, p.mask.as_ref(), self.settings.feature_side);
+        match (&mut frame.grey, picture) {
+            // The same picture with other features.
+            (Some(_), Some(_)) => {}
+            (none, picture) => *none = picture.map(|p| Kept::at_best(grey(p), self.file.as_ref())),
+        }
         self.union.shrink(first);
         self.union.grow(newest, count);
     }

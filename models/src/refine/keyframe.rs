@@ -3,9 +3,44 @@
 use super::grey::Grey;
 use super::radial::Radial;
 use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma};
+use crate::frame_file::{AsBytes, FrameFile, Kept};
 pub(crate) use crate::onnx::features::DESCRIPTOR;
 use crate::onnx::features::Features;
+use glam::DVec3;
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::sync::Arc;
+
+/// `DESCRIPTOR` values per key point.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Descriptors(pub Vec<i8>);
+
+impl Descriptors {
+    /// Of key point `i`; empty where there is none.
+    pub fn of(&self, i: usize) -> &[i8] {
+        self.0.get(i * DESCRIPTOR..(i + 1) * DESCRIPTOR).unwrap_or_default()
+    }
+}
+
+impl AsBytes for Descriptors {
+    type Shape = usize;
+
+    fn shape(&self) -> usize {
+        self.0.len()
+    }
+
+    fn to_bytes(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(bytemuck::cast_slice(&self.0))
+    }
+
+    fn byte_count(length: usize) -> usize {
+        length
+    }
+
+    fn from_bytes(_: usize, bytes: Vec<u8>) -> Self {
+        Self(bytemuck::cast_vec(bytes))
+    }
+}
 
 /// A key frame and what is known about it.
 pub(crate) struct KeyFrame {
@@ -14,6 +49,8 @@ pub(crate) struct KeyFrame {
     pub intrinsics: Intrinsics,
     /// The telemetry's word, never changed.
     pub prior: Pose,
+    /// Along-track velocity at it, as far as known when it was last placed.
+    pub velocity: DVec3,
     pub sigma: PoseSigma,
     /// Best estimate so far.
     pub pose: Pose,
@@ -43,23 +80,39 @@ pub(crate) struct KeyFrame {
     /// Key points whose place photometric alignment has settled.
     pub settled: Vec<bool>,
     /// What is kept of the picture, when there was one.
-    pub grey: Option<Grey>,
+    pub grey: Option<Kept<Grey>>,
     /// `DESCRIPTOR` values per key point, a unit vector times 127: a quarter of the memory of f32, and the
     /// cosine keeps three digits.
-    pub descriptors: Vec<i8>,
+    pub descriptors: Kept<Descriptors>,
     /// Node of the first key point in the union of matches.
     pub first_node: u32,
 }
 
 impl KeyFrame {
-    pub fn descriptor(&self, i: usize) -> &[i8] {
-        &self.descriptors[i * DESCRIPTOR..(i + 1) * DESCRIPTOR]
+    /// Its descriptors; none, with a word about it, where they cannot be read.
+    pub fn descriptors(&self) -> Cow<'_, Descriptors> {
+        self.descriptors.get().unwrap_or_else(|e| {
+            tracing::warn!("{}: {e}; it matches nothing", self.name);
+            Cow::Owned(Descriptors::default())
+        })
+    }
+
+    /// What is kept of its picture; nothing, with a word about it, where it cannot be read.
+    pub fn grey(&self) -> Option<Cow<'_, Grey>> {
+        let read = self.grey.as_ref()?.get();
+        read.inspect_err(|e| tracing::warn!("{}: {e}; its matches are not settled", self.name)).ok()
+    }
+
+    /// Bytes it takes of the memory.
+    pub fn bytes(&self) -> usize {
+        let kept = self.descriptors.bytes_in_memory() + self.grey.as_ref().map_or(0, Kept::bytes_in_memory);
+        kept + self.keypoints.len() * 20
     }
 
     /// What the picture looks like on the whole: the mean of its descriptors, of unit length.
     pub fn look(&self) -> Vec<f32> {
         let mut mean = vec![0.0f32; DESCRIPTOR];
-        for d in self.descriptors.chunks_exact(DESCRIPTOR) {
+        for d in self.descriptors().0.chunks_exact(DESCRIPTOR) {
             mean.iter_mut().zip(d).for_each(|(m, v)| *m += f32::from(*v));
         }
         let length = mean.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
@@ -68,10 +121,17 @@ impl KeyFrame {
     }
 
     /// Takes the best `max` of features found with the picture turned by `turns`; colours are the caller's.
-    pub fn describe(&mut self, features: Features, turns: u8, max: usize, lens: (f64, &Radial)) {
+    pub fn describe(
+        &mut self,
+        features: Features,
+        turns: u8,
+        max: usize,
+        lens: (f64, &Radial),
+        file: Option<&Arc<FrameFile>>,
+    ) {
         let features = spread(features, max);
         self.turns = turns;
-        self.descriptors = quantise(&features.descriptors);
+        self.descriptors = Kept::at_best(quantise(&features.descriptors), file);
         self.settled = vec![false; features.keypoints.len()];
         self.seen = features.keypoints;
         self.straighten(lens.0, lens.1);
@@ -86,14 +146,14 @@ impl KeyFrame {
 }
 
 /// Unit vectors times 127, rounded; a descriptor that is not finite or zero becomes all zero and matches nothing.
-pub(crate) fn quantise(descriptors: &[f32]) -> Vec<i8> {
+pub(crate) fn quantise(descriptors: &[f32]) -> Descriptors {
     let mut out = Vec::with_capacity(descriptors.len());
     for d in descriptors.chunks_exact(DESCRIPTOR) {
         let norm = d.iter().map(|x| x * x).sum::<f32>().sqrt();
         let scale = if norm.is_finite() && norm > 1e-12 { 127.0 / norm } else { 0.0 };
         out.extend(d.iter().map(|x| if scale > 0.0 { (x * scale).round() as i8 } else { 0 }));
     }
-    out
+    Descriptors(out)
 }
 
 /// Key points closer than this to a better one are left out, pixels: their descriptors come from the same cells of

@@ -187,7 +187,7 @@ impl Refiner {
         mut found: TwoView,
     ) -> (Vec<Match>, TwoView) {
         let (fa, fb) = (&self.frames[a], &self.frames[b]);
-        let (Some(ga), Some(gb)) = (&fa.grey, &fb.grey) else { return (matches, found) };
+        let (Some(ga), Some(gb)) = (fa.grey(), fb.grey()) else { return (matches, found) };
         let ca = self.camera_of(fa);
         let places: Vec<Option<[f32; 2]>> = found
             .inliers
@@ -195,8 +195,8 @@ impl Refiner {
             .with_min_len(32)
             .map(|i| {
                 let m = matches[*i as usize];
-                let from = Side { grey: ga, camera: &ca, at: fa.seen[m.a as usize] };
-                align_patch(&from, &Side { grey: gb, camera: cb, at: fb.seen[m.b as usize] }, ground)
+                let from = Side { grey: &ga, camera: &ca, at: fa.seen[m.a as usize] };
+                align_patch(&from, &Side { grey: &gb, camera: cb, at: fb.seen[m.b as usize] }, ground)
             })
             .collect();
         let inliers = std::mem::take(&mut found.inliers);

@@ -40,6 +40,7 @@ const SAME_PLACE: f32 = 12.0;
 /// Matches `b` against `a`.
 pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: MatchLimits) -> Vec<Match> {
     let (of_a, of_b) = (a.keypoints.len().min(limits.features), b.keypoints.len().min(limits.features));
+    let (described_a, described_b) = (a.descriptors(), b.descriptors());
     let grid = Buckets::new(a, of_a);
     let mut best_of_a = vec![(i32::MIN, u32::MAX); of_a];
     let mut found = Vec::with_capacity(of_b);
@@ -50,7 +51,7 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
     let margin = (limits.cosine_margin * unit) as i32;
     for (j, place) in guide.predicted.iter().enumerate().take(of_b) {
         let Some(place) = place else { continue };
-        let descriptor = b.descriptor(j);
+        let descriptor = described_b.of(j);
         scored.clear();
         for cells in grid.rows(*place, guide.radius) {
             for &i in cells {
@@ -60,7 +61,7 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
                 if off_line || (p - *place).length_squared() > r2 {
                     continue;
                 }
-                let score = dot(a.descriptor(i as usize), descriptor);
+                let score = dot(described_a.of(i as usize), descriptor);
                 scored.push((score, i));
                 let rival = &mut best_of_a[i as usize];
                 if score > rival.0 {

@@ -89,6 +89,8 @@ const BEHIND_PX: f64 = 2000.0;
 
 /// Everything the adjustment works on.
 pub(crate) struct Problem {
+    /// So many of the poses, the first ones, are unknown; the others stand still.
+    pub moving: usize,
     pub intrinsics: Vec<Intrinsics>,
     pub poses: Vec<Pose>,
     pub priors: Vec<PosePrior>,
@@ -140,7 +142,7 @@ impl Problem {
     pub fn cost(&self, loss: Loss) -> f64 {
         let cameras: Vec<Pinhole> = (0..self.poses.len()).map(|i| self.camera(i)).collect();
         let mut sum = self.shared_residuals().iter().map(|r| r * r).sum::<f64>();
-        for i in 0..self.poses.len() {
+        for i in 0..self.moving {
             sum += self.prior_rows(i).cost;
         }
         let per_px = 1.0 / self.pixel_sigma;

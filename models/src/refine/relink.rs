@@ -3,6 +3,8 @@
 //! a picture that lies on its side. On brighton_beach's card, where six of 18 are turned around, that left a line of forest hanging
 //! by a few matches, one picture of it 25 m off.
 
+use std::borrow::Cow;
+
 use super::keyframe::KeyFrame;
 use super::level::HEIGHT;
 use super::linking::LINKED_SIGMA;
@@ -47,6 +49,7 @@ impl Refiner {
     pub(super) fn link_anew(&mut self, report: &mut AddReport) {
         self.union = Union::with_capacity(self.settings.max_keyframes * self.settings.max_features);
         self.pairs.clear();
+        self.solved_pairs = 0;
         for (i, frame) in self.frames.iter_mut().enumerate() {
             frame.first_node = self.union.grow(i as u32, frame.seen.len());
             frame.pairs = 0;
@@ -91,14 +94,13 @@ impl Refiner {
     /// Extracts the features of a frame anew, its picture turned, where it was kept.
     pub(super) fn extract_turned(&mut self, i: usize, turns: u8, report: &mut AddReport) -> Result<(), RefineError> {
         let size = (self.frames[i].intrinsics.width, self.frames[i].intrinsics.height);
-        let Some(grey) = self.frames[i].grey.take() else { return Ok(()) };
-        let features = self.extract(&grey.picture(), size, turns, Some(&grey), report);
-        self.frames[i].grey = Some(grey);
-        let features = features?;
+        let Some(grey) = self.frames[i].grey().map(Cow::into_owned) else { return Ok(()) };
+        let features = self.extract(&grey.picture(), size, turns, Some(&grey), report)?;
+        let file = self.file.clone();
         let (focal, radial, max) = (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
         let frame = &mut self.frames[i];
         let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
-        frame.describe(features, turns, max, (focal, &radial));
+        frame.describe(features, turns, max, (focal, &radial), file.as_ref());
         // Colours are no longer there; that of the nearest key point is.
         let nearest = |p: &[f32; 2]| {
             let apart = |q: &[f32; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);

@@ -31,6 +31,25 @@ pub struct AddReport {
     pub match_seconds: f64,
 }
 
+/// What a look at the newest key frames did; nothing in it grows with the key frames before them.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct NearReport {
+    /// Key frames that came, or were first linked, since the last solve.
+    pub frames: usize,
+    /// Key frames that moved in the adjustment, those among them.
+    pub adjusted_frames: usize,
+    /// Sightings in the adjustment.
+    pub observations: usize,
+    /// Levenberg–Marquardt steps.
+    pub steps: u32,
+    /// Frames placed from points because their telemetry position was far off.
+    pub replaced_frames: usize,
+    /// Names of the key frames whose poses may have changed.
+    pub moved: Vec<String>,
+    /// Wall time.
+    pub solve_seconds: f64,
+}
+
 /// State after a solve; counts are totals since the refiner was opened.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct RefineReport {

@@ -7,6 +7,7 @@ use crate::camera::Pinhole;
 use glam::DVec3;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
+use std::sync::Arc;
 
 pub(crate) type Block = SMatrix<f64, 6, 6>;
 pub(crate) type Border = SMatrix<f64, 6, SHARED>;
@@ -16,11 +17,35 @@ pub(crate) type SharedVec = SVector<f64, SHARED>;
 /// Parts of the points summed side by side; fixed, so that the sum has one order on every machine.
 const PARTS: usize = 4;
 
+/// Which block is that of two frames; its room grows with the pairs that see a common point, not with the square of the frames.
+pub(crate) struct Index {
+    /// Of each frame those of its own number and above, ascending, with their blocks.
+    rows: Vec<Vec<(u32, u32)>>,
+}
+
+impl Index {
+    /// Notes that the block of (i, j), i ≤ j, is `slot`; false when there is one already.
+    fn enter(&mut self, i: u32, j: u32, slot: u32) -> bool {
+        let row = &mut self.rows[i as usize];
+        match row.binary_search_by_key(&j, |b| b.0) {
+            Ok(_) => false,
+            Err(at) => {
+                row.insert(at, (j, slot));
+                true
+            }
+        }
+    }
+
+    fn of(&self, i: u32, j: u32) -> Option<u32> {
+        let row = self.rows.get(i as usize)?;
+        row.binary_search_by_key(&j, |b| b.0).ok().map(|at| row[at].1)
+    }
+}
+
 /// `[frames, border; borderᵀ, shared] · step = −gradient`, symmetric.
 #[derive(Clone)]
 pub(crate) struct Reduced {
-    /// `pairs` index of block (i, j) with i ≤ j, or `u32::MAX`; row-major n × n.
-    index: Vec<u32>,
+    index: Arc<Index>,
     pub pairs: Vec<(u32, u32)>,
     pub blocks: Vec<Block>,
     pub border: Vec<Border>,
@@ -32,27 +57,22 @@ pub(crate) struct Reduced {
 impl Reduced {
     /// Empty equations with the structure of `problem`: diagonal blocks first, then pairs with common points.
     pub fn new(problem: &Problem) -> Self {
-        let n = problem.poses.len();
-        let mut index = vec![u32::MAX; n * n];
+        let n = problem.moving;
+        let mut index = Index { rows: (0..n as u32).map(|i| vec![(i, i)]).collect() };
         let mut pairs: Vec<(u32, u32)> = (0..n as u32).map(|i| (i, i)).collect();
-        for i in 0..n {
-            index[i * n + i] = i as u32;
-        }
         for p in 0..problem.points.len() {
             let seen = problem.sightings(p);
             for (k, a) in seen.iter().enumerate() {
                 for b in &seen[..k] {
                     let (i, j) = (a.camera.min(b.camera), a.camera.max(b.camera));
-                    let slot = &mut index[i as usize * n + j as usize];
-                    if *slot == u32::MAX {
-                        *slot = pairs.len() as u32;
+                    if (j as usize) < n && index.enter(i, j, pairs.len() as u32) {
                         pairs.push((i, j));
                     }
                 }
             }
         }
         Self {
-            index,
+            index: Arc::new(index),
             blocks: vec![Block::zeros(); pairs.len()],
             pairs,
             border: vec![Border::zeros(); n],
@@ -71,7 +91,7 @@ impl Reduced {
             .into_par_iter()
             .map(|part| {
                 let mut sum = self.clone();
-                let mut undamped = vec![Block::zeros(); cameras.len()];
+                let mut undamped = vec![Block::zeros(); problem.moving];
                 let mut rows = Vec::new();
                 for i in n * part / PARTS..n * (part + 1) / PARTS {
                     sum.eliminate(problem, &cameras, i, loss, lambda, &mut rows, &mut undamped);
@@ -79,7 +99,7 @@ impl Reduced {
                 (sum, undamped)
             })
             .collect();
-        let mut diagonal = vec![Block::zeros(); cameras.len()];
+        let mut diagonal = vec![Block::zeros(); problem.moving];
         for (part, undamped) in &parts {
             self.blocks.iter_mut().zip(&part.blocks).for_each(|(a, b)| *a += b);
             self.border.iter_mut().zip(&part.border).for_each(|(a, b)| *a += b);
@@ -151,9 +171,16 @@ impl Reduced {
     ) {
         let eq = PointEquation::new(problem, cameras, point, loss, lambda, rows);
         let Some(inverse) = eq.inverse else { return };
-        let n = cameras.len();
+        let moves = |row: &Row| (row.camera as usize) < problem.moving;
         let to_lens = inverse * eq.by_lens;
         for (k, row) in rows.iter().enumerate() {
+            let mut corner = self.shared.fixed_view_mut::<LENS, LENS>(FOCAL, FOCAL);
+            corner += row.jl.transpose() * row.jl * row.weight;
+            let mut gradient = self.shared_gradient.fixed_rows_mut::<LENS>(FOCAL);
+            gradient += row.jl.transpose() * row.r * row.weight;
+            if !moves(row) {
+                continue;
+            }
             let i = row.camera as usize;
             undamped[i] += row.jc.transpose() * row.jc * row.weight;
             let t = row.cross * inverse;
@@ -161,20 +188,17 @@ impl Reduced {
             let lens = row.jc.transpose() * row.jl * row.weight - row.cross * to_lens;
             let mut columns = self.border[i].fixed_columns_mut::<LENS>(FOCAL);
             columns += lens;
-            for other in &rows[..=k] {
-                let (i, j) = (row.camera.min(other.camera) as usize, row.camera.max(other.camera) as usize);
+            for other in rows[..=k].iter().filter(|other| moves(other)) {
+                let (i, j) = (row.camera.min(other.camera), row.camera.max(other.camera));
                 let product = t * other.cross.transpose();
-                let block = &mut self.blocks[self.index[i * n + j] as usize];
+                let Some(slot) = self.index.of(i, j) else { continue };
+                let block = &mut self.blocks[slot as usize];
                 if row.camera <= other.camera {
                     *block -= product;
                 } else {
                     *block -= product.transpose();
                 }
             }
-            let mut corner = self.shared.fixed_view_mut::<LENS, LENS>(FOCAL, FOCAL);
-            corner += row.jl.transpose() * row.jl * row.weight;
-            let mut gradient = self.shared_gradient.fixed_rows_mut::<LENS>(FOCAL);
-            gradient += row.jl.transpose() * row.r * row.weight;
         }
         let mut corner = self.shared.fixed_view_mut::<LENS, LENS>(FOCAL, FOCAL);
         corner -= eq.by_lens.transpose() * to_lens;
@@ -266,7 +290,8 @@ pub(crate) fn point_steps(
             let Some(inverse) = eq.inverse else { return DVec3::ZERO };
             let mut g = eq.gradient + eq.by_lens * lens;
             for row in rows.iter() {
-                g += row.cross.transpose() * frames[row.camera as usize];
+                // What stands still takes no step.
+                g += frames.get(row.camera as usize).map_or_else(Vector3::zeros, |step| row.cross.transpose() * step);
             }
             let d = -(inverse * g);
             DVec3::new(d.x, d.y, d.z)

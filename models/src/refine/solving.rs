@@ -4,6 +4,7 @@
 use super::adjust::{Limits, adjust, shared_sigma};
 use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
+use super::part::Part;
 use super::problem::{FOCAL, Loss, Observation, PosePrior, Problem, SHARED};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
@@ -15,10 +16,10 @@ use std::time::{Duration, Instant};
 
 /// Reprojection errors (pixels) a triangulation may have while poses are telemetry's, and after a first
 /// adjustment; sightings beyond are left out until poses are better.
-const COARSE_PX: f64 = 60.0;
-const FINE_PX: f64 = 12.0;
+pub(super) const COARSE_PX: f64 = 60.0;
+pub(super) const FINE_PX: f64 = 12.0;
 /// Sightings that tie a frame to the map; with fewer, its pose is mostly telemetry's.
-const TIED: usize = 12;
+pub(super) const TIED: usize = 12;
 /// Sightings of one picture that count as independent when the lens is asked for. What no such lens holds (a rolling shutter,
 /// leaves in the wind, relief under a patch) shifts whole regions of a picture together: on brighton_beach (480 sightings per
 /// picture) a free focal length went 13 % off with a formal sigma of 1.3 %.
@@ -34,7 +35,8 @@ impl Refiner {
         let tracks = Tracks::build(&mut self.union, &self.frames, self.settings.max_observations);
         report.tracks = tracks.len();
         report.observations_over_cap = tracks.over_cap;
-        let chosen = tracks.select(self.frames.len(), self.settings.max_tracks);
+        let most = self.settings.max_tracks.max(self.settings.tracks_per_keyframe * self.frames.len());
+        let chosen = tracks.select(self.frames.len(), most);
         report.adjusted_tracks = chosen.len();
         // Frames never adjusted are still metres off: a convex loss first, and frames that most points disagree
         // with (a GPS position that jumped) are placed from the points alone.
@@ -43,10 +45,12 @@ impl Refiner {
             let limits = Limits { loss: Loss::Huber(3.0), max_steps: 12, deadline };
             report.steps += adjust(&mut problem, limits).steps;
             self.take(&problem);
-            report.replaced_frames = self.replace_strays(&problem, &tracks, &chosen);
+            let (all, whole) = ((0..self.frames.len() as u32).collect::<Vec<_>>(), Part::whole(self.frames.len()));
+            report.replaced_frames = self.replace_strays((&whole, &all), &problem, &tracks, &chosen);
         }
         if !self.anchored {
             self.move_to_control();
+            self.note_velocities();
         }
         let mut problem = self.problem(&tracks, &chosen, FINE_PX);
         let limits = Limits { loss: Loss::Cauchy(2.0), max_steps: 12, deadline };
@@ -72,6 +76,7 @@ impl Refiner {
                 frame.position_sigma = frame.position_sigma.min(0.3);
             }
         }
+        (self.solved_frames, self.solved_pairs) = (self.frames.len(), self.pairs.len());
         self.solves += 1;
         report.solve_seconds = start.elapsed().as_secs_f64();
         Ok(report)
@@ -80,10 +85,10 @@ impl Refiner {
     /// Unlinked frames, and the positions of frames not yet adjusted, follow telemetry and what is known about
     /// its shared errors.
     fn place_new_frames(&mut self) {
-        let velocity = self.velocities();
-        for (frame, v) in self.frames.iter_mut().zip(velocity) {
+        self.note_velocities();
+        for frame in &mut self.frames {
             if !frame.adjusted {
-                frame.pose.center = frame.prior.center + v * self.shared.delay;
+                frame.pose.center = frame.prior.center + frame.velocity * self.shared.delay;
             }
             if frame.pairs == 0 {
                 frame.pose.rotation = (frame.prior.rotation * self.shared.mount).normalize();
@@ -91,24 +96,31 @@ impl Refiner {
         }
     }
 
-    fn velocities(&self) -> Vec<DVec3> {
+    fn note_velocities(&mut self) {
         let path: Vec<_> = self.frames.iter().map(|f| (f.time_ns, f.prior.center)).collect();
-        velocities(&path)
+        self.frames.iter_mut().zip(velocities(&path)).for_each(|(frame, v)| frame.velocity = v);
     }
 
     /// The adjustment's problem at the present poses: chosen tracks that triangulate to below `max_px`.
     pub(super) fn problem(&self, tracks: &Tracks, chosen: &[u32], max_px: f64) -> Problem {
+        self.problem_of(&Part::whole(self.frames.len()), tracks, chosen, max_px)
+    }
+
+    /// The same of some key frames, of which some stand still.
+    pub(super) fn problem_of(&self, part: &Part, tracks: &Tracks, chosen: &[u32], max_px: f64) -> Problem {
         let s = &self.settings;
         let weight = |sigma: f64| if sigma > 0.0 { 1.0 / sigma } else { 0.0 };
-        let priors = self.frames.iter().zip(self.velocities()).map(|(f, velocity)| {
+        let frames = || part.frames.iter().map(|i| &self.frames[*i as usize]);
+        let priors = frames().map(|f| {
             let per = |v: [f32; 3]| DVec3::from_array(v.map(|x| 1.0 / f64::from(x)));
             let rotation_weight = if f.rotation_refused { DVec3::ZERO } else { per(f.sigma.rotation_rad) };
-            PosePrior { pose: f.prior, velocity, position_weight: per(f.sigma.position_m), rotation_weight }
+            PosePrior { pose: f.prior, velocity: f.velocity, position_weight: per(f.sigma.position_m), rotation_weight }
         });
         let mount = weight(s.mount_sigma_deg.to_radians());
         let mut problem = Problem {
-            intrinsics: self.frames.iter().map(|f| f.intrinsics).collect(),
-            poses: self.frames.iter().map(|f| f.pose).collect(),
+            moving: part.moving,
+            intrinsics: frames().map(|f| f.intrinsics).collect(),
+            poses: frames().map(|f| f.pose).collect(),
             priors: priors.collect(),
             points: Vec::with_capacity(chosen.len()),
             starts: vec![0],
@@ -126,11 +138,12 @@ impl Refiner {
         let mut views = Vec::new();
         for t in chosen {
             let mut seen = self.sightings(tracks, *t);
+            seen.retain(|s| part.at(s.frame).is_some());
             if let Some(point) = self.robust_point(&cameras, &mut seen, max_px, &mut views) {
                 problem.points.push(point.world);
-                problem.observations.extend(seen.iter().map(|s| Observation {
-                    camera: s.frame,
-                    pixel: self.frames[s.frame as usize].seen[s.feature as usize],
+                problem.observations.extend(seen.iter().filter_map(|s| {
+                    let pixel = self.frames[s.frame as usize].seen[s.feature as usize];
+                    Some(Observation { camera: part.at(s.frame)?, pixel })
                 }));
                 problem.starts.push(problem.observations.len() as u32);
             }
@@ -188,15 +201,30 @@ impl Refiner {
         }
     }
 
-    /// Frames that hold few of the sightings they should have had are placed from the points around them.
-    fn replace_strays(&mut self, problem: &Problem, tracks: &Tracks, chosen: &[u32]) -> usize {
+    /// Writes back the poses that moved.
+    pub(super) fn take_part(&mut self, part: &Part, problem: &Problem) {
+        for (i, pose) in part.frames.iter().zip(&problem.poses).take(part.moving) {
+            if pose.center.is_finite() && pose.rotation.is_finite() {
+                self.frames[*i as usize].pose = *pose;
+            }
+        }
+    }
+
+    /// Those of the frames `of` a part that hold few of the sightings they should have had are placed from the points around them.
+    pub(super) fn replace_strays(
+        &mut self,
+        (part, of): (&Part, &[u32]),
+        problem: &Problem,
+        tracks: &Tracks,
+        chosen: &[u32],
+    ) -> usize {
         let mut wanted = vec![0usize; self.frames.len()];
         let mut held = vec![0usize; self.frames.len()];
         chosen.iter().flat_map(|t| self.sightings(tracks, *t)).for_each(|s| wanted[s.frame as usize] += 1);
-        problem.observations.iter().for_each(|o| held[o.camera as usize] += 1);
+        problem.observations.iter().for_each(|o| held[part.frames[o.camera as usize] as usize] += 1);
         let strays: Vec<usize> =
-            (0..self.frames.len()).filter(|i| wanted[*i] >= TIED && held[*i] * 2 < wanted[*i]).collect();
-        if strays.is_empty() || strays.len() * 2 > self.frames.len() {
+            of.iter().map(|i| *i as usize).filter(|i| wanted[*i] >= TIED && held[*i] * 2 < wanted[*i]).collect();
+        if strays.is_empty() || strays.len() * 2 > part.frames.len() {
             return 0;
         }
         let cameras = self.cameras();
@@ -255,6 +283,21 @@ impl Refiner {
         }
     }
 
+    pub(super) fn refined_point(&self, p: &Triangulated, seen: &[Sighting]) -> RefinedPoint {
+        let mut color = [0u32; 3];
+        for s in seen {
+            let c = self.frames[s.frame as usize].colors[s.feature as usize];
+            (0..3).for_each(|k| color[k] += u32::from(c[k]));
+        }
+        RefinedPoint {
+            position: p.world.to_array(),
+            color: color.map(|c| (c / seen.len().max(1) as u32) as u8),
+            views: seen.len() as u32,
+            error_px: p.rms_px as f32,
+            angle_deg: p.angle.to_degrees() as f32,
+        }
+    }
+
     /// All tracks at the final poses: points, depth ranges, ground heights and the errors that remain.
     fn harvest(&mut self, tracks: &Tracks, report: &mut RefineReport) {
         let cameras = self.cameras();
@@ -271,25 +314,17 @@ impl Refiner {
                 continue;
             };
             report.outlier_observations += all - seen.len();
-            let mut color = [0u32; 3];
             for (s, (camera, pixel)) in seen.iter().zip(&views) {
                 let frame = s.frame as usize;
                 depths[frame].push(camera.local(p.world).z as f32);
                 heights[frame].push(p.world.z);
-                let c = self.frames[frame].colors[s.feature as usize];
-                (0..3).for_each(|k| color[k] += u32::from(c[k]));
                 if let Some(q) = camera.project(p.world) {
                     errors.push((q - glam::DVec2::new(pixel[0].into(), pixel[1].into())).length());
                 }
             }
-            self.points.push(RefinedPoint {
-                position: p.world.to_array(),
-                color: color.map(|c| (c / seen.len() as u32) as u8),
-                views: seen.len() as u32,
-                error_px: p.rms_px as f32,
-                angle_deg: p.angle.to_degrees() as f32,
-            });
+            self.points.push(self.refined_point(&p, &seen));
         }
+        self.recent.clear();
         report.points = self.points.len();
         report.observations = errors.len();
         report.reprojection_rms_px = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len().max(1) as f64).sqrt();
@@ -309,7 +344,7 @@ impl Refiner {
     }
 }
 
-fn quantile(values: &mut [f32], q: f64) -> f32 {
+pub(super) fn quantile(values: &mut [f32], q: f64) -> f32 {
     let k = ((values.len() - 1) as f64 * q).round() as usize;
     *values.select_nth_unstable_by(k, f32::total_cmp).1
 }

@@ -13,8 +13,14 @@ pub(crate) struct Union {
 }
 
 impl Union {
+    /// Takes its memory from the system at once.
     pub fn with_capacity(nodes: usize) -> Self {
-        let empty = || Vec::with_capacity(nodes);
+        let empty = || {
+            let mut list = Vec::with_capacity(nodes);
+            list.resize(nodes, 1);
+            list.clear();
+            list
+        };
         Self { parent: empty(), next: empty(), frame: empty() }
     }
 
@@ -45,6 +51,17 @@ impl Union {
             node = above;
         }
         node
+    }
+
+    /// Whether nothing was joined to `node`.
+    pub fn is_single(&self, node: u32) -> bool {
+        self.next[node as usize] == node
+    }
+
+    /// The nodes of the set of `node`, each with its key frame.
+    pub fn members(&self, node: u32) -> impl Iterator<Item = (u32, u32)> + '_ {
+        let after = move |at: &u32| Some(self.next[*at as usize]).filter(|next| *next != node);
+        std::iter::successors(Some(node), after).map(|at| (self.frame[at as usize], at))
     }
 
     /// Joins the sets of `a` and `b`; false when they already hold a picture in common at different places.
@@ -94,6 +111,17 @@ pub(crate) struct Tracks {
 }
 
 impl Tracks {
+    /// These, longest first; among equals in the order given.
+    pub fn of(mut tracks: Vec<Vec<Sighting>>) -> Self {
+        tracks.sort_by_key(|t| std::cmp::Reverse(t.len()));
+        let mut out = Self { starts: vec![0], ..Self::default() };
+        for track in tracks {
+            out.sightings.extend(track);
+            out.starts.push(out.sightings.len() as u32);
+        }
+        out
+    }
+
     /// Groups the key points of `frames` by their root.
     pub fn build(union: &mut Union, frames: &[KeyFrame], max_observations: usize) -> Self {
         let nodes = union.parent.len();

@@ -7,6 +7,7 @@ use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Plan, SORT_LANES_SOFTWARE};
+use config::refine::RefineSettings;
 use config::training::{CropSettings, ShSettings};
 use models::dataset::{Dataset, scaled};
 use vulkan::gpu::GpuInfo;
@@ -137,7 +138,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         width: job.picture.0,
         height: job.picture.1,
         key_frames: request.views,
-        scratch: scratch_bytes(&request, &job.init, &job.network),
+        scratch: scratch_bytes(&request, &job.init, &job.network, job.refine.as_ref()),
         gaussians: plan.scene,
         sh_degree: plan.sh_degree,
         delivered: job.delivered,
@@ -169,6 +170,8 @@ struct Job {
     sh: ShSettings,
     init: InitSettings,
     network: NetworkSettings,
+    /// Where poses are refined.
+    refine: Option<RefineSettings>,
     /// Most bytes of a Gaussian as it is delivered.
     delivered: usize,
     /// What an aircraft draws.
@@ -186,6 +189,7 @@ impl Job {
             sh: mission.training.sh,
             init: mission.init,
             network: mission.network,
+            refine: Some(mission.refine),
         }
     }
 
@@ -215,7 +219,7 @@ impl Job {
         };
         let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
         let (init, network) = (InitSettings::default(), NetworkSettings::default());
-        Ok(Self { device, memory, picture, sh, init, network, delivered: 0, map: MapSettings::default() })
+        Ok(Self { device, memory, picture, sh, init, network, refine: None, delivered: 0, map: MapSettings::default() })
     }
 }
 

@@ -5,10 +5,13 @@
 //! motions contradict each other it was trained with a wrong camera, and fresh ones take its place. SH is not rotated: where
 //! the world turned further than shows in it, fresh ones take the place as well. (Linear blend skinning, with cameras as bones.)
 
+use std::collections::HashMap;
+
 use glam::{DQuat, DVec3, Quat, Vec3};
 use models::camera::View;
 use models::cloud::GaussianCloud;
 use rayon::prelude::*;
+use vulkan::trainer::Fate;
 
 /// Key frames that a Gaussian is moved by.
 const NEAREST: usize = 4;
@@ -26,6 +29,11 @@ pub struct Motion {
 }
 
 impl Motion {
+    /// Whether it moved at all.
+    pub fn is_still(&self) -> bool {
+        self.then.pose == self.now.pose
+    }
+
     fn turn(&self) -> DQuat {
         (self.now.pose.rotation * self.then.pose.rotation.conjugate()).normalize()
     }
@@ -61,8 +69,59 @@ struct Blended {
     apart_px: f64,
 }
 
-/// `None` where no key frame saw it: it stays where it is.
-fn blend(p: DVec3, motions: &[Motion]) -> Option<Blended> {
+/// Key frames by where they look: those near a place are found without a look at all of them.
+pub struct Motions {
+    all: Vec<Motion>,
+    /// Side of a square, metres: what a picture shows.
+    side: f64,
+    squares: HashMap<[i64; 2], Vec<u32>>,
+}
+
+impl Motions {
+    /// Of key frames that look at ground `depth_m` away.
+    pub fn new(all: Vec<Motion>, depth_m: f64) -> Self {
+        let wide = |m: &Motion| depth_m * f64::from(m.then.intrinsics.width) / f64::from(m.then.intrinsics.fx);
+        let side = all.iter().map(wide).fold(1e-3, f64::max);
+        let mut squares: HashMap<[i64; 2], Vec<u32>> = HashMap::new();
+        for (i, m) in all.iter().enumerate() {
+            let at = m.then.pose.center + m.then.pose.forward() * depth_m;
+            squares.entry(square(at, side)).or_default().push(i as u32);
+        }
+        Self { all, side, squares }
+    }
+
+    /// Those whose axes pass near a place; all, where hardly any do.
+    fn near(&self, p: DVec3) -> Vec<&Motion> {
+        let [x, y] = square(p, self.side);
+        let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [x + dx, y + dy]));
+        let found: Vec<&Motion> =
+            around.filter_map(|at| self.squares.get(&at)).flatten().map(|i| &self.all[*i as usize]).collect();
+        if found.len() < NEAREST { self.all.iter().collect() } else { found }
+    }
+
+    /// Where a Gaussian goes with its key frames; those whose key frames disagree by more than `limit_px`, or turn it further than
+    /// [`MOST_TURN`], go. What no key frame that moved sees stays as it is, to the bit.
+    pub fn fate(&self, mean: [f32; 3], rotation: [f32; 4], limit_px: f64) -> Fate {
+        let p = Vec3::from_array(mean).as_dvec3();
+        let Some(blended) = blend(p, &self.near(p)) else { return Fate::Stays };
+        if blended.apart_px > limit_px || 2.0 * blended.turn.w.abs().min(1.0).acos() > MOST_TURN {
+            return Fate::Goes;
+        }
+        let [w, x, y, z] = rotation;
+        let turned = blended.turn.as_quat() * Quat::from_xyzw(x, y, z, w);
+        Fate::Moves {
+            mean: (p + blended.shift).as_vec3().to_array(),
+            rotation: [turned.w, turned.x, turned.y, turned.z],
+        }
+    }
+}
+
+fn square(p: DVec3, side: f64) -> [i64; 2] {
+    [(p.x / side).floor() as i64, (p.y / side).floor() as i64]
+}
+
+/// `None` where no key frame saw it, or none of those that did has moved: it stays where it is.
+fn blend(p: DVec3, motions: &[&Motion]) -> Option<Blended> {
     let mut nearest: [Option<(f64, f64, &Motion)>; NEAREST] = [None; NEAREST];
     for motion in motions {
         let Some((depth, weight)) = motion.weight(p) else { continue };
@@ -71,6 +130,9 @@ fn blend(p: DVec3, motions: &[Motion]) -> Option<Blended> {
         if let Some(at) = at.filter(|at| weight > lightest(&nearest[*at])) {
             nearest[at] = Some((depth, weight, motion));
         }
+    }
+    if nearest.iter().flatten().all(|n| n.2.is_still()) {
+        return None;
     }
     let total: f64 = nearest.iter().flatten().map(|n| n.1).sum();
     let mean = |of: &dyn Fn(&(f64, f64, &Motion)) -> DVec3| {
@@ -91,22 +153,16 @@ fn blend(p: DVec3, motions: &[Motion]) -> Option<Blended> {
     (shift.is_finite() && turn.length_squared() > 1e-12).then(|| Blended { shift, turn: turn.normalize(), apart_px })
 }
 
-/// Moves the Gaussians of `cloud` with their key frames; those whose key frames disagree by more than `limit_px`, or turn them further
-/// than [`MOST_TURN`], are taken out.
-/// Returns how many those were.
-pub fn follow(cloud: &mut GaussianCloud, motions: &[Motion], limit_px: f64) -> usize {
-    let blended: Vec<Option<Blended>> =
-        cloud.means.par_iter().map(|m| blend(Vec3::from_array(*m).as_dvec3(), motions)).collect();
-    for (i, motion) in blended.iter().enumerate() {
-        let Some(motion) = motion else { continue };
-        let mean = Vec3::from_array(cloud.means[i]).as_dvec3() + motion.shift;
-        cloud.means[i] = mean.as_vec3().to_array();
-        let [w, x, y, z] = cloud.rotations[i];
-        let turned = motion.turn.as_quat() * Quat::from_xyzw(x, y, z, w);
-        cloud.rotations[i] = [turned.w, turned.x, turned.y, turned.z];
+/// Moves the Gaussians of `cloud` with their key frames, as [`Motions::fate`] says; how many were taken out.
+pub fn follow(cloud: &mut GaussianCloud, motions: &Motions, limit_px: f64) -> usize {
+    let places = cloud.means.par_iter().zip(&cloud.rotations);
+    let fates: Vec<Fate> = places.map(|(m, r)| motions.fate(*m, *r, limit_px)).collect();
+    for (i, fate) in fates.iter().enumerate() {
+        if let Fate::Moves { mean, rotation } = fate {
+            (cloud.means[i], cloud.rotations[i]) = (*mean, *rotation);
+        }
     }
-    let holds = |m: &Blended| m.apart_px <= limit_px && 2.0 * m.turn.w.abs().min(1.0).acos() <= MOST_TURN;
-    cloud.retain(|i| blended[i].as_ref().is_none_or(holds))
+    cloud.retain(|i| fates[i] != Fate::Goes)
 }
 
 #[cfg(test)]
@@ -126,9 +182,9 @@ mod tests {
         (0..12).map(|i| view(10.0 * f64::from(i % 4), 10.0 * f64::from(i / 4))).collect()
     }
 
-    fn moved(views: &[View], by: impl Fn(usize, &Pose) -> Pose) -> Vec<Motion> {
+    fn moved(views: &[View], by: impl Fn(usize, &Pose) -> Pose) -> Motions {
         let now = |(i, then): (usize, &View)| Motion { then: *then, now: View { pose: by(i, &then.pose), ..*then } };
-        views.iter().enumerate().map(now).collect()
+        Motions::new(views.iter().enumerate().map(now).collect(), 50.0)
     }
 
     fn cloud() -> GaussianCloud {
@@ -149,7 +205,7 @@ mod tests {
         });
         let (before, mut after) = (cloud(), cloud());
         assert_eq!(follow(&mut after, &motions, 1.5), 0);
-        for motion in &motions {
+        for motion in &motions.all {
             let (then, now) = (Projector::new(&motion.then), Projector::new(&motion.now));
             for i in 0..before.len() {
                 let seen = |p: &Projector, c: &GaussianCloud| p.project(c.means[i].into()).unwrap();
@@ -169,13 +225,35 @@ mod tests {
         // The first camera was 20 m off; the others stay.
         let motions =
             moved(&grid(), |i, p| Pose { center: p.center + if i == 0 { DVec3::X * 20.0 } else { DVec3::ZERO }, ..*p });
-        assert!(motions[0].pixels_at(50.0) > 150.0);
+        assert!(motions.all[0].pixels_at(50.0) > 150.0);
         let mut after = cloud();
         let dropped = follow(&mut after, &motions, 1.5);
         assert!(dropped > 0 && dropped < 32, "{dropped}");
         let far = |m: &&[f32; 3]| m[0] > 20.0;
         let kept: Vec<_> = after.means.iter().filter(far).collect();
         assert_eq!(kept, cloud().means.iter().filter(far).collect::<Vec<_>>(), "far from it nothing moves");
+    }
+
+    #[test]
+    fn what_is_found_near_a_place_is_what_a_look_at_all_key_frames_finds() {
+        let grid: Vec<View> = (0..1000).map(|i| view(12.0 * f64::from(i % 20), 20.0 * f64::from(i / 20))).collect();
+        let motions = moved(&grid, |i, p| match i {
+            200..206 => Pose { center: p.center + DVec3::new(0.02, -0.01, 0.03) * (i - 199) as f64, ..*p },
+            _ => *p,
+        });
+        let all: Vec<&Motion> = motions.all.iter().collect();
+        let mut stayed = 0;
+        for i in 0..2000 {
+            let p = DVec3::new(f64::from(i % 50) * 5.0, f64::from(i / 50) * 10.0, f64::from(i % 7) - 3.0);
+            assert!(motions.near(p).len() < 260, "{}", motions.near(p).len());
+            let (near, of_all) = (blend(p, &motions.near(p)), blend(p, &all));
+            assert_eq!(near.is_some(), of_all.is_some(), "{p}");
+            stayed += usize::from(near.is_none());
+            if let (Some(near), Some(of_all)) = (near, of_all) {
+                assert!((near.shift - of_all.shift).length() < 1e-12);
+            }
+        }
+        assert!(stayed > 1500 && stayed < 2000, "{stayed} are seen by nothing that moved");
     }
 
     #[test]
@@ -199,6 +277,6 @@ mod tests {
             assert!((now[2] - then[2] - 0.002 * then[0]).abs() < 0.02, "{then:?} {now:?}");
         }
         let mut empty = GaussianCloud::default();
-        assert_eq!(follow(&mut empty, &motions, 1.5) + follow(&mut cloud(), &[], 1.5), 0);
+        assert_eq!(follow(&mut empty, &motions, 1.5) + follow(&mut cloud(), &Motions::new(Vec::new(), 50.0), 1.5), 0);
     }
 }

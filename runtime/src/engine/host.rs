@@ -33,6 +33,8 @@ pub struct HostRequest<'a> {
     pub initialiser: u64,
     /// `[refine]`, when poses are refined.
     pub refine: Option<&'a RefineSettings>,
+    /// What is large of matching's key frames waits in a file.
+    pub refine_in_file: bool,
     /// Pixels of a picture as it leaves the camera.
     pub camera_pixels: u64,
     /// Pictures decoded ahead of the engine, at training size.
@@ -58,10 +60,10 @@ impl HostPlan {
         let (n, v, p) = (r.plan.scene as u64, r.plan.views as u64, r.plan.pixels as u64);
         let coefficients = (u64::from(r.plan.sh_degree) + 1).pow(2);
         let matching = r.refine.map_or(0, |s| {
-            let side = u64::from(s.feature_side);
-            // Per feature 100 bytes, per observation 250 (`RefineSettings`); luma at the network's size, 4:3.
+            // Per feature 100 bytes, 64 of them its descriptor's, per observation 250 (`RefineSettings`).
             let keyframes = v.max(s.max_keyframes.min(r.plan.views) as u64);
-            let per_keyframe = s.max_features as u64 * 100 + side * side * 3 / 4;
+            let kept = if r.refine_in_file { 0 } else { s.kept_bytes() };
+            let per_keyframe = s.max_features as u64 * 36 + kept;
             let observations = (s.max_observations as u64).min(keyframes * s.max_features as u64);
             FEATURES_BYTES + keyframes * per_keyframe + observations * 250
         });
@@ -120,6 +122,7 @@ mod tests {
             shared: false,
             initialiser: 100 << 20,
             refine: Some(&refine),
+            refine_in_file: false,
             camera_pixels: 640 * 480,
             ahead: 4,
             ahead_in_memory: false,
@@ -128,6 +131,10 @@ mod tests {
         };
         of(&mut request);
         HostPlan::new(&request).total_bytes()
+    }
+
+    fn refine_kept() -> u64 {
+        RefineSettings::default().kept_bytes()
     }
 
     #[test]
@@ -141,6 +148,8 @@ mod tests {
         let delivery = plan.gaussians as u64 * (ENCODING_BYTES as u64 + 4 * (11 + 48));
         assert_eq!(total(&plan, |r| r.delivers = true) - before, delivery);
         assert_eq!(total(&plan, |r| r.map = 1 << 20) - before, 1 << 20);
+        let kept = plan.views as u64 * refine_kept();
+        assert_eq!(before - total(&plan, |r| r.refine_in_file = true), kept);
         assert!(total(&plan, |r| r.refine = None) < before && total(&plan, |r| r.initialiser = 0) < before);
         let larger = Plan::new(&PlanRequest { device_mib: 1024, ..PlanRequest::default() }).unwrap();
         let more = (larger.gaussians - plan.gaussians) as u64;

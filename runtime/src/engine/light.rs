@@ -11,11 +11,11 @@ use crate::error::JobError;
 const SAME: f32 = 1.002;
 
 impl Reconstruction {
-    /// Brings all training pictures from the light they are kept in into the common one of `light`; without it (a continuation makes
-    /// no new depths) into that of the model that is continued.
-    pub(super) fn even_light(&mut self, light: Option<Light>) -> Result<(), JobError> {
+    /// Brings the training pictures from number `from` on from the light they are kept in into the common one of `light`; without it
+    /// (a continuation makes no new depths) into that of the model that is continued.
+    pub(super) fn even_light(&mut self, light: Option<Light>, from: usize) -> Result<(), JobError> {
         self.taken_out.resize(self.views.len(), PictureLight::default());
-        for i in 0..self.views.len() {
+        for i in from..self.views.len() {
             let (name, was) = (&self.views[i].0, self.taken_out[i]);
             let known = || self.resumed_lights.get(name).copied().filter(|_| self.builds == 0).unwrap_or(was);
             let now = light.as_ref().map_or_else(known, |light| light.of(name));

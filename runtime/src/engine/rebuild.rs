@@ -3,32 +3,42 @@
 use models::camera::View;
 
 use super::Reconstruction;
-use super::carry::carry_over;
+use super::budget::Share;
+use super::carry::{Room, carry_over};
 use super::first_gaussians::FirstGaussians;
-use super::follow::{Motion, follow};
+use super::follow::{Motion, Motions, follow};
 use crate::error::JobError;
 
 /// Key frames that refinement moved less than this have not moved, pixels at the ground.
-const MOVED_PX: f64 = 0.05;
+pub(super) const MOVED_PX: f64 = 0.05;
 /// Trained Gaussians are kept over a rebuild only where their key frames' motions agree to this, pixels.
-const CONTRADICTED_PX: f64 = 1.5;
+pub(super) const CONTRADICTED_PX: f64 = 1.5;
 
 impl Reconstruction {
-    /// The cloud to train: what is trained already, and fresh Gaussians where it is not.
-    pub(super) fn take_over(&mut self, fresh: &FirstGaussians) -> Result<(), JobError> {
+    /// The cloud to train: what is trained already, and fresh Gaussians where it is not. How many of them are fresh.
+    pub(super) fn take_over(&mut self, fresh: &FirstGaussians) -> Result<usize, JobError> {
         if self.builds > 0 {
             self.trainer.snapshot(&mut self.cloud)?;
         }
         let made = fresh.report.as_ref().filter(|_| self.settings.incremental);
-        match made {
-            _ if self.is_continued() => {}
+        Ok(match made {
+            _ if self.is_continued() => 0,
             Some(made) => {
                 self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
-                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, self.trainer.plan().scene);
+                if self.builds > 0 && 2 * self.cloud.len() < fresh.cloud.len() {
+                    // What grew with the region in mind is coarse where less of it was flown.
+                    self.cloud.clone_from(&fresh.cloud);
+                    return Ok(self.cloud.len());
+                }
+                let (capacity, ground) = (self.trainer.plan().scene, self.initialiser.as_ref().map(|i| i.ground_m2()));
+                let room = Room::new(Share::over(capacity, ground.unwrap_or(0.0)).square());
+                carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, capacity, room)
             }
-            None => self.cloud.clone_from(&fresh.cloud),
-        }
-        Ok(())
+            None => {
+                self.cloud.clone_from(&fresh.cloud);
+                self.cloud.len()
+            }
+        })
     }
 
     /// Moves what is trained with the key frames that refinement moved since, at `depth_m`.
@@ -40,7 +50,7 @@ impl Reconstruction {
         let motions: Vec<Motion> = self.views.iter().enumerate().filter_map(then).collect();
         let most_px = motions.iter().map(|m| m.pixels_at(depth_m.into())).fold(0.0, f64::max);
         if most_px > MOVED_PX {
-            let dropped = follow(&mut self.cloud, &motions, CONTRADICTED_PX);
+            let dropped = follow(&mut self.cloud, &Motions::new(motions, depth_m.into()), CONTRADICTED_PX);
             self.report.skip("gaussians_contradicted", dropped as u64);
             tracing::info!(
                 "refinement moved earlier key frames by up to {most_px:.1} px: {} Gaussians follow, {dropped} are made anew",

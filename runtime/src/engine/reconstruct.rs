@@ -15,6 +15,8 @@ use crate::error::JobError;
 
 /// Fewer key frames than this say too little about the ground.
 const FIRST_BUILD: usize = 3;
+/// Key frames that may wait to be placed together.
+const PLACED_AT_ONCE: usize = 4;
 /// A model is rebuilt when the key frames have grown by this share since the last build: often enough that new ground
 /// is trained on soon, seldom enough that building does not eat the time of training.
 const REBUILD_GROWTH: f64 = 0.34;
@@ -32,6 +34,19 @@ pub trait Reconstruct {
     fn pose(&self, name: &str) -> Option<Pose>;
     /// Whether enough key frames came since the last build; with `last`, whether any did.
     fn wants_build(&self, last: bool) -> bool;
+    /// Whether key frames came that can be added to the model without building it anew.
+    fn wants_growth(&self) -> bool {
+        false
+    }
+    /// Adds the key frames that came to the model as it is trained; true when the poses of all others are known better, too.
+    ///
+    /// # Errors
+    /// The network or the device fails.
+    fn grow(&mut self) -> Result<bool, JobError> {
+        Ok(false)
+    }
+    /// No more key frames come.
+    fn land(&mut self) {}
     /// Whether there is a model to train.
     fn has_model(&self) -> bool;
     /// (Re)builds the model from all key frames and starts its schedule anew; false when `go_on` said no before it was.
@@ -105,12 +120,14 @@ impl Reconstruct for Reconstruction {
         picture.view.intrinsics = lens;
         let prior = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
         self.trainer.add_view(&picture, prior.as_ref())?;
+        self.index.insert(picture.name.clone(), self.views.len());
         self.views.push((picture.name.clone(), picture.view));
-        if self.settings.incremental && more {
+        let waiting = self.views.len() - self.initialised;
+        if self.settings.incremental && more && waiting < PLACED_AT_ONCE {
             return Ok(());
         }
         if self.settings.incremental && std::mem::take(&mut self.unsolved) {
-            self.refine()?;
+            self.place()?;
         }
         // Without refinement, or while pictures come, the pose is as good as it will be for now.
         if (self.settings.incremental || self.refiner.is_none())
@@ -119,11 +136,12 @@ impl Reconstruct for Reconstruction {
         {
             let from = Instant::now();
             self.initialise_waiting(self.views.len() - 1)?;
+            let first = !self.has_model();
             let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
             picture.view.pose = view.pose;
             initialiser.add(&picture)?;
             self.initialised = self.views.len();
-            if self.settings.incremental {
+            if self.settings.incremental && first {
                 // The network runs on a picture once its neighbours are there; doing it now spreads the work over the flight.
                 initialiser.advance(1)?;
             }
@@ -137,15 +155,29 @@ impl Reconstruct for Reconstruction {
     }
 
     fn pose(&self, name: &str) -> Option<Pose> {
-        self.views.iter().find(|v| v.0 == name).map(|v| v.1.pose)
+        self.index.get(name).map(|i| self.views[*i].1.pose)
     }
 
     fn wants_build(&self, last: bool) -> bool {
-        let (now, then) = (self.views.len(), self.built.len());
-        if now < FIRST_BUILD {
-            return false;
+        let (now, then) = (self.views.len(), self.growing.built);
+        match last {
+            _ if now < FIRST_BUILD => false,
+            true => now > then,
+            false if then > 0 && self.can_grow() => false,
+            false => then == 0 || now as f64 >= then as f64 * (1.0 + REBUILD_GROWTH),
         }
-        if last { now > then } else { then == 0 || now as f64 >= then as f64 * (1.0 + REBUILD_GROWTH) }
+    }
+
+    fn wants_growth(&self) -> bool {
+        self.has_model() && self.can_grow() && !self.unsolved && self.views.len() > self.built.len()
+    }
+
+    fn grow(&mut self) -> Result<bool, JobError> {
+        self.grow_model()
+    }
+
+    fn land(&mut self) {
+        self.flying = false;
     }
 
     fn has_model(&self) -> bool {
@@ -158,10 +190,11 @@ impl Reconstruct for Reconstruction {
         let from = Instant::now();
         let Some(mut fresh) = self.initialise(go_on)? else { return Ok(false) };
         self.report.stage("init", from);
-        self.even_light(fresh.light.take())?;
-        self.take_over(&fresh)?;
+        self.even_light(fresh.light.take(), 0)?;
+        let new = self.take_over(&fresh)?;
         let loaded = self.trainer.load(&self.cloud)?;
         self.unround()?;
+        self.fly_on();
         self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
         self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
         let mut with_prior = 0;
@@ -174,6 +207,8 @@ impl Reconstruct for Reconstruction {
             with_prior += u64::from(self.depth.is_some() || has_depth);
         }
         self.built = self.views.iter().map(|v| v.1).collect();
+        self.growing.all_built(self.views.len());
+        self.depth_m = fresh.report.as_ref().map_or(0.0, |made| 0.5 * (made.depth_m[0] + made.depth_m[1]));
         let network = self.depth.as_ref().map(|network| network.name().to_owned());
         let network = network.or(fresh.report.as_ref().map(|report| report.network.clone()));
         if with_prior > 0 {
@@ -199,11 +234,12 @@ impl Reconstruct for Reconstruction {
         self.builds += 1;
         self.report.views = self.views.len() as u64;
         self.report.more.insert("builds".into(), self.builds.into());
+        self.report.more.insert("gaussians_kept".into(), loaded.loaded.saturating_sub(new).into());
         tracing::info!(
-            "built from {} key frames: {} Gaussians ({} of them from the pictures) in {:.1} s",
+            "built from {} key frames: {} Gaussians ({} of them new) in {:.1} s",
             self.views.len(),
             loaded.loaded,
-            fresh.cloud.len(),
+            new,
             clock.elapsed().as_secs_f64()
         );
         Ok(true)
@@ -291,6 +327,7 @@ impl Reconstruct for Reconstruction {
         let (steps, seconds) = self.trainer.spent();
         self.trainer.load(&self.cloud)?;
         self.trainer.continue_from(steps, seconds);
+        self.fly_on();
         tracing::warn!("gave up {removed} Gaussians, {} remain", self.cloud.len());
         Ok(())
     }

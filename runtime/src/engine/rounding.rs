@@ -26,6 +26,7 @@ impl Reconstruction {
         let (steps, seconds) = self.trainer.spent();
         self.trainer.load(&self.cloud)?;
         self.trainer.continue_from(steps, seconds);
+        self.fly_on();
         let rates = self.settings.training.rates;
         self.trainer.set_rates(&RateSettings {
             mean_start: 0.0,

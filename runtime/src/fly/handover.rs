@@ -1,11 +1,12 @@
 //! Between the capture thread and the job: key frames one way, words for the ground control station the other, and what
 //! either has to know about the other without waiting for it.
 
+use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use hal::failsafe::{Action, Flags};
 use hal::mavlink::dialect::MavSeverity;
@@ -42,6 +43,8 @@ pub(super) struct Told {
 #[derive(Default)]
 struct Shared {
     waiting: AtomicUsize,
+    /// When those that wait came.
+    came: Mutex<VecDeque<Instant>>,
     stop: AtomicBool,
     over: AtomicBool,
     flags: Mutex<Flags>,
@@ -60,6 +63,10 @@ pub struct Handover {
     without_room: u64,
     /// Whether the last one was kept.
     room: bool,
+    /// When those came that are not in the model yet.
+    taken: Vec<Instant>,
+    /// Seconds that each took from its arrival into the model.
+    waited_s: Vec<f64>,
     frames: Receiver<KeyFrame>,
     words: SyncSender<(MavSeverity, String)>,
     shared: Arc<Shared>,
@@ -78,7 +85,17 @@ pub(super) fn handover() -> (Handover, CaptureEnd) {
     let (words, inbox) = sync_channel(WORDS);
     let shared = Arc::new(Shared::default());
     (
-        Handover { store: None, taken_up: None, without_room: 0, room: true, frames, words, shared: shared.clone() },
+        Handover {
+            store: None,
+            taken_up: None,
+            without_room: 0,
+            room: true,
+            taken: Vec::new(),
+            waited_s: Vec::new(),
+            frames,
+            words,
+            shared: shared.clone(),
+        },
         CaptureEnd { frames: to, words: inbox, shared },
     )
 }
@@ -160,6 +177,16 @@ impl Handover {
         Ok(())
     }
 
+    /// All key frames taken so far are in the model.
+    pub(super) fn note_in_model(&mut self) {
+        self.waited_s.extend(self.taken.drain(..).map(|came| came.elapsed().as_secs_f64()));
+    }
+
+    /// Seconds from the arrival of a picture until the model had it, in the order of the key frames.
+    pub fn waited_s(&self) -> &[f64] {
+        &self.waited_s
+    }
+
     /// What the HAL saw last, for the failsafe ladder.
     pub fn flags(&self) -> Flags {
         *self.shared.flags.lock().unwrap_or_else(PoisonError::into_inner)
@@ -193,6 +220,8 @@ impl PictureSource for Handover {
         }
         let Ok(frame) = self.frames.recv_timeout(patience) else { return Ok(None) };
         self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
+        let came = self.shared.came.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
+        self.taken.extend(came);
         self.keep(&frame)?;
         Ok(Some(frame.posed))
     }
@@ -223,9 +252,12 @@ impl PictureSource for Handover {
 impl CaptureEnd {
     /// One key frame more, or one less, waits to be taken.
     pub(super) fn count(&self, more: bool) {
+        let mut came = self.shared.came.lock().unwrap_or_else(PoisonError::into_inner);
         if more {
+            came.push_back(Instant::now());
             self.shared.waiting.fetch_add(1, Ordering::AcqRel);
         } else {
+            came.pop_back();
             self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
         }
     }

@@ -147,6 +147,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     fn reconstruct(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
         if capture.earlier_left() == 0 && self.reconstruction.wants_build(false) {
             self.build(capture)?;
+        } else if self.reconstruction.wants_growth() {
+            self.grow(capture)?;
         }
         self.train(capture, interrupt)
     }
@@ -207,12 +209,31 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         };
         match self.reconstruction.build(&at_work) {
             Ok(_) => {
+                capture.note_in_model();
                 capture.refined(|name| self.reconstruction.pose(name))?;
                 self.save(capture)
             }
             // In flight more pictures may mend what too few of them could not do.
             Err(e @ (JobError::Init(_) | JobError::Network(_))) if capture.is_open() => {
                 tracing::warn!("not built yet: {e}");
+                Ok(())
+            }
+            Err(e) => Err(e),
+        }
+    }
+
+    /// Adds the newest key frames to the model; the next checkpoint that is due has them.
+    fn grow(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+        self.act_as(capture, Activity::Building);
+        self.supervisor.alive();
+        match self.reconstruction.grow() {
+            Ok(whole) => {
+                capture.note_in_model();
+                if whole { capture.refined(|name| self.reconstruction.pose(name)) } else { Ok(()) }
+            }
+            // In flight more pictures may mend what too few of them could not do.
+            Err(e @ (JobError::Init(_) | JobError::Network(_))) if capture.is_open() => {
+                tracing::warn!("not in the model yet: {e}");
                 Ok(())
             }
             Err(e) => Err(e),

@@ -4,7 +4,7 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::Instant;
 
 use config::disk::Disk;
 use config::mission::CameraSettings;
@@ -112,14 +112,18 @@ fn kill_9_at_random_moments_loses_nothing_promised_leaves_no_file_and_ends_with_
     let (undisturbed, said) = (folder.path().join("undisturbed"), folder.path().join("said"));
     fly(&undisturbed, |_| {});
     let whole = std::fs::read(model_path(&undisturbed)).expect("a model");
+    // How long a flight of a process takes that nobody kills: some machines sync in no time.
+    let begun = Instant::now();
+    assert!(start(&folder.path().join("timed"), &said).wait().expect("ends").success());
+    let flies = begun.elapsed();
     let (mut flight, mut killed, mut in_work, mut swept) = (0, 0, 0, 0);
     let (mut key_frames, mut steps): (Vec<String>, u64) = (Vec::new(), 0);
     while killed < kills {
         let out = folder.path().join(format!("flight-{flight}"));
         let mut child = start(&out, &said);
         // Seeded, and anywhere between the start and some time after the end.
-        let chance = u64::from(blake3::hash(&killed.to_le_bytes()).as_bytes()[0]);
-        std::thread::sleep(Duration::from_millis(1 + chance));
+        let chance = f64::from(blake3::hash(&killed.to_le_bytes()).as_bytes()[0]) / 255.0;
+        std::thread::sleep(flies.mul_f64(1.5 * chance));
         child.kill().expect("killed");
         child.wait().expect("gone");
         killed += 1;

@@ -76,7 +76,7 @@ impl Trainer {
         Ok(())
     }
 
-    fn count_missing(&mut self) {
+    pub(super) fn count_missing(&mut self) {
         let most = sh_coefficients(self.plan.sh_degree);
         let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
         let missing = |state: f32| (most - sh_coefficients(degree_of(state)).min(most)) as u64;

@@ -247,7 +247,7 @@ impl Trainer {
 }
 
 /// A record of Gaussian `from` with its first `coefficients` numbers of SH, without moments.
-fn record_of(cloud: &GaussianCloud, from: usize, coefficients: usize, record: &mut [u8]) {
+pub(super) fn record_of(cloud: &GaussianCloud, from: usize, coefficients: usize, record: &mut [u8]) {
     let stride = cloud.sh_stride();
     let coefficients = &cloud.sh[from * stride..from * stride + coefficients];
     let geometry = Geometry {

@@ -1,9 +1,19 @@
-//! Which view comes next: each once per epoch in a seeded shuffle, plus extra visits to those with the largest loss.
+//! Which view comes next: each once per epoch in a seeded shuffle, plus extra visits to those with the largest loss; or, while
+//! views still come, the newest first.
 
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+/// Mean age of the views that are looked at while new ones come, in views: from two lines of flight every view of the last line is
+/// still looked at.
+const TAIL: u32 = 12;
+/// Views drawn at once, so that the next one is known.
+const DRAWN: usize = 4;
+
 pub(crate) struct Sampler {
+    newest: bool,
+    /// Views drawn since the last new one.
+    drawn: u32,
     seed: u64,
     rng: Pcg64Mcg,
     order: Vec<u32>,
@@ -13,7 +23,14 @@ pub(crate) struct Sampler {
 impl Sampler {
     pub fn new(seed: u64, capacity: usize) -> Self {
         let order = Vec::with_capacity(2 * capacity + 1);
-        Self { seed, rng: Pcg64Mcg::seed_from_u64(seed), order, by_loss: Vec::with_capacity(capacity) }
+        Self {
+            newest: false,
+            drawn: 0,
+            seed,
+            rng: Pcg64Mcg::seed_from_u64(seed),
+            order,
+            by_loss: Vec::with_capacity(capacity),
+        }
     }
 
     /// Back to the first epoch.
@@ -25,6 +42,28 @@ impl Sampler {
     /// The set of views changed: the present epoch ends.
     pub fn forget(&mut self) {
         self.order.clear();
+        self.drawn = 0;
+    }
+
+    /// Newest first, or epochs.
+    pub fn look_at_newest(&mut self, on: bool) {
+        if std::mem::replace(&mut self.newest, on) != on {
+            self.order.clear();
+        }
+    }
+
+    /// Views by age, each less likely than the next newer one by the same factor. The longer no new one comes, the longer the tail.
+    fn draw_newest(&mut self, views: usize) {
+        for _ in 0..DRAWN {
+            let mean = TAIL + self.drawn / 2;
+            let mut age = 0;
+            while self.rng.random_range(0..mean) != 0 {
+                age += 1;
+            }
+            self.order.push((views - 1 - age % views) as u32);
+            self.drawn = self.drawn.saturating_add(1);
+        }
+        self.order.reverse();
     }
 
     /// A generator for what else needs chance (density control).
@@ -39,6 +78,9 @@ impl Sampler {
 
     /// `losses(view)` is the view's last loss; `views` is at least 1.
     pub fn next(&mut self, views: usize, residual_share: f32, losses: impl Fn(usize) -> f32) -> usize {
+        if self.order.is_empty() && self.newest {
+            self.draw_newest(views);
+        }
         if self.order.is_empty() {
             self.order.extend(0..views as u32);
             let extra = (views as f32 * residual_share) as usize;
@@ -78,6 +120,31 @@ mod tests {
             assert_eq!(visits(4, |_| loss), [2, 2, 1, 1], "{loss}");
         }
         assert_eq!(visits(1, |_| 0.0), [1]);
+    }
+
+    #[test]
+    fn while_views_come_the_newest_are_looked_at_first_and_each_as_often_however_many_there_are() {
+        // A view every eight steps.
+        let flown = |views: usize| {
+            let mut sampler = Sampler::new(3, views);
+            sampler.look_at_newest(true);
+            let mut visits = vec![0; views];
+            for newest in 0..views {
+                sampler.forget();
+                (0..8).for_each(|_| visits[sampler.next(newest + 1, 0.0, |_| 0.0)] += 1);
+            }
+            visits
+        };
+        let visits = flown(400);
+        let mean = |part: &[usize]| part.iter().sum::<usize>() as f64 / part.len() as f64;
+        let (early, late) = (mean(&visits[50..150]), mean(&visits[250..350]));
+        assert!((early / late - 1.0).abs() < 0.1 && (late - 8.0).abs() < 1.0, "{early} {late}");
+        // When nothing new comes every view has its turn.
+        let mut sampler = Sampler::new(3, 100);
+        sampler.look_at_newest(true);
+        let mut seen = vec![0; 100];
+        (0..2000).for_each(|_| seen[sampler.next(100, 0.0, |_| 0.0)] += 1);
+        assert!(seen.iter().all(|n| *n > 0), "{seen:?}");
     }
 
     #[test]

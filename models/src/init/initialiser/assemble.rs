@@ -7,7 +7,7 @@ use config::init::InitSettings;
 use rayon::prelude::*;
 
 use super::{Initialiser, VOXELS_PER_GAUSSIAN};
-use crate::camera::{DepthPrior, Pinhole, View};
+use crate::camera::{DepthPrior, Pinhole};
 use crate::init::consistency::{ConsistencyCount, resolve};
 use crate::init::fill::continued;
 use crate::init::lighting::measure;
@@ -28,21 +28,22 @@ const VOXEL: f32 = 0.7;
 const SPREAD: f32 = 1.7;
 
 impl Initialiser {
-    /// Consistency, samples, merge.
+    /// Consistency, samples, merge of `pictures`.
     pub(super) fn assemble(
         &mut self,
+        pictures: &[usize],
         max_gaussians: usize,
         prior: &mut dyn FnMut(&str, DepthPrior),
     ) -> Result<Initialisation, InitError> {
         let started = Instant::now();
-        let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
         let mut spacing = Vec::new();
         let mut center = glam::DVec3::ZERO;
-        for (i, frame) in self.frames.iter().enumerate() {
+        for &i in pictures {
+            let frame = &self.frames[i];
             let k = &frame.view.intrinsics;
             if let Some(depth) = self.typical_depth(i) {
                 spacing.push((depth as f32 * self.settings.stride as f32 / k.fx.max(k.fy), depth as f32));
-                center += Pinhole::from(&frame.view).unproject([k.cx, k.cy], depth) / self.frames.len() as f64;
+                center += Pinhole::from(&frame.view).unproject([k.cx, k.cy], depth) / pictures.len() as f64;
             }
         }
         spacing.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -52,20 +53,13 @@ impl Initialiser {
         let report = &mut self.report;
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
         (report.consistency_ms, report.samples_ms, report.voxels_ms) = (0.0, 0.0, 0.0);
-        let with_depth: Vec<usize> = (0..self.frames.len()).filter(|&i| self.frames[i].has_depth()).collect();
-        let light = match self.settings.light {
-            true => self.measure_light(&views)?,
-            false => None,
-        };
+        let with_depth: Vec<usize> = pictures.iter().copied().filter(|&i| self.frames[i].has_depth()).collect();
         // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
         let mut waiting: Vec<Checked> = Vec::new();
         for next in with_depth.chunks(AHEAD).map(Some).chain([None]) {
             let this = &*self;
             let check = || -> Result<Vec<Checked>, InitError> {
-                let checked = next
-                    .unwrap_or(&[])
-                    .par_iter()
-                    .map(|&i| this.check(i, &views, light.as_ref(), global_scale).transpose());
+                let checked = next.unwrap_or(&[]).par_iter().map(|&i| this.check(i, global_scale).transpose());
                 checked.flatten_iter().collect()
             };
             let sort = || {
@@ -101,21 +95,22 @@ impl Initialiser {
         report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
         let planned = self.planned_bytes(self.frames.len(), max_gaussians);
         self.report.planned_bytes = planned;
-        Ok(Initialisation { cloud, light, report: self.report.clone() })
+        Ok(Initialisation { cloud, light: self.light.clone(), report: self.report.clone() })
     }
 
     /// The pictures that see most of what picture `i` sees.
-    fn witnesses(&self, i: usize, views: &[View]) -> Vec<usize> {
+    pub(super) fn witnesses(&self, i: usize) -> Vec<usize> {
         let depth = self.typical_depth(i).unwrap_or(1.0);
         let wide = InitSettings { covisible: WITNESSES, ..self.settings.clone() };
-        let others = partners(i, views, depth, &wide, &mut SkippedPairs::default());
+        let views = self.frames.iter().map(|f| &f.view);
+        let others = partners((i, &self.frames[i].view), views, depth, &wide, &mut SkippedPairs::default());
         others.into_iter().take(WITNESSES).map(|o| o.0).collect()
     }
 
     /// The pictures' light where it is uneven.
-    fn measure_light(&mut self, views: &[View]) -> Result<Option<Light>, InitError> {
+    pub(super) fn measure_light(&mut self) -> Result<Option<Light>, InitError> {
         let started = Instant::now();
-        let found = measure(&self.frames, |i| self.witnesses(i, views), self.settings.depth_tolerance)?;
+        let found = measure(&self.frames, |i| self.witnesses(i), self.settings.depth_tolerance)?;
         self.report.light = [found.solved.before, found.solved.after];
         self.report.light_ms = started.elapsed().as_secs_f64() * 1e3;
         let [differ, left] = [found.solved.before, found.solved.after].map(|log| 100.0 * log.exp_m1());
@@ -135,20 +130,14 @@ impl Initialiser {
     }
 
     /// The depths of picture `i` after comparison with the pictures that see the same ground, as samples and as a prior.
-    fn check(
-        &self,
-        i: usize,
-        views: &[View],
-        light: Option<&Light>,
-        global_scale: f32,
-    ) -> Result<Option<Checked>, InitError> {
+    fn check(&self, i: usize, global_scale: f32) -> Result<Option<Checked>, InitError> {
         let started = Instant::now();
         let Some(own) = self.frames[i].depth()? else { return Ok(None) };
         let range = self.known_range(i);
         let mut count = ConsistencyCount::default();
         let mut grid = None;
         if self.settings.consistency {
-            let others = self.witnesses(i, views);
+            let others = self.witnesses(i);
             let fill = range.filter(|_| self.settings.fill).and_then(|range| continued(&own, range));
             if let Some((resolved, found)) =
                 resolve(&self.frames, i, &others, self.settings.depth_tolerance, fill.as_deref())?
@@ -162,7 +151,7 @@ impl Initialiser {
         let consistency_ms = started.elapsed().as_secs_f64() * 1e3;
         let appearance = self.appearance.get(i).and_then(Option::as_ref);
         let mut image = self.frames[i].image()?;
-        if let Some(light) = light {
+        if let Some(light) = &self.light {
             let (own, lens) = (light.of(&self.frames[i].name), &self.frames[i].view.intrinsics);
             own.change(&PictureLight::default(), image.to_mut(), lens);
         }

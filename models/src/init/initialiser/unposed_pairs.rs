@@ -18,7 +18,7 @@ impl Initialiser {
                 return Err(InitError::NoRange { points: self.range.len() });
             };
             self.report.searched(range);
-            let good = partners(i, views, middle(range), &self.settings, &mut SkippedPairs::default());
+            let good = partners((i, &views[i]), views, middle(range), &self.settings, &mut SkippedPairs::default());
             pairs.extend(good.into_iter().map(|(j, _)| [i.min(j), i.max(j)]));
         }
         pairs.sort_unstable();

@@ -75,6 +75,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     fn finish_schedule(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
+        self.reconstruction.land();
         if self.reconstruction.wants_build(true) && !interrupt.requested() {
             self.build(capture)?;
         }

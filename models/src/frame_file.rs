@@ -49,6 +49,22 @@ impl<T: AsBytes> Kept<T> {
         Ok(Self::File { file: Arc::clone(file), at, shape: value.shape() })
     }
 
+    /// As [`Self::new`]; what cannot be written stays in memory.
+    pub fn at_best(value: T, file: Option<&Arc<FrameFile>>) -> Self {
+        Self::new(value.clone(), file).unwrap_or_else(|e| {
+            tracing::warn!("the file of what waits of key frames: {e}; kept in memory");
+            Self::Memory(value)
+        })
+    }
+
+    /// Bytes it takes of the memory.
+    pub fn bytes_in_memory(&self) -> usize {
+        match self {
+            Self::Memory(value) => T::byte_count(value.shape()),
+            Self::File { .. } => 0,
+        }
+    }
+
     /// Another value in its place; one of the same shape takes no more of the file.
     pub fn replace(&mut self, value: T) -> io::Result<()> {
         match self {

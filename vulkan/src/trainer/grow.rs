@@ -1,0 +1,297 @@
+//! A scene that grows while it is trained: Gaussians of new ground come to those there are, and others move or go, while all that
+//! nobody touches keeps its place, its moments and its part of the schedule.
+
+use super::parameters::{Geometry, LoadReport, record_of};
+use super::{TrainError, Trainer, state};
+use config::training::Strategy;
+use models::cloud::{GaussianCloud, sh_coefficients};
+
+/// Gaussians among which one is sought whose second moments new ones begin with.
+const LOOKED_AT: usize = 1024;
+
+/// A Gaussian as it is trained.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Trained {
+    /// Metres.
+    pub mean: [f32; 3],
+    /// Natural logarithms of metres.
+    pub log_scale: [f32; 3],
+    /// w, x, y, z.
+    pub rotation: [f32; 4],
+    /// Opacity before the sigmoid.
+    pub opacity_logit: f32,
+}
+
+impl Trained {
+    /// Opacity-weighted area of the disc spanned by its two longest axes, m²: how much of the ground it covers.
+    pub fn covers_m2(&self) -> f32 {
+        let [a, b, c] = self.log_scale;
+        let area = a + b + c - a.min(b).min(c);
+        std::f32::consts::PI * area.exp() / (1.0 + (-self.opacity_logit).exp())
+    }
+}
+
+impl From<&Geometry> for Trained {
+    fn from(g: &Geometry) -> Self {
+        let Geometry { mean, log_scale, rotation, opacity_logit, .. } = *g;
+        Self { mean, log_scale, rotation, opacity_logit }
+    }
+}
+
+/// What becomes of a Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Fate {
+    /// Nothing.
+    Stays,
+    /// It lies elsewhere, turned.
+    Moves {
+        /// Metres.
+        mean: [f32; 3],
+        /// w, x, y, z.
+        rotation: [f32; 4],
+    },
+    /// It is taken out.
+    Goes,
+}
+
+impl Trainer {
+    /// Whether Gaussians can be added and moved where they are; else [`Trainer::snapshot`] and [`Trainer::load`] do it.
+    pub fn grows_in_place(&self) -> bool {
+        !self.plan.is_paged()
+    }
+
+    /// From here on, until the next [`Trainer::load`] that is followed by none of this: views are looked at newest first, with an
+    /// exponential tail of older ones, instead of once in an epoch each, and the number of Gaussians is the caller's: nothing is
+    /// densified.
+    pub fn while_views_come(&mut self) {
+        self.sampler.look_at_newest(true);
+        self.strategy = Strategy::None;
+    }
+
+    /// Begins the schedule anew for what is there; moments stay.
+    pub fn renew_schedule(&mut self) {
+        self.before = (0, 0.0);
+        self.since = (self.steps, self.elapsed_s);
+    }
+
+    /// Shows every Gaussian, in order.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`].
+    pub fn each(&mut self, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
+        self.flush()?;
+        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
+        geometry.iter().for_each(|g| see(&g.into()));
+        Ok(())
+    }
+
+    /// Moves Gaussians and takes others out, as `fate` says of each by its number; never the last one. Returns how many went. Only
+    /// where [`Trainer::grows_in_place`].
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`].
+    pub fn revise(&mut self, mut fate: impl FnMut(usize, &Trained) -> Fate) -> Result<usize, TrainError> {
+        self.flush()?;
+        let mut gone: Vec<u32> = Vec::new();
+        for (i, g) in self.parameters.geometry_mut(&mut self.arena)[..self.gaussians].iter_mut().enumerate() {
+            match fate(i, &(&*g).into()) {
+                Fate::Stays => {}
+                Fate::Moves { mean, rotation } => (g.mean, g.rotation) = (mean, rotation),
+                Fate::Goes => gone.push(i as u32),
+            }
+        }
+        // From the last one on: what takes a place is one that stays.
+        for index in gone.iter().rev().map(|i| *i as usize) {
+            if self.gaussians <= 1 {
+                break;
+            }
+            self.gaussians -= 1;
+            if index != self.gaussians {
+                self.parameters.shift(&mut self.arena, self.gaussians, index);
+            }
+        }
+        self.count_missing();
+        Ok(gone.len())
+    }
+
+    /// Adds Gaussians, as many as find room; those that are not finite are left out. Only where [`Trainer::grows_in_place`].
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`].
+    pub fn extend(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
+        self.flush()?;
+        let valid: Vec<usize> = (0..cloud.len()).filter(|i| cloud.is_valid(*i)).collect();
+        let room = self.plan.gaussians.saturating_sub(self.gaussians);
+        let report = LoadReport {
+            loaded: valid.len().min(room),
+            dropped_non_finite: cloud.len() - valid.len(),
+            dropped_over_capacity: valid.len().saturating_sub(room),
+        };
+        let donor = self.donor();
+        let coefficients = sh_coefficients(self.plan.sh_degree.min(cloud.sh_degree)) * 3;
+        let all_degrees = self.settings.sh.raise_share >= 1.0;
+        let mut record = std::mem::take(&mut self.record);
+        for from in valid.into_iter().take(room) {
+            let to = self.gaussians;
+            record_of(cloud, from, coefficients, &mut record);
+            self.parameters.write_record(&mut self.arena, to, &record);
+            let second = donor.map(|donor| {
+                self.parameters.sh_second.copy(&mut self.arena, donor, to);
+                self.parameters.geometry(&self.arena)[donor].second
+            });
+            let g = &mut self.parameters.geometry_mut(&mut self.arena)[to];
+            // It missed nothing before it was there.
+            g.state = state::up_to(g.state, self.steps);
+            if all_degrees {
+                g.state = state::with_degree(g.state, self.plan.sh_degree);
+            }
+            g.second = second.unwrap_or(g.second);
+            self.gaussians += 1;
+        }
+        self.record = record;
+        self.count_missing();
+        Ok(report)
+    }
+
+    /// The Gaussian whose second moments new ones begin with: from zero, their first steps would be several times too long, as Adam no
+    /// longer corrects that bias after many steps ([`Parameters::copy`](super::parameters::Parameters::copy)). Its position is pulled
+    /// harder than three quarters of those looked at are, as new ones are; none before the first step.
+    fn donor(&self) -> Option<usize> {
+        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
+        let pull = |g: &Geometry| g.second[0][..3].iter().sum::<f32>();
+        let every = self.gaussians.div_ceil(LOOKED_AT).max(1);
+        let looked_at = geometry.iter().enumerate().step_by(every).map(|(i, g)| (pull(g), i));
+        let mut moved: Vec<(f32, usize)> = looked_at.filter(|(pull, _)| *pull > 0.0 && pull.is_finite()).collect();
+        let at = moved.len() * 3 / 4;
+        (at < moved.len()).then(|| moved.select_nth_unstable_by(at, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).1.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use config::plan::{Plan, PlanRequest};
+
+    use super::*;
+    use crate::gpu::Gpu;
+    use crate::synthetic::{cloud, photo, plain, posed, view};
+
+    fn trainer(views: u32) -> Option<Trainer> {
+        let Ok(gpu) = Gpu::open(None) else {
+            println!("skipped: no Vulkan device");
+            return None;
+        };
+        let request = PlanRequest { width: 48, height: 32, views, max_gaussians: Some(200), ..Default::default() };
+        let mut t = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap();
+        for k in 0..views {
+            let v = view(48, 32);
+            t.add_view(&posed(&v, &photo(u64::from(k), &v)), None).unwrap();
+        }
+        Some(t)
+    }
+
+    fn snapshot(t: &mut Trainer) -> GaussianCloud {
+        let mut out = GaussianCloud::default();
+        t.snapshot(&mut out).unwrap();
+        out
+    }
+
+    #[test]
+    fn new_gaussians_come_to_the_trained_ones_which_keep_places_and_moments() {
+        let Some(mut t) = trainer(1) else { return };
+        t.load(&cloud(1, 80, 0)).unwrap();
+        (0..6).for_each(|_| _ = t.step().unwrap());
+        let before = snapshot(&mut t);
+        let moments =
+            |t: &Trainer| t.parameters.geometry(&t.arena)[..80].iter().map(|g| (g.first, g.second)).collect::<Vec<_>>();
+        let (then, steps) = (moments(&t), t.steps());
+        let mut more = cloud(2, 150, 0);
+        more.means[3][1] = f32::NAN;
+        let report = t.extend(&more).unwrap();
+        assert_eq!((report.loaded, report.dropped_non_finite, report.dropped_over_capacity), (120, 1, 29));
+        assert_eq!((t.gaussians(), t.steps()), (200, steps));
+        let after = snapshot(&mut t);
+        assert_eq!(after.means[..80], before.means[..]);
+        assert_eq!(after.sh[..80 * after.sh_stride()], before.sh[..]);
+        assert_eq!(after.means[80..83], more.means[..3]);
+        assert_eq!(after.means[83], more.means[4], "what is no number is left out");
+        assert!(moments(&t) == then);
+        let new = t.parameters.geometry(&t.arena)[90];
+        assert!(new.second[0][0] > 0.0 && new.first == [[0.0; 4]; 3], "the first step is of the usual length");
+        // The next steps move new ones no further than the first steps of all moved the old ones.
+        let first = cloud(1, 80, 0);
+        let furthest = |a: &[[f32; 3]], b: &[[f32; 3]]| {
+            let apart = |(p, q): (&[f32; 3], &[f32; 3])| (0..3).map(|k| (p[k] - q[k]).abs()).fold(0.0, f32::max);
+            a.iter().zip(b).map(apart).fold(0.0, f32::max)
+        };
+        (0..6).for_each(|_| _ = t.step().unwrap());
+        let later = snapshot(&mut t);
+        let (old, new) = (furthest(&first.means, &before.means), furthest(&after.means[80..], &later.means[80..]));
+        assert!(new > 0.0 && new < 3.0 * old, "{new} {old}");
+        assert_eq!(t.gaussians(), 200, "their number is the caller's");
+    }
+
+    #[test]
+    fn gaussians_move_and_go_where_they_are_and_the_others_stay_to_the_bit() {
+        let Some(mut t) = trainer(1) else { return };
+        t.load(&cloud(1, 60, 0)).unwrap();
+        (0..3).for_each(|_| _ = t.step().unwrap());
+        let before = snapshot(&mut t);
+        let turned = [0.0, 1.0, 0.0, 0.0];
+        let gone = t
+            .revise(|i, g| match i {
+                0..10 => Fate::Goes,
+                10..20 => Fate::Moves { mean: [g.mean[0] + 1.0, g.mean[1], g.mean[2]], rotation: turned },
+                59 => Fate::Goes,
+                _ => Fate::Stays,
+            })
+            .unwrap();
+        assert_eq!((gone, t.gaussians()), (11, 49));
+        let after = snapshot(&mut t);
+        assert_eq!(after.means[20..49], before.means[20..49]);
+        for i in 10..20 {
+            assert_eq!(after.means[i][0], before.means[i][0] + 1.0);
+            assert_eq!(after.rotations[i], turned);
+        }
+        let mut filled = after.means[..10].to_vec();
+        filled.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        let mut last = before.means[49..59].to_vec();
+        last.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        assert_eq!(filled, last, "the last ones take the places that became free");
+        assert!(t.step().unwrap().loss.is_finite());
+        assert_eq!(t.revise(|_, _| Fate::Goes).unwrap(), 49);
+        assert_eq!(t.gaussians(), 1, "never the last one");
+    }
+
+    #[test]
+    fn a_schedule_that_begins_anew_leaves_gaussians_and_steps_as_they_are() {
+        let Some(mut t) = trainer(1) else { return };
+        t.load(&cloud(1, 40, 0)).unwrap();
+        (0..5).for_each(|_| _ = t.step().unwrap());
+        assert_eq!(t.spent().0, 5);
+        let before = snapshot(&mut t);
+        t.renew_schedule();
+        assert_eq!((t.spent().0, t.steps(), t.progress()), (0, 5, 0.0));
+        assert_eq!(snapshot(&mut t), before);
+        t.step().unwrap();
+        assert_eq!((t.spent().0, t.steps()), (1, 6));
+        t.load(&before).unwrap();
+        assert_eq!((t.spent().0, t.steps()), (0, 0));
+    }
+
+    #[test]
+    fn what_grows_is_the_same_bytes_whenever_it_grows_in_the_same_steps() {
+        let grown = || {
+            let mut t = trainer(3)?;
+            t.load(&cloud(1, 60, 0)).unwrap();
+            t.while_views_come();
+            for k in 0..4 {
+                (0..5).for_each(|_| _ = t.step().unwrap());
+                t.extend(&cloud(10 + k, 20, 0)).unwrap();
+                t.renew_schedule();
+            }
+            (0..5).for_each(|_| _ = t.step().unwrap());
+            Some(snapshot(&mut t))
+        };
+        assert_eq!(grown(), grown());
+    }
+}
