@@ -37,7 +37,7 @@ fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the
         assert!(psnr(&own) > psnr(&naive["mean_color"]) + 4.0, "{aircraft}: {own}");
         // What merging costs an aircraft on its own views. At the demo's own length on an idle machine it costs nothing (BENCHMARKS);
         // with fifteen seconds of training, and as many of distillation beside other tests, 0.1 to 0.5 dB were seen.
-        assert!(psnr(&global) > psnr(&own) - 0.8, "{aircraft}: {global}\n{own}");
+        assert!(psnr(&global) > psnr(&own) - 0.5, "{aircraft}: {global}\n{own}");
         let run = json_file(&out.join(aircraft).join("out/run.json"));
         assert_eq!(run["outcome"], "done");
         assert_eq!(run["device_bytes_planned"], run["device_bytes_peak"]);
