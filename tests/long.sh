@@ -1,6 +1,6 @@
 #!/bin/bash
 # A long flight: `dgtr sim` flies a survey of as many pictures as asked, `dgtr fly` makes the model in a fixed plan, under a bound on
-# its memory. What is asked of it (issue 17): memory that does not grow with the flight, and a new picture in the model within
+# its memory. What is asked of it: memory that does not grow with the flight, and a new picture in the model within
 # seconds, however long the flight is already.
 #   tests/long.sh [--pictures N] [--width W] [--speed X] [--seconds S] [--out DIR]
 # N pictures of a region of 600 × 400 m per 1,000; W pixels wide (4:3); X seconds of flight per second; S seconds of training after
@@ -47,8 +47,6 @@ sim=$!
 fly=
 trap 'kill "$sim" ${fly:+"$fly"} 2>/dev/null || true' EXIT
 while [ ! -e port ]; do kill -0 "$sim" || { cat sim.log >&2; exit 1; }; sleep 0.1; done
-# What is large and only for a moment goes back to the system, as in the packages' unit.
-export MALLOC_ARENA_MAX=2 MALLOC_MMAP_THRESHOLD_=1048576
 DGTR_KERNELS=default "$dgtr" --limit-mib "$host_mib" fly --mission mission.toml --out out --silence 120 > fly.log 2>&1 &
 fly=$!
 

@@ -12,13 +12,12 @@ use crate::formats::FormatError;
 use crate::formats::model::Chunks;
 use crate::formats::sog::streamed::Writer;
 use leaves::{Counts, Ground};
+use merge::coarser;
 use scratch::Scratch;
 
 mod leaves;
 mod merge;
 mod scratch;
-
-pub use merge::coarser;
 
 /// Side of a level's voxels, in those of the level below or in usual distances between neighbours: four to one on a surface.
 const WIDER: f64 = 2.0;

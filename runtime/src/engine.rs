@@ -312,15 +312,7 @@ impl Reconstruction {
         let from = Instant::now();
         let solved = refiner.solve()?;
         for (name, view) in &mut self.views {
-            if let Some(pose) = refiner.pose(name) {
-                view.pose = pose;
-                if let Some(initialiser) = &mut self.initialiser {
-                    initialiser.update_pose(name, &pose);
-                }
-            }
-            if let Some(lens) = refiner.intrinsics(name) {
-                view.intrinsics = lens.resized(view.intrinsics.width, view.intrinsics.height);
-            }
+            take_refined(refiner, &mut self.initialiser, name, view);
         }
         self.refined = Some(solved);
         self.growing.all_placed(self.views.len());
@@ -380,5 +372,18 @@ impl Reconstruction {
             }
             InitKind::FeedForward | InitKind::SparsePoints => sparse(&self.points, capacity)?.into(),
         }))
+    }
+}
+
+/// What refinement knows of a view by now: for the view, and for the initialiser's picture of it.
+fn take_refined(refiner: &Refiner, initialiser: &mut Option<Initialiser>, name: &str, view: &mut View) {
+    if let Some(pose) = refiner.pose(name) {
+        view.pose = pose;
+        if let Some(initialiser) = initialiser {
+            initialiser.update_pose(name, &pose);
+        }
+    }
+    if let Some(lens) = refiner.intrinsics(name) {
+        view.intrinsics = lens.resized(view.intrinsics.width, view.intrinsics.height);
     }
 }

@@ -8,10 +8,10 @@ use models::camera::DepthPrior;
 use models::cloud::GaussianCloud;
 use vulkan::trainer::{Fate, Trained};
 
-use super::Reconstruction;
 use super::carry::{Claims, Room};
 use super::follow::{Motion, Motions};
 use super::rebuild::{CONTRADICTED_PX, MOVED_PX};
+use super::{Reconstruction, take_refined};
 use crate::error::JobError;
 
 /// All poses are solved at once whenever the key frames have grown by this share: their errors, which pictures and GPS bound, are
@@ -78,16 +78,7 @@ impl Reconstruction {
         let near = refiner.solve_near()?;
         for name in &near.moved {
             let Some(&i) = self.index.get(name) else { continue };
-            let view = &mut self.views[i].1;
-            if let Some(pose) = refiner.pose(name) {
-                view.pose = pose;
-                if let Some(initialiser) = &mut self.initialiser {
-                    initialiser.update_pose(name, &pose);
-                }
-            }
-            if let Some(lens) = refiner.intrinsics(name) {
-                view.intrinsics = lens.resized(view.intrinsics.width, view.intrinsics.height);
-            }
+            take_refined(refiner, &mut self.initialiser, name, &mut self.views[i].1);
             self.growing.moved.insert(i);
         }
         let points = refiner.recent_points().iter().map(|p| p.position.map(|v| v as f32));

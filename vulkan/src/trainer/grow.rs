@@ -100,6 +100,7 @@ impl Trainer {
                 Fate::Goes => gone.push(i as u32),
             }
         }
+        let before = self.gaussians;
         // From the last one on: what takes a place is one that stays.
         for index in gone.iter().rev().map(|i| *i as usize) {
             if self.gaussians <= 1 {
@@ -111,7 +112,7 @@ impl Trainer {
             }
         }
         self.count_missing();
-        Ok(gone.len())
+        Ok(before - self.gaussians)
     }
 
     /// Adds Gaussians, as many as find room; those that are not finite are left out. Only where [`Trainer::grows_in_place`].
