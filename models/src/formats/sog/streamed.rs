@@ -84,11 +84,9 @@ impl Writer {
     /// The operating system's.
     pub fn create(folder: &Path, levels: usize, sh_degree: u8, shift: [f32; 3]) -> Result<Self, FormatError> {
         let failed = |e| FormatError::io(folder, "creating", e);
-        Disk::default().make_folders(folder).map_err(failed)?;
-        match std::fs::remove_file(folder.join(INDEX)) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(failed(e)),
-            _ => {}
-        }
+        let disk = Disk::default();
+        disk.make_folders(folder).map_err(failed)?;
+        disk.remove(&folder.join(INDEX)).map_err(failed)?;
         let level =
             || Level { cloud: GaussianCloud::with_capacity(sh_degree, 0), order: Vec::new(), files: 0, name: 0 };
         Ok(Self {
