@@ -259,7 +259,7 @@ mod tests {
         last.sort_by(|a, b| a[0].total_cmp(&b[0]));
         assert_eq!(filled, last, "the last ones take the places that became free");
         assert!(t.step().unwrap().loss.is_finite());
-        assert_eq!(t.revise(|_, _| Fate::Goes).unwrap(), 49);
+        assert_eq!(t.revise(|_, _| Fate::Goes).unwrap(), 48);
         assert_eq!(t.gaussians(), 1, "never the last one");
     }
 
