@@ -16,7 +16,7 @@ table! {
         pub max_gaussians: Option<usize> = None;
         /// Passes over the distillation views; 0 = merge only.
         pub epochs: u32 = 5, in Limits::within(0.0, 1000.0),
-            from "the paper and Fed3DGS; dgtr demo: 27.38 and 29.20 dB with 5, at half the rate 27.47 and 29.24 with 15";
+            from "the paper and Fed3DGS; dgtr demo --seconds 75: 27.38 and 29.20 dB with 5, at half the rate 27.47 and 29.24 with 15";
         /// Time for distillation at most; absent = all epochs.
         pub seconds: Option<f64> = None, in Limits::above(0.0);
         /// Size of the distillation pictures relative to the training pictures.
@@ -31,7 +31,7 @@ table! {
         pub between_views: bool = true;
         /// Learning rates of distillation, as a fraction of the trainer's.
         pub rate: f32 = 1.0, in Limits::above(0.0).up_to(10.0),
-            from "dgtr demo, 5 epochs: 0.03 gains 0.06 and 0.03 dB, 0.1 0.17 and 0.08, 0.3 0.38 and 0.13, 1 0.64 and 0.19";
+            from "dgtr demo --seconds 75, 5 epochs: 0.03 gains 0.06 and 0.03 dB, 0.1 0.17 and 0.08, 0.3 0.38 and 0.13, 1 0.64 and 0.19";
         /// Gaussians at or below this opacity are removed after distillation.
         pub prune_opacity: f32 = 0.005, in Limits::at_least(0.0).below(0.5), from "Fed3DGS";
         /// Bring the models together by what they show in common before merging (each lies where its own GPS put it).
