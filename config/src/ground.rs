@@ -22,6 +22,9 @@ table! {
         /// Size of the distillation pictures relative to the training pictures.
         pub scale: f32 = 1.0, in Limits::above(0.0).up_to(1.0),
             from "Fed3DGS uses 0.25; sheffield_cross at 0.5 SSIM 0.800, at 1 SSIM 0.811";
+        /// Ground so near to another aircraft's region is of whoever saw it best (pixels of all pictures per m² of it); 0 = every
+        /// region is its own aircraft's.
+        pub border_m: f32 = 10.0, in Limits::at_least(0.0).up_to(1e4);
         /// Side of the cells of ground that are distilled: those in which Gaussians of two aircraft meet, and those that touch one.
         pub seam_m: f32 = 8.0, in Limits::above(0.0);
         /// Share of the Gaussians a view sees that must lie in a seam for the view to take part in distillation.

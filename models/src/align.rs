@@ -4,5 +4,6 @@
 pub mod graph;
 pub mod icp;
 pub mod nearest;
+pub mod sightings;
 pub mod similarity;
 pub mod solve;

@@ -30,6 +30,7 @@ pub mod merge;
 pub mod region;
 pub mod register;
 pub mod seam;
+pub mod sight;
 pub mod summary;
 
 /// One aircraft's model as it arrived.
@@ -162,7 +163,7 @@ pub fn run(
     outcome.light = light::unite(&mut members)?;
     outcome.seconds.push(("light", start.elapsed().as_secs_f64()));
     let start = Instant::now();
-    let partition = region::Partition::new(&members);
+    let partition = region::Partition::new(&members, settings.border_m);
     let mut merged = merge::merge(&members, &partition, settings.max_gaussians.unwrap_or(usize::MAX))?;
     outcome.seconds.push(("merge", start.elapsed().as_secs_f64()));
     outcome.header = ModelHeader {

@@ -39,6 +39,9 @@ mod heat;
 mod killed;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+mod outrun;
+#[cfg(test)]
+#[cfg(feature = "lab")]
 mod power_cut;
 #[cfg(test)]
 #[cfg(feature = "lab")]
@@ -155,6 +158,7 @@ pub fn fly(
     let health = Health::new(mission.failsafe, mission.memory.host_mib, &options.out);
     let failsafe = Failsafe::new(health, &mission.failsafe);
     let job = Job::new(reconstruction, offerer, &options.out, budget, failsafe, MonotonicClock::default());
+    let job = job.training_for_each(mission.keyframes.train_steps);
     let mut job = job.supervised(supervisor, options.watch.clone());
     while job.turn(flight.handover(), interrupt)? {}
     let (mut capture, ended, counters) = flight.finish()?;

@@ -15,5 +15,8 @@ table! {
         /// Leave out pictures from where an earlier key frame already stood, unless the ground in sight still lacks pictures (see
         /// `[coverage]`).
         pub skip_covered: bool = true;
+        /// Steps trained for every key frame that is taken in, however many more wait: a flight that outruns its computer has a
+        /// trained model in flight, too. With 0 nothing is trained while key frames wait.
+        pub train_steps: u32 = 4, in Limits::within(0.0, 1000.0), unit "steps";
     }
 }

@@ -117,6 +117,12 @@ impl<F: Fitter> Registrar<F> {
                 None if !go_on() => None,
                 None => {
                     let found = self.fitter.fit(&members[first], &members[second])?;
+                    if let Some(Fitted { points: [agree, all], rms_m: [before, after], .. }) = &found {
+                        let (a, b) = (members[first].name(), members[second].name());
+                        tracing::debug!(
+                            "{b} onto {a}: {agree} of {all} points, {before:.3} m apart before, {after:.3} m after"
+                        );
+                    }
                     self.edges.put(&key, found)?;
                     fitted += 1;
                     found

@@ -45,7 +45,7 @@ pub fn written(dir: &Path, local: &LocalModel) -> Member {
 pub fn united(models: &[LocalModel], budget: usize) -> Merged {
     let dir = tempfile::tempdir().expect("temp dir");
     let members: Vec<Member> = models.iter().map(|m| written(dir.path(), m)).collect();
-    merge(&members, &Partition::new(&members), budget).expect("merged")
+    merge(&members, &Partition::new(&members, 0.0), budget).expect("merged")
 }
 
 /// A 64 × 48 camera looking straight down.

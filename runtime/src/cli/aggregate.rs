@@ -49,6 +49,9 @@ pub struct Settings {
     /// Size of the distillation pictures relative to the training pictures.
     #[arg(long)]
     pub scale: Option<f32>,
+    /// Ground so near to a border is of whoever saw it best, metres; 0: of whose region it is
+    #[arg(long)]
+    pub border_m: Option<f32>,
     /// Learning rates relative to training.
     #[arg(long)]
     pub rate: Option<f32>,
@@ -80,6 +83,7 @@ impl Settings {
         to.epochs = self.epochs.unwrap_or(to.epochs);
         to.seconds = self.seconds.or(to.seconds);
         to.scale = self.scale.unwrap_or(to.scale);
+        to.border_m = self.border_m.unwrap_or(to.border_m);
         to.rate = self.rate.unwrap_or(to.rate);
         to.device = self.device.clone().or(to.device.take());
         to.seed = self.seed.unwrap_or(to.seed);

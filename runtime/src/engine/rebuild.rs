@@ -14,6 +14,10 @@ pub(super) const MOVED_PX: f64 = 0.05;
 /// Trained Gaussians are kept over a rebuild only where their key frames' motions agree to this, pixels.
 pub(super) const CONTRADICTED_PX: f64 = 1.5;
 
+/// After the landing, what was trained in flight makes way for first Gaussians of all pictures when less than this share of a
+/// schedule went into it: theirs come from depths that all neighbours had a part in.
+const WORTH_KEEPING: f32 = 0.5;
+
 impl Reconstruction {
     /// The cloud to train: what is trained already, and fresh Gaussians where it is not. How many of them are fresh.
     pub(super) fn take_over(&mut self, fresh: &FirstGaussians) -> Result<usize, JobError> {
@@ -25,8 +29,9 @@ impl Reconstruction {
             _ if self.is_continued() => 0,
             Some(made) => {
                 self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
-                if self.builds > 0 && 2 * self.cloud.len() < fresh.cloud.len() {
-                    // What grew with the region in mind is coarse where less of it was flown.
+                // What grew with the region in mind is coarse where less of it was flown.
+                let is_coarse = 2 * self.cloud.len() < fresh.cloud.len();
+                if self.builds > 0 && (is_coarse || self.is_hardly_trained()) {
                     self.cloud.clone_from(&fresh.cloud);
                     return Ok(self.cloud.len());
                 }
@@ -39,6 +44,12 @@ impl Reconstruction {
                 self.cloud.len()
             }
         })
+    }
+
+    /// No more pictures come, and most of the training is still ahead.
+    fn is_hardly_trained(&self) -> bool {
+        let steps = u32::try_from(self.header.steps).unwrap_or(u32::MAX);
+        !self.flying && self.settings.training.progress(steps, self.train_s) < WORTH_KEEPING
     }
 
     /// Moves what is trained with the key frames that refinement moved since, at `depth_m`.

@@ -28,6 +28,8 @@ mod landing;
 const CHECKPOINT_EVERY_NS: u64 = 15_000_000_000;
 /// Between two lines to the ground control station.
 const SAY_EVERY_NS: u64 = 10_000_000_000;
+/// Key frames for which training can be owed at once.
+const OWED_FOR: u32 = 4;
 /// While there is nothing to train on a turn waits this long for the next key frame, and this long when there is
 /// nothing to do at all.
 const FOR_A_FRAME: Duration = Duration::from_millis(200);
@@ -45,6 +47,9 @@ pub(super) struct Job<R, K> {
     shown: ShownJob,
     /// The device failed; the last checkpoint is what there is.
     training_failed: bool,
+    /// Steps trained for each key frame, however many more wait, and those that are still to be trained.
+    steps_each: u32,
+    owed: u32,
     saved_ns: u64,
     said_ns: Option<u64>,
     for_a_frame: Duration,
@@ -82,6 +87,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             supervisor: Supervisor::default(),
             shown: ShownJob::default(),
             training_failed: false,
+            steps_each: 0,
+            owed: 0,
             said_ns: None,
             for_a_frame: FOR_A_FRAME,
             idle: IDLE,
@@ -91,6 +98,11 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     /// A service manager hears of every turn and every step, and so does whoever looks at the page.
     pub(super) fn supervised(self, supervisor: Supervisor, watch: Watch) -> Self {
         Self { supervisor, shown: ShownJob::new(watch), ..self }
+    }
+
+    /// Trains so many steps for every key frame it takes in, though more wait (`keyframes.train_steps`).
+    pub(super) fn training_for_each(self, steps: u32) -> Self {
+        Self { steps_each: steps, ..self }
     }
 
     fn show(&self, state: &'static str) {
@@ -171,6 +183,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let Some(frame) = capture.next(patience)? else { return Ok(false) };
         tracing::info!("key frame {}: {}", self.reconstruction.keyframes() + 1, frame.name);
         self.reconstruction.add(frame, capture.waiting() > 0)?;
+        self.owed = (self.owed + self.steps_each).min(OWED_FOR * self.steps_each);
         self.act_as(capture, Activity::Collecting);
         Ok(true)
     }
@@ -240,20 +253,23 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
     }
 
-    /// Trains until a key frame waits, a checkpoint is due, or capture ends.
+    /// Trains what is owed, and on until a key frame waits, a checkpoint is due, or capture ends.
     fn train(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
-        if !self.reconstruction.has_model() || capture.waiting() > 0 {
+        if !self.reconstruction.has_model() || (self.owed == 0 && capture.waiting() > 0) {
             return Ok(());
         }
         if self.reconstruction.is_done(&self.budget) {
-            std::thread::sleep(self.idle);
+            self.owed = 0;
+            if capture.waiting() == 0 {
+                std::thread::sleep(self.idle);
+            }
             return Ok(());
         }
         let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
         let mut last = None;
         self.act_as(capture, Activity::Training);
         let (clock, failsafe, supervisor, budget) = (&self.clock, &mut self.failsafe, &self.supervisor, self.budget);
-        let shown = &mut self.shown;
+        let (shown, owed) = (&mut self.shown, &mut self.owed);
         let views = self.reconstruction.keyframes();
         self.reconstruction.train(&budget, &mut |report: &StepReport| {
             last = Some(*report);
@@ -263,7 +279,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
                 (told.gaussians, told.progress, told.loss) = (count(report.gaussians), report.progress, report.loss);
             });
             let now_ns = clock.now_ns();
-            let undisturbed = capture.waiting() == 0 && capture.is_open() && !interrupt.requested();
+            *owed = owed.saturating_sub(1);
+            let waited_for = *owed == 0 && capture.waiting() > 0;
+            let undisturbed = !waited_for && capture.is_open() && !interrupt.requested();
             let alarmed = failsafe.glance(now_ns, capture.flags(), &budget, views);
             if undisturbed && now_ns < due_ns && !alarmed { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
         })?;

@@ -17,7 +17,7 @@ use crate::aggregate::frame::Motion;
 use crate::aggregate::member::Member;
 
 /// Begins every file; another number when fits are made in another way.
-const MAGIC: [u8; 8] = *b"dgtredg2";
+const MAGIC: [u8; 8] = *b"dgtredg3";
 /// What follows the name of a pair.
 const SUFFIX: &str = "edge";
 /// Longest file taken.
@@ -37,7 +37,7 @@ pub struct Fitted {
     pub places: [[f64; 3]; 6],
     /// Points that agree, of those matched.
     pub points: [u32; 2],
-    /// Root mean square distance of the agreeing points, metres: before and after.
+    /// Root mean square distance of the agreeing points across the lines of sight, metres: before and after.
     pub rms_m: [f64; 2],
 }
 

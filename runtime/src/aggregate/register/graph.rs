@@ -12,7 +12,7 @@ use models::align::similarity::Similarity;
 /// What telemetry is worth, one standard deviation: position, tilt and heading.
 /// Position as in [`config`]'s GPS priors without RTK.
 const POSITION_M: f64 = 3.0;
-const TILT_RAD: f64 = 0.017;
+pub(super) const TILT_RAD: f64 = 0.017;
 const HEADING_RAD: f64 = 0.05;
 /// Telemetry is never so far off: an edge that says so is set aside at once, metres.
 const MOST_APART_M: f64 = 10_000.0;

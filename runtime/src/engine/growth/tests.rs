@@ -190,23 +190,35 @@ fn new_ground_gets_gaussians_and_what_is_far_from_it_stays_to_the_bit() {
     assert!(engine.gaussians() > 3000 && looked_at > 1000, "{} {looked_at}", engine.gaussians());
 }
 
+/// Flies `pictures`, trains `share` of a schedule as far as is written down, and lands: what there was in flight, how much of it the
+/// landing kept, and what there is then.
+fn landed(pictures: &[PosedImage], share: f64) -> Option<(GaussianCloud, usize, GaussianCloud)> {
+    let mut engine = engine()?;
+    pictures.iter().for_each(|p| _ = take(&mut engine, p.clone()));
+    let in_flight = snapshot(&mut engine);
+    assert!(!engine.wants_build(false));
+    engine.header.steps = (share * f64::from(engine.settings.training.steps)) as u64;
+    engine.land();
+    assert!(engine.wants_build(true) && engine.build(&|| true).expect("built") && !engine.wants_build(true));
+    assert!(!engine.wants_growth());
+    let kept = engine.report.more["gaussians_kept"].as_u64().expect("a number") as usize;
+    Some((in_flight, kept, snapshot(&mut engine)))
+}
+
 #[test]
 fn the_same_flight_twice_is_the_same_bytes_and_the_landing_builds_it_once_more() {
     let pictures: Vec<PosedImage> = flight().into_iter().take(16).collect();
-    let flown = || {
-        let mut engine = engine()?;
-        pictures.iter().for_each(|p| _ = take(&mut engine, p.clone()));
-        let in_flight = snapshot(&mut engine);
-        assert!(!engine.wants_build(false));
-        engine.land();
-        assert!(engine.wants_build(true) && engine.build(&|| true).expect("built") && !engine.wants_build(true));
-        assert!(!engine.wants_growth());
-        // What was trained in flight is where the schedule after the landing begins.
-        let kept = engine.report.more["gaussians_kept"].as_u64().expect("a number") as usize;
-        assert!(2 * kept > in_flight.len(), "{kept} of {}", in_flight.len());
-        Some((in_flight, snapshot(&mut engine)))
-    };
-    let Some((in_flight, landed)) = flown() else { return };
-    assert!(flown() == Some((in_flight.clone(), landed.clone())));
-    assert!(landed.len() >= in_flight.len() * 9 / 10, "{} {}", landed.len(), in_flight.len());
+    let Some(first) = landed(&pictures, 0.0) else { return };
+    assert!(landed(&pictures, 0.0).as_ref() == Some(&first));
+    let (in_flight, _, after) = first;
+    assert!(after.len() >= in_flight.len() * 9 / 10, "{} {}", after.len(), in_flight.len());
+}
+
+#[test]
+fn what_was_trained_in_flight_is_where_the_schedule_begins_unless_most_of_it_is_still_ahead() {
+    let pictures: Vec<PosedImage> = flight().into_iter().take(16).collect();
+    let Some((in_flight, kept, _)) = landed(&pictures, 0.6) else { return };
+    assert!(2 * kept > in_flight.len(), "{kept} of {}", in_flight.len());
+    let Some((_, kept, _)) = landed(&pictures, 0.4) else { return };
+    assert_eq!(kept, 0, "depths of all pictures are better than those of the few there were");
 }

@@ -23,7 +23,7 @@ fn the_missions_regions_win_over_what_models_claim() {
     let east = written(dir.path(), "east", |_| {});
     let models =
         [admit(&mission, "west", &west), admit(&mission, "east", &east)].map(|m| Member::of(m.expect("admitted")));
-    let kept = merge(&models, &Partition::new(&models), usize::MAX).expect("merged").kept;
+    let kept = merge(&models, &Partition::new(&models, 0.0), usize::MAX).expect("merged").kept;
     assert_eq!((kept[0].own, kept[1].own), (1600, 1600));
 }
 
