@@ -42,6 +42,9 @@ table! {
         pub local_scale: bool = true, from "the paper";
         /// Gaussians longer than this many median extents are abnormal and removed.
         pub max_scale_ratio: f32 = 8.0, in Limits::above(1.0);
+        /// The pair network's depths for the depth loss when training starts from sparse points or at random, too; a feed-forward start
+        /// has them anyway.
+        pub depth_priors: bool = false;
         /// Opacity of a Gaussian of full confidence.
         pub opacity: f32 = 0.9, in Limits::within(0.0, 1.0);
         /// Most steps of the global alignment.

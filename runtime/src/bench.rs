@@ -10,6 +10,7 @@ pub mod ground;
 pub mod levels;
 pub mod map;
 pub mod memory;
+pub mod methods;
 pub mod skips;
 pub mod slopes;
 pub mod stages;

@@ -43,7 +43,7 @@ mod rounding;
 pub mod source;
 
 use device::DeviceRequest;
-use first_gaussians::{FirstGaussians, at_random, feed_forward, sparse};
+use first_gaussians::{FirstGaussians, feed_forward};
 pub use first_gaussians::{InitKind, Point};
 use host::{HostPlan, HostRequest};
 pub use reconstruct::Reconstruct;
@@ -178,9 +178,11 @@ impl Reconstruction {
             Refiner::open(&RefineSettings { max_keyframes: refine.max_keyframes.max(views), ..refine.clone() })
         });
         init.max_pictures = init.max_pictures.max(views);
+        // Another start asks the network for depths only.
+        let wants_depths = init.depth_priors && depth.is_none() && settings.training.loss.depth > 0.0;
         let mut initialiser = match settings.start {
-            InitKind::FeedForward => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
-            InitKind::SparsePoints | InitKind::Random => None,
+            InitKind::SparsePoints | InitKind::Random if !wants_depths => None,
+            _ => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
         };
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
         if let Some(initialiser) = &mut initialiser
@@ -361,17 +363,15 @@ impl Reconstruction {
             };
             let made = feed_forward(initialiser, self.views.len(), capacity, at_once, &mut prior, go_on)?;
             failed?;
-            return Ok(made);
+            return match made {
+                // Asked for its depths alone: neither its Gaussians nor the light it found.
+                Some(made) if self.settings.start != InitKind::FeedForward => {
+                    Ok(Some(FirstGaussians { cloud: self.other_start(capacity)?, light: None, ..made }))
+                }
+                made => Ok(made),
+            };
         }
-        let views: Vec<View> = self.views.iter().map(|v| v.1).collect();
-        Ok(Some(match self.settings.start {
-            _ if self.is_continued() => GaussianCloud::default().into(),
-            InitKind::Random => {
-                at_random(&views, &self.points, self.settings.init.depth_m, capacity, self.settings.training.seed)?
-                    .into()
-            }
-            InitKind::FeedForward | InitKind::SparsePoints => sparse(&self.points, capacity)?.into(),
-        }))
+        Ok(Some(self.other_start(capacity)?.into()))
     }
 }
 

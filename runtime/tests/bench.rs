@@ -184,3 +184,76 @@ fn a_device_s_report_says_who_it_is_and_that_it_computes_what_the_twin_does() {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     assert!(host.trim().len() < 4 || !report.to_string().contains(host.trim()));
 }
+
+/// Three methods on 32 pictures of 80×60: the first two share their trainings.
+#[test]
+fn methods_end_in_one_table_and_what_is_there_is_continued_and_not_done_again() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let path = out.to_string_lossy().into_owned();
+    let compare_in = |steps: &str, more: &[&str]| {
+        let small = ["--scale", "0.25", "--steps", steps, "--max-gaussians", "900", "--budget-mib", "64"];
+        held(&bench(&[&["methods", "--simulated", "2", "--out", &path][..], &small, more].concat()))
+    };
+    let compare = |more: &[&str]| compare_in("6", more);
+    let three = ["--methods", "distributed-3dgs,fed-3dgs,vastgaussian"];
+    let text = compare(&three);
+    assert!(text.contains("| fed-3dgs") && text.contains("near seams") && text.contains("By region"), "{text}");
+    assert_eq!(std::fs::read_to_string(out.join("methods.md")).unwrap(), text);
+    let first = json(&out.join("methods.json"));
+    let rows = first["methods"].as_array().unwrap();
+    assert_eq!(rows.len(), 3);
+    for row in rows {
+        let name = row["method"].as_str().unwrap();
+        assert_eq!((row["quality"]["all"]["views"].as_u64(), row["steps"].as_u64()), (Some(5), Some(12)), "{name}");
+        assert!(row["quality"]["all"]["psnr"].as_f64().unwrap() > 5.0, "{row}");
+        assert_eq!(row["onboard_s"].as_array().unwrap().len(), 2, "{name}");
+        let [sent, delivered] = ["sent_bytes", "delivery_bytes"].map(|b| row[b].as_u64().unwrap());
+        assert!(delivered > 0 && delivered < sent, "{name}");
+    }
+    let sent = |i: usize| rows[i]["pictures_sent"].as_u64().unwrap();
+    assert!(sent(0) == 0 && sent(1) == 0 && sent(2) > 0 && sent(2) < 27, "neighbours' pictures alone leave");
+    let trainings = || std::fs::read_dir(out.join("models")).unwrap().map(|e| e.unwrap().path()).collect::<Vec<_>>();
+    assert_eq!(trainings().len(), 4, "two of the methods are trained alike");
+    // Without one result, with all trainings: that one is made again, and nothing else.
+    let when = |path: &Path| std::fs::metadata(path).unwrap().modified().unwrap();
+    let made = |name: &str| when(&out.join(name).join("result.json"));
+    let trained: Vec<_> = trainings().iter().map(|p| (p.clone(), when(&p.join("model.dgtr")))).collect();
+    let before = ["distributed-3dgs", "vastgaussian"].map(made);
+    std::fs::remove_file(out.join("fed-3dgs/result.json")).unwrap();
+    let answer: Value = serde_json::from_str(&compare(&[&three[..], &["--json"]].concat())).unwrap();
+    assert_eq!(["distributed-3dgs", "vastgaussian"].map(made), before);
+    assert!(trained.iter().all(|(path, then)| when(&path.join("model.dgtr")) == *then), "trained again");
+    let quality = |all: &Value| (0..3).map(|i| all["methods"][i]["quality"].clone()).collect::<Vec<_>>();
+    assert_eq!(quality(&answer), quality(&first), "the same seed, the same figures");
+    // Other steps are another comparison.
+    compare_in("7", &["--methods", "distributed-3dgs"]);
+    assert_eq!(trainings().len(), 6);
+}
+
+#[test]
+fn methods_that_cannot_be_compared_are_refused_in_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    write_data_set(&dir.path().join("world"), 2, 0.1).unwrap();
+    let (set, out) = (path("world"), path("out"));
+    let refused = |arguments: &[&str], line: &str| {
+        let output = bench(&[&["methods", "--out", &out], arguments].concat());
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {text}");
+        assert!(text.contains(line), "{arguments:?}: {text}");
+    };
+    refused(&[&set, "--methods", "dgtr,central-3dgs"], "has no sparse points");
+    refused(&[&set, "--methods", "nerf"], "nerf");
+    refused(&[&set, "--methods", "dgtr", "--regions", "12"], "21 training pictures are too few for 12 regions");
+    refused(&[&set, "--methods", "dgtr", "--split", "dense"], "dense");
+    refused(&[&set, "--scale", "0"], "--scale 0 must be above 0");
+    refused(&[&set, "--seconds=-1"], "--seconds");
+    refused(&["--simulated", "1"], "must be 2 to 24 aircraft");
+    refused(&[&path("nowhere"), "--methods", "dgtr"], "nowhere");
+    refused(&[], "DATASET");
+    assert!(!dir.path().join("out/models").exists(), "nothing was trained");
+}

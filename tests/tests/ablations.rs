@@ -54,3 +54,28 @@ fn depth_loss_and_shape_freezing_act_and_freezing_needs_the_loss() {
     assert_ne!(free.log_scales, frozen.log_scales, "freezing keeps it from the shapes");
     assert_eq!(frozen, trained(at, "default", ""), "the default is on and on");
 }
+
+#[test]
+fn a_random_start_takes_depths_for_its_loss_when_it_is_told_to_and_only_then() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let at = dir.path();
+    plane_dataset(&at.join("set"), 1);
+    let from_random = |out: &str, settings: &str| {
+        let file = format!("{out}.toml");
+        std::fs::write(at.join(&file), settings).expect("settings");
+        let budget = ["--steps", "5", "--max-gaussians", "3000", "--budget-mib", "64", "--no-eval"];
+        let start = ["train", "set", "--init", "random", "--out", out, "--settings", &file];
+        let output = run(at, &[&start[..], &budget].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let report = std::fs::read_to_string(at.join(out).join("run.json")).expect("run.json");
+        (model::read(&at.join(out).join("model.dgtr")).expect("model").1, report.contains("\"depth_prior\""))
+    };
+    let (plain, told) = from_random("plain", "");
+    assert!(!told, "nothing asks for depths");
+    let (with_depths, told) = from_random("depths", "[init]\ndepth_priors = true\n");
+    assert!(told, "run.json says which network gave them");
+    assert_eq!(plain.len(), with_depths.len(), "the start is the same");
+    assert_ne!(plain.means, with_depths.means, "the loss moves centres");
+    let (no_loss, told) = from_random("no_loss", "[init]\ndepth_priors = true\n[training.loss]\ndepth = 0.0\n");
+    assert_eq!((no_loss == plain, told), (true, false), "without the loss nobody asks");
+}

@@ -6,6 +6,7 @@ mod ground;
 mod levels;
 mod map;
 mod memory;
+mod methods;
 mod skips;
 mod stages;
 mod stress;
@@ -38,6 +39,8 @@ enum Command {
     Levels(levels::Args),
     /// Planned against measured bytes, and quality, across memory budgets.
     Memory(memory::Args),
+    /// The field's methods beside ours, on the same pictures, poses, steps, Gaussians, memory and seed.
+    Methods(methods::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
     Skips(skips::Args),
     /// Numbers that broke other renderers: the promise, the outcome, what was counted.
@@ -73,6 +76,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Ground(args) => ground::run(args),
         Command::Levels(args) => levels::run(args),
         Command::Memory(args) => memory::run(args),
+        Command::Methods(args) => methods::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),
         Command::TimeError(args) => time_error::run(args),

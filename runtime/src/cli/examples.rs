@@ -39,6 +39,13 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
         &["dgtr bench levels global.dgtr --out levels", "dgtr bench levels --gaussians 20000000 --out levels"],
     ),
     ("bench memory", &["dgtr bench memory pictures"]),
+    (
+        "bench methods",
+        &[
+            "dgtr bench methods pictures --regions 3 --steps 400 --out methods",
+            "dgtr bench methods --simulated 6 --methods dgtr,vastgaussian",
+        ],
+    ),
     ("bench skips", &["dgtr bench skips pictures"]),
     ("bench stress", &["dgtr bench stress"]),
     ("bench time-error", &["dgtr bench time-error pictures --out time-error"]),

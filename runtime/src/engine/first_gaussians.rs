@@ -7,6 +7,7 @@ use models::cloud::GaussianCloud;
 use models::init::{InitReport, Initialiser, from_sfm, random};
 use models::light::Light;
 
+use super::Reconstruction;
 use crate::console::Progress;
 use crate::error::JobError;
 
@@ -46,6 +47,20 @@ impl From<GaussianCloud> for FirstGaussians {
     }
 }
 
+impl Reconstruction {
+    /// The Gaussians of a start that is not the network's: at most `capacity`, none where a model is continued.
+    pub(super) fn other_start(&self, capacity: usize) -> Result<GaussianCloud, JobError> {
+        let views: Vec<View> = self.views.iter().map(|v| v.1).collect();
+        match self.settings.start {
+            _ if self.is_continued() => Ok(GaussianCloud::default()),
+            InitKind::Random => {
+                at_random(&views, &self.points, self.settings.init.depth_m, capacity, self.settings.training.seed)
+            }
+            InitKind::FeedForward | InitKind::SparsePoints => sparse(&self.points, capacity),
+        }
+    }
+}
+
 /// All pictures of `initialiser` into at most `capacity` Gaussians; `None` when `go_on` said no. With `at_once` no picture
 /// is still to come, and every depth is made once, from its best partners, on all threads. `prior` takes the depths one by one.
 pub(super) fn feed_forward(
@@ -77,7 +92,7 @@ pub(super) fn feed_forward(
 }
 
 /// The points themselves.
-pub(super) fn sparse(points: &[Point], capacity: usize) -> Result<GaussianCloud, JobError> {
+fn sparse(points: &[Point], capacity: usize) -> Result<GaussianCloud, JobError> {
     if points.is_empty() {
         let what = "no sparse points that two of the training pictures saw; use --init feed-forward or random";
         return Err(JobError::Request(what.into()));
@@ -88,7 +103,7 @@ pub(super) fn sparse(points: &[Point], capacity: usize) -> Result<GaussianCloud,
 }
 
 /// Anywhere in what `views` see between the depths `range`, or those of `points`.
-pub(super) fn at_random(
+fn at_random(
     views: &[View],
     points: &[Point],
     range: Option<[f32; 2]>,
