@@ -55,6 +55,8 @@ macro_rules! growing {
 }
 
 const NO_DEPTH: &str = growing!("[training.loss]\ndepth = 0.0\n", "");
+/// Each region has its own aircraft's Gaussians, up to its border.
+const PLAIN_UNION: &str = "border_m = 0.0\nepochs = 0\n";
 const GROWTH: &str = "growth by relocation and splitting under the cap (3DGS-MCMC), not by gradients";
 
 const DGTR: Method = Method {
@@ -86,7 +88,7 @@ pub const METHODS: &[Method] = &[
         start: "sfm",
         pictures: Pictures::Own,
         settings: NO_DEPTH,
-        merge: Merge::ByRegion("epochs = 0\n"),
+        merge: Merge::ByRegion(PLAIN_UNION),
         ablation: false,
         what: "D-3DGS of the paper's table: 3DGS per region, SfM points, plain union by region",
         departs: "growth as central-3dgs; each region begins with those points of one SfM that its own pictures saw",
@@ -96,7 +98,7 @@ pub const METHODS: &[Method] = &[
         start: "sfm",
         pictures: Pictures::Seen,
         settings: growing!("[training]\nrefine_exposure = true\n[training.loss]\ndepth = 0.0\n", ""),
-        merge: Merge::ByRegion("epochs = 0\n"),
+        merge: Merge::ByRegion(PLAIN_UNION),
         ablation: false,
         what: "VastGaussian (Lin et al. 2024): regions with the pictures of others that see them (airspace-aware, 25 %), appearance, union",
         departs: "gain and offset per picture and channel instead of its appearance network; no expansion of regions by 20 %; growth as central-3dgs",
@@ -252,12 +254,17 @@ mod tests {
     }
 
     #[test]
-    fn only_those_that_merge_by_region_change_the_ground_and_then_its_epochs_alone() {
+    fn others_are_united_up_to_the_border_without_distillation_and_ours_as_by_default() {
         for method in METHODS {
             match method.merge {
                 Merge::ByRegion(text) => {
                     let ground: GroundSettings = toml::from_str(text).expect(method.name);
-                    let wanted = if text.is_empty() { vec![] } else { vec![("epochs".to_owned(), "0".to_owned())] };
+                    let wanted: &[(&str, &str)] = match method.name {
+                        "distributed-3dgs" | "vastgaussian" => &[("border_m", "0.0"), ("epochs", "0")],
+                        "dgtr-union" => &[("epochs", "0")],
+                        _ => &[],
+                    };
+                    let wanted: Vec<_> = wanted.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
                     assert_eq!(changed(&GroundSettings::default(), &ground), wanted, "{}", method.name);
                     assert_ne!(method.pictures, Pictures::All);
                 }
