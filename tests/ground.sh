@@ -17,7 +17,7 @@ if [ $# = 0 ]; then
     set -- "$out"/field/ground/received/*/model.dgtr
 fi
 
-hash_of() { b3=$("$python" -c 'import hashlib,sys; print(hashlib.sha256(open(sys.argv[1],"rb").read()).hexdigest())' "$1/global.dgtr"); echo "$b3"; }
+hash_of() { sha256sum < "$1/global.dgtr" | cut -d ' ' -f 1; }
 wanted=
 same() { # NAME FOLDER
     local got
@@ -48,7 +48,7 @@ if "$python" -c 'import ray' 2> /dev/null; then
     half=$(($(wc -l < "$out/keys") / 2))
     killed=
     while kill -0 "$job" 2> /dev/null && [ -z "$killed" ]; do
-        there=$(find "$out/killed-store/cells" -type f 2> /dev/null | wc -l)
+        there=$(find "$out/killed-store" -path '*/cells/*' -type f 2> /dev/null | wc -l || true)
         child=$(pgrep -f "ground cell .*--store $out/killed-store" | head -1 || true)
         if [ "$there" -ge "$half" ] && [ -n "$child" ]; then
             worker=$(ps -o ppid= -p "$child" | tr -d ' ' || true)
