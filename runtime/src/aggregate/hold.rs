@@ -61,3 +61,39 @@ impl<'a> Held<'a> {
         self.plan.and_then(|p| p.share).filter(near).unwrap_or(share)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use config::ground::GroundSettings;
+    use glam::{DQuat, DVec3};
+
+    use super::*;
+    use crate::aggregate::store::Store;
+    use crate::aggregate::testing::{carpet, model, planned, written};
+
+    #[test]
+    fn what_was_settled_stays_to_the_bit_while_it_is_near_and_no_longer() {
+        let dir = tempfile::tempdir().expect("temp dir");
+        let mut members = [written(dir.path(), &model("a", &[], carpet([0.0, 0.0], [40.0, 20.0], 1.0)))];
+        let settings = GroundSettings { register: false, epochs: 0, ..Default::default() };
+        let mut plan = planned(&mut members, &settings, &Store::folder(&dir.path().join("store")));
+        let moved = |turn: f64, east: f64| Motion::rigid(DQuat::from_rotation_z(turn), DVec3::new(east, 0.1, 0.0));
+        let earlier = moved(0.01, 0.3);
+        plan.models[0].correction = Some(earlier.parts());
+        (plan.models[0].gain, plan.coverage_m, plan.share) = ([0.1; 3], 0.8, Some(0.5));
+        let held = Held::of(Some(&plan), |_| true);
+        let a = &members[0];
+        assert_eq!(held.motion(a, moved(0.01, 0.31)).parts(), earlier.parts());
+        assert_eq!(held.motion(a, moved(0.01, 0.33)), moved(0.01, 0.33), "3 cm are too much");
+        assert_eq!(held.motion(a, moved(0.011, 0.3)), moved(0.011, 0.3), "a milliradian is 4 cm at the far end");
+        assert_eq!([held.gain(a, [0.104; 3]), held.gain(a, [0.1, 0.11, 0.1])], [[0.1; 3], [0.1, 0.11, 0.1]]);
+        assert_eq!([1.0, 0.5, 2.0].map(|m| held.coverage_m(m)), [0.8, 0.8, 2.0]);
+        // Never more than may be kept now.
+        assert_eq!([0.51, 0.49, 0.6].map(|s| held.share(s)), [0.5, 0.49, 0.6]);
+        // Another model's, and another place's, hold nothing.
+        let b = written(dir.path(), &model("b", &[], carpet([0.0, 0.0], [30.0, 20.0], 1.0)));
+        assert_eq!(held.motion(&b, moved(0.01, 0.31)), moved(0.01, 0.31));
+        let elsewhere = Held::of(Some(&plan), |_| false);
+        assert_eq!(elsewhere.motion(a, moved(0.01, 0.31)), moved(0.01, 0.31));
+    }
+}

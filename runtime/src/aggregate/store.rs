@@ -114,16 +114,24 @@ impl Store {
 
     /// Removes what killed workers left half written, a day ago or earlier.
     pub fn sweep(&self) {
-        if let Self::Folder(folder) = self {
-            folder.sweep(folder::ABANDONED);
+        match self {
+            Self::Folder(folder) => folder.sweep(folder::ABANDONED),
+            // What is not whole is not there.
+            #[cfg(feature = "s3")]
+            Self::Bucket(_) => {}
         }
     }
 
-    /// Leaves in its folder `within` only what `is_kept` holds for. Nobody else may be working there.
+    /// Leaves in its folder `within` only what `is_kept` holds for. Nobody else may be working there; a bucket, which others do, is left
+    /// as it is.
     pub fn keep_only(&self, within: &str, is_kept: &dyn Fn(&str) -> bool) {
-        if let Self::Folder(folder) = self {
-            folder.keep_only(within, is_kept);
-            folder.sweep(std::time::Duration::ZERO);
+        match self {
+            Self::Folder(folder) => {
+                folder.keep_only(within, is_kept);
+                folder.sweep(std::time::Duration::ZERO);
+            }
+            #[cfg(feature = "s3")]
+            Self::Bucket(_) => {}
         }
     }
 
