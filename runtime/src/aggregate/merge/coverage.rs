@@ -6,6 +6,7 @@ use super::ground;
 use crate::aggregate::AggregateError;
 use crate::aggregate::block::Block;
 use crate::aggregate::member::Member;
+use crate::aggregate::squares::SURROUNDINGS;
 use glam::DVec2;
 
 /// Cells along the longer side of a middling model's ground: coarse enough to hold many Gaussians, fine enough to find a
@@ -40,14 +41,22 @@ impl Coverage {
     pub fn of(block: &Block<'_>) -> Result<Self, AggregateError> {
         let side = block.inputs.coverage_m;
         let mut this = Self { side, covered: Vec::new(), cells: HashMap::new() };
+        // Nothing is asked about cells farther out than those beside the surroundings; one more is room for rounding.
+        let squares = &block.inputs.squares;
+        let reach = 0.5 * squares.side_m() + SURROUNDINGS as f64 * f64::from(squares.seam_m) + 2.0 * side;
+        let middle = squares.middle(block.inputs.key);
+        let (low, high) = (this.cell(middle - reach), this.cell(middle + reach));
+        let is_near = |(x, y): Cell| (low.0..=high.0).contains(&x) && (low.1..=high.1).contains(&y);
         let mut entries: Vec<(Cell, u16, f32)> = Vec::new();
         for m in 0..block.inputs.models.len() {
             let mut area: HashMap<Cell, f32> = HashMap::new();
             for cloud in block.pieces(m) {
                 let cloud = cloud?;
                 for i in 0..cloud.len() {
-                    *area.entry(this.cell(ground(cloud.means[i]))).or_default() +=
-                        cloud.covered_m2(i).min(side * side) as f32;
+                    let cell = this.cell(ground(cloud.means[i]));
+                    if is_near(cell) {
+                        *area.entry(cell).or_default() += cloud.covered_m2(i).min(side * side) as f32;
+                    }
                 }
             }
             entries.reserve_exact(area.len());
