@@ -27,6 +27,9 @@ table! {
         pub border_m: f32 = 10.0, in Limits::at_least(0.0).up_to(1e4);
         /// Side of the cells of ground that are distilled: those in which Gaussians of two aircraft meet, and those that touch one.
         pub seam_m: f32 = 8.0, in Limits::above(0.0);
+        /// Side of the squares of ground that are merged and distilled as jobs of their own, at least; they are made of whole `seam_m`,
+        /// and the origin lies in the middle of one.
+        pub cell_m: f32 = 256.0, in Limits::within(1.0, 1e5), from "1,000 aircraft over 10 km²: some 150 jobs of a million Gaussians";
         /// Share of the Gaussians a view sees that must lie in a seam for the view to take part in distillation.
         pub seam_share: f32 = 0.02, in Limits::within(0.0, 1.0);
         /// Distil on views half-way between neighbouring training views, too: on its training views alone the union would

@@ -155,16 +155,26 @@ impl GaussianCloud {
 
     /// Which rows remain when those that cover least are left out until `budget` are left.
     pub fn most_covering(&self, budget: usize) -> Vec<bool> {
-        let over = self.len().saturating_sub(budget);
         let mut keep = vec![true; self.len()];
-        if over > 0 {
-            let mut order: Vec<(f64, u32)> = (0..self.len()).map(|i| (self.covered_m2(i), i as u32)).collect();
-            let by_area = |a: &(f64, u32), b: &(f64, u32)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
-            // With a budget of nothing there is no row behind the last one that goes.
-            order.select_nth_unstable_by(over.min(self.len() - 1), by_area);
-            order[..over].iter().for_each(|&(_, i)| keep[i as usize] = false);
+        if self.len() > budget {
+            let least = self.least_covering((0..self.len() as u32).collect(), budget);
+            least.into_iter().for_each(|i| keep[i as usize] = false);
         }
         keep
+    }
+
+    /// Those of `rows` that cover least, until `budget` of them are left; of equals the first.
+    pub fn least_covering(&self, rows: Vec<u32>, budget: usize) -> Vec<u32> {
+        let over = rows.len().saturating_sub(budget);
+        if over == 0 {
+            return Vec::new();
+        }
+        let mut order: Vec<(f64, u32)> = rows.into_iter().map(|i| (self.covered_m2(i as usize), i)).collect();
+        let by_area = |a: &(f64, u32), b: &(f64, u32)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
+        // With a budget of nothing there is no row behind the last one that goes.
+        let nth = over.min(order.len() - 1);
+        order.select_nth_unstable_by(nth, by_area);
+        order[..over].iter().map(|o| o.1).collect()
     }
 
     /// Keeps the rows for which `keep(index)` holds, in order; returns how many were removed.

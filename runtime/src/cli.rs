@@ -20,6 +20,7 @@ mod eval;
 mod examples;
 mod export;
 mod fly;
+mod ground;
 mod http;
 mod import;
 mod init;
@@ -93,6 +94,8 @@ enum Command {
     Ortho(ortho::Args),
     /// Merges local models into a global one.
     Aggregate(aggregate::Args),
+    /// Merging as jobs that many machines share: plan, cells, join.
+    Ground(ground::Args),
     /// Receives the models of all aircraft of a mission and merges them.
     Serve(serve::Args),
     /// The onboard job: from MAVLink and pictures to a model, while flying.
@@ -176,6 +179,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Command::Render(args) => render::run(args),
         Command::Ortho(args) => ortho::run(args),
         Command::Aggregate(args) => aggregate::run(args),
+        Command::Ground(args) => ground::run(args),
         Command::Serve(args) => serve::run(args),
         Command::Fly(args) => fly::run(args),
         Command::Export(args) => export::run(args),

@@ -16,6 +16,8 @@ use models::formats::transforms::pose_to_opengl;
 
 #[path = "commands/first_steps.rs"]
 mod first_steps;
+#[path = "commands/ground.rs"]
+mod ground;
 #[path = "commands/keys.rs"]
 mod keys;
 #[path = "commands/manual.rs"]

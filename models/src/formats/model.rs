@@ -29,18 +29,18 @@ use crate::cloud::{GaussianCloud, sh_coefficients};
 use crate::light::PictureLight;
 use celled::Cells;
 use chunks::compare;
-use columns::{read_words, triples, write_floats};
+use columns::{read_cloud, read_words, write_floats};
 use hashing::Hashing;
 use opening::{Body, Opened, open, read_header_of};
 
 mod celled;
 mod chunks;
-mod columns;
+pub mod columns;
 mod hashing;
 mod opening;
 
 pub use celled::{pieces, write_cells};
-pub use chunks::{Chunks, write_chunks};
+pub use chunks::{Chunks, write_chunks, write_columns};
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.
@@ -52,7 +52,7 @@ const CELLED: u32 = 3;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 130 bytes per view; this is room for 100,000 of them and long names.
-const MAX_HEADER: u64 = 64 << 20;
+pub const MAX_HEADER: u64 = 64 << 20;
 /// Corners of a region taken, far more than any field has.
 const MAX_CORNERS: usize = 4096;
 
@@ -142,11 +142,9 @@ fn content<'a>(
     let head = encode_header(path, header)?;
     Ok(move |file: &mut dyn Write| {
         let mut out = begin(file, EXACT, &head, cloud.len(), cloud.sh_degree)?;
-        write_floats(&mut out, cloud.means.as_flattened())?;
-        write_floats(&mut out, cloud.log_scales.as_flattened())?;
-        write_floats(&mut out, cloud.rotations.as_flattened())?;
-        write_floats(&mut out, &cloud.opacity_logits)?;
-        write_floats(&mut out, &cloud.sh)?;
+        for column in columns::of(cloud) {
+            write_floats(&mut out, column)?;
+        }
         finish(out).map(drop)
     })
 }
@@ -164,7 +162,11 @@ fn check_columns(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatError> 
     Err(FormatError::invalid(path, "not written: the cloud's columns differ in length"))
 }
 
-fn encode_header(path: &Path, header: &ModelHeader) -> Result<Vec<u8>, FormatError> {
+/// A header's bytes (postcard). `path` is what an error names.
+///
+/// # Errors
+/// One that [`decode_header`] would refuse.
+pub fn encode_header(path: &Path, header: &ModelHeader) -> Result<Vec<u8>, FormatError> {
     check_header(path, header)?;
     let head = postcard::to_allocvec(header)
         .map_err(|e| FormatError::invalid(path, format!("not written: its header cannot be encoded ({e})")))?;
@@ -221,14 +223,7 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
     match body {
         Body::Words(words) => coded = read_words(&mut input, words, u32::from_le_bytes).map_err(failed)?,
         Body::Cells => cells = Some(Cells::read(path, &mut input, count, size - FIXED - header.len() as u64)?),
-        Body::Columns => {
-            let mut column = |floats: usize| read_words(&mut input, floats, f32::from_le_bytes).map_err(failed);
-            cloud.means = triples(column(3 * count)?);
-            cloud.log_scales = triples(column(3 * count)?);
-            cloud.rotations = column(4 * count)?.as_chunks().0.to_vec();
-            cloud.opacity_logits = column(count)?;
-            cloud.sh = column(count * cloud.sh_stride())?;
-        }
+        Body::Columns => cloud = read_cloud(&mut input, sh_degree, count).map_err(failed)?,
     }
     let hash = compare(path, &mut input)?;
     if let Some(cells) = cells {
@@ -272,7 +267,11 @@ fn exact_bytes(sh_degree: u8) -> u64 {
     4 * (11 + 3 * sh_coefficients(sh_degree) as u64)
 }
 
-fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
+/// The header that these bytes hold.
+///
+/// # Errors
+/// [`FormatError::Invalid`]: it cannot be decoded, or a later stage could not work with it.
+pub fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
     // Files of earlier versions end before the lights: an empty list of them is one byte.
     let earlier = || postcard::from_bytes(&[bytes, &[0]].concat());
     let header: ModelHeader = postcard::from_bytes(bytes)

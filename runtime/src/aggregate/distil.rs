@@ -10,19 +10,23 @@
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-use config::ground::GroundSettings;
 use config::training::{RateSettings, Strategy, TrainSettings};
 use image::RgbImage;
 use models::camera::Intrinsics;
+use models::camera::View;
 use models::cloud::GaussianCloud;
+use serde::{Deserialize, Serialize};
 use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::AggregateError;
-use super::member::Member;
+use super::block::Block;
 use super::merge::{Merged, opacity};
+use super::plan::Recipe;
 use super::seam::Seams;
 use crate::engine::device::DeviceRequest;
 use lesson::{Errors, Lesson, choose, draw, psnr};
+
+pub use lesson::psnr_of;
 
 mod lesson;
 
@@ -51,10 +55,10 @@ pub struct Sample {
     pub psnr: [f64; 2],
 }
 
-/// What distillation came to.
-#[derive(Clone, Debug, Default)]
-pub struct Distilled {
-    /// Training views of all models, and views between them.
+/// What the seams of a cell have learnt: the same for the same input.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Learnt {
+    /// Training views of all models around, and views between them.
     pub views: usize,
     /// Those that see a seam and took part.
     pub used: usize,
@@ -70,11 +74,16 @@ pub struct Distilled {
     pub seam_share: f64,
     /// Steps taken.
     pub steps: u32,
-    /// Per model: PSNR of the union against the teacher where the views kept back show seams, before and after; None where none
-    /// did.
-    pub agreement: Vec<Option<[f64; 2]>>,
+    /// Per model: squared differences and number of the values in which the views kept back show seams, of the union against the
+    /// teacher before and after.
+    pub shown: Vec<[[f64; 2]; 2]>,
     /// Transparent Gaussians removed at the end.
     pub pruned: usize,
+}
+
+/// What it took, and what it looks like.
+#[derive(Clone, Debug, Default)]
+pub struct Effort {
     /// Name of the device; empty when none was needed.
     pub device: String,
     /// Bytes planned and allocated on it.
@@ -86,9 +95,9 @@ pub struct Distilled {
 }
 
 /// The recipe: the trainer's, without everything that adds, moves or discards Gaussians.
-fn recipe(settings: &GroundSettings, sh_degree: u8) -> TrainSettings {
-    let mut t = TrainSettings { seed: settings.seed, ..Default::default() };
-    t.rates = rates(settings.rate);
+fn training(recipe: &Recipe, sh_degree: u8) -> TrainSettings {
+    let mut t = TrainSettings { seed: recipe.seed, ..Default::default() };
+    t.rates = rates(recipe.rate);
     t.loss.depth = 0.0;
     t.density.strategy = Strategy::None;
     t.regularise.noise = 0.0;
@@ -122,44 +131,49 @@ fn rates(factor: f32) -> RateSettings {
     r
 }
 
-/// Distils in place.
+/// Distils the seams of a square in place; None: asked to stop.
 ///
 /// # Errors
 /// No device, or a memory plan that does not fit; `merged` is then what it was.
 pub fn distil(
-    members: &[Member],
+    block: &Block<'_>,
     merged: &mut Merged,
-    settings: &GroundSettings,
+    device: Option<&str>,
     go_on: &dyn Fn() -> bool,
-) -> Result<Distilled, AggregateError> {
-    let mut seams = Seams::find(merged, settings.seam_m);
-    let (mut lessons, views) = choose(members, &seams, settings);
-    let mut report = Distilled {
+) -> Result<Option<(Learnt, Effort)>, AggregateError> {
+    let (inputs, recipe) = (block.inputs, &block.inputs.recipe);
+    let models = inputs.models.len();
+    let views = (0..models).map(|m| Ok(block.head(m)?.views));
+    let views: Vec<Vec<(String, View)>> = views.collect::<Result<_, AggregateError>>()?;
+    let mut seams = Seams::find(merged, inputs.squares.seam_m, &|c| inputs.squares.key_of(c) == inputs.key);
+    let (mut lessons, views) = choose(&views, &seams, recipe);
+    let mut report = Learnt {
         views,
         used: lessons.len(),
         cells: seams.cells.len(),
         seam_share: seams.share,
-        agreement: vec![None; members.len()],
+        shown: vec![[[0.0; 2]; 2]; models],
         ..Default::default()
     };
-    if lessons.is_empty() || settings.epochs == 0 {
+    let mut effort = Effort::default();
+    if lessons.is_empty() || recipe.epochs == 0 {
         report.used = 0;
-        return Ok(report);
+        return Ok(Some((report, effort)));
     }
     let mut rows = seams.with_halo(merged);
-    let mut trainer = open(members, &lessons, rows.len(), merged.cloud.sh_degree, settings)?;
+    let mut trainer = open(block, &lessons, rows.len(), merged.cloud.sh_degree, device)?;
     while rows.len() > trainer.plan().gaussians && !seams.cells.is_empty() {
         seams.keep((seams.cells.len() as f64 * FEWER) as usize);
         rows = seams.with_halo(merged);
     }
     report.over_plan = report.cells - seams.cells.len();
-    report.device = trainer.gpu().info().name.clone();
-    report.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
+    effort.device = trainer.gpu().info().name.clone();
+    effort.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
 
     let start = Instant::now();
-    for (m, member) in members.iter().enumerate() {
+    for m in 0..models {
         if lessons.iter().any(|l| l.model == m) {
-            trainer.load(&member.cloud()?)?;
+            trainer.load(&block.cloud(m)?)?;
             for lesson in lessons.iter_mut().filter(|l| l.model == m) {
                 lesson.ask(&mut trainer, &seams)?;
             }
@@ -167,70 +181,73 @@ pub fn distil(
     }
     lessons.retain(Lesson::is_worth_it);
     report.used = lessons.len();
-    report.seconds[0] = start.elapsed().as_secs_f64();
+    effort.seconds[0] = start.elapsed().as_secs_f64();
     let (kept_back, taught): (Vec<Lesson>, Vec<Lesson>) = lessons.into_iter().partition(|l| l.is_kept_back);
     report.kept_back = kept_back.len();
     let part = merged.cloud.rows(&rows);
     // Rows that the trainer leaves out would no longer be those of the union.
     let is_whole = (0..part.len()).all(|i| part.is_valid(i));
     if taught.is_empty() || kept_back.is_empty() || !is_whole || part.is_empty() {
-        return Ok(report);
+        return Ok(Some((report, effort)));
     }
 
     let start = Instant::now();
     trainer.load(&part)?;
-    let before = Shown::of(&mut trainer, &kept_back, members.len(), seams.cells.len())?;
+    let before = Shown::of(&mut trainer, &kept_back, models, seams.cells.len())?;
     for lesson in &taught {
         trainer.add_view(&lesson.picture(), None)?;
     }
     let of_row: Vec<Option<u16>> = part.means.iter().map(|mean| seams.index_of(mean)).collect();
     trainer.hold(|row| of_row[row].is_none());
-    let steps = settings.epochs.saturating_mul(taught.len() as u32);
-    let budget = RunBudget { steps: Some(steps), seconds: settings.seconds };
+    let steps = recipe.epochs.saturating_mul(taught.len() as u32);
+    let budget = RunBudget { steps: Some(steps), seconds: recipe.seconds };
     let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
     report.steps = trainer.run(&budget, &mut each)?.steps;
+    if !go_on() {
+        return Ok(None);
+    }
     let mut trained = GaussianCloud::default();
     trainer.snapshot(&mut trained)?;
-    let learnt = Shown::of(&mut trainer, &kept_back, members.len(), seams.cells.len())?;
+    let learnt = Shown::of(&mut trainer, &kept_back, models, seams.cells.len())?;
     let accepted = closer(&before.errors(), &learnt.errors());
 
     // A cell beside one that was not taken over is another surrounding than it was trained in: what is taken over is asked again.
     let takes = |row: usize| of_row[row].is_some_and(|cell| accepted[usize::from(cell)]);
     let mixed = mixed(&part, &trained, takes);
     trainer.load(&mixed)?;
-    let after = Shown::of(&mut trainer, &kept_back, members.len(), seams.cells.len())?;
-    let psnr = |shown: &Shown| shown.errors().psnr(|_| true);
+    let after = Shown::of(&mut trainer, &kept_back, models, seams.cells.len())?;
+    let psnr = |shown: &Shown| psnr_of(shown.errors().sum());
     let holds = psnr(&after) > psnr(&before);
-    report.seconds[1] = start.elapsed().as_secs_f64();
+    effort.seconds[1] = start.elapsed().as_secs_f64();
     let after = if holds { &after } else { &before };
-    let of_model = |m: usize| Some([before.of_model[m].psnr(|_| true)?, after.of_model[m].psnr(|_| true)?]);
-    report.agreement = (0..members.len()).map(of_model).collect();
-    report.samples = samples(members.len(), &kept_back, &before, after);
+    report.shown = (0..models).map(|m| [before.of_model[m].sum(), after.of_model[m].sum()]).collect();
+    effort.samples = samples(models, &kept_back, &before, after);
     if holds {
         report.accepted = accepted.iter().filter(|a| **a).count();
         let mut visible = vec![true; merged.cloud.len()];
         for (i, row) in rows.iter().enumerate().filter(|(i, _)| takes(*i)) {
             merged.cloud.set_row(*row as usize, &mixed, i);
-            visible[*row as usize] = opacity(mixed.opacity_logits[i]) > settings.prune_opacity;
+            visible[*row as usize] = opacity(mixed.opacity_logits[i]) > recipe.prune_opacity;
         }
         report.pruned = merged.retain(|i| visible[i]);
     }
-    Ok(report)
+    Ok(Some((report, effort)))
 }
 
 /// The trainer: room for the largest model and for what is trained, and for the lessons.
 fn open(
-    members: &[Member],
+    block: &Block<'_>,
     lessons: &[Lesson],
     rows: usize,
     sh_degree: u8,
-    settings: &GroundSettings,
+    device: Option<&str>,
 ) -> Result<Trainer, AggregateError> {
-    let largest = members.iter().map(|m| m.gaussians).max().unwrap_or(0).max(rows);
+    let recipe = &block.inputs.recipe;
+    let largest = (0..block.inputs.models.len()).map(|m| block.rows(m)).max().unwrap_or(0).max(rows);
     let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);
     let request = DeviceRequest {
-        device: settings.device.clone(),
-        device_mib: settings.device_mib,
+        device: device.map(str::to_owned),
+        device_mib: recipe.device_mib,
         size: (side(|k| k.width), side(|k| k.height)),
         views: lessons.len(),
         crops: 0,
@@ -240,7 +257,7 @@ fn open(
         max_gaussians: Some(largest),
         scene_gaussians: None,
     };
-    request.open::<AggregateError>(&recipe(settings, sh_degree))
+    request.open::<AggregateError>(&training(recipe, sh_degree))
 }
 
 /// What the views kept back show.
@@ -326,8 +343,10 @@ mod tests {
     #[test]
     fn what_seams_are_off_is_measured_where_they_are() {
         let errors = Errors(vec![[3.0 * 255.0 * 255.0, 300.0], [0.0, 600.0], [1.0, 0.0]]);
-        assert!(errors.psnr(|c| c == 0).is_some_and(|db| (db - 20.0).abs() < 1e-9));
-        assert_eq!(errors.psnr(|c| c == 1), Some(60.0));
-        assert_eq!(errors.psnr(|_| false), None);
+        let of = |c: usize| psnr_of(Errors(vec![errors.0[c]]).sum());
+        assert!(of(0).is_some_and(|db| (db - 20.0).abs() < 1e-9));
+        assert_eq!(of(1), Some(60.0));
+        assert_eq!(of(2), None);
+        assert!(psnr_of(errors.sum()).is_some_and(|db| db > 20.0 && db < 60.0));
     }
 }

@@ -43,6 +43,17 @@ impl Motion {
         Self(Similarity { rotation: similarity.rotation.normalize(), ..similarity })
     }
 
+    /// The numbers it is made of, as a file keeps them: x y z w of the turn, scale, shift.
+    pub fn parts(&self) -> [f64; 8] {
+        let Similarity { scale, rotation: q, translation: t } = self.0;
+        [q.x, q.y, q.z, q.w, scale, t.x, t.y, t.z]
+    }
+
+    /// The motion of [`Motion::parts`], bit for bit.
+    pub fn of_parts([x, y, z, w, scale, a, b, c]: [f64; 8]) -> Self {
+        Self(Similarity { scale, rotation: DQuat::from_xyzw(x, y, z, w), translation: DVec3::new(a, b, c) })
+    }
+
     /// First `self`, then `after`.
     pub fn then(&self, after: &Self) -> Self {
         Self(self.0.then(&after.0))

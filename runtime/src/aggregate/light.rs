@@ -40,11 +40,11 @@ impl Default for Light {
     }
 }
 
-/// Finds the gain of each model and has it taken out of its Gaussians.
+/// Finds the gain of each model and has it, or what `hold` says instead, taken out of its Gaussians.
 ///
 /// # Errors
 /// A model's file cannot be read any more.
-pub fn unite(members: &mut [Member]) -> Result<Light, AggregateError> {
+pub fn unite(members: &mut [Member], hold: &dyn Fn(&Member, [f32; 3]) -> [f32; 3]) -> Result<Light, AggregateError> {
     if members.len() < 2 {
         return Ok(Light::default());
     }
@@ -64,13 +64,15 @@ pub fn unite(members: &mut [Member]) -> Result<Light, AggregateError> {
     let solved = solve(members.len(), &mut ratios);
     let largest = solved.gains.iter().flatten().flatten().fold(0.0f32, |most, g| most.max(g.abs()));
     let step = solved.before.exp();
-    if largest < EVEN {
-        return Ok(Light { largest: 1.0, step: [step; 2] });
-    }
-    for (member, gain) in members.iter_mut().zip(&solved.gains) {
-        if let Some(gain) = gain {
-            member.brought_into_common_light(*gain);
+    let is_even = largest < EVEN;
+    for (member, found) in members.iter_mut().zip(&solved.gains) {
+        let gain = hold(member, found.filter(|_| !is_even).unwrap_or_default());
+        if (found.is_some() && !is_even) || gain != [0.0; 3] {
+            member.brought_into_common_light(gain);
         }
+    }
+    if is_even {
+        return Ok(Light { largest: 1.0, step: [step; 2] });
     }
     Ok(Light { largest: largest.exp(), step: [step, solved.after.exp()] })
 }
@@ -135,7 +137,7 @@ mod tests {
             members.push(written(dir.path(), &local));
         }
         let before = members[1].cloud().expect("read");
-        let light = unite(&mut members).expect("united");
+        let light = unite(&mut members, &|_, gain| gain).expect("united");
         assert!((light.largest - 1.3).abs() < 0.02, "{light:?}");
         assert!(light.step[0] > 1.08 && light.step[1] < 1.01, "{light:?}");
         let after = members[1].cloud().expect("read");
@@ -144,7 +146,7 @@ mod tests {
             assert!((ratio * factor[c] - 1.0).abs() < 0.02, "channel {c}: {ratio}");
             assert!((members[1].header.lights[0].gain[c] - factor[c].ln()).abs() < 0.02);
         }
-        let again = unite(&mut members).expect("united");
+        let again = unite(&mut members, &|_, gain| gain).expect("united");
         assert!(
             again.largest == 1.0 && again.step[0] == again.step[1] && again.step[0] < 1.01,
             "one light now: {again:?}"
@@ -157,12 +159,12 @@ mod tests {
         let carpets = [carpet([0.0, 0.0], [40.0, 40.0], 0.25), carpet([500.0, 0.0], [540.0, 40.0], 0.25)];
         let [near, far] = carpets.map(|cloud| model("m", &[], cloud));
         let mut same = [written(dir.path(), &near), written(dir.path(), &near)];
-        assert_eq!(unite(&mut same).expect("united"), Light::default());
+        assert_eq!(unite(&mut same, &|_, gain| gain).expect("united"), Light::default());
         let mut dark = far;
         dark.path = "dark".into();
         dark.cloud.multiply_colors([0.5; 3]);
         let mut apart = [written(dir.path(), &near), written(dir.path(), &dark)];
-        assert_eq!(unite(&mut apart).expect("united"), Light::default());
+        assert_eq!(unite(&mut apart, &|_, gain| gain).expect("united"), Light::default());
         let even = |m: &Member| m.header.lights.iter().all(|l| *l == PictureLight::default());
         assert!(same.iter().chain(&apart).all(even));
     }

@@ -94,6 +94,8 @@ pub struct Member {
     origin: Option<Geodetic>,
     /// From the file's frame to the header's.
     motion: Motion,
+    /// The part of it that registration said.
+    correction: Option<Motion>,
     /// Log gain of its colours over the common light's.
     gain: [f32; 3],
 }
@@ -108,6 +110,7 @@ impl Member {
             content: model.content,
             origin: model.header.origin,
             motion: Motion::NONE,
+            correction: None,
             gain: [0.0; 3],
             path: model.path,
             header: model.header,
@@ -138,6 +141,31 @@ impl Member {
         self.motion = self.motion.then(by);
     }
 
+    /// Moves it to where its neighbours have it. Regions are agreed on beforehand and stay where they are.
+    pub fn corrected(&mut self, by: &Motion) {
+        let region = std::mem::take(&mut self.header.region);
+        self.moved(by);
+        self.header.region = region;
+        self.correction = Some(*by);
+    }
+
+    /// What registration moved it by.
+    pub fn correction(&self) -> Option<&Motion> {
+        self.correction.as_ref()
+    }
+
+    /// Log gain of its colours over the common light's.
+    pub fn gain(&self) -> [f32; 3] {
+        self.gain
+    }
+
+    /// Corners of the ground that it shows, in the common frame.
+    pub fn corners(&self) -> [DVec3; 4] {
+        let Ground { bounds: Bounds { low, high }, height_m } = self.ground;
+        let corners = [low, DVec2::new(low.x, high.y), high, DVec2::new(high.x, low.y)];
+        corners.map(|c| self.motion.point(c.extend(height_m)))
+    }
+
     /// Its colours are `gain` (natural logarithm) over the common light's: that is taken out of its Gaussians when they are read, and
     /// is the light of its pictures.
     pub fn brought_into_common_light(&mut self, gain: [f32; 3]) {
@@ -165,13 +193,11 @@ impl Member {
 
     /// The ground its Gaussians show, in the common frame.
     pub fn bounds(&self) -> Bounds {
-        let Ground { bounds: Bounds { low, high }, height_m } = self.ground;
+        let Bounds { low, high } = self.ground.bounds;
         if low.cmpgt(high).any() {
             return Bounds::EMPTY;
         }
-        let corners = [low, DVec2::new(low.x, high.y), high, DVec2::new(high.x, low.y)];
-        let moved = corners.map(|c| self.motion.point(c.extend(height_m)).truncate());
-        moved.into_iter().fold(Bounds::EMPTY, Bounds::around)
+        self.corners().into_iter().map(|c| c.truncate()).fold(Bounds::EMPTY, Bounds::around)
     }
 
     /// The middle of that ground.

@@ -9,17 +9,19 @@ use std::collections::HashMap;
 
 use glam::DVec2;
 use models::cloud::GaussianCloud;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::AggregateError;
-use super::member::Member;
-use super::region::Partition;
+use super::block::Block;
+use super::region::{Partition, Region};
 use coverage::{Cell, Coverage};
+
+pub use coverage::side_m;
 
 mod coverage;
 
 /// What became of one model's Gaussians.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Kept {
     /// Before.
     pub gaussians: usize,
@@ -31,16 +33,32 @@ pub struct Kept {
     pub foreign: usize,
     /// Left out to stay within the Gaussian budget.
     pub over_budget: usize,
+    /// Left out: so far from all others of its model that it shows no ground.
+    pub stray: usize,
 }
 
-/// One cloud out of many.
+impl Kept {
+    /// Adds what became of others.
+    pub fn add(&mut self, other: &Self) {
+        self.gaussians += other.gaussians;
+        self.own += other.own;
+        self.fill += other.fill;
+        self.foreign += other.foreign;
+        self.over_budget += other.over_budget;
+        self.stray += other.stray;
+    }
+}
+
+/// One cloud out of many: a square of ground and its surroundings.
 #[derive(Clone, Debug, Default)]
 pub struct Merged {
     /// The union.
     pub cloud: GaussianCloud,
-    /// Which model each Gaussian came from.
+    /// Which of the job's models each Gaussian came from.
     pub source: Vec<u16>,
-    /// Per model.
+    /// Whether it lies in the square, or in its surroundings.
+    pub inside: Vec<bool>,
+    /// Per model of the job, of those in the square.
     pub kept: Vec<Kept>,
 }
 
@@ -53,63 +71,90 @@ fn ground(mean: [f32; 3]) -> DVec2 {
     DVec2::new(f64::from(mean[0]), f64::from(mean[1]))
 }
 
-/// Filters and unites the models, one at a time, and keeps the `budget` most important Gaussians.
+/// Filters and unites the models in a square and its surroundings, one piece at a time. Of those in the square the `most` important
+/// ones are kept; the surroundings, which are only looked at, are not thinned out.
 ///
 /// # Errors
-/// A model's file cannot be read any more.
-pub fn merge(members: &[Member], partition: &Partition, budget: usize) -> Result<Merged, AggregateError> {
-    let coverage = Coverage::of(members)?;
+/// A piece cannot be read.
+pub fn merge(block: &Block<'_>) -> Result<Merged, AggregateError> {
+    let inputs = block.inputs;
+    let coverage = Coverage::of(block)?;
+    let regions: Vec<Option<Region>> = inputs.regions.iter().map(|r| Some(r.1.clone())).collect();
+    let partition = Partition::of(regions, inputs.border_m);
     let mut owners = partition.owners();
+    // An owner that is not among the models around here shows nothing here.
+    let nobody = usize::MAX;
+    let mut owner = |p: DVec2| match inputs.regions.get(owners.owner(p)) {
+        Some((model, _)) => model.map_or(nobody, usize::from),
+        None => inputs.owner_of_all.map_or(nobody, usize::from),
+    };
     let mut fill: HashMap<(usize, Cell), usize> = HashMap::new();
-    let degree = members.iter().map(|m| m.sh_degree).max().unwrap_or(0);
-    let mut merged = Merged { cloud: GaussianCloud::with_capacity(degree, 0), ..Default::default() };
-    for (m, member) in members.iter().enumerate() {
-        let mut own = member.cloud()?;
-        let mut kept = Kept { gaussians: own.len(), ..Default::default() };
-        let keep: Vec<bool> = (0..own.len())
-            .map(|i| {
-                let p = ground(own.means[i]);
-                let owner = owners.owner(p);
-                let cell = coverage.cell(p);
-                let keeper = *fill.entry((owner, cell)).or_insert_with(|| coverage.fill_in(owner, cell));
-                // Where somebody fills in for the owner, the little the owner has stays too: it is less than a tenth.
-                match (owner == m, keeper == m) {
-                    (true, _) => kept.own += 1,
-                    (false, true) => kept.fill += 1,
-                    (false, false) => kept.foreign += 1,
+    let mut merged = Merged { cloud: GaussianCloud::with_capacity(inputs.sh_degree, 0), ..Default::default() };
+    for m in 0..inputs.models.len() {
+        let mut kept = Kept::default();
+        for piece in block.pieces(m) {
+            let mut own = piece?;
+            let (mut rows, mut inside) = (Vec::new(), Vec::new());
+            for (i, mean) in own.means.iter().enumerate() {
+                let seam = inputs.squares.seam(mean);
+                if !inputs.squares.surrounds(inputs.key, seam) {
+                    continue;
                 }
-                owner == m || keeper == m
-            })
-            .collect();
-        own.retain(|i| keep[i]);
-        merged.source.reserve_exact(own.len());
-        merged.source.extend(std::iter::repeat_n(m as u16, own.len()));
-        merged.cloud.reserve_exact(own.len());
-        merged.cloud.extend(&own);
+                let p = ground(*mean);
+                let (owner, cell) = (owner(p), coverage.cell(p));
+                let keeper = *fill.entry((owner, cell)).or_insert_with(|| coverage.fill_in(owner, cell));
+                let is_inside = inputs.squares.key_of(seam) == inputs.key;
+                if is_inside {
+                    kept.gaussians += 1;
+                    // Where somebody fills in for the owner, the little the owner has stays too: it is less than a tenth.
+                    match (owner == m, keeper == m) {
+                        (true, _) => kept.own += 1,
+                        (false, true) => kept.fill += 1,
+                        (false, false) => kept.foreign += 1,
+                    }
+                }
+                if owner == m || keeper == m {
+                    rows.push(i as u32);
+                    inside.push(is_inside);
+                }
+            }
+            if rows.len() < own.len() {
+                own = own.rows(&rows);
+            }
+            merged.source.extend(std::iter::repeat_n(m as u16, own.len()));
+            merged.inside.append(&mut inside);
+            merged.cloud.reserve_exact(own.len());
+            merged.cloud.extend(&own);
+        }
         merged.kept.push(kept);
     }
-    merged.keep_most_important(budget);
+    if let Some(most) = inputs.most {
+        merged.keep_most_important(usize::try_from(most).unwrap_or(usize::MAX));
+    }
     Ok(merged)
 }
 
 impl Merged {
-    /// Drops the Gaussians that cover least until `budget` are left; returns how many.
-    pub fn keep_most_important(&mut self, budget: usize) -> usize {
-        let n = self.cloud.len();
-        if n <= budget {
-            return 0;
-        }
-        let keep = self.cloud.most_covering(budget);
-        for (_, source) in keep.iter().zip(&self.source).filter(|(keep, _)| !**keep) {
-            self.kept[usize::from(*source)].over_budget += 1;
+    /// Drops the Gaussians of the square that cover least until `budget` are left; returns how many.
+    fn keep_most_important(&mut self, budget: usize) -> usize {
+        let rows: Vec<u32> = (0..self.cloud.len() as u32).filter(|i| self.inside[*i as usize]).collect();
+        let mut keep = vec![true; self.cloud.len()];
+        for row in self.cloud.least_covering(rows, budget) {
+            keep[row as usize] = false;
+            self.kept[usize::from(self.source[row as usize])].over_budget += 1;
         }
         self.retain(|i| keep[i])
     }
 
-    /// Keeps the rows for which `keep` holds, in cloud and sources alike.
+    /// Keeps the rows for which `keep` holds, in all columns alike.
     pub fn retain(&mut self, keep: impl Fn(usize) -> bool) -> usize {
         let mut row = 0;
         self.source.retain(|_| {
+            row += 1;
+            keep(row - 1)
+        });
+        row = 0;
+        self.inside.retain(|_| {
             row += 1;
             keep(row - 1)
         });

@@ -9,6 +9,7 @@ use std::collections::HashMap;
 use glam::{DVec2, DVec3};
 use models::coverage::hull;
 use models::formats::model::ModelHeader;
+use serde::{Deserialize, Serialize};
 
 use super::member::{Bounds, Member};
 use super::sight::Sight;
@@ -24,8 +25,11 @@ const STRIP_SQUARES: f64 = 8.0;
 /// for a picture more or less.
 const CLEARLY: f64 = 1.25;
 
+/// Corners of a region in a file, far more than any has.
+const MOST_CORNERS: usize = 1 << 20;
+
 /// The part of the ground one aircraft answers for.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Region {
     /// Corners in order, metres east and north; 1 or 2 are allowed (a point, a line).
     pub corners: Vec<DVec2>,
@@ -52,6 +56,11 @@ impl Region {
         let looked_at = header.views.iter().map(|(_, v)| look_at(v.pose.center, v.pose.forward(), ground));
         let corners = hull(looked_at.collect());
         (!corners.is_empty()).then_some(Self { corners, declared: false, sight })
+    }
+
+    /// Whether a plan may have it.
+    pub fn is_usable(&self) -> bool {
+        (1..=MOST_CORNERS).contains(&self.corners.len()) && self.corners.iter().all(|p| p.is_finite())
     }
 
     /// Whether the point lies inside or on the border (even-odd rule, so concave polygons work).
@@ -94,7 +103,8 @@ impl Partition {
         Self::of(members.iter().map(|m| Region::of(&m.header, m.middle().z)).collect(), border_m.into())
     }
 
-    fn of(regions: Vec<Option<Region>>, border_m: f64) -> Self {
+    /// The partition of these regions.
+    pub fn of(regions: Vec<Option<Region>>, border_m: f64) -> Self {
         let side = |r: &Region| r.corners.iter().fold(Bounds::EMPTY, |b, c| b.around(*c)).span().max_element();
         let mut sides: Vec<f64> = regions.iter().flatten().map(side).collect();
         sides.sort_by(f64::total_cmp);
@@ -137,7 +147,7 @@ pub struct Owners<'a> {
     partition: &'a Partition,
     /// By square, the regions that may own a point of it: squares of [`Partition::square_m`], and of [`COARSE`] times that,
     /// in which those of the small ones are looked for.
-    near: [HashMap<(i64, i64), Vec<u16>>; 2],
+    near: [HashMap<(i64, i64), Vec<usize>>; 2],
     /// By square of the strips along borders and model: how well it saw the middle.
     seen: HashMap<((i64, i64), usize), f64>,
 }
@@ -147,12 +157,16 @@ impl Owners<'_> {
     pub fn owner(&mut self, p: DVec2) -> usize {
         let Self { partition, near: [few, several], seen } = self;
         let (fine, coarse) = (partition.square_m, partition.square_m * COARSE);
+        let middle = |side: f64| ((p / side).floor() + 0.5) * side;
+        let of = |i: usize| Some((i, partition.regions[i].as_ref()?));
         let few = few.entry(square_of(p, fine)).or_insert_with(|| {
-            let all = 0..partition.regions.len() as u16;
-            let several = several.entry(square_of(p, coarse)).or_insert_with(|| nearest(partition, p, coarse, all));
-            nearest(partition, p, fine, several.iter().copied())
+            let all = (0..partition.regions.len()).filter_map(of);
+            let several = several
+                .entry(square_of(p, coarse))
+                .or_insert_with(|| nearest(all, middle(coarse), coarse, partition.border_m));
+            nearest(several.iter().copied().filter_map(of), middle(fine), fine, partition.border_m)
         });
-        let owner = partition.owner(p, few.iter().map(|i| usize::from(*i)));
+        let owner = partition.owner(p, few.iter().copied());
         let region = |model: usize| partition.regions.get(model).and_then(Option::as_ref);
         let Some(own) = region(owner).filter(|_| partition.border_m > 0.0 && few.len() > 1) else { return owner };
         let (reach, side) = (own.distance(p) + partition.border_m, partition.border_m / STRIP_SQUARES);
@@ -161,7 +175,7 @@ impl Owners<'_> {
             *seen.entry((square_of(p, side), model)).or_insert_with(|| of.sight.pixels_per_m2(middle))
         };
         let (mut best, mut most) = (owner, None);
-        for rival in few.iter().map(|i| usize::from(*i)).filter(|i| *i != owner) {
+        for rival in few.iter().copied().filter(|i| *i != owner) {
             let Some(of) = region(rival).filter(|r| r.distance(p) <= reach) else { continue };
             let least = most.unwrap_or_else(|| CLEARLY * seen(owner, own));
             most = Some(least);
@@ -177,14 +191,18 @@ fn square_of(p: DVec2, side: f64) -> (i64, i64) {
     ((p.x / side).floor() as i64, (p.y / side).floor() as i64)
 }
 
-/// Those of `among` that may be the nearest region of a point in the square of this side around `p`.
-fn nearest(partition: &Partition, p: DVec2, side: f64, among: impl Iterator<Item = u16>) -> Vec<u16> {
-    let middle = ((p / side).floor() + 0.5) * side;
-    let to = |i: u16| Some((i, partition.regions[usize::from(i)].as_ref()?.distance(middle)));
-    let distances: Vec<(u16, f64)> = among.filter_map(to).collect();
+/// Those of `among` that may own a point of the square of this side around `middle`, in their order: the nearest, and those no farther
+/// than `border_m` beyond it.
+pub fn nearest<'a>(
+    among: impl Iterator<Item = (usize, &'a Region)>,
+    middle: DVec2,
+    side: f64,
+    border_m: f64,
+) -> Vec<usize> {
+    let distances: Vec<(usize, f64)> = among.map(|(i, region)| (i, region.distance(middle))).collect();
     let least = distances.iter().map(|d| d.1).fold(f64::INFINITY, f64::min);
     // From the middle to any point of the square, both distances change by half its diagonal at most.
-    let reach = least + partition.border_m + side * std::f64::consts::SQRT_2 + 2.0 * TIE_M;
+    let reach = least + border_m + side * std::f64::consts::SQRT_2 + 2.0 * TIE_M;
     distances.into_iter().filter(|d| d.1 <= reach).map(|d| d.0).collect()
 }
 

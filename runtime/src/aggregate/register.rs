@@ -7,6 +7,7 @@
 
 use std::collections::HashSet;
 
+use super::frame::Motion;
 use super::member::Member;
 use edge::{Edges, Fitted, Key};
 use graph::{Link, Node};
@@ -133,12 +134,17 @@ impl<F: Fitter> Registrar<F> {
         Ok((pairs, used, fitted))
     }
 
-    /// Brings all models together: each moves as its neighbours and its telemetry agree on. Models that overlap no other stay
-    /// where their GPS put them. Pairs that are in use no more are forgotten.
+    /// Brings all models together: each moves as its neighbours and its telemetry agree on, or as `hold` says instead. Models that
+    /// overlap no other stay where their GPS put them. Pairs that are in use no more are forgotten.
     ///
     /// # Errors
     /// Those of [`Registrar::fit`]; the models are then as they were.
-    pub fn register(&mut self, members: &mut [Member], go_on: &dyn Fn() -> bool) -> Result<Registered, String> {
+    pub fn register(
+        &mut self,
+        members: &mut [Member],
+        hold: &dyn Fn(&Member, Motion) -> Motion,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Registered, String> {
         let (pairs, used, fitted) = self.pairs(members, go_on)?;
         let mut report = Registered { pairs: pairs.len(), fitted, ..Default::default() };
         let node = |m: &Member| Node {
@@ -163,8 +169,9 @@ impl<F: Fitter> Registrar<F> {
                 ));
             }
         }
+        let mut corrections = Vec::new();
         for (i, neighbours) in of_model.iter().enumerate().filter(|(_, n)| !n.is_empty()) {
-            let motion = super::frame::Motion::of(settled.corrections[i]);
+            let motion = hold(&members[i], Motion::of(settled.corrections[i]));
             report.models.push(Registration {
                 name: name(i),
                 neighbours: neighbours.iter().map(|n| name(n.0)).collect(),
@@ -173,12 +180,10 @@ impl<F: Fitter> Registrar<F> {
                 scale: motion.similarity().scale,
                 rms_m: (neighbours.iter().map(|n| n.1 * n.1).sum::<f64>() / neighbours.len() as f64).sqrt(),
             });
+            corrections.push((i, motion));
         }
-        for (i, _) in of_model.iter().enumerate().filter(|(_, n)| !n.is_empty()) {
-            // Regions are agreed on beforehand and stay where they are.
-            let region = members[i].header.region.clone();
-            members[i].moved(&super::frame::Motion::of(settled.corrections[i]));
-            members[i].header.region = region;
+        for (i, motion) in corrections {
+            members[i].corrected(&motion);
         }
         self.edges.keep_only(&used);
         report.warnings.append(&mut self.edges.damaged);

@@ -6,14 +6,10 @@ use std::collections::{BTreeSet, HashMap};
 use models::camera::View;
 
 use super::merge::Merged;
+use super::squares::{HALO, Seam as Cell, seam};
 
 /// Gaussians looked at per view; more would not change a share in the percents.
 const SAMPLE: usize = 20_000;
-/// Cells around those of the seams whose Gaussians are drawn with them: what stands there may stand in the way.
-const HALO: i64 = 2;
-
-/// Column and row.
-pub type Cell = (i64, i64);
 
 /// The seams of a merged scene.
 pub struct Seams {
@@ -29,9 +25,9 @@ pub struct Seams {
 }
 
 impl Seams {
-    /// Cells of side `seam_m`, as many as can be numbered.
-    pub fn find(merged: &Merged, seam_m: f32) -> Self {
-        let place = |mean: &[f32; 3]| cell(mean, seam_m);
+    /// Those cells of side `seam_m` that `is_inside` holds for, as many as can be numbered.
+    pub fn find(merged: &Merged, seam_m: f32, is_inside: &dyn Fn(Cell) -> bool) -> Self {
+        let place = |mean: &[f32; 3]| seam(mean, seam_m);
         // Source of the cell, or None once two are in it.
         let mut sources: HashMap<Cell, Option<u16>> = HashMap::new();
         for (mean, &source) in merged.cloud.means.iter().zip(&merged.source) {
@@ -43,7 +39,8 @@ impl Seams {
         let meets = |c: &Cell, source: &Option<u16>| {
             source.is_none() || around(*c, 1).any(|c| sources.get(&c).is_some_and(|other| other != source))
         };
-        let mut cells: Vec<Cell> = sources.iter().filter(|(c, s)| meets(c, s)).map(|(c, _)| *c).collect();
+        let inside = sources.iter().filter(|(c, s)| is_inside(**c) && meets(c, s));
+        let mut cells: Vec<Cell> = inside.map(|(c, _)| *c).collect();
         cells.sort_unstable_by_key(|c| (c.1, c.0));
         let mut this = Self { side_m: seam_m, cells, index: HashMap::new(), points: Vec::new(), share: 0.0 };
         this.keep(usize::from(u16::MAX));
@@ -62,14 +59,14 @@ impl Seams {
 
     /// Which of the cells a place lies in.
     pub fn index_of(&self, place: &[f32; 3]) -> Option<u16> {
-        self.index.get(&cell(place, self.side_m)).copied()
+        self.index.get(&seam(place, self.side_m)).copied()
     }
 
     /// Rows of the Gaussians in the cells and around them.
     pub fn with_halo(&self, merged: &Merged) -> Vec<u32> {
         let near: BTreeSet<Cell> = self.cells.iter().flat_map(|c| around(*c, HALO)).collect();
         let rows = merged.cloud.means.iter().zip(0..);
-        rows.filter(|(mean, _)| near.contains(&cell(mean, self.side_m))).map(|(_, row)| row).collect()
+        rows.filter(|(mean, _)| near.contains(&seam(mean, self.side_m))).map(|(_, row)| row).collect()
     }
 
     /// The part of this view's picture, in whole pixels, that shows Gaussians in seams: left, top, right and bottom; None when
@@ -113,10 +110,6 @@ impl Seams {
     }
 }
 
-fn cell(mean: &[f32; 3], side_m: f32) -> Cell {
-    ((mean[0] / side_m).floor() as i64, (mean[1] / side_m).floor() as i64)
-}
-
 fn around((x, y): Cell, reach: i64) -> impl Iterator<Item = Cell> {
     (-reach..=reach).flat_map(move |v| (-reach..=reach).map(move |u| (x.saturating_add(u), y.saturating_add(v))))
 }
@@ -133,7 +126,7 @@ mod tests {
         let all = carpet([-100.0, -50.0], [100.0, 50.0], 1.0);
         let models = [model("west", &west, all.clone()), model("east", &east, all)];
         let merged = united(&models, usize::MAX);
-        let seams = Seams::find(&merged, 4.0);
+        let seams = Seams::find(&merged, 4.0, &|_| true);
         assert!(seams.share > 0.03 && seams.share < 0.1, "{}", seams.share);
         assert_eq!(seams.seen_by(&nadir(-60.0, 0.0, 30.0)), 0.0);
         assert!(seams.seen_by(&nadir(1.0, 0.0, 30.0)) > 0.1);
@@ -153,6 +146,6 @@ mod tests {
     fn one_model_has_no_seam() {
         let models = [model("a", &[], carpet([0.0, 0.0], [20.0, 20.0], 1.0))];
         let merged = united(&models, usize::MAX);
-        assert_eq!(Seams::find(&merged, 4.0).share, 0.0);
+        assert_eq!(Seams::find(&merged, 4.0, &|_| true).share, 0.0);
     }
 }

@@ -2,12 +2,13 @@
 
 use glam::{DVec2, DVec3};
 use models::camera::View;
+use serde::{Deserialize, Serialize};
 
 /// Ground that fewer pictures saw than this has no depth of its own.
 const FEWEST: usize = 2;
 
 /// Where an aircraft's pictures were taken.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Sight {
     views: Vec<View>,
     /// Height of its ground, metres.

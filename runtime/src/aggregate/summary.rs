@@ -23,14 +23,17 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
     for kept in &outcome.kept {
         run.skip("gaussians_outside_own_region", kept.foreign as u64);
         run.skip("gaussians_over_budget", kept.over_budget as u64);
+        run.skip("gaussians_far_from_all", kept.stray as u64);
     }
+    let [made, of] = outcome.cells;
+    run.more.insert("ground_cells".into(), serde_json::json!({ "made": made, "of": of }));
     let r = &outcome.registered;
     let registered = serde_json::json!({ "pairs": r.pairs, "fitted": r.fitted, "models": r.models.len() });
     run.more.insert("registered".into(), registered);
     run.more.insert("light".into(), outcome.light.largest.into());
     run.more.insert("color_step".into(), serde_json::json!(outcome.light.step));
     if let Some(d) = &outcome.distilled {
-        run.steps = d.steps.into();
+        run.steps = d.steps;
         run.skip("views_without_seam", (d.views - d.used) as u64);
         run.skip("gaussians_transparent", d.pruned as u64);
         run.device = d.device.clone();

@@ -7,10 +7,15 @@ use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
 
+use config::ground::GroundSettings;
+
 use super::LocalModel;
+use super::block::Block;
 use super::member::Member;
 use super::merge::{Merged, merge};
-use super::region::Partition;
+use super::plan::Plan;
+use super::planning::{lay_out, plan, publish};
+use super::store::Store;
 
 /// A grid of flat round Gaussians on z = 0, coloured by place.
 pub fn carpet(low: [f64; 2], high: [f64; 2], spacing: f64) -> GaussianCloud {
@@ -41,11 +46,40 @@ pub fn written(dir: &Path, local: &LocalModel) -> Member {
     Member::of(LocalModel::read(&path).expect("read"))
 }
 
+/// The plan of a merge in `store`, which has the models.
+pub fn planned(members: &mut [Member], settings: &GroundSettings, store: &Store) -> Plan {
+    let fits = store.path().expect("a folder").join("fits");
+    let plan = plan(members, settings, None, store, fits, &|| true).expect("a plan").plan;
+    lay_out(members, &plan, store, &|_| true).expect("laid out");
+    publish(&plan, store).expect("published");
+    plan
+}
+
 /// Models merged without more ado.
 pub fn united(models: &[LocalModel], budget: usize) -> Merged {
     let dir = tempfile::tempdir().expect("temp dir");
-    let members: Vec<Member> = models.iter().map(|m| written(dir.path(), m)).collect();
-    merge(&members, &Partition::new(&members, 0.0), budget).expect("merged")
+    let mut members: Vec<Member> = models.iter().map(|m| written(dir.path(), m)).collect();
+    merged(&mut members, budget)
+}
+
+/// The same, in one square.
+pub fn merged(members: &mut [Member], budget: usize) -> Merged {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let store = Store::folder(dir.path());
+    let settings = GroundSettings {
+        cell_m: 2048.0,
+        max_gaussians: Some(budget),
+        register: false,
+        epochs: 0,
+        border_m: 0.0,
+        ..Default::default()
+    };
+    let plan = planned(members, &settings, &store);
+    match plan.cells.as_slice() {
+        [] => Merged::default(),
+        [cell] => merge(&Block::new(&plan.inputs(cell), &store)).expect("merged"),
+        more => panic!("{} squares", more.len()),
+    }
 }
 
 /// A 64 × 48 camera looking straight down.

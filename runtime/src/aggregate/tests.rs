@@ -5,6 +5,8 @@ use config::geodesy::Geodetic;
 use super::testing::{carpet, model, nadir, written};
 use super::*;
 
+mod jobs;
+
 const WEST: [[f64; 2]; 4] = [[-40.0, -20.0], [0.0, -20.0], [0.0, 20.0], [-40.0, 20.0]];
 const EAST: [[f64; 2]; 4] = [[0.0, -20.0], [40.0, -20.0], [40.0, 20.0], [0.0, 20.0]];
 

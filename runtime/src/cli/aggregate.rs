@@ -31,9 +31,26 @@ pub struct Args {
     pub settings: Settings,
 }
 
-/// What `aggregate` and `serve` let one change on the command line.
+/// What `aggregate` and `serve` let one change on the command line, and what they are compared with.
 #[derive(Debug, clap::Args)]
 pub struct Settings {
+    /// How to merge.
+    #[command(flatten)]
+    pub merging: Merging,
+    /// Data set with held-out pictures (split `test`), to measure the models and to show them side by side.
+    #[arg(long, value_name = "DATASET")]
+    pub compare: Option<PathBuf>,
+    /// Size at which they are compared, above 0 and at most 1.
+    #[arg(long, default_value_t = 1.0)]
+    pub compare_scale: f64,
+    /// Also measure a perceptual distance: manifest of a network of contract `metric`.
+    #[arg(long, value_name = "MANIFEST", requires = "compare")]
+    pub metric: Option<PathBuf>,
+}
+
+/// How to merge, over `[ground]`.
+#[derive(Debug, clap::Args)]
+pub struct Merging {
     /// Device memory, MiB.
     #[arg(long)]
     pub budget_mib: Option<u32>,
@@ -61,18 +78,12 @@ pub struct Settings {
     /// Seed of the order of views.
     #[arg(long)]
     pub seed: Option<u64>,
-    /// Data set with held-out pictures (split `test`), to measure the models and to show them side by side.
-    #[arg(long, value_name = "DATASET")]
-    pub compare: Option<PathBuf>,
-    /// Size at which they are compared, above 0 and at most 1.
-    #[arg(long, default_value_t = 1.0)]
-    pub compare_scale: f64,
-    /// Also measure a perceptual distance: manifest of a network of contract `metric`.
-    #[arg(long, value_name = "MANIFEST", requires = "compare")]
-    pub metric: Option<PathBuf>,
+    /// Side of the squares of ground that are jobs of their own, metres.
+    #[arg(long, value_name = "METRES")]
+    pub cell_m: Option<f32>,
 }
 
-impl Settings {
+impl Merging {
     /// Overrides what was given.
     ///
     /// # Errors
@@ -87,9 +98,12 @@ impl Settings {
         to.rate = self.rate.unwrap_or(to.rate);
         to.device = self.device.clone().or(to.device.take());
         to.seed = self.seed.unwrap_or(to.seed);
+        to.cell_m = self.cell_m.unwrap_or(to.cell_m);
         Ok(to.check()?)
     }
+}
 
+impl Settings {
     /// Measures the models on the held-out pictures of `--compare`, when given; `metric` is the mission's.
     pub(super) fn compare(
         &self,
@@ -102,7 +116,7 @@ impl Settings {
         let start = Instant::now();
         let set = Dataset::open(root)?;
         let metric = self.metric.as_deref().or(metric);
-        let device = self.device.as_deref();
+        let device = self.merging.device.as_deref();
         let held = compare(&set, "test", self.compare_scale, locals, &outcome.path, metric, device)?;
         let figures = held.iter().map(|h| {
             (h.name.clone(), serde_json::json!({ "local": h.local, "global": h.global, "near_border": h.near_border }))
@@ -125,7 +139,7 @@ impl Settings {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut settings = GroundSettings::default();
-    args.settings.apply(&mut settings)?;
+    args.settings.merging.apply(&mut settings)?;
     let stop = Interrupt::install()?;
     let members = args.models.iter().map(|p| LocalModel::read(p).map(Member::of)).collect::<Result<Vec<_>, _>>()?;
     let outcome = aggregate::run(members, &settings, None, &args.out, &|| !stop.requested())?;

@@ -12,6 +12,15 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
     ("render", &["dgtr render model/model.dgtr --cameras pictures --out renders"]),
     ("ortho", &["dgtr ortho global.dgtr --out map --gsd 5"]),
     ("aggregate", &["dgtr aggregate west/model.dgtr east/model.dgtr --out merged"]),
+    (
+        "ground plan",
+        &[
+            "dgtr ground plan west/model.dgtr east/model.dgtr --store shared",
+            "dgtr ground plan a.dgtr b.dgtr --mission mission.toml --store s3://bucket/field",
+        ],
+    ),
+    ("ground cell", &["dgtr ground cell 0/0/0 0/-1/0 --store shared", "dgtr ground cell --share 3/16 --store shared"]),
+    ("ground join", &["dgtr ground join --store shared --out merged"]),
     ("serve", &["dgtr serve --mission mission.toml --out ground --http 127.0.0.1:8080"]),
     (
         "fly",

@@ -46,7 +46,7 @@ pub struct Args {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut mission = Mission::read(&args.mission)?;
-    args.settings.apply(&mut mission.ground)?;
+    args.settings.merging.apply(&mut mission.ground)?;
     let timeout = match args.timeout {
         Some(s) => Some(Duration::try_from_secs_f64(s).map_err(|e| CliError::input(format!("--timeout {s}: {e}")))?),
         None => None,

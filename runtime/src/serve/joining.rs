@@ -10,8 +10,9 @@ use std::time::{Duration, Instant, SystemTime};
 use config::mission::Mission;
 
 use super::{Received, admit};
+use crate::aggregate::REGISTRATION;
 use crate::aggregate::member::{Member, unify};
-use crate::aggregate::registrar;
+use crate::aggregate::planning::registrar;
 
 /// How often a waiting ground says that it is alive.
 const LOOK_UP: Duration = Duration::from_millis(100);
@@ -83,7 +84,7 @@ impl Joining {
 }
 
 fn work(mission: &Mission, out: &Path, queue: &Receiver<Arrival>) -> Joined {
-    let mut registrar = registrar(&mission.ground, out);
+    let mut registrar = registrar(&mission.ground, &out.join(REGISTRATION));
     let mut members: Vec<Member> = Vec::new();
     let mut joined = Joined::default();
     for Arrival { aircraft, path } in queue {

@@ -6,7 +6,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::celled::Cells;
-use super::columns::{read_words, triples, write_floats};
+use super::columns::{self, read_words, triples, write_floats};
 use super::hashing::Hashing;
 use super::opening::{Body, Opened, open, read_header_of};
 use super::{
@@ -125,28 +125,64 @@ pub fn write_chunks(
     sh_degree: u8,
     rows: &dyn Fn(Range<usize>) -> GaussianCloud,
 ) -> Result<(), FormatError> {
+    let written = write_columns(path, header, count, sh_degree, &mut |column, out| {
+        for start in (0..count).step_by(ROWS) {
+            let range = start..count.min(start + ROWS);
+            let cloud = rows(range.clone());
+            if cloud.len() != range.len() || cloud.sh_degree != sh_degree {
+                return Err(std::io::Error::other("rows of another number or degree than was asked for"));
+            }
+            write_floats(&mut &mut *out, columns::of(&cloud)[column])?;
+        }
+        Ok(())
+    });
+    written.map(drop)
+}
+
+/// Writes exact columns that `fill` writes one after the other, each as a whole. Returns the file's content hash.
+///
+/// # Errors
+/// As [`super::write()`]; those of `fill`; it wrote columns of another length.
+pub fn write_columns(
+    path: &Path,
+    header: &ModelHeader,
+    count: usize,
+    sh_degree: u8,
+    fill: &mut dyn FnMut(usize, &mut dyn Write) -> std::io::Result<()>,
+) -> Result<[u8; HASH as usize], FormatError> {
     let head = encode_header(path, header)?;
-    let columns: [fn(&GaussianCloud) -> &[f32]; 5] = [
-        |c| c.means.as_flattened(),
-        |c| c.log_scales.as_flattened(),
-        |c| c.rotations.as_flattened(),
-        |c| &c.opacity_logits,
-        |c| &c.sh,
-    ];
+    let mut hash = [0; HASH as usize];
     write_atomic(path, |file: &mut dyn Write| {
         let mut out = begin(file, EXACT, &head, count, sh_degree)?;
-        for column in columns {
-            for start in (0..count).step_by(ROWS) {
-                let range = start..count.min(start + ROWS);
-                let cloud = rows(range.clone());
-                if cloud.len() != range.len() || cloud.sh_degree != sh_degree {
-                    return Err(std::io::Error::other("rows of another number or degree than was asked for"));
-                }
-                write_floats(&mut out, column(&cloud))?;
+        for (column, floats) in columns::floats(sh_degree).into_iter().enumerate() {
+            let mut counting = Counting { inner: &mut out, bytes: 0 };
+            fill(column, &mut counting)?;
+            if counting.bytes != 4 * (floats * count) as u64 {
+                return Err(std::io::Error::other("a column of another length than its Gaussians have"));
             }
         }
+        hash = *out.hasher.finalize().as_bytes();
         finish(out).map(drop)
-    })
+    })?;
+    Ok(hash)
+}
+
+/// Counts what passes through.
+struct Counting<T> {
+    inner: T,
+    bytes: u64,
+}
+
+impl<T: Write> Write for Counting<T> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let n = self.inner.write(bytes)?;
+        self.bytes += n as u64;
+        Ok(n)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.inner.flush()
+    }
 }
 
 /// Reads exact columns to their end and compares the hash.

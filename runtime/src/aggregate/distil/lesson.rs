@@ -6,14 +6,14 @@ use models::metrics::{self, to_rgb8};
 use models::picture::mask::Mask;
 use vulkan::trainer::{Rendering, Trainer};
 
-use config::ground::GroundSettings;
-
 use crate::aggregate::AggregateError;
-use crate::aggregate::member::Member;
+use crate::aggregate::plan::Recipe;
 use crate::aggregate::seam::Seams;
 
 /// Of so many lessons of an aircraft one is kept back from training.
 const KEEP_BACK: usize = 4;
+/// Lessons of one job, at most: where more views see its seams, every so-many-th is taken.
+const MOST_LESSONS: usize = 512;
 /// A model vouches for what it shows where less than this much light passes through it.
 const CLEAR: f32 = 0.3;
 /// A pixel that shows no seam.
@@ -35,34 +35,35 @@ pub struct Lesson {
     cells: Vec<u16>,
 }
 
-/// The lessons, without their pictures yet, and the number of views there are.
-pub fn choose(members: &[Member], seams: &Seams, settings: &GroundSettings) -> (Vec<Lesson>, usize) {
-    let (mut lessons, mut views) = (Vec::new(), 0);
-    for (m, model) in members.iter().enumerate() {
-        let between = if settings.between_views { between(&model.header.views) } else { Vec::new() };
-        let mut of_model = 0;
-        for (name, view) in model.header.views.iter().chain(&between) {
-            views += 1;
+/// The lessons, without their pictures yet, and the number of views there are; `views` are those of each model.
+pub fn choose(views: &[Vec<(String, View)>], seams: &Seams, recipe: &Recipe) -> (Vec<Lesson>, usize) {
+    let (mut lessons, mut count) = (Vec::new(), 0);
+    for (model, views) in views.iter().enumerate() {
+        let between = if recipe.between_views { between(views) } else { Vec::new() };
+        for (name, view) in views.iter().chain(&between) {
+            count += 1;
             let share = seams.seen_by(view);
-            let view = View { intrinsics: scaled(&view.intrinsics, settings.scale), pose: view.pose };
-            let window = if share >= f64::from(settings.seam_share) { seams.window(&view) } else { None };
+            let view = View { intrinsics: scaled(&view.intrinsics, recipe.scale), pose: view.pose };
+            let window = if share >= f64::from(recipe.seam_share) { seams.window(&view) } else { None };
             if let Some(window) = window {
-                let is_kept_back = of_model % KEEP_BACK == 1;
-                of_model += 1;
-                let (view, target) = (part(&view, window), RgbImage::new(0, 0));
-                lessons.push(Lesson {
-                    model: m,
-                    name: name.clone(),
-                    view,
-                    share,
-                    is_kept_back,
-                    target,
-                    cells: Vec::new(),
-                });
+                let (name, view) = (name.clone(), part(&view, window));
+                let (target, cells) = (RgbImage::new(0, 0), Vec::new());
+                lessons.push(Lesson { model, name, view, share, is_kept_back: false, target, cells });
             }
         }
     }
-    (lessons, views)
+    let (every, mut seen) = (lessons.len().div_ceil(MOST_LESSONS).max(1), 0);
+    lessons.retain(|_| {
+        seen += 1;
+        (seen - 1) % every == 0
+    });
+    let mut of_model = vec![0; views.len()];
+    for lesson in &mut lessons {
+        let n = &mut of_model[lesson.model];
+        lesson.is_kept_back = *n % KEEP_BACK == 1;
+        *n += 1;
+    }
+    (lessons, count)
 }
 
 /// A view half-way from each view to its nearest neighbour, turned like the view itself; each pair once.
@@ -159,12 +160,15 @@ impl Errors {
         Self(vec![[0.0; 2]; cells])
     }
 
-    /// Over the cells for which `counts` says so: PSNR, dB; None without a pixel. Equal pictures are as close as 8 bits can tell.
-    pub fn psnr(&self, counts: impl Fn(usize) -> bool) -> Option<f64> {
-        let [sum, n] =
-            (0..self.0.len()).filter(|c| counts(*c)).fold([0.0; 2], |[s, n], c| [s + self.0[c][0], n + self.0[c][1]]);
-        (n > 0.0).then(|| (10.0 * (255.0 * 255.0 * n / sum.max(f64::MIN_POSITIVE)).log10()).min(60.0))
+    /// Of all cells.
+    pub fn sum(&self) -> [f64; 2] {
+        self.0.iter().fold([0.0; 2], |[s, n], of_cell| [s + of_cell[0], n + of_cell[1]])
     }
+}
+
+/// PSNR of squared differences of 8-bit values and their number, dB; None without a value. Equal pictures are as close as 8 bits can tell.
+pub fn psnr_of([sum, n]: [f64; 2]) -> Option<f64> {
+    (n > 0.0).then(|| (10.0 * (255.0 * 255.0 * n / sum.max(f64::MIN_POSITIVE)).log10()).min(60.0))
 }
 
 /// Draws what a trainer holds.

@@ -4,17 +4,28 @@ use std::collections::HashMap;
 
 use super::ground;
 use crate::aggregate::AggregateError;
+use crate::aggregate::block::Block;
 use crate::aggregate::member::Member;
+use crate::aggregate::squares::SURROUNDINGS;
 use glam::DVec2;
 
 /// Cells along the longer side of a middling model's ground: coarse enough to hold many Gaussians, fine enough to find a
 /// missed courtyard, and no coarser where the scene is vast.
 const CELLS: f64 = 64.0;
+/// A cell's side in metres at most; what a job must know of its surroundings grows with it.
+const MOST_M: f64 = 1e4;
 /// An owner with less than this share of another one's coverage leaves a hole.
 const HOLE_SHARE: f64 = 0.1;
 
 /// Column and row.
 pub type Cell = (i32, i32);
+
+/// Side of the cells in which holes are looked for, metres.
+pub fn side_m(members: &[Member]) -> f64 {
+    let mut sides: Vec<f64> = members.iter().map(|m| m.bounds().span().max_element()).collect();
+    sides.sort_by(f64::total_cmp);
+    (sides.get(sides.len() / 2).copied().unwrap_or(0.0) / CELLS).clamp(1e-3, MOST_M)
+}
 
 /// Only cells that somebody covers take memory.
 pub struct Coverage {
@@ -26,19 +37,27 @@ pub struct Coverage {
 }
 
 impl Coverage {
-    /// Reads every model once.
-    pub fn of(members: &[Member]) -> Result<Self, AggregateError> {
-        let mut sides: Vec<f64> = members.iter().map(|m| m.bounds().span().max_element()).collect();
-        sides.sort_by(f64::total_cmp);
-        let side = (sides.get(sides.len() / 2).copied().unwrap_or(0.0) / CELLS).max(1e-3);
+    /// Of what lies around a job's square; every piece is read once.
+    pub fn of(block: &Block<'_>) -> Result<Self, AggregateError> {
+        let side = block.inputs.coverage_m;
         let mut this = Self { side, covered: Vec::new(), cells: HashMap::new() };
+        // Nothing is asked about cells farther out than those beside the surroundings; one more is room for rounding.
+        let squares = &block.inputs.squares;
+        let reach = 0.5 * squares.side_m() + SURROUNDINGS as f64 * f64::from(squares.seam_m) + 2.0 * side;
+        let middle = squares.middle(block.inputs.key);
+        let (low, high) = (this.cell(middle - reach), this.cell(middle + reach));
+        let is_near = |(x, y): Cell| (low.0..=high.0).contains(&x) && (low.1..=high.1).contains(&y);
         let mut entries: Vec<(Cell, u16, f32)> = Vec::new();
-        for (m, member) in members.iter().enumerate() {
-            let cloud = member.cloud()?;
+        for m in 0..block.inputs.models.len() {
             let mut area: HashMap<Cell, f32> = HashMap::new();
-            for i in 0..cloud.len() {
-                *area.entry(this.cell(ground(cloud.means[i]))).or_default() +=
-                    cloud.covered_m2(i).min(side * side) as f32;
+            for cloud in block.pieces(m) {
+                let cloud = cloud?;
+                for i in 0..cloud.len() {
+                    let cell = this.cell(ground(cloud.means[i]));
+                    if is_near(cell) {
+                        *area.entry(cell).or_default() += cloud.covered_m2(i).min(side * side) as f32;
+                    }
+                }
             }
             entries.reserve_exact(area.len());
             entries.extend(area.into_iter().map(|(cell, m2)| (cell, m as u16, m2)));

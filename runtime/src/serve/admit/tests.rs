@@ -1,8 +1,6 @@
 use super::*;
 use crate::aggregate::member::Member;
-use crate::aggregate::merge::merge;
-use crate::aggregate::region::Partition;
-use crate::aggregate::testing::{carpet, model, nadir};
+use crate::aggregate::testing::{carpet, merged, model, nadir};
 use crate::serve::tests::mission;
 
 fn written(dir: &Path, name: &str, edit: impl FnOnce(&mut LocalModel)) -> std::path::PathBuf {
@@ -21,9 +19,9 @@ fn the_missions_regions_win_over_what_models_claim() {
     let far = [[-1e4, -1e4], [1e4, -1e4], [1e4, 1e4], [-1e4, 1e4]];
     let west = written(dir.path(), "west", |m| m.header.region = far.to_vec());
     let east = written(dir.path(), "east", |_| {});
-    let models =
+    let mut models =
         [admit(&mission, "west", &west), admit(&mission, "east", &east)].map(|m| Member::of(m.expect("admitted")));
-    let kept = merge(&models, &Partition::new(&models, 0.0), usize::MAX).expect("merged").kept;
+    let kept = merged(&mut models, usize::MAX).kept;
     assert_eq!((kept[0].own, kept[1].own), (1600, 1600));
 }
 

@@ -1,0 +1,158 @@
+//! A bucket of an object store that speaks S3 (Amazon's, MinIO, Ceph, Garage …). What names it is where their own tools look:
+//! `AWS_ENDPOINT_URL`, `AWS_REGION`, `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY` and, where there is one, `AWS_SESSION_TOKEN`.
+
+use std::time::Duration;
+
+use rusty_s3::actions::S3Action;
+use rusty_s3::{Credentials, UrlStyle};
+use ureq::http::{Response, StatusCode};
+use ureq::{Agent, Body};
+
+use super::{Fill, StoreError};
+
+/// How long a signature holds: longer than any request takes.
+const SIGNED_FOR: Duration = Duration::from_secs(3600);
+/// A request that fails for a reason that may pass is made so often, with so much longer a rest each time.
+const TRIES: u32 = 5;
+const REST: Duration = Duration::from_millis(200);
+const CONNECT: Duration = Duration::from_secs(10);
+/// Between two pieces of an answer or after the last one of a question.
+const SILENCE: Duration = Duration::from_secs(60);
+
+pub struct Bucket {
+    agent: Agent,
+    bucket: rusty_s3::Bucket,
+    credentials: Credentials,
+    /// What all names begin with.
+    prefix: String,
+}
+
+impl Bucket {
+    /// `BUCKET/PREFIX` at the endpoint that the environment names.
+    pub fn open(place: &str, bucket: &str) -> Result<Self, StoreError> {
+        let wrong = |why: String| StoreError::Place { place: place.into(), why };
+        let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
+        let needed = |name: &str| variable(name).ok_or_else(|| wrong(format!("the environment lacks {name}; set it")));
+        let (name, prefix) = bucket.split_once('/').unwrap_or((bucket, ""));
+        if name.is_empty() {
+            return Err(wrong("names no bucket; give s3://BUCKET/PREFIX".into()));
+        }
+        let region = variable("AWS_REGION").or_else(|| variable("AWS_DEFAULT_REGION"));
+        let region = region.unwrap_or_else(|| "us-east-1".into());
+        // Amazon's own names its buckets by host, what one runs oneself by path.
+        let (endpoint, style) = match variable("AWS_ENDPOINT_URL") {
+            Some(own) => (own, UrlStyle::Path),
+            None => (format!("https://s3.{region}.amazonaws.com"), UrlStyle::VirtualHost),
+        };
+        let url = endpoint.parse().map_err(|e| wrong(format!("AWS_ENDPOINT_URL {endpoint}: {e}")))?;
+        let bucket = rusty_s3::Bucket::new(url, style, name.to_owned(), region);
+        let bucket = bucket.map_err(|e| wrong(format!("{endpoint}: {e}")))?;
+        let (key, secret) = (needed("AWS_ACCESS_KEY_ID")?, needed("AWS_SECRET_ACCESS_KEY")?);
+        let credentials = match variable("AWS_SESSION_TOKEN") {
+            Some(token) => Credentials::new_with_token(key, secret, token),
+            None => Credentials::new(key, secret),
+        };
+        let config = Agent::config_builder()
+            .http_status_as_error(false)
+            .timeout_connect(Some(CONNECT))
+            .timeout_recv_response(Some(SILENCE))
+            .build();
+        let prefix = prefix.trim_end_matches('/');
+        let prefix = if prefix.is_empty() { String::new() } else { format!("{prefix}/") };
+        Ok(Self { agent: config.into(), bucket, credentials, prefix })
+    }
+
+    fn key(&self, name: &str) -> String {
+        format!("{}{name}", self.prefix)
+    }
+
+    /// Makes a request until its answer is none that may pass; `read` takes the answer.
+    fn ask<T>(
+        &self,
+        (name, action): (&str, &'static str),
+        send: &dyn Fn() -> Result<Response<Body>, ureq::Error>,
+        read: &dyn Fn(Response<Body>) -> Result<T, String>,
+    ) -> Result<T, StoreError> {
+        let mut why = String::new();
+        for n in 0..TRIES {
+            std::thread::sleep(REST * n);
+            match send() {
+                Ok(answer) if answer.status().is_server_error() => why = format!("the server says {}", answer.status()),
+                Ok(answer) => match read(answer) {
+                    Ok(read) => return Ok(read),
+                    Err(e) => why = e,
+                },
+                Err(e) => why = e.to_string(),
+            }
+        }
+        let name = format!("s3://{}/{}", self.bucket.name(), self.key(name));
+        Err(StoreError::Request { name, action, why })
+    }
+
+    pub fn size(&self, name: &str) -> Result<Option<u64>, StoreError> {
+        let key = self.key(name);
+        let send = || {
+            let url = self.bucket.head_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
+            self.agent.head(url.as_str()).call()
+        };
+        self.ask((name, "asking for it"), &send, &|answer| match answer.status() {
+            StatusCode::NOT_FOUND => Ok(None),
+            StatusCode::OK => {
+                let length = answer.headers().get("content-length").and_then(|v| v.to_str().ok()?.parse().ok());
+                length.map(Some).ok_or_else(|| "the answer has no length".to_owned())
+            }
+            status => Err(format!("the server says {status}")),
+        })
+    }
+
+    pub fn range(&self, name: &str, from: u64, bytes: u64) -> Result<Vec<u8>, StoreError> {
+        let key = self.key(name);
+        let send = || {
+            let url = self.bucket.get_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
+            let range = format!("bytes={from}-{}", from + bytes - 1);
+            self.agent.get(url.as_str()).header("range", range).call()
+        };
+        let found = self.ask((name, "reading"), &send, &|mut answer| match answer.status() {
+            StatusCode::NOT_FOUND => Ok(None),
+            StatusCode::PARTIAL_CONTENT => {
+                // One more than is wanted, so that a longer answer is seen to be one.
+                let read = answer.body_mut().with_config().limit(bytes + 1).read_to_vec();
+                let read = read.map_err(|e| e.to_string())?;
+                match read.len() as u64 == bytes {
+                    true => Ok(Some(read)),
+                    false => Err(format!("{} bytes came of {bytes}", read.len())),
+                }
+            }
+            status => Err(format!("the server says {status}")),
+        })?;
+        found.ok_or_else(|| StoreError::Missing(format!("s3://{}/{key}", self.bucket.name())))
+    }
+
+    pub fn put(&self, name: &str, fill: Fill<'_>) -> Result<(), StoreError> {
+        let key = self.key(name);
+        let mut bytes = Vec::new();
+        let disk = |source| StoreError::Disk { name: key.clone(), action: "writing", source };
+        fill(&mut bytes).map_err(disk)?;
+        let send = || {
+            let url = self.bucket.put_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
+            self.agent.put(url.as_str()).send(&bytes[..])
+        };
+        self.ask((name, "writing"), &send, &|answer| match answer.status().is_success() {
+            true => Ok(()),
+            false => Err(format!("the server says {}", answer.status())),
+        })
+    }
+
+    pub fn remove(&self, name: &str) -> Result<(), StoreError> {
+        let key = self.key(name);
+        let send = || {
+            let url = self.bucket.delete_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
+            self.agent.delete(url.as_str()).call()
+        };
+        self.ask((name, "removing"), &send, &|answer| match answer.status() {
+            StatusCode::NOT_FOUND => Ok(()),
+            status if status.is_success() => Ok(()),
+            status => Err(format!("the server says {status}")),
+        })
+    }
+}

@@ -1,0 +1,33 @@
+//! `dgtr ground join --store STORE --out DIR`.
+
+use std::path::PathBuf;
+
+use super::CliError;
+use crate::aggregate::join::{header_in, join};
+use crate::aggregate::plan::{Hash, Plan};
+use crate::aggregate::store::{Store, hex};
+use crate::cli::output::outln;
+
+/// Arguments of `dgtr ground join`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The folder or bucket that has plan and cells.
+    #[arg(long)]
+    store: String,
+    /// Folder for global.dgtr.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+pub(super) fn run(args: Args) -> Result<(), CliError> {
+    let store = Store::open(&args.store)?;
+    let plan = Plan::of(&store)?;
+    let inputs: Vec<Hash> = plan.cells.iter().map(|c| c.input).collect();
+    let mut header = header_in(&store, &plan)?;
+    header.finished = true;
+    let path = args.out.join("global.dgtr");
+    let joined = join(&store, &plan, &inputs, header, &path)?;
+    outln!("{}: {} Gaussians out of {} models", path.display(), joined.gaussians, plan.models.len());
+    outln!("{}", hex(&joined.content));
+    Ok(())
+}
