@@ -30,9 +30,10 @@ pub use lesson::psnr_of;
 
 mod lesson;
 
-/// Views of each aircraft kept as pictures for the report, and of all of them.
+/// Views of each aircraft kept as pictures for the report.
 const SAMPLES_PER_MODEL: usize = 1;
-const MOST_SAMPLES: usize = 32;
+/// And of all aircraft.
+pub const MOST_SAMPLES: usize = 32;
 /// Rates of means, scales and rotations beside those of colours and opacities.
 const SHAPE_FACTOR: f32 = 0.1;
 /// Where cells are more than the device holds, so large a share of them is tried next.
@@ -79,6 +80,24 @@ pub struct Learnt {
     pub shown: Vec<[[f64; 2]; 2]>,
     /// Transparent Gaussians removed at the end.
     pub pruned: usize,
+}
+
+impl Learnt {
+    /// Adds what another cell has learnt, whose models are `models` here. The share of Gaussians in seams is none to be added.
+    pub fn add(&mut self, cell: &Self, models: &[usize]) {
+        self.views += cell.views;
+        self.used += cell.used;
+        self.kept_back += cell.kept_back;
+        self.cells += cell.cells;
+        self.accepted += cell.accepted;
+        self.over_plan += cell.over_plan;
+        self.pruned += cell.pruned;
+        self.steps = self.steps.saturating_add(cell.steps);
+        for (of_cell, model) in cell.shown.iter().zip(models) {
+            let sums = self.shown[*model].as_flattened_mut();
+            sums.iter_mut().zip(of_cell.as_flattened()).for_each(|(sum, add)| *sum += add);
+        }
+    }
 }
 
 /// What it took, and what it looks like.

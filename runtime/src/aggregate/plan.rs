@@ -28,7 +28,7 @@ const MAGIC: [u8; 8] = *b"dgtrplan";
 pub const VERSION: u32 = 1;
 const HEAD: usize = MAGIC.len() + 4;
 const HASH: usize = 32;
-/// Longest plan taken: a thousand aircraft have a hundredth of it.
+/// Longest plan taken: a thousand aircraft of 256 key frames have a tenth of it.
 const MOST_BYTES: u64 = 256 << 20;
 /// Cells of a plan, at most.
 pub const MOST_CELLS: usize = 1 << 17;

@@ -1,7 +1,7 @@
 //! How well an aircraft saw a piece of ground: by how many pictures, from how near and how steeply.
 
-use glam::{DVec2, DVec3};
-use models::camera::View;
+use glam::DVec2;
+use models::camera::{Pinhole, View};
 use serde::{Deserialize, Serialize};
 
 /// Ground that fewer pictures saw than this has no depth of its own.
@@ -28,16 +28,13 @@ impl Sight {
 
     /// Pixels that all pictures together spent on a square metre of level ground at `p`; 0 where fewer than two saw it.
     pub fn pixels_per_m2(&self, p: DVec2) -> f64 {
+        let p = p.extend(self.ground);
         let of_view = |view: &View| {
-            let (rotation, k) = (view.pose.rotation.conjugate(), &view.intrinsics);
-            let c = rotation * (p.extend(self.ground) - view.pose.center);
-            let at = DVec2::new(f64::from(k.fx) * c.x, f64::from(k.fy) * c.y) / c.z
-                + DVec2::new(f64::from(k.cx), f64::from(k.cy));
-            let size = DVec2::new(f64::from(k.width), f64::from(k.height));
-            let inside = c.z > 0.0 && at.cmpge(DVec2::ZERO).all() && at.cmplt(size).all();
-            let above = (rotation * DVec3::Z).dot(-c);
+            let (camera, k) = (Pinhole::from(view), &view.intrinsics);
+            let (at, depth, above) = (camera.project(p)?, camera.local(p).z, camera.pose.center.z - self.ground);
+            let inside = at.cmpge(DVec2::ZERO).all() && at.cmplt(DVec2::new(k.width.into(), k.height.into())).all();
             // Jacobian of the projection restricted to the plane.
-            (inside && above > 0.0).then(|| f64::from(k.fx) * f64::from(k.fy) * above / c.z.powi(3))
+            (inside && above > 0.0).then(|| camera.f.x * camera.f.y * above / depth.powi(3))
         };
         let (count, sum) = self.views.iter().filter_map(of_view).fold((0, 0.0), |(n, sum), v| (n + 1, sum + v));
         if count < FEWEST { 0.0 } else { sum }
@@ -46,6 +43,8 @@ impl Sight {
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec3;
+
     use super::*;
     use crate::aggregate::testing::nadir;
 

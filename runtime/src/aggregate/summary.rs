@@ -33,14 +33,14 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
     run.more.insert("light".into(), outcome.light.largest.into());
     run.more.insert("color_step".into(), serde_json::json!(outcome.light.step));
     if let Some(d) = &outcome.distilled {
-        run.steps = d.steps;
-        run.skip("views_without_seam", (d.views - d.used) as u64);
-        run.skip("gaussians_transparent", d.pruned as u64);
+        run.steps = d.learnt.steps.into();
+        run.skip("views_without_seam", (d.learnt.views - d.learnt.used) as u64);
+        run.skip("gaussians_transparent", d.learnt.pruned as u64);
         run.device = d.device.clone();
         [run.device_bytes_planned, run.device_bytes_peak] = d.device_bytes;
-        run.more.insert("seam_share".into(), d.seam_share.into());
+        run.more.insert("seam_share".into(), d.learnt.seam_share.into());
         let cells = serde_json::json!({
-            "met": d.cells, "accepted": d.accepted, "over_plan": d.over_plan, "views_kept_back": d.kept_back
+            "met": d.learnt.cells, "accepted": d.learnt.accepted, "over_plan": d.learnt.over_plan, "views_kept_back": d.learnt.kept_back
         });
         run.more.insert("distilled_cells".into(), cells);
     }
@@ -179,11 +179,14 @@ fn distillation(outcome: &Outcome, data: &mut ReportData) {
         data.warnings.push("Stopped on request before distillation was over.".into());
     }
     let Some(d) = &outcome.distilled else { return };
-    data.skipped.push(("views that see no seam, not distilled".into(), (d.views - d.used) as u64));
-    data.skipped.push(("Gaussians that ended up transparent".into(), d.pruned as u64));
-    data.skipped.push(("cells of seams that distillation did not bring closer".into(), (d.cells - d.accepted) as u64));
-    if d.over_plan > 0 {
-        let cells = count(d.over_plan as u64);
+    data.skipped.push(("views that see no seam, not distilled".into(), (d.learnt.views - d.learnt.used) as u64));
+    data.skipped.push(("Gaussians that ended up transparent".into(), d.learnt.pruned as u64));
+    data.skipped.push((
+        "cells of seams that distillation did not bring closer".into(),
+        (d.learnt.cells - d.learnt.accepted) as u64,
+    ));
+    if d.learnt.over_plan > 0 {
+        let cells = count(d.learnt.over_plan as u64);
         data.warnings.push(format!(
             "{cells} cells of seams were not distilled to stay within ground.device_mib; raise it to mend them"
         ));

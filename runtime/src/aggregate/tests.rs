@@ -66,9 +66,10 @@ fn distillation_brings_the_seam_closer_to_both_teachers_and_leaves_the_rest_alon
         return;
     }
     let d = outcome.distilled.as_ref().expect("distilled");
+    let l = &d.learnt;
     // Of the two views of each aircraft that see the border one is learnt and one is asked.
-    assert_eq!((d.views, d.used, d.kept_back, d.steps), (6, 4, 2, 60));
-    assert!(d.accepted > 0 && d.accepted <= d.cells, "{} of {} cells", d.accepted, d.cells);
+    assert_eq!((l.views, l.used, l.kept_back, l.steps), (6, 4, 2, 60));
+    assert!(l.accepted > 0 && l.accepted <= l.cells, "{} of {} cells", l.accepted, l.cells);
     let gain = d.agreement.iter().flatten().map(|a| a[1] - a[0]).sum::<f64>();
     assert!(gain > 0.5, "{:?}", d.agreement);
     let (header, cloud) = model::read(&outcome.path).expect("global model");
@@ -97,8 +98,8 @@ fn views_between_training_views_take_part_when_asked() {
         return;
     }
     // Each side: -30 and -3 meet half-way at -16.5, where there is no seam; -3 and -1 at -2, where there is one.
-    let d = outcome.distilled.as_ref().expect("distilled");
-    assert_eq!((d.views, d.used, d.kept_back, d.steps), (10, 6, 2, 4));
+    let l = &outcome.distilled.as_ref().expect("distilled").learnt;
+    assert_eq!((l.views, l.used, l.kept_back, l.steps), (10, 6, 2, 4));
 }
 
 #[test]
@@ -130,7 +131,7 @@ fn a_single_model_becomes_the_global_one_unchanged() {
     let one = vec![pair().remove(0)];
     let cloud = one[0].cloud.clone();
     let outcome = run(one, &settings(), None, dir.path(), &|| true).expect("aggregate");
-    assert_eq!(outcome.distilled.as_ref().map(|d| d.used), Some(0));
+    assert_eq!(outcome.distilled.as_ref().map(|d| d.learnt.used), Some(0));
     assert_eq!(model::read(&outcome.path).expect("global model").1, cloud);
 }
 

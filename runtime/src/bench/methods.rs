@@ -204,6 +204,7 @@ impl<'a> Field<'a> {
         let plan = json!({
             "trainings": trainings.iter().map(Training::key).collect::<Vec<_>>(),
             "merge": format!("{:?}", method.merge),
+            "ground": ground,
             "metric": request.metric,
         });
         if let Some(result) = earlier(&kept).filter(|r| r.plan == plan && !request.again) {

@@ -28,10 +28,13 @@ impl Reconstruction {
         Ok(match made {
             _ if self.is_continued() => 0,
             Some(made) => {
+                if self.builds > 0 && self.is_hardly_trained() {
+                    self.cloud.clone_from(&fresh.cloud);
+                    return Ok(self.cloud.len());
+                }
                 self.follow_key_frames(0.5 * (made.depth_m[0] + made.depth_m[1]));
-                // What grew with the region in mind is coarse where less of it was flown.
-                let is_coarse = 2 * self.cloud.len() < fresh.cloud.len();
-                if self.builds > 0 && (is_coarse || self.is_hardly_trained()) {
+                if self.builds > 0 && 2 * self.cloud.len() < fresh.cloud.len() {
+                    // What grew with the region in mind is coarse where less of it was flown.
                     self.cloud.clone_from(&fresh.cloud);
                     return Ok(self.cloud.len());
                 }

@@ -239,7 +239,6 @@ fn fitted(pairs: &[Sighting], has_free_scale: bool) -> Option<Fitted> {
     let rms_m = [rms(&Similarity::IDENTITY), rms(&motion)];
     let middle = kept.iter().map(|s| s.moving).sum::<DVec3>() / kept.len() as f64;
     let Similarity { scale, rotation, translation } = motion;
-    tracing::debug!("{} of {} matches agree, half of them to {middling:.3} m", kept.len(), pairs.len());
     let plausible = middling <= CLOSER * AGREE_M
         && motion.apply(middle).distance(middle) <= MOST_METRES
         && Motion::of(motion).angle().to_degrees() <= MOST_DEGREES

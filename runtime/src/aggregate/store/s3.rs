@@ -78,10 +78,16 @@ impl Bucket {
             std::thread::sleep(REST * n);
             match send() {
                 Ok(answer) if answer.status().is_server_error() => why = format!("the server says {}", answer.status()),
-                Ok(answer) => match read(answer) {
-                    Ok(read) => return Ok(read),
-                    Err(e) => why = e,
-                },
+                Ok(answer) => {
+                    let is_refused = answer.status().is_client_error();
+                    match read(answer) {
+                        Ok(read) => return Ok(read),
+                        Err(e) => why = e,
+                    }
+                    if is_refused {
+                        break;
+                    }
+                }
                 Err(e) => why = e.to_string(),
             }
         }

@@ -69,7 +69,7 @@ fn one_process_any_order_two_workers_and_a_killed_one_give_the_same_bytes() {
     let (models, settings) = (row(3), in_cells());
     let outcome = run(models.clone(), &settings, None, &dir.path().join("one"), &|| true).expect("aggregate");
     let one = std::fs::read(&outcome.path).expect("read");
-    let distilled = outcome.distilled.expect("distilled");
+    let distilled = outcome.distilled.expect("distilled").learnt;
     assert!(outcome.cells[0] == outcome.cells[1] && outcome.cells[1] > 9, "{:?}", outcome.cells);
     assert!(distilled.steps > 0 && distilled.accepted > 0, "{distilled:?}");
     assert!(outcome.kept[0].fill > 0, "the yard is filled: {:?}", outcome.kept);
