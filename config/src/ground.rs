@@ -25,7 +25,7 @@ table! {
         /// Ground so near to another aircraft's region is of whoever saw it best (pixels of all pictures per m² of it); 0 = every
         /// region is its own aircraft's.
         pub border_m: f32 = 10.0, in Limits::at_least(0.0).up_to(1e4);
-        /// Side of the cells of ground that are distilled: those in which Gaussians of two aircraft meet, and those that touch one.
+        /// Side of the cells of ground that are distilled: those in which Gaussians of two aircraft meet, and six around them.
         pub seam_m: f32 = 8.0, in Limits::above(0.0);
         /// Side of the squares of ground that are merged and distilled as jobs of their own, at least; they are made of whole `seam_m`,
         /// and the origin lies in the middle of one.

@@ -25,7 +25,7 @@ pub const NAME: &str = "plan";
 /// Begins the file.
 const MAGIC: [u8; 8] = *b"dgtrplan";
 /// Of this file and of all that a cell depends on; another one when cells are made in another way.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 const HEAD: usize = MAGIC.len() + 4;
 const HASH: usize = 32;
 /// Longest plan taken: a thousand aircraft of 256 key frames have a tenth of it.

@@ -6,7 +6,7 @@ use crate::aggregate::testing::{self, carpet, model, written};
 fn planned(store: &Store, dir: &std::path::Path) -> Plan {
     let region = [[0.0, 0.0], [40.0, 0.0], [40.0, 20.0], [0.0, 20.0]];
     let mut members = [written(dir, &model("a", &region, carpet([0.0, 0.0], [40.0, 20.0], 1.0)))];
-    let settings = GroundSettings { cell_m: 24.0, epochs: 0, register: false, ..Default::default() };
+    let settings = GroundSettings { cell_m: 24.0, seam_m: 2.0, epochs: 0, register: false, ..Default::default() };
     testing::planned(&mut members, &settings, store)
 }
 
