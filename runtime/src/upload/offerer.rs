@@ -62,7 +62,8 @@ pub struct Offerer {
     shared: Arc<(Mutex<Inbox>, Condvar)>,
     thread: Option<JoinHandle<()>>,
     configured: bool,
-    checkpoints: bool,
+    /// From one checkpoint to the next, at least; 0 = none is offered.
+    spacing: Duration,
 }
 
 fn locked(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
@@ -116,14 +117,22 @@ impl Offerer {
             .name("upload".into())
             .spawn(move || worker.run())
             .map_err(UploadError::Thread)?;
-        Ok(Self { shared, thread: Some(thread), configured, checkpoints: settings.checkpoint_s > 0.0 })
+        Ok(Self { shared, thread: Some(thread), configured, spacing: Duration::from_secs_f64(settings.checkpoint_s) })
     }
 
     /// Offers a checkpoint in place of whatever was offered before, as soon as that is not being fetched any more and
     /// `checkpoint_s` has passed. The file may be replaced (by renaming) at any time afterwards.
     pub fn offer(&self, model: &Path) {
-        if self.checkpoints {
+        if !self.spacing.is_zero() {
             self.put(model, Kind::Checkpoint);
+        }
+    }
+
+    /// Offers a checkpoint, unless the last model is expected sooner than another checkpoint could be: the link would carry the same
+    /// Gaussians twice.
+    pub fn offer_before_last(&self, model: &Path, last_in: Duration) {
+        if last_in >= self.spacing {
+            self.offer(model);
         }
     }
 
@@ -262,7 +271,7 @@ impl Worker {
         let rounded = match self.settings.encoding {
             Encoding::Exact => None,
             // Rather the whole file than none: the disk may be too full for another.
-            Encoding::Delivery => write_delivery(&self.source, path)
+            Encoding::Delivery => write_delivery(&self.source, path, &rounding_of(kind))
                 .inspect_err(|e| tracing::warn!("upload: {e}; the exact model is offered instead"))
                 .ok(),
         };
@@ -371,15 +380,20 @@ impl Worker {
     }
 }
 
+/// A checkpoint is replaced before long: it tells the ground what there is for fewer bytes than the last model, which stays.
+fn rounding_of(kind: Kind) -> Rounding {
+    if kind == Kind::Final { Rounding::default() } else { Rounding::coarse() }
+}
+
 /// Writes the delivery encoding of a model beside it, without cells that are others' to deliver.
-fn write_delivery(source: &Source, path: &Path) -> Result<PathBuf, FormatError> {
+fn write_delivery(source: &Source, path: &Path, rounding: &Rounding) -> Result<PathBuf, FormatError> {
     let (header, cloud) = model::read(path)?;
     let rounded = path.with_extension("delivery.dgtr");
     let margin = territory::margin(&header, cloud.middle()[2]);
     // A model that does not lie in the mission's frame has no place among regions.
     let territory = source.territory.as_ref().filter(|_| header.origin.is_some());
     let wanted = |grid: Grid, key: CellKey| territory.is_none_or(|t| t.wants(grid, key, margin));
-    model::write_cells(&source.disk, &rounded, &header, &cloud, &Rounding::default(), &wanted)?;
+    model::write_cells(&source.disk, &rounded, &header, &cloud, rounding, &wanted)?;
     Ok(rounded)
 }
 

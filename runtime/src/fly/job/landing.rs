@@ -1,6 +1,7 @@
 //! After the flight: the last build, crops, the rest of the schedule, and the model that remains.
 
 use std::ops::ControlFlow;
+use std::time::Duration;
 
 use hal::failsafe::{Cause, Flags};
 use hal::traits::Clock;
@@ -95,6 +96,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let seen = Flags { battery_low: capture.flags().battery_low, ..Flags::default() };
         let (at_leisure, views) = (RunBudget { seconds: None, ..self.budget }, self.reconstruction.keyframes());
         let mut progress = crate::console::Progress::new("training", 100);
+        // When this training began, and how much of the schedule was behind it then and is now.
+        let (began, mut behind) = (self.clock.now_ns(), None::<[f32; 2]>);
         while !self.reconstruction.is_done(&self.budget)
             && !interrupt.requested()
             && !self.failsafe.state().forbids_training()
@@ -106,6 +109,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
                 supervisor.alive();
                 shown.step(r);
+                behind = Some([behind.map_or(r.progress, |[first, _]| first), r.progress]);
                 progress.set((r.progress * 100.0) as u64, || {
                     format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
                 });
@@ -119,10 +123,33 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             if reason != StopReason::Caller || interrupt.requested() {
                 break;
             }
-            if self.clock.now_ns() >= due_ns {
-                self.save(capture)?;
+            if self.clock.now_ns() >= due_ns
+                && let Some(path) = self.save(capture)?
+            {
+                let trained = Duration::from_nanos(self.clock.now_ns().saturating_sub(began));
+                self.offerer.offer_before_last(&path, behind.map_or(Duration::MAX, |b| left(trained, b)));
             }
         }
         Ok(())
+    }
+}
+
+/// Time that the rest of a schedule will take if it goes on as fast as from `first` to `now`, in which `trained` has passed.
+fn left(trained: Duration, [first, now]: [f32; 2]) -> Duration {
+    let share = f64::from(1.0 - now) / f64::from(now - first);
+    Duration::try_from_secs_f64(trained.as_secs_f64() * share.max(0.0)).unwrap_or(Duration::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_of_a_schedule_is_estimated_from_its_pace() {
+        let minute = Duration::from_secs(60);
+        assert_eq!(left(minute, [0.25, 0.5]), 2 * minute);
+        assert_eq!(left(minute, [0.0, 1.0]), Duration::ZERO);
+        assert_eq!(left(minute, [0.5, 0.5]), Duration::MAX, "nothing is known yet");
+        assert_eq!(left(minute, [1.0, 1.0]), Duration::ZERO, "nothing is left");
     }
 }
