@@ -224,7 +224,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             Ok(_) => {
                 capture.note_in_model();
                 capture.refined(|name| self.reconstruction.pose(name))?;
-                self.offer_checkpoint(capture)
+                self.save(capture)
             }
             // In flight more pictures may mend what too few of them could not do.
             Err(e @ (JobError::Init(_) | JobError::Network(_))) if capture.is_open() => {
@@ -289,31 +289,21 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             self.failsafe.note_step(&report);
             self.say(capture, &report);
         }
-        if self.clock.now_ns() >= due_ns { self.offer_checkpoint(capture) } else { Ok(()) }
+        if self.clock.now_ns() >= due_ns { self.save(capture) } else { Ok(()) }
     }
 
-    fn offer_checkpoint(&mut self, capture: &mut Handover) -> Result<(), JobError> {
-        if let Some(path) = self.save(capture)? {
-            self.offerer.offer(&path);
-        }
-        Ok(())
-    }
-
-    /// Writes a checkpoint; None where it must wait for the next time.
-    fn save(&mut self, capture: &mut Handover) -> Result<Option<PathBuf>, JobError> {
+    fn save(&mut self, capture: &mut Handover) -> Result<(), JobError> {
         self.saved_ns = self.clock.now_ns();
         match self.checkpoint(capture, false) {
             Ok((path, gaussians)) => {
                 tracing::debug!("saved {} ({gaussians} Gaussians)", path.display());
-                Ok(Some(path))
+                self.offerer.offer(&path);
             }
             // The one before is whole; the next is due in the usual time.
-            Err(e) if e.may_pass() => {
-                tracing::warn!("{e}; no checkpoint this time");
-                Ok(None)
-            }
-            Err(e) => Err(e),
+            Err(e) if e.may_pass() => tracing::warn!("{e}; no checkpoint this time"),
+            Err(e) => return Err(e),
         }
+        Ok(())
     }
 
     /// Writes a checkpoint; while there is no room, gives up what costs least and tries again.

@@ -53,6 +53,8 @@ enum Kind {
 struct Inbox {
     /// The newest model not yet taken up; an older one it replaces was never sent, which is as it should be.
     next: Option<(PathBuf, Kind)>,
+    /// When the last model will be here, if anybody knows.
+    last: Option<Instant>,
     stop: bool,
     status: OffererStatus,
 }
@@ -62,8 +64,7 @@ pub struct Offerer {
     shared: Arc<(Mutex<Inbox>, Condvar)>,
     thread: Option<JoinHandle<()>>,
     configured: bool,
-    /// From one checkpoint to the next, at least; 0 = none is offered.
-    spacing: Duration,
+    checkpoints: bool,
 }
 
 fn locked(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
@@ -117,23 +118,21 @@ impl Offerer {
             .name("upload".into())
             .spawn(move || worker.run())
             .map_err(UploadError::Thread)?;
-        Ok(Self { shared, thread: Some(thread), configured, spacing: Duration::from_secs_f64(settings.checkpoint_s) })
+        Ok(Self { shared, thread: Some(thread), configured, checkpoints: settings.checkpoint_s > 0.0 })
     }
 
     /// Offers a checkpoint in place of whatever was offered before, as soon as that is not being fetched any more and
     /// `checkpoint_s` has passed. The file may be replaced (by renaming) at any time afterwards.
     pub fn offer(&self, model: &Path) {
-        if !self.spacing.is_zero() {
+        if self.checkpoints {
             self.put(model, Kind::Checkpoint);
         }
     }
 
-    /// Offers a checkpoint, unless the last model is expected sooner than another checkpoint could be: the link would carry the same
-    /// Gaussians twice.
-    pub fn offer_before_last(&self, model: &Path, last_in: Duration) {
-        if last_in >= self.spacing {
-            self.offer(model);
-        }
+    /// Says in how long the last model is expected. A checkpoint that it would replace before another could follow is held back:
+    /// the link would carry the same Gaussians twice.
+    pub fn expect_last(&self, within: Duration) {
+        locked(&self.shared.0).last = Instant::now().checked_add(within);
     }
 
     /// Offers a checkpoint at once, because it may be the last one.
@@ -245,7 +244,7 @@ impl Worker {
     fn wait(&self, wait: Duration) -> Option<Option<(PathBuf, Kind)>> {
         let (inbox, changed) = &*self.shared;
         let mut inbox = locked(inbox);
-        let due = |inbox: &Inbox| inbox.next.as_ref().is_some_and(|n| self.is_due(n.1) || inbox.stop);
+        let due = |inbox: &Inbox| inbox.next.as_ref().is_some_and(|n| self.is_due(n.1, inbox.last) || inbox.stop);
         if !due(&inbox) && !inbox.stop {
             let held_back = inbox.next.is_some();
             let left = self.next_checkpoint.saturating_duration_since(Instant::now());
@@ -260,10 +259,18 @@ impl Worker {
         }
     }
 
-    /// A checkpoint waits until the one before has been fetched, if somebody is about it, and for its share of the link.
-    fn is_due(&self, kind: Kind) -> bool {
+    /// A checkpoint waits until the one before has been fetched, if somebody is about it, for its share of the link, and for
+    /// the last model where that is near.
+    fn is_due(&self, kind: Kind, last: Option<Instant>) -> bool {
         let busy = self.is_fetched && !self.delivered;
-        kind != Kind::Checkpoint || (!busy && Instant::now() >= self.next_checkpoint)
+        let now = Instant::now();
+        let replaced = last.is_some_and(|last| last < now + self.spacing());
+        kind != Kind::Checkpoint || (!busy && !replaced && now >= self.next_checkpoint)
+    }
+
+    /// From one checkpoint to the next, at least.
+    fn spacing(&self) -> Duration {
+        Duration::from_secs_f64(self.settings.checkpoint_s)
     }
 
     fn take_up(&mut self, path: &Path, kind: Kind) {
@@ -301,7 +308,7 @@ impl Worker {
         self.model = Some(Arc::new(model));
         (self.delivered, self.is_fetched) = (false, false);
         self.offered = Instant::now();
-        self.next_checkpoint = self.offered + Duration::from_secs_f64(self.settings.checkpoint_s);
+        self.next_checkpoint = self.offered + self.spacing();
     }
 
     /// Brings every way up to the newest model; returns whether one of them failed.

@@ -96,8 +96,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         let seen = Flags { battery_low: capture.flags().battery_low, ..Flags::default() };
         let (at_leisure, views) = (RunBudget { seconds: None, ..self.budget }, self.reconstruction.keyframes());
         let mut progress = crate::console::Progress::new("training", 100);
-        // When this training began, and how much of the schedule was behind it then and is now.
-        let (began, mut behind) = (self.clock.now_ns(), None::<[f32; 2]>);
+        // When this training began, and how much of the schedule was behind it then.
+        let (began, mut behind) = (self.clock.now_ns(), None);
         while !self.reconstruction.is_done(&self.budget)
             && !interrupt.requested()
             && !self.failsafe.state().forbids_training()
@@ -105,15 +105,17 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             let due_ns = self.saved_ns + CHECKPOINT_EVERY_NS;
             self.show("training after the flight");
             let (clock, failsafe, supervisor) = (&self.clock, &mut self.failsafe, &self.supervisor);
+            let offerer = &self.offerer;
             let shown = &mut self.shown;
             let reason = self.reconstruction.train(&self.budget, &mut |r: &StepReport| {
                 supervisor.alive();
                 shown.step(r);
-                behind = Some([behind.map_or(r.progress, |[first, _]| first), r.progress]);
                 progress.set((r.progress * 100.0) as u64, || {
                     format!("step {}, loss {:.4}, {} Gaussians", r.step, r.loss, r.gaussians)
                 });
                 let now_ns = clock.now_ns();
+                let first = *behind.get_or_insert(r.progress);
+                offerer.expect_last(left(Duration::from_nanos(now_ns.saturating_sub(began)), [first, r.progress]));
                 let alarmed = failsafe.glance(now_ns, seen, &at_leisure, views);
                 // Only where saving leaves no trace, as in any training.
                 let go_on = !interrupt.requested() && !alarmed && (now_ns < due_ns || !r.settled);
@@ -123,11 +125,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             if reason != StopReason::Caller || interrupt.requested() {
                 break;
             }
-            if self.clock.now_ns() >= due_ns
-                && let Some(path) = self.save(capture)?
-            {
-                let trained = Duration::from_nanos(self.clock.now_ns().saturating_sub(began));
-                self.offerer.offer_before_last(&path, behind.map_or(Duration::MAX, |b| left(trained, b)));
+            if self.clock.now_ns() >= due_ns {
+                self.save(capture)?;
             }
         }
         Ok(())

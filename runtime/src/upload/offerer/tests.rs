@@ -120,9 +120,10 @@ fn no_checkpoint_is_offered_that_the_last_model_replaces_before_another_could_fo
     let dir = tempfile::tempdir().expect("temp dir");
     let (settings, path, ..) = delivery(dir.path());
     let spacing = Duration::from_secs_f64(settings.checkpoint_s);
-    for (last_in, offers) in [(spacing.mul_f64(0.9), 1), (spacing, 2)] {
+    for (last_in, offers) in [(spacing.mul_f64(0.9), 1), (2 * spacing, 2)] {
         let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
-        o.offer_before_last(&path, last_in);
+        o.expect_last(last_in);
+        o.offer(&path);
         assert_eq!(o.wait_delivered(Duration::from_secs(2), || true), offers == 2);
         o.offer_final(&path);
         assert!(o.wait_delivered(LIMIT, || true));
