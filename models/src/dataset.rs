@@ -1,4 +1,4 @@
-//! Posed pictures: nerfstudio `transforms.json`, a COLMAP model or an OpenDroneMap reconstruction, with the split, the
+//! Posed pictures: nerfstudio `transforms.json`, a COLMAP model, Mega-NeRF's form or an OpenDroneMap reconstruction, with the split, the
 //! sparse points and the aircraft's own telemetry when they are there; or a card, whose pictures have only what they say
 //! of themselves. Opening reads the small files only; pictures are decoded
 //! one at a time, so that a thousand of them need no more memory than one.
@@ -94,7 +94,7 @@ impl Dataset {
     /// # Errors
     /// A description is damaged or describes nothing, or there is neither one nor a picture with a position.
     pub fn open(root: &Path) -> Result<Self, DatasetError> {
-        let Some(found) = reconstruction(root)? else {
+        let Some((found, held_out)) = reconstruction(root)? else {
             return match root.is_dir() && Card::has_pictures(root) {
                 true => Self::open_card(&[root.to_owned()], &CardOptions::default()),
                 false => Err(DatasetError::NotADataset(root.to_owned())),
@@ -113,7 +113,9 @@ impl Dataset {
                 frame.prior = frame.telemetry.map(|t| t.prior);
             }
         }
-        Self { root: root.to_owned(), frames, split: Split::default(), origin, card: None }.with_split()?.with_masks()
+        Self { root: root.to_owned(), frames, split: Split::default(), origin, card: None }
+            .with_split(held_out)?
+            .with_masks()
     }
 
     /// Reads the pictures below `folders` by what they say of themselves, whatever reconstruction lies beside them.
@@ -151,7 +153,7 @@ impl Dataset {
         let root = folders.first().cloned().unwrap_or_default();
         let frames = frames.collect();
         Self { root, frames, split: Split::default(), origin: card.origin, card: Some(notes) }
-            .with_split()?
+            .with_split(None)?
             .with_masks()
     }
 

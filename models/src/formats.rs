@@ -12,6 +12,7 @@ pub mod colmap;
 pub mod delivery;
 pub mod flight_plan;
 pub mod gltf;
+pub mod mega_nerf;
 pub mod model;
 pub mod opensfm;
 pub mod ply;
@@ -21,6 +22,7 @@ pub mod split;
 pub mod spz;
 mod stream;
 pub mod telemetry;
+pub mod torch;
 pub mod transforms;
 
 /// Why a file could not be read or written.

@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose};
 use models::dataset::Dataset;
 use models::formats::reconstruction::{CAMERA_MODELS, CameraModel, LensDescription, Reconstruction, Shot};
-use models::formats::{colmap, opensfm, transforms};
+use models::formats::{colmap, mega_nerf, opensfm, transforms};
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 158.5 };
 
@@ -215,4 +215,55 @@ fn opendronemaps_reconstruction_is_a_data_set_with_points_and_an_origin() {
     assert!(said.contains("DJI_0018.JPG") && said.contains("pose is not a number"), "{said}");
     std::fs::write(folder.join("reconstruction.json"), text.replace("\"brown\"", "\"spherical\"")).unwrap();
     assert!(Dataset::open(dir.path()).unwrap_err().to_string().contains("spherical"));
+}
+
+/// Six pictures of `dgtr demo`, written in that form by PyTorch (tests/mega_nerf.py).
+fn miniature() -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/mega_nerf")
+}
+
+#[test]
+fn mill_19s_form_is_read_in_metres_with_what_its_authors_hold_out() {
+    let set = Dataset::open(&miniature()).unwrap();
+    let truth = transforms::read(&miniature().join("truth.json")).unwrap();
+    let names: Vec<&str> = set.frames.iter().map(|f| f.name.as_str()).collect();
+    assert_eq!(names, ["000000.jpg", "000001.jpg", "000002.jpg", "000003.jpg", "000004.jpg", "000005.jpg"]);
+    assert_eq!(set.select("test", None).unwrap(), [0, 5]);
+    assert_eq!(set.select("train", None).unwrap(), [1, 2, 3, 4]);
+    // Single precision in units of 21 m, around the middle of the cameras.
+    let shift = set.frames[0].view.pose.center - truth.shots[0].pose.center;
+    for (frame, shot) in set.frames.iter().zip(&truth.shots) {
+        let (read, true_pose) = (frame.view.pose, shot.pose);
+        assert!((read.center - true_pose.center).distance(shift) < 1e-5, "{}", frame.name);
+        assert!(read.rotation.dot(true_pose.rotation).abs() > 1.0 - 1e-9, "{}", frame.name);
+        assert!((read.forward() + DVec3::Z).length() < 0.05, "{} looks down", frame.name);
+        let k = frame.view.intrinsics;
+        assert_eq!((k.width, k.height, k.fx, k.fy, k.cx, k.cy), (80, 60, 60.0, 60.0, 40.0, 30.0));
+    }
+    let picture = set.load(1, 1.0).unwrap().image;
+    assert_eq!((picture.width(), picture.height()), (80, 60));
+}
+
+#[test]
+fn mill_19s_form_with_a_damaged_file_is_refused_with_the_file_s_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let copy = |name: &str| {
+        let to = dir.path().join(name);
+        std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+        std::fs::copy(miniature().join(name), to).unwrap();
+    };
+    let said = || mega_nerf::read(dir.path()).unwrap_err().to_string();
+    assert!(mega_nerf::read(dir.path()).unwrap().is_none(), "another form");
+    copy("coordinates.pt");
+    assert!(Dataset::open(dir.path()).unwrap_err().to_string().contains("describes no pictures"));
+    copy("train/metadata/000001.pt");
+    let (found, held_out) = mega_nerf::read(dir.path()).unwrap().unwrap();
+    assert_eq!((found.shots.len(), held_out.len()), (1, 0));
+    std::fs::create_dir_all(dir.path().join("val/metadata")).unwrap();
+    std::fs::copy(miniature().join("coordinates.pt"), dir.path().join("val/metadata/000002.pt")).unwrap();
+    assert!(said().contains("000002.pt") && said().contains("c2w"), "{}", said());
+    std::fs::rename(dir.path().join("val/metadata/000002.pt"), dir.path().join("val/metadata/000001.pt")).unwrap();
+    assert!(said().contains("in train and in val"), "{}", said());
+    std::fs::write(dir.path().join("coordinates.pt"), "PK").unwrap();
+    assert!(said().contains("coordinates.pt: not a dictionary of torch.save"), "{}", said());
 }

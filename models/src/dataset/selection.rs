@@ -1,4 +1,4 @@
-//! Which frames are for what: `split.json`, or every eighth held out.
+//! Which frames are for what: `split.json`, what the description holds out, or every eighth held out.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -31,9 +31,14 @@ pub struct Split {
 }
 
 impl Dataset {
-    pub(super) fn with_split(mut self) -> Result<Self, DatasetError> {
+    /// `held_out`: what the description says of it.
+    pub(super) fn with_split(mut self, held_out: Option<Vec<usize>>) -> Result<Self, DatasetError> {
         let file = self.root.join("split.json");
-        self.split = if file.is_file() { self.resolve(&file)? } else { self.every_eighth() };
+        self.split = match held_out {
+            _ if file.is_file() => self.resolve(&file)?,
+            Some(test) => self.without(test),
+            None => self.without(self.every_eighth()),
+        };
         Ok(self)
     }
 
@@ -76,10 +81,13 @@ impl Dataset {
         self.split.regions.iter().find(|r| r.name == name)
     }
 
-    fn every_eighth(&self) -> Split {
+    fn every_eighth(&self) -> Vec<usize> {
         let mut by_name: Vec<usize> = (0..self.frames.len()).collect();
         by_name.sort_by(|&a, &b| self.frames[a].name.cmp(&self.frames[b].name));
-        let mut test: Vec<usize> = by_name.iter().copied().step_by(TEST_EVERY).collect();
+        by_name.iter().copied().step_by(TEST_EVERY).collect()
+    }
+
+    fn without(&self, mut test: Vec<usize>) -> Split {
         test.sort_unstable();
         let train = (0..self.frames.len()).filter(|i| test.binary_search(i).is_err()).collect();
         Split { lists: BTreeMap::from([("test".to_owned(), test), ("train".to_owned(), train)]), regions: Vec::new() }

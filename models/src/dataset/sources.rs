@@ -7,23 +7,29 @@ use super::error::DatasetError;
 use super::frame::DatasetFrame;
 use crate::camera::View;
 use crate::formats::reconstruction::Reconstruction;
-use crate::formats::{colmap, opensfm, transforms};
+use crate::formats::{colmap, mega_nerf, opensfm, transforms};
 use crate::picture::{Orientation, dimensions};
 
 pub(super) fn file_name(path: &str) -> &str {
     path.rsplit(['/', '\\']).next().unwrap_or(path)
 }
 
-/// The description in `root`: nerfstudio's, COLMAP's, OpenSfM's; `None` where there is none.
-pub(super) fn reconstruction(root: &Path) -> Result<Option<Reconstruction>, DatasetError> {
+/// A description, and the numbers of the pictures that it holds out, where it says so.
+pub(super) type Described = (Reconstruction, Option<Vec<usize>>);
+
+/// The description in `root`: nerfstudio's, COLMAP's, Mega-NeRF's, OpenSfM's; `None` where there is none.
+pub(super) fn reconstruction(root: &Path) -> Result<Option<Described>, DatasetError> {
     let file = root.join("transforms.json");
     if file.is_file() {
-        return Ok(Some(transforms::read(&file)?));
+        return Ok(Some((transforms::read(&file)?, None)));
     }
     if let Some(model) = colmap::Model::find(root) {
-        return Ok(Some(model.read()?));
+        return Ok(Some((model.read()?, None)));
     }
-    Ok(opensfm::find(root).map(|file| opensfm::read(&file)).transpose()?)
+    if let Some((found, held_out)) = mega_nerf::read(root)? {
+        return Ok(Some((found, Some(held_out))));
+    }
+    Ok(opensfm::find(root).map(|file| opensfm::read(&file)).transpose()?.map(|found| (found, None)))
 }
 
 /// Where the picture that a description calls `name` lies: as written, or in the folder of pictures; Blender data sets

@@ -1,20 +1,22 @@
 //! What describes pictures beside them, and networks: nerfstudio, OpenSfM, splits, telemetry, flight plans, manifests.
 
-use std::io::Cursor;
+use std::io::{Cursor, Read as _, Write as _};
 use std::path::Path;
 
 use config::geodesy::Geodetic;
 use glam::DVec2;
 use models::formats::flight_plan::{self, FlightPlan, Waypoint};
 use models::formats::reconstruction::Reconstruction;
-use models::formats::{opensfm, split, telemetry, transforms};
+use models::formats::{opensfm, split, telemetry, torch, transforms};
 use models::onnx::manifest::Manifest;
 use models::ortho;
 use tiff::encoder::colortype::Gray32Float;
 use tiff::encoder::{Compression, TiffEncoder};
 use tiff::tags::Tag;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use crate::driver::{Read, Reader, line, survive};
+use crate::driver::{Read, Reader, Shell, line, survive};
 
 fn finite(r: &Reconstruction) -> bool {
     r.shots.iter().all(|f| f.pose.center.is_finite() && f.pose.rotation.is_finite())
@@ -36,6 +38,49 @@ fn nerfstudio_transforms() {
         shell: None,
         memory: (64 << 10, 256),
         read: Read::File("transforms.json", &|path| line(transforms::read(path), |file| finite(&file))),
+    });
+}
+
+const PICKLE: &str = "000001/data.pkl";
+
+/// A picture of Mill-19's form, as PyTorch saved it.
+fn saved_by_torch() -> Vec<u8> {
+    let file = "tests/data/mega_nerf/train/metadata/000001.pt";
+    std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).expect("a fixture")
+}
+
+fn entry(file: &[u8], name: &str) -> Vec<u8> {
+    let (mut zip, mut bytes) = (ZipArchive::new(Cursor::new(file)).expect("a zip"), Vec::new());
+    zip.by_name(name).expect("an entry").read_to_end(&mut bytes).expect("read");
+    bytes
+}
+
+/// The same with another pickle.
+fn with_pickle(pickle: &[u8]) -> Vec<u8> {
+    let file = saved_by_torch();
+    let (names, mut zip) =
+        (ZipArchive::new(Cursor::new(&file)).expect("a zip"), ZipWriter::new(Cursor::new(Vec::new())));
+    for name in names.file_names() {
+        let bytes = if name == PICKLE { pickle.to_vec() } else { entry(&file, name) };
+        zip.start_file(name, SimpleFileOptions::default().compression_method(CompressionMethod::Stored))
+            .expect("begun");
+        zip.write_all(&bytes).expect("written");
+    }
+    zip.finish().expect("ended").into_inner()
+}
+
+#[test]
+fn dictionaries_of_torch() {
+    let pickle = Shell { open: |file| entry(file, PICKLE), close: |pickle| with_pickle(&pickle) };
+    survive(&Reader {
+        name: "torch",
+        seeds: vec![saved_by_torch()],
+        text: false,
+        shell: Some(pickle),
+        memory: (256 << 10, 256),
+        read: Read::File("000001.pt", &|path| {
+            line(torch::read(path), |numbers| numbers.values().all(|values| values.len() <= 64))
+        }),
     });
 }
 

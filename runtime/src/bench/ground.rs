@@ -64,6 +64,8 @@ pub struct GroundScores {
     pub fitted: [usize; 2],
     /// Seconds that a model took from its arrival until it was fitted: mean of the first and of the last aircraft.
     pub joined_s: [f64; 2],
+    /// Fits of each of those, mean: the field fills, so that the last ones find more neighbours there.
+    pub joined_fits: [f64; 2],
     /// Models of each of both.
     pub compared: usize,
     /// Seconds by stage of the second start.
@@ -262,15 +264,17 @@ fn serve(arguments: &[String], out: &Path, limit_mib: u64) -> Result<RunReport, 
 
 fn scores(field: &Field, [first, second]: [&RunReport; 2], out: &Path) -> Result<GroundScores, JobError> {
     let number = |run: &RunReport, name: &str| run.more.get("registered").and_then(|r| r[name].as_u64()).unwrap_or(0);
-    let seconds = |run: &RunReport| -> Vec<f64> {
-        let all = run.more.get("joined_s").and_then(|s| s.as_array()).cloned().unwrap_or_default();
+    let list = |run: &RunReport, name: &str| -> Vec<f64> {
+        let all = run.more.get(name).and_then(|s| s.as_array()).cloned().unwrap_or_default();
         all.iter().filter_map(serde_json::Value::as_f64).collect()
     };
-    let (early, late) = (seconds(first), seconds(second));
-    let compared = COMPARED.min(early.len()).min(field.aircraft - field.aircraft / 2);
+    let compared = COMPARED.min(list(first, "joined_s").len()).min(field.aircraft - field.aircraft / 2);
     let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len().max(1) as f64;
-    let fitted =
-        |run: &RunReport| run.more.get("fitted_early").and_then(|n| n.as_u64()).unwrap_or(0) + number(run, "fitted");
+    let first_and_last = |name| {
+        let (early, late) = (list(first, name), list(second, name));
+        [mean(&early[..compared.min(early.len())]), mean(&late[late.len().saturating_sub(compared)..])]
+    };
+    let fitted = |run: &RunReport| list(run, "joined_fits").iter().sum::<f64>() as u64 + number(run, "fitted");
     let global: PathBuf = out.join("ground").join("global.dgtr");
     let (header, cloud) = model::read(&global)?;
     Ok(GroundScores {
@@ -278,7 +282,8 @@ fn scores(field: &Field, [first, second]: [&RunReport; 2], out: &Path) -> Result
         gaussians: [field.aircraft * field.along().pow(2), cloud.len()],
         pairs: number(second, "pairs"),
         fitted: [fitted(first), fitted(second)].map(|n| n as usize),
-        joined_s: [mean(&early[..compared]), mean(&late[late.len().saturating_sub(compared)..])],
+        joined_s: first_and_last("joined_s"),
+        joined_fits: first_and_last("joined_fits"),
         compared,
         stage_s: second.stage_ms.iter().map(|(name, ms)| (name.clone(), ms / 1e3)).collect(),
         rss_mib: first.host_rss_peak.max(second.host_rss_peak) as f64 / (1 << 20) as f64,

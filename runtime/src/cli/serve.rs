@@ -103,7 +103,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let counters = serde_json::to_value(reception.counters).unwrap_or_default();
     run.more.insert("received".into(), counters);
     run.more.insert("joined_s".into(), joined.seconds.into());
-    run.more.insert("fitted_early".into(), joined.fitted.into());
+    run.more.insert("joined_fits".into(), joined.fits.into());
     run.more.insert("refused".into(), serde_json::to_value(&reception.refusals).unwrap_or_default());
     run.more.insert("missing".into(), reception.missing.clone().into());
     let mut data = summary::report(&outcome);

@@ -26,9 +26,9 @@ struct Arrival {
 /// What was done while others still flew.
 #[derive(Clone, Debug, Default)]
 pub struct Joined {
-    /// Pairs fitted.
-    pub fitted: usize,
-    /// Seconds of each model from when it was looked at until it was fitted, in the order they arrived.
+    /// Pairs fitted for each model, in the order they arrived.
+    pub fits: Vec<usize>,
+    /// Seconds of each from when it was looked at until it was fitted.
     pub seconds: Vec<f64>,
 }
 
@@ -98,7 +98,7 @@ fn work(mission: &Mission, out: &Path, queue: &Receiver<Arrival>) -> Joined {
         members.retain(|m| m.name() != aircraft);
         members.extend(member);
         match registrar.fit(&members, &|| true) {
-            Ok(fitted) => joined.fitted += fitted,
+            Ok(fitted) => joined.fits.push(fitted),
             // The merge meets it again and says so.
             Err(e) => {
                 tracing::debug!("serve: fitting stopped: {e}");

@@ -44,6 +44,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let scores = measure(&field, &args.out)?;
     let stages: Vec<String> = scores.stage_s.iter().map(|(name, s)| format!("{name} {s:.1} s")).collect();
     let row = |what: &str, figure: String| vec![what.to_owned(), figure];
+    let joining = |which: &str, i: usize| {
+        let (seconds, fits) = (scores.joined_s[i], scores.joined_fits[i]);
+        let name = format!("seconds an aircraft, its fits, seconds a fit, {which} {}", scores.compared);
+        row(&name, format!("{seconds:.2}, {fits:.2}, {:.3}", seconds / fits))
+    };
     let table = Table {
         title: format!("A ground station of {aircraft} aircraft"),
         note: format!(
@@ -60,8 +65,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
             row("pairs of neighbours", count(scores.pairs)),
             row("fitted before the restart", count(scores.fitted[0] as u64)),
             row("fitted after it", count(scores.fitted[1] as u64)),
-            row(&format!("seconds an aircraft, first {}", scores.compared), format!("{:.2}", scores.joined_s[0])),
-            row(&format!("seconds an aircraft, last {}", scores.compared), format!("{:.2}", scores.joined_s[1])),
+            joining("first", 0),
+            joining("last", 1),
             row(&format!("largest resident set of {} MiB", args.host_mib), format!("{:.0} MiB", scores.rss_mib)),
             row("neighbours apart as they came, RMS", format!("{:.2} m", scores.apart_m[0])),
             row("neighbours apart in the global model, RMS", format!("{:.3} m", scores.apart_m[1])),
