@@ -36,13 +36,13 @@ fn numbers(bytes: &[u8]) -> Result<Numbers, String> {
     let mut zip = ZipArchive::new(Cursor::new(bytes)).map_err(super::one_line)?;
     let pickle = zip.file_names().find(|n| n.ends_with("data.pkl")).ok_or("it has no data.pkl")?.to_owned();
     let folder = pickle.trim_end_matches("data.pkl").to_owned();
-    let mut entry = |name: &str| {
+    let mut entry = |name: &str, what: &str| {
         let mut bytes = Vec::new();
-        let entry = zip.by_name(name).map_err(|e| format!("{name}: {}", super::one_line(e)))?;
-        entry.take(LIMIT).read_to_end(&mut bytes).map_err(|e| format!("{name}: {e}"))?;
+        let entry = zip.by_name(name).map_err(|e| format!("its {what}: {}", super::one_line(e)))?;
+        entry.take(LIMIT).read_to_end(&mut bytes).map_err(|e| format!("its {what}: {e}"))?;
         Ok::<_, String>(bytes)
     };
-    let program = entry(&pickle)?;
+    let program = entry(&pickle, "pickle")?;
     let Value::Dictionary(entries) = Machine::run(&program)? else {
         return Err("it holds something else".to_owned());
     };
@@ -50,7 +50,9 @@ fn numbers(bytes: &[u8]) -> Result<Numbers, String> {
     for (name, value) in entries {
         let values = match value {
             Value::Number(v) => vec![v],
-            Value::Tensor(tensor) => tensor.gather(&entry(&format!("{folder}data/{}", tensor.storage.key))?)?,
+            Value::Tensor(tensor) => {
+                tensor.gather(&entry(&format!("{folder}data/{}", tensor.storage.key), "numbers of a tensor")?)?
+            }
             _ => continue,
         };
         numbers.insert(name.to_string(), values);
@@ -91,7 +93,9 @@ impl Tensor {
         let bytes = match &*self.storage.class {
             "FloatStorage" | "IntStorage" => 4,
             "DoubleStorage" | "LongStorage" => 8,
-            other => return Err(format!("a tensor of {other} is not taken; save it as float or double")),
+            _ => {
+                return Err("a tensor of it is neither of floats nor of integers; save it as float or double".to_owned());
+            }
         };
         let number = |at: usize| -> Option<f64> {
             let word = raw.get(at.checked_mul(bytes)?..)?.get(..bytes)?;

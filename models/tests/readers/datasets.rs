@@ -77,7 +77,8 @@ fn dictionaries_of_torch() {
         seeds: vec![saved_by_torch()],
         text: false,
         shell: Some(pickle),
-        memory: (256 << 10, 256),
+        // The crate zip makes room for as many entries as a directory may claim, at most one for each byte before it.
+        memory: (256 << 10, 2048),
         read: Read::File("000001.pt", &|path| {
             line(torch::read(path), |numbers| numbers.values().all(|values| values.len() <= 64))
         }),

@@ -70,10 +70,10 @@ pub fn choose(views: &[Vec<(String, View)>], seams: &Seams, recipe: &Recipe) -> 
 fn keep_back(lessons: &mut [Lesson], models: usize) {
     let unflown = lessons.iter().any(|l| l.is_kept_back);
     let every = if unflown { KEEP_BACK_UNFLOWN } else { KEEP_BACK };
-    let mut of_model = vec![0; models];
+    let mut of_model = vec![0usize; models];
     for lesson in lessons.iter_mut().filter(|l| l.is_kept_back || !unflown) {
         let n = &mut of_model[lesson.model];
-        lesson.is_kept_back = *n % every == 0;
+        lesson.is_kept_back = n.is_multiple_of(every);
         *n += 1;
     }
 }
