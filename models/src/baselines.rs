@@ -2,7 +2,6 @@
 //! colour everywhere. A model that does not clearly beat both has learnt nothing.
 
 use glam::DVec3;
-use image::RgbImage;
 use rayon::prelude::*;
 
 use crate::camera::{Pinhole, PosedImage, View};
@@ -15,14 +14,14 @@ pub struct MeanColor {
 }
 
 impl MeanColor {
-    /// Takes a picture in.
-    pub fn add(&mut self, image: &RgbImage) {
-        for p in image.pixels() {
+    /// Takes a picture in, without what its mask leaves out.
+    pub fn add(&mut self, picture: &PosedImage) {
+        for (_, _, p) in picture.image.enumerate_pixels().filter(|(x, y, _)| picture.keeps(*x, *y)) {
             for (sum, v) in self.sum.iter_mut().zip(p.0) {
                 *sum += u64::from(v);
             }
+            self.pixels += 1;
         }
-        self.pixels += u64::from(image.width()) * u64::from(image.height());
     }
 
     /// The mean; mid grey before any picture.
@@ -46,7 +45,7 @@ pub fn nearest_view(target: &View, views: &[View]) -> Option<usize> {
 }
 
 /// What `target` would see if the world were the plane z = 0 painted with `source`: interleaved RGB, 0…1. Pixels that
-/// see the sky, or ground outside the source picture, are `elsewhere`.
+/// see the sky, or ground outside the source picture or that its mask leaves out, are `elsewhere`.
 pub fn warp_over_ground(source: &PosedImage, target: &View, elsewhere: [f32; 3]) -> Vec<f32> {
     let (width, height) = (target.intrinsics.width as usize, target.intrinsics.height as usize);
     let mut out = vec![0.0; 3 * width * height];
@@ -71,6 +70,7 @@ fn at_ground(camera: &Pinhole, pixel: [f32; 2]) -> Option<DVec3> {
 /// Bilinear colour of the source at a place on the ground.
 fn sample(source: &PosedImage, camera: &Pinhole, p: DVec3) -> Option<[f32; 3]> {
     let q = camera.project(p).filter(|q| source.view.intrinsics.contains(*q))?.as_vec2();
+    source.keeps(q.x as u32, q.y as u32).then_some(())?;
     Some(crate::undistort::sample_bilinear(&source.image, q.x, q.y).0.map(|c| f32::from(c) / 255.0))
 }
 
@@ -78,8 +78,9 @@ fn sample(source: &PosedImage, camera: &Pinhole, p: DVec3) -> Option<[f32; 3]> {
 mod tests {
     use super::*;
     use crate::camera::{Intrinsics, Pose, PoseSigma};
+    use crate::picture::mask::Mask;
     use glam::DQuat;
-    use image::Rgb;
+    use image::{Rgb, RgbImage};
 
     fn nadir(east: f64, north: f64, yaw: f64) -> View {
         let down = DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0);
@@ -132,10 +133,32 @@ mod tests {
     fn the_mean_colour_is_the_mean_over_all_pixels() {
         let mut mean = MeanColor::default();
         assert_eq!(mean.get(), [0.5; 3]);
-        mean.add(&RgbImage::from_pixel(1, 1, Rgb([255, 0, 0])));
-        mean.add(&RgbImage::from_pixel(3, 1, Rgb([0, 0, 255])));
+        let of = |image| PosedImage { image, ..ground(nadir(0.0, 0.0, 0.0)) };
+        mean.add(&of(RgbImage::from_pixel(1, 1, Rgb([255, 0, 0]))));
+        mean.add(&of(RgbImage::from_pixel(3, 1, Rgb([0, 0, 255]))));
         assert_eq!(mean.get(), [0.25, 0.0, 0.75]);
         assert_eq!(mean.picture(2), [0.25, 0.0, 0.75, 0.25, 0.0, 0.75]);
+    }
+
+    #[test]
+    fn what_a_mask_leaves_out_is_no_guess() {
+        let target = nadir(4.0, 3.0, 0.0);
+        let elsewhere = |source: &PosedImage| {
+            warp_over_ground(source, &target, [-1.0; 3]).chunks_exact(3).filter(|p| p[0] < 0.0).count()
+        };
+        let whole = ground(nadir(0.0, 0.0, 0.0));
+        let masked = PosedImage { mask: Some(Mask::from_fn(40, 30, |x, _| x < 20)), ..whole.clone() };
+        // Four metres to the east, 16 of the 20 columns are in the picture still.
+        assert!(elsewhere(&masked) >= elsewhere(&whole) + 16 * 25, "{} {}", elsewhere(&masked), elsewhere(&whole));
+        let (mut all, mut west) = (MeanColor::default(), MeanColor::default());
+        all.add(&whole);
+        west.add(&masked);
+        // The ramp rises by two of 255 a metre: half the width is 20 m.
+        assert!((all.get()[0] - west.get()[0] - 20.0 / 255.0).abs() < 1e-3, "{:?} {:?}", all.get(), west.get());
+        let nothing = PosedImage { mask: Some(Mask::from_fn(40, 30, |_, _| false)), ..whole };
+        let mut none = MeanColor::default();
+        none.add(&nothing);
+        assert_eq!(none.get(), [0.5; 3]);
     }
 
     #[test]

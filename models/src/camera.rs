@@ -154,6 +154,13 @@ pub struct PosedImage {
     pub sigma: PoseSigma,
 }
 
+impl PosedImage {
+    /// Whether this pixel counts.
+    pub fn keeps(&self, x: u32, y: u32) -> bool {
+        self.mask.as_ref().is_none_or(|mask| mask.keeps(x, y))
+    }
+}
+
 /// An estimated depth map that the Pearson loss correlates with the rendered one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthPrior {

@@ -172,7 +172,7 @@ pub fn evaluate(
 pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64) -> Result<BaselineScores, JobError> {
     let mut mean = MeanColor::default();
     for &i in training {
-        mean.add(&set.load(i, scale)?.image);
+        mean.add(&set.load(i, scale)?);
     }
     let views: Vec<View> = training.iter().map(|&i| set.frames[i].view).collect();
     let (mut warped, mut flat) = (Vec::new(), Vec::new());
@@ -191,7 +191,7 @@ pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64
 fn score(truth: &PosedImage, rgb: &[f32]) -> ViewScore {
     let k = &truth.view.intrinsics;
     let target = to_f32(&truth.image);
-    let kept = |i: usize| truth.mask.as_ref().is_none_or(|m| m.keeps(i as u32 % k.width, i as u32 / k.width));
+    let kept = |i: usize| truth.keeps(i as u32 % k.width, i as u32 / k.width);
     // What is left out counts as rendered right in the windows that reach over it, and not at all by itself.
     let shown: Vec<f32> = (0..target.len())
         .map(|i| if kept(i / 3) { rgb.get(i).copied().unwrap_or(f32::NAN) } else { target[i] })

@@ -94,7 +94,9 @@ impl Tensor {
             "FloatStorage" | "IntStorage" => 4,
             "DoubleStorage" | "LongStorage" => 8,
             _ => {
-                return Err("a tensor of it is neither of floats nor of integers; save it as float or double".to_owned());
+                return Err(
+                    "a tensor of it is neither of floats nor of integers; save it as float or double".to_owned()
+                );
             }
         };
         let number = |at: usize| -> Option<f64> {
