@@ -1,7 +1,7 @@
 //! What an earlier plan of the same store settled stays as it was while it is near enough to what would be settled now.
 //!
-//! Registration and light are settled over all models at once, so that whoever joins moves everybody, most by less than a millimetre;
-//! without this every cell would be another one each time.
+//! Registration and light are settled over all models at once, so that whoever joins moves everybody, most by little (registration
+//! begins where things were, `register/graph.rs`); without this every cell would be another one each time.
 
 use std::collections::HashMap;
 
@@ -34,10 +34,14 @@ impl<'a> Held<'a> {
         Self { plan, by_content }
     }
 
+    /// What a model was moved by before.
+    pub fn earlier(&self, member: &Member) -> Option<Motion> {
+        self.by_content.get(member.content()).and_then(|m| m.correction).map(Motion::of_parts)
+    }
+
     /// Where a model goes that would be moved by `motion` now.
     pub fn motion(&self, member: &Member, motion: Motion) -> Motion {
-        let Some(parts) = self.by_content.get(member.content()).and_then(|m| m.correction) else { return motion };
-        let earlier = Motion::of_parts(parts);
+        let Some(earlier) = self.earlier(member) else { return motion };
         let stays = member.corners().into_iter().all(|p| earlier.point(p).distance(motion.point(p)) <= STAYS_M);
         if stays { earlier } else { motion }
     }

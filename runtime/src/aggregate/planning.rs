@@ -81,7 +81,7 @@ pub fn plan(
     laps.end("unify");
     let (mut registered, mut not_registered) = (Registered::default(), None);
     if settings.register {
-        match registrar(settings, &fits).register(members, &|m, motion| held.motion(m, motion), go_on) {
+        match registrar(settings, &fits).register(members, &held, go_on) {
             Ok(done) => registered = done,
             Err(e) => not_registered = Some(e),
         }

@@ -8,6 +8,7 @@
 use std::collections::HashSet;
 
 use super::frame::Motion;
+use super::hold::Held;
 use super::member::Member;
 use edge::{Edges, Fitted, Key};
 use graph::{Link, Node};
@@ -134,15 +135,15 @@ impl<F: Fitter> Registrar<F> {
         Ok((pairs, used, fitted))
     }
 
-    /// Brings all models together: each moves as its neighbours and its telemetry agree on, or as `hold` says instead. Models that
-    /// overlap no other stay where their GPS put them. Pairs that are in use no more are forgotten.
+    /// Brings all models together: each moves as its neighbours and its telemetry agree on, or stays where `held` has it while that is
+    /// near enough. Models that overlap no other stay where their GPS put them. Pairs that are in use no more are forgotten.
     ///
     /// # Errors
     /// Those of [`Registrar::fit`]; the models are then as they were.
     pub fn register(
         &mut self,
         members: &mut [Member],
-        hold: &dyn Fn(&Member, Motion) -> Motion,
+        held: &Held<'_>,
         go_on: &dyn Fn() -> bool,
     ) -> Result<Registered, String> {
         let (pairs, used, fitted) = self.pairs(members, go_on)?;
@@ -150,6 +151,8 @@ impl<F: Fitter> Registrar<F> {
         let node = |m: &Member| Node {
             middle: m.middle(),
             scale_sigma: if m.is_georeferenced() { SCALE_BY_GPS } else { SCALE_BY_NOTHING },
+            reach_m: m.corners().into_iter().map(|c| c.distance(m.middle())).fold(0.0, f64::max),
+            earlier: held.earlier(m).map(|motion| *motion.similarity()),
         };
         let nodes: Vec<Node> = members.iter().map(node).collect();
         let found: Vec<(&Pair, Fitted)> = pairs.iter().filter_map(|p| Some((p, p.found?))).collect();
@@ -171,7 +174,7 @@ impl<F: Fitter> Registrar<F> {
         }
         let mut corrections = Vec::new();
         for (i, neighbours) in of_model.iter().enumerate().filter(|(_, n)| !n.is_empty()) {
-            let motion = hold(&members[i], Motion::of(settled.corrections[i]));
+            let motion = held.motion(&members[i], Motion::of(settled.corrections[i]));
             report.models.push(Registration {
                 name: name(i),
                 neighbours: neighbours.iter().map(|n| name(n.0)).collect(),

@@ -5,6 +5,9 @@
 //! six places that two models show ([`Link`]). One false edge must not bend the scene: edges are weighed by Geman and McClure's
 //! function, whose width shrinks from where every edge counts to where only those that agree do (graduated non-convexity, Yang
 //! et al. 2020). The linear systems are solved by conjugate gradients, block by block: time and memory grow as the edges do.
+//!
+//! Whoever joins brings its own telemetry's error, and over all models together it would move everybody by some of it. What was settled
+//! before stays where it was, wherever no two neighbours are thereby farther apart than they need be.
 
 use glam::{DQuat, DVec3};
 use models::align::similarity::Similarity;
@@ -25,6 +28,10 @@ const TOLERANCE: f64 = 1e-9;
 const MOST_ROUNDS: usize = 1000;
 /// An edge counted less than this is set aside.
 const SET_ASIDE: f64 = 0.25;
+/// What an earlier settlement is worth where it is held, one standard deviation over the ground of a model, metres: a tenth of an edge.
+const HELD_M: f64 = 0.005;
+/// Holding may leave neighbours so much farther apart than they need be, metres: no more than a model may move and be taken for unmoved.
+const STRAIN_M: f64 = 0.02;
 
 /// One model.
 #[derive(Clone, Copy, Debug)]
@@ -33,6 +40,10 @@ pub struct Node {
     pub middle: DVec3,
     /// What its size is known to from telemetry, one standard deviation, as a share.
     pub scale_sigma: f64,
+    /// How far its ground reaches from there, metres.
+    pub reach_m: f64,
+    /// What it was corrected by before, if it was.
+    pub earlier: Option<Similarity>,
 }
 
 /// What two models show in common: places as the first has them and as the second has them.
@@ -57,6 +68,8 @@ pub struct Settled {
     pub corrections: Vec<Similarity>,
     /// Per link: whether it counts.
     pub holds: Vec<bool>,
+    /// Per link: root mean square distance of its places, metres.
+    apart_m: Vec<f64>,
 }
 
 type Block = [f64; 7];
@@ -71,6 +84,11 @@ struct State {
 
 impl State {
     const START: Self = Self { shift: DVec3::ZERO, turn: DQuat::IDENTITY, log_scale: 0.0 };
+
+    fn of(similarity: &Similarity, node: &Node) -> Self {
+        let Similarity { scale, rotation, .. } = *similarity;
+        Self { shift: similarity.apply(node.middle) - node.middle, turn: rotation.normalize(), log_scale: scale.ln() }
+    }
 
     fn lever(&self, node: &Node, p: DVec3) -> DVec3 {
         self.log_scale.exp() * (self.turn * (p - node.middle))
@@ -88,15 +106,67 @@ impl State {
     }
 }
 
+/// What is known of a node beside its links.
+struct Prior {
+    at: State,
+    /// 1/σ² of each number of a state.
+    per: Block,
+}
+
+impl Prior {
+    fn of(node: &Node, is_held: bool) -> Self {
+        let per = |sigma: f64| 1.0 / (sigma * sigma);
+        match node.earlier.filter(|_| is_held) {
+            Some(earlier) => {
+                let (p, t) = (per(HELD_M), per(HELD_M / node.reach_m.max(1.0)));
+                Self { at: State::of(&earlier, node), per: [p, p, p, t, t, t, t] }
+            }
+            None => {
+                let (p, t, h) = (per(POSITION_M), per(TILT_RAD), per(HEADING_RAD));
+                Self { at: State::START, per: [p, p, p, t, t, h, per(node.scale_sigma)] }
+            }
+        }
+    }
+}
+
 /// Settles the graph.
 pub fn settle(nodes: &[Node], links: &[Link]) -> Settled {
+    let free = settle_held(nodes, links, &vec![false; nodes.len()]);
+    let mut held: Vec<bool> = nodes.iter().map(|n| n.earlier.is_some()).collect();
+    while held.contains(&true) {
+        let settled = settle_held(nodes, links, &held);
+        let is_strained = |i: &usize| free.holds[*i] && settled.apart_m[*i] > free.apart_m[*i] + STRAIN_M;
+        let strained: Vec<usize> = (0..links.len()).filter(is_strained).collect();
+        if strained.is_empty() {
+            return settled;
+        }
+        // Whoever is strained is let go; then, if that is not enough, whoever holds them.
+        let ends: Vec<usize> = strained.iter().flat_map(|i| [links[*i].a, links[*i].b]).collect();
+        let let_go = match ends.iter().any(|end| held[*end]) {
+            true => ends,
+            false => {
+                let beside = links.iter().filter(|l| ends.contains(&l.a) || ends.contains(&l.b));
+                beside.flat_map(|l| [l.a, l.b]).filter(|i| held[*i]).collect()
+            }
+        };
+        if let_go.is_empty() {
+            break;
+        }
+        let_go.into_iter().for_each(|i| held[i] = false);
+    }
+    free
+}
+
+fn settle_held(nodes: &[Node], links: &[Link], held: &[bool]) -> Settled {
     let is_likely = |l: &Link| l.places.iter().all(|(a, b)| a.distance(*b) <= MOST_APART_M);
     let likely: Vec<usize> = (0..links.len()).filter(|i| is_likely(&links[*i])).collect();
     let used: Vec<Link> = likely.iter().map(|i| links[*i]).collect();
+    let priors: Vec<Prior> = nodes.iter().zip(held).map(|(n, h)| Prior::of(n, *h)).collect();
     let mut solver = Solver {
         nodes,
         links: &used,
-        states: vec![State::START; nodes.len()],
+        states: priors.iter().map(|p| p.at).collect(),
+        priors,
         weights: vec![1.0; used.len()],
         levers: vec![[(DVec3::ZERO, DVec3::ZERO); 6]; used.len()],
     };
@@ -117,14 +187,19 @@ pub fn settle(nodes: &[Node], links: &[Link]) -> Settled {
         }
         solver.step();
     }
-    let mut holds = vec![false; links.len()];
-    likely.iter().zip(&solver.weights).for_each(|(i, weight)| holds[*i] = *weight >= SET_ASIDE);
-    Settled { corrections: solver.states.iter().zip(nodes).map(|(s, n)| s.similarity(n)).collect(), holds }
+    let (mut holds, mut apart_m) = (vec![false; links.len()], vec![f64::INFINITY; links.len()]);
+    for (used, link) in likely.iter().enumerate() {
+        holds[*link] = solver.weights[used] >= SET_ASIDE;
+        apart_m[*link] = solver.apart2(used).sqrt();
+    }
+    let corrections = solver.states.iter().zip(nodes).map(|(s, n)| s.similarity(n)).collect();
+    Settled { corrections, holds, apart_m }
 }
 
 struct Solver<'a> {
     nodes: &'a [Node],
     links: &'a [Link],
+    priors: Vec<Prior>,
     states: Vec<State>,
     weights: Vec<f64>,
     /// Per link and place: from both middles, as the states have them.
@@ -147,13 +222,6 @@ impl Solver<'_> {
         self.weights[link] / (6.0 * self.links[link].sigma_m.powi(2))
     }
 
-    /// 1/σ² of what telemetry says.
-    fn prior(&self, node: usize) -> Block {
-        let per = |sigma: f64| 1.0 / (sigma * sigma);
-        let (p, t, h) = (per(POSITION_M), per(TILT_RAD), per(HEADING_RAD));
-        [p, p, p, t, t, h, per(self.nodes[node].scale_sigma)]
-    }
-
     /// One step of Gauss and Newton.
     fn step(&mut self) {
         for (levers, l) in self.levers.iter_mut().zip(self.links) {
@@ -173,10 +241,10 @@ impl Solver<'_> {
             }
         }
         for (i, g) in gradient.iter_mut().enumerate() {
-            let (s, prior) = (&self.states[i], self.prior(i));
-            let turned = s.turn.to_scaled_axis();
-            let now = [s.shift.x, s.shift.y, s.shift.z, turned.x, turned.y, turned.z, s.log_scale];
-            (0..7).for_each(|k| g[k] -= prior[k] * now[k]);
+            let (s, Prior { at, per }) = (&self.states[i], &self.priors[i]);
+            let (shift, turned) = (s.shift - at.shift, (s.turn * at.turn.conjugate()).to_scaled_axis());
+            let off = [shift.x, shift.y, shift.z, turned.x, turned.y, turned.z, s.log_scale - at.log_scale];
+            (0..7).for_each(|k| g[k] -= per[k] * off[k]);
         }
         let steps = self.solve(gradient);
         self.states.iter_mut().zip(&steps).for_each(|(s, by)| s.step(by));
@@ -199,8 +267,7 @@ impl Solver<'_> {
     /// The matrix of the normal equations times `x`.
     fn times(&self, x: &[Block], into: &mut [Block]) {
         for (i, block) in into.iter_mut().enumerate() {
-            let prior = self.prior(i);
-            *block = std::array::from_fn(|k| prior[k] * x[i][k]);
+            *block = std::array::from_fn(|k| self.priors[i].per[k] * x[i][k]);
         }
         for (i, l) in self.links.iter().enumerate() {
             let w = self.weight(i);
@@ -214,12 +281,10 @@ impl Solver<'_> {
 
     /// Factors of the blocks on the diagonal.
     fn blocks(&self) -> Vec<[Block; 7]> {
-        let mut blocks: Vec<[Block; 7]> = (0..self.nodes.len())
-            .map(|i| {
-                let prior = self.prior(i);
-                std::array::from_fn(|r| std::array::from_fn(|c| if r == c { prior[r] } else { 0.0 }))
-            })
-            .collect();
+        let diagonal = |prior: &Prior| -> [Block; 7] {
+            std::array::from_fn(|r| std::array::from_fn(|c| if r == c { prior.per[r] } else { 0.0 }))
+        };
+        let mut blocks: Vec<[Block; 7]> = self.priors.iter().map(diagonal).collect();
         for (i, l) in self.links.iter().enumerate() {
             let w = self.weight(i);
             for (ya, yb) in &self.levers[i] {

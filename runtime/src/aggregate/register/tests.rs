@@ -86,7 +86,7 @@ fn each_pair_of_neighbours_is_fitted_once_and_an_aircraft_that_joins_fits_its_ow
     assert_eq!(registrar.fit(&members[..23], &|| true), Ok(0));
     let before = worst_disagreement(&members);
     let mut all = members;
-    let report = registrar.register(&mut all, &|_, motion| motion, &|| true).expect("registered");
+    let report = registrar.register(&mut all, &Held::default(), &|| true).expect("registered");
     assert_eq!((report.fitted, report.pairs, report.models.len()), (3, fitted + 3, 24));
     assert!(report.warnings.is_empty(), "{:?}", report.warnings);
     let after = worst_disagreement(&all);
@@ -101,10 +101,10 @@ fn a_restart_keeps_every_edge_and_a_new_version_of_a_model_asks_for_its_own_agai
     let mut members = field(dir.path(), 4, 3);
     let mut exact = Exact::default();
     let first =
-        registrar(dir.path(), &mut exact).register(&mut members, &|_, motion| motion, &|| true).expect("registered");
+        registrar(dir.path(), &mut exact).register(&mut members, &Held::default(), &|| true).expect("registered");
     let mut again = field(dir.path(), 4, 3);
     let second =
-        registrar(dir.path(), &mut exact).register(&mut again, &|_, motion| motion, &|| true).expect("registered");
+        registrar(dir.path(), &mut exact).register(&mut again, &Held::default(), &|| true).expect("registered");
     assert_eq!((second.fitted, second.pairs), (0, first.pairs));
     assert_eq!(
         members.iter().map(|m| *m.motion()).collect::<Vec<_>>(),
@@ -117,8 +117,7 @@ fn a_restart_keeps_every_edge_and_a_new_version_of_a_model_asks_for_its_own_agai
     // The corner has three neighbours.
     again = field(dir.path(), 4, 3);
     again[0] = aircraft(dir.path(), [0, 0], 1.9);
-    let third =
-        registrar(dir.path(), &mut exact).register(&mut again, &|_, motion| motion, &|| true).expect("registered");
+    let third = registrar(dir.path(), &mut exact).register(&mut again, &Held::default(), &|| true).expect("registered");
     assert_eq!((third.fitted, third.pairs), (3, first.pairs));
     let files = std::fs::read_dir(dir.path().join("registration")).expect("folder").count();
     assert_eq!(files, first.pairs, "edges of the version before are forgotten");
@@ -130,7 +129,7 @@ fn a_damaged_edge_is_named_and_fitted_again() {
     let mut members = field(dir.path(), 2, 2);
     let mut exact = Exact::default();
     let report =
-        registrar(dir.path(), &mut exact).register(&mut members, &|_, motion| motion, &|| true).expect("registered");
+        registrar(dir.path(), &mut exact).register(&mut members, &Held::default(), &|| true).expect("registered");
     assert_eq!(report.pairs, 6);
     let folder = dir.path().join("registration");
     let mut files: Vec<_> = std::fs::read_dir(&folder).expect("folder").map(|e| e.expect("entry").path()).collect();
@@ -144,7 +143,7 @@ fn a_damaged_edge_is_named_and_fitted_again() {
     std::fs::write(&files[3], vec![0; 1 << 20]).expect("too long");
     let mut again = field(dir.path(), 2, 2);
     let report =
-        registrar(dir.path(), &mut exact).register(&mut again, &|_, motion| motion, &|| true).expect("registered");
+        registrar(dir.path(), &mut exact).register(&mut again, &Held::default(), &|| true).expect("registered");
     assert_eq!((report.fitted, report.warnings.len()), (4, 4));
     for (file, why) in files.iter().zip(["checksum", "checksum", "another pair", "long"]) {
         let name = file.file_name().and_then(|n| n.to_str()).expect("a name");
@@ -159,7 +158,7 @@ fn a_false_edge_is_named_and_the_others_hold() {
     let mut members = field(dir.path(), 4, 4);
     let mut exact = Exact { lies: vec![[[1, 1], [2, 1]]], ..Default::default() };
     let report =
-        registrar(dir.path(), &mut exact).register(&mut members, &|_, motion| motion, &|| true).expect("registered");
+        registrar(dir.path(), &mut exact).register(&mut members, &Held::default(), &|| true).expect("registered");
     assert_eq!(report.warnings.len(), 1, "{:?}", report.warnings);
     assert!(report.warnings[0].contains("a-1-1") && report.warnings[0].contains("a-2-1"));
     assert!(worst_disagreement(&members) < 0.02, "{}", worst_disagreement(&members));
@@ -171,7 +170,7 @@ fn aircraft_far_from_each_other_are_never_fitted() {
     let mut members: Vec<Member> = [[0, 0], [5, 0], [0, 5]].map(|at| aircraft(dir.path(), at, 2.0)).into();
     let mut exact = Exact::default();
     let report =
-        registrar(dir.path(), &mut exact).register(&mut members, &|_, motion| motion, &|| true).expect("registered");
+        registrar(dir.path(), &mut exact).register(&mut members, &Held::default(), &|| true).expect("registered");
     assert_eq!((report.pairs, report.models.len(), exact.fits), (0, 0, 0));
     assert!(members.iter().all(|m| *m.motion() == Motion::NONE));
     assert!(!dir.path().join("registration").exists());

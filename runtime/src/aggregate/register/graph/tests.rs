@@ -22,7 +22,8 @@ impl Field {
     /// Scales are wrong by up to 0.6 times what they are known to.
     fn new(side: usize, scale_sigma: f64) -> Self {
         let middle = |i: usize| DVec3::new((i % side) as f64 * 100.0, (i / side) as f64 * 100.0, 0.0);
-        let nodes: Vec<Node> = (0..side * side).map(|i| Node { middle: middle(i), scale_sigma }).collect();
+        let nodes: Vec<Node> =
+            (0..side * side).map(|i| Node { middle: middle(i), scale_sigma, reach_m: 70.0, earlier: None }).collect();
         let errors = (0..side * side).map(|i| {
             let scale = 1.0 + 0.6 * scale_sigma * wobble(i, 6);
             let rotation = DQuat::from_rotation_z(0.05 * wobble(i, 3)) * DQuat::from_rotation_x(0.01 * wobble(i, 4));
@@ -157,4 +158,46 @@ fn an_edge_beyond_all_telemetry_is_set_aside_at_once_and_moves_nothing() {
             assert!(at(&settled).distance(at(&without)) < 1e-6, "{off}");
         }
     }
+}
+
+/// Models that lie more than two centimetres from where they were, anywhere on their ground.
+fn moved(field: &Field, settled: &Settled) -> usize {
+    let corners = [DVec3::new(50.0, 50.0, 0.0), DVec3::new(-50.0, 50.0, 0.0)];
+    let is_moved = |(node, now): (&Node, &Similarity)| {
+        let at = |p: DVec3| node.earlier.is_some_and(|e| e.apply(p).distance(now.apply(p)) > STRAIN_M);
+        corners.iter().any(|c| at(node.middle + *c) || at(node.middle - *c))
+    };
+    field.nodes.iter().zip(&settled.corrections).filter(|pair| is_moved(*pair)).count()
+}
+
+#[test]
+fn who_joins_takes_the_place_that_its_neighbours_leave_it() {
+    for joins in [0, 14, 35] {
+        let mut field = Field::new(6, BY_GPS);
+        let before: Vec<Link> = field.links.iter().filter(|l| l.a != joins && l.b != joins).copied().collect();
+        let earlier = settle(&field.nodes, &before);
+        let free = settle(&field.nodes, &field.links);
+        for (i, node) in field.nodes.iter_mut().enumerate().filter(|(i, _)| *i != joins) {
+            node.earlier = Some(earlier.corrections[i]);
+        }
+        let settled = settle(&field.nodes, &field.links);
+        let gaps = [&free, &settled].map(|s| field.worst_gap(s, field.links.len()));
+        assert!(gaps[1] < gaps[0] + 2.0 * STRAIN_M, "{joins}: {gaps:?} m");
+        let moved = [&free, &settled].map(|s| moved(&field, s));
+        assert!(moved[0] >= 20 && moved[1] <= 4, "{joins}: {moved:?} models moved");
+    }
+}
+
+#[test]
+fn what_was_settled_wrongly_is_let_go() {
+    let mut field = Field::new(5, BY_GPS);
+    let free = settle(&field.nodes, &field.links);
+    for (i, node) in field.nodes.iter_mut().enumerate() {
+        // One half was never registered, the other half is where it belongs.
+        node.earlier = Some(if i < 12 { Similarity::IDENTITY } else { free.corrections[i] });
+    }
+    let settled = settle(&field.nodes, &field.links);
+    assert!(settled.holds.iter().all(|h| *h));
+    let gaps = [&free, &settled].map(|s| field.worst_gap(s, field.links.len()));
+    assert!(gaps[1] < gaps[0] + 2.0 * STRAIN_M, "{gaps:?} m");
 }
