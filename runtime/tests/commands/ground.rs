@@ -5,14 +5,14 @@ use super::*;
 /// Three models side by side, without views: nothing needs a device.
 fn models(dir: &Path) -> Vec<String> {
     let model = |i: usize| {
-        let west = 40.0 * i as f32;
+        let west = 160.0 * i as f32;
         let mut cloud = GaussianCloud::with_capacity(0, 60 * 40);
         for n in 0..60 * 40 {
-            let mean = [west - 10.0 + (n % 60) as f32, (n / 60) as f32 - 20.0, 0.0];
-            cloud.push(mean, [-0.7; 3], [1.0, 0.0, 0.0, 0.0], 3.0, &[0.1 * i as f32; 3]);
+            let mean = [west - 40.0 + 4.0 * (n % 60) as f32, 4.0 * (n / 60) as f32 - 80.0, 0.0];
+            cloud.push(mean, [0.7; 3], [1.0, 0.0, 0.0, 0.0], 3.0, &[0.1 * i as f32; 3]);
         }
-        let (w, e) = (f64::from(west), f64::from(west + 40.0));
-        let region = vec![[w, -20.0], [e, -20.0], [e, 20.0], [w, 20.0]];
+        let (w, e) = (f64::from(west), f64::from(west + 160.0));
+        let region = vec![[w, -80.0], [e, -80.0], [e, 80.0], [w, 80.0]];
         let path = dir.join(format!("a{i}.dgtr"));
         model::write(&path, &ModelHeader { aircraft: format!("a{i}"), region, ..Default::default() }, &cloud).unwrap();
         path.display().to_string()
@@ -32,7 +32,7 @@ fn three_commands_give_the_model_that_one_process_gives() {
     let models: Vec<&str> = models.iter().map(String::as_str).collect();
     let at = |name: &str| dir.path().join(name).display().to_string();
     let (store, out, one) = (at("store"), at("merged"), at("one"));
-    let how = ["--epochs", "0", "--cell-m", "32"];
+    let how = ["--epochs", "0", "--cell-m", "64"];
     let plan = [&["ground", "plan"], &models[..], &["--store", &store], &how].concat();
     let keys = lines(&dgtr(&plan));
     assert!(keys.len() >= 8 && keys.contains(&"0/0/0".to_owned()), "{keys:?}");
