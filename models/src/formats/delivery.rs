@@ -86,17 +86,6 @@ impl Rounding {
             color: ColorSteps { luma: 1.0 / 96.0, chroma: 1.6, variation: 0.011, by_importance: 0.5, rounding: 0.5 },
         }
     }
-
-    /// A fifth less bytes: for a checkpoint, whose Gaussians are still on their way and will be sent again (the same sweep over
-    /// sheffield_cross: 7.5 bytes a Gaussian at -0.27 dB where the default takes 9.2 at -0.14).
-    pub fn coarse() -> Self {
-        Self {
-            position: 0.38,
-            shape: ShapeSteps { log_scale: 0.36, rotation_bits: 4, opacity_bits: 4 },
-            color: ColorSteps { luma: 1.0 / 50.0, chroma: 1.6, variation: 0.04, by_importance: 0.5, rounding: 0.45 },
-            ..Self::default()
-        }
-    }
 }
 
 /// How a stream of words is laid out.

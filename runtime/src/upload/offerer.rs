@@ -260,11 +260,11 @@ impl Worker {
     }
 
     /// A checkpoint waits until the one before has been fetched, if somebody is about it, for its share of the link, and for
-    /// the last model where that is near.
+    /// the last model where that is near: not beyond when it was expected, for training may rest meanwhile.
     fn is_due(&self, kind: Kind, last: Option<Instant>) -> bool {
         let busy = self.is_fetched && !self.delivered;
         let now = Instant::now();
-        let replaced = last.is_some_and(|last| last < now + self.spacing());
+        let replaced = last.is_some_and(|last| now < last && last < now + self.spacing());
         kind != Kind::Checkpoint || (!busy && !replaced && now >= self.next_checkpoint)
     }
 
@@ -278,7 +278,7 @@ impl Worker {
         let rounded = match self.settings.encoding {
             Encoding::Exact => None,
             // Rather the whole file than none: the disk may be too full for another.
-            Encoding::Delivery => write_delivery(&self.source, path, &rounding_of(kind))
+            Encoding::Delivery => write_delivery(&self.source, path)
                 .inspect_err(|e| tracing::warn!("upload: {e}; the exact model is offered instead"))
                 .ok(),
         };
@@ -387,20 +387,15 @@ impl Worker {
     }
 }
 
-/// A checkpoint is replaced before long: it tells the ground what there is for fewer bytes than the last model, which stays.
-fn rounding_of(kind: Kind) -> Rounding {
-    if kind == Kind::Final { Rounding::default() } else { Rounding::coarse() }
-}
-
 /// Writes the delivery encoding of a model beside it, without cells that are others' to deliver.
-fn write_delivery(source: &Source, path: &Path, rounding: &Rounding) -> Result<PathBuf, FormatError> {
+fn write_delivery(source: &Source, path: &Path) -> Result<PathBuf, FormatError> {
     let (header, cloud) = model::read(path)?;
     let rounded = path.with_extension("delivery.dgtr");
     let margin = territory::margin(&header, cloud.middle()[2]);
     // A model that does not lie in the mission's frame has no place among regions.
     let territory = source.territory.as_ref().filter(|_| header.origin.is_some());
     let wanted = |grid: Grid, key: CellKey| territory.is_none_or(|t| t.wants(grid, key, margin));
-    model::write_cells(&source.disk, &rounded, &header, &cloud, rounding, &wanted)?;
+    model::write_cells(&source.disk, &rounded, &header, &cloud, &Rounding::default(), &wanted)?;
     Ok(rounded)
 }
 
