@@ -11,7 +11,7 @@ use super::plan::{Hash, Placed, Plan};
 
 /// A model stays while it would move by no more than this anywhere, metres: less than half of what registration takes a border to be
 /// known to at best.
-const STAYS_M: f64 = 0.02;
+pub const STAYS_M: f64 = 0.02;
 /// Its light stays while it would change by no more than this (natural logarithm): half of what counts as even.
 const STAYS_LIT: f32 = 0.005;
 /// Cells in which holes are looked for keep their size within this factor.

@@ -12,6 +12,8 @@
 use glam::{DQuat, DVec3};
 use models::align::similarity::Similarity;
 
+use crate::aggregate::hold::STAYS_M;
+
 /// What telemetry is worth, one standard deviation: position, tilt and heading.
 /// Position as in [`config`]'s GPS priors without RTK.
 const POSITION_M: f64 = 3.0;
@@ -30,8 +32,6 @@ const MOST_ROUNDS: usize = 1000;
 const SET_ASIDE: f64 = 0.25;
 /// What an earlier settlement is worth where it is held, one standard deviation over the ground of a model, metres: a tenth of an edge.
 const HELD_M: f64 = 0.005;
-/// Holding may leave neighbours so much farther apart than they need be, metres: no more than a model may move and be taken for unmoved.
-const STRAIN_M: f64 = 0.02;
 
 /// One model.
 #[derive(Clone, Copy, Debug)]
@@ -129,13 +129,14 @@ impl Prior {
     }
 }
 
-/// Settles the graph.
+/// Settles the graph. What was settled before is held, unless that leaves neighbours farther apart than they need be by more than a
+/// model may move and be taken for unmoved.
 pub fn settle(nodes: &[Node], links: &[Link]) -> Settled {
     let free = settle_held(nodes, links, &vec![false; nodes.len()]);
     let mut held: Vec<bool> = nodes.iter().map(|n| n.earlier.is_some()).collect();
     while held.contains(&true) {
         let settled = settle_held(nodes, links, &held);
-        let is_strained = |i: &usize| free.holds[*i] && settled.apart_m[*i] > free.apart_m[*i] + STRAIN_M;
+        let is_strained = |i: &usize| free.holds[*i] && settled.apart_m[*i] > free.apart_m[*i] + STAYS_M;
         let strained: Vec<usize> = (0..links.len()).filter(is_strained).collect();
         if strained.is_empty() {
             return settled;

@@ -164,7 +164,7 @@ fn an_edge_beyond_all_telemetry_is_set_aside_at_once_and_moves_nothing() {
 fn moved(field: &Field, settled: &Settled) -> usize {
     let corners = [DVec3::new(50.0, 50.0, 0.0), DVec3::new(-50.0, 50.0, 0.0)];
     let is_moved = |(node, now): (&Node, &Similarity)| {
-        let at = |p: DVec3| node.earlier.is_some_and(|e| e.apply(p).distance(now.apply(p)) > STRAIN_M);
+        let at = |p: DVec3| node.earlier.is_some_and(|e| e.apply(p).distance(now.apply(p)) > STAYS_M);
         corners.iter().any(|c| at(node.middle + *c) || at(node.middle - *c))
     };
     field.nodes.iter().zip(&settled.corrections).filter(|pair| is_moved(*pair)).count()
@@ -182,7 +182,7 @@ fn who_joins_takes_the_place_that_its_neighbours_leave_it() {
         }
         let settled = settle(&field.nodes, &field.links);
         let gaps = [&free, &settled].map(|s| field.worst_gap(s, field.links.len()));
-        assert!(gaps[1] < gaps[0] + 2.0 * STRAIN_M, "{joins}: {gaps:?} m");
+        assert!(gaps[1] < gaps[0] + 2.0 * STAYS_M, "{joins}: {gaps:?} m");
         let moved = [&free, &settled].map(|s| moved(&field, s));
         assert!(moved[0] >= 20 && moved[1] <= 4, "{joins}: {moved:?} models moved");
     }
@@ -199,5 +199,5 @@ fn what_was_settled_wrongly_is_let_go() {
     let settled = settle(&field.nodes, &field.links);
     assert!(settled.holds.iter().all(|h| *h));
     let gaps = [&free, &settled].map(|s| field.worst_gap(s, field.links.len()));
-    assert!(gaps[1] < gaps[0] + 2.0 * STRAIN_M, "{gaps:?} m");
+    assert!(gaps[1] < gaps[0] + 2.0 * STAYS_M, "{gaps:?} m");
 }
