@@ -260,11 +260,11 @@ impl Worker {
     }
 
     /// A checkpoint waits until the one before has been fetched, if somebody is about it, for its share of the link, and for
-    /// the last model where that is near: not beyond when it was expected, for training may rest meanwhile.
+    /// the last model where that is near; not long beyond when it was expected, for training may rest meanwhile.
     fn is_due(&self, kind: Kind, last: Option<Instant>) -> bool {
         let busy = self.is_fetched && !self.delivered;
         let now = Instant::now();
-        let replaced = last.is_some_and(|last| now < last && last < now + self.spacing());
+        let replaced = last.is_some_and(|last| now < last + self.spacing() && last < now + self.spacing());
         kind != Kind::Checkpoint || (!busy && !replaced && now >= self.next_checkpoint)
     }
 

@@ -97,8 +97,7 @@ fn no_checkpoint_is_offered_that_the_last_model_replaces_before_another_could_fo
     let dir = tempfile::tempdir().expect("temp dir");
     let (settings, path, ..) = delivery(dir.path());
     let spacing = Duration::from_secs_f64(settings.checkpoint_s);
-    // The last one says that training rests: the model was expected by now.
-    for (last_in, offers) in [(spacing.mul_f64(0.9), 1), (2 * spacing, 2), (Duration::ZERO, 2)] {
+    for (last_in, offers) in [(spacing.mul_f64(0.9), 1), (2 * spacing, 2), (Duration::ZERO, 1)] {
         let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
         o.expect_last(last_in);
         o.offer(&path);
@@ -107,6 +106,19 @@ fn no_checkpoint_is_offered_that_the_last_model_replaces_before_another_could_fo
         assert!(o.wait_delivered(LIMIT, || true));
         assert_eq!(o.status().offers, offers);
     }
+}
+
+#[test]
+fn a_checkpoint_does_not_wait_for_a_last_model_that_is_overdue() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let (settings, path, ..) = delivery(dir.path());
+    let settings = UploadSettings { checkpoint_s: 0.5, ..settings };
+    let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
+    // It was to be here by now, and training rests.
+    o.expect_last(Duration::ZERO);
+    o.offer(&path);
+    assert!(o.wait_delivered(LIMIT, || true));
+    assert_eq!(o.status().offers, 1);
 }
 
 #[test]
