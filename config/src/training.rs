@@ -88,6 +88,8 @@ table! {
         pub depth_confidence: f32 = 0.1, in Limits::within(0.0, 1.0), from "coverage matters more than purity";
         /// Shape freezing: depth gradients reach means and opacities but not scales and rotations.
         pub freeze_shape: bool = true, from "the paper, table 4: 21.53 → 21.72 dB";
+        /// Weight of the mean binary entropy of the opacities in view: what hesitates becomes opaque or nothing.
+        pub entropy: f32 = 0.0, in Limits::at_least(0.0), from "Fed3DGS' distillation alone has it (0.01)";
     }
 }
 

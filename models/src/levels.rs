@@ -13,6 +13,7 @@ use crate::formats::model::Chunks;
 use crate::formats::sog::streamed::Writer;
 use leaves::{Counts, Ground};
 use merge::coarser;
+pub use scratch::Rows;
 use scratch::Scratch;
 
 mod leaves;
@@ -28,8 +29,8 @@ const MOST_TRIES: usize = 12;
 const GROWTH: f64 = 1.25;
 /// Leaves that they are tried with.
 const SAMPLED_LEAVES: usize = 4;
-/// Gaussians that the coarsest level may have about: what a viewer loads before anything else.
-const COARSEST: f64 = 30_000.0;
+/// Gaussians that the coarsest level may have about: what a viewer loads before anything else, half a megabyte.
+const COARSEST: f64 = 50_000.0;
 /// Levels at most, the finest among them.
 const MAX_LEVELS: usize = 8;
 /// Means that say how far a scene extends.
@@ -58,10 +59,10 @@ pub struct Report {
 /// of growing sides with which `sample`, some of its leaves, is thinned enough. Where Gaussians lie above each other, in trees
 /// and on walls, they are farther apart than on the ground.
 fn voxels_m(count: u64, spacing_m: f64, mut sample: GaussianCloud) -> Vec<f64> {
-    let above = (count as f64 / COARSEST).max(1.0).log(THINNED).ceil() as usize;
+    let sampled = count as f64 / sample.len().max(1) as f64;
     let mut sides = Vec::new();
     let mut side = spacing_m;
-    for _ in 0..above.clamp(1, MAX_LEVELS - 1) {
+    while sides.is_empty() || (sampled * sample.len() as f64 > COARSEST && sides.len() < MAX_LEVELS - 1) {
         side *= WIDER;
         let enough = (sample.len() as f64 / THINNED).ceil() as usize;
         let mut level = coarser(&sample, side);
@@ -93,6 +94,19 @@ pub fn of(cloud: GaussianCloud, voxels_m: &[f64]) -> Vec<GaussianCloud> {
 /// # Errors
 /// As [`Chunks::open`], a model without Gaussians, the operating system's.
 pub fn write(model: &Chunks, folder: &Path, sh_degree: u8) -> Result<Report, FormatError> {
+    write_and_see(model, folder, sh_degree, &mut |_| Ok(()))
+}
+
+/// The same; `see` is given the levels of each leaf as they are before they are packed, the finest first.
+///
+/// # Errors
+/// As [`write`]; those of `see`.
+pub fn write_and_see(
+    model: &Chunks,
+    folder: &Path,
+    sh_degree: u8,
+    see: &mut dyn FnMut(&[GaussianCloud]) -> std::io::Result<()>,
+) -> Result<Report, FormatError> {
     let scratch_failed = |e| FormatError::io(folder, "sorting Gaussians in a scratch file", e);
     std::fs::create_dir_all(folder).map_err(|e| FormatError::io(folder, "creating", e))?;
     let degree = sh_degree.min(model.sh_degree);
@@ -145,6 +159,7 @@ pub fn write(model: &Chunks, folder: &Path, sh_degree: u8) -> Result<Report, For
     for leaf in 0..leaves.counts.len() {
         let levels = of(sorted.read(leaf).map_err(scratch_failed)?, &voxels_m);
         writer.leaf(&levels)?;
+        see(&levels).map_err(|e| FormatError::io(folder, "keeping levels", e))?;
         levels.last().into_iter().for_each(|level| coarsest.extend(level));
     }
     let counts = writer.finish()?;

@@ -155,6 +155,11 @@ layout(std140, set = 0, binding = 0) uniform Frame {
     uint source_width;
     // u32 offset of the view's depth prior; 0: none.
     uint depth_offset;
+    // Weight of the mean entropy of the opacities in view.
+    float entropy_weight;
+    uint unused_0;
+    uint unused_1;
+    uint unused_2;
     // By the number of steps missed.
     MissedSteps deferred[512];
 } frame;

@@ -129,7 +129,9 @@ void main() {
 
         bool all_finite = true;
         float opacity = sigmoid(p0.w);
-        vec4 g0 = finite(vec4(to_world(point) + by_place, s0.x * (1.0 - opacity)), all_finite);
+        // d/dx of the binary entropy of sigmoid(x) is -x sigmoid'(x); the mean is over those in view.
+        float entropy = -frame.entropy_weight / float(n) * p0.w * opacity * (1.0 - opacity);
+        vec4 g0 = finite(vec4(to_world(point) + by_place, s0.x * (1.0 - opacity) + entropy), all_finite);
         vec4 g1 = finite(vec4(log_scale, 0.0), all_finite);
         vec4 g2 = finite(rotation, all_finite);
         if (push.mode == 1u) {

@@ -156,6 +156,11 @@ layout! {
         source_width: u32,
         /// u32 offset of the view's depth prior; 0: none.
         depth_offset: u32,
+        /// Weight of the mean entropy of the opacities in view.
+        entropy_weight: f32,
+        unused_0: u32,
+        unused_1: u32,
+        unused_2: u32,
         /// By the number of steps missed.
         deferred: [MissedSteps; DEFERRED_STEPS],
     }

@@ -1,6 +1,6 @@
 //! CPU twins of the stages, in plain Rust, over f32 or f64: `project`, `sort`, `emit` (counting included), `shade`,
-//! `rasterise`, `loss`, `rasterise_backward` (with `reduce`: a twin sums at once), and of `optimise` the two halves
-//! `project_backward` and `adam`. The stage `target` has none, and neither has density control, which runs on the host.
+//! `rasterise`, `loss`, `rasterise_backward` (with `reduce`: a twin sums at once), and of `optimise` the parts
+//! `project_backward`, `entropy` and `adam`. The stage `target` has none, and neither has density control, which runs on the host.
 //!
 //! In f32 they say what the shaders should have computed; in f64 they are the judge of both: the gradient checks
 //! compare them with central differences, and the parity test with the published formulas. They are
@@ -9,6 +9,7 @@
 pub mod adam;
 pub mod camera;
 pub mod emit;
+pub mod entropy;
 pub mod gaussian;
 pub mod loss;
 pub mod project;

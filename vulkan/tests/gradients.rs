@@ -8,6 +8,7 @@ use config::training::LossSettings;
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use vulkan::twin::camera::{Camera, Rays};
+use vulkan::twin::entropy::entropy;
 use vulkan::twin::gaussian::{Gaussian, PARAMETERS};
 use vulkan::twin::loss::{Exposure, Target, loss};
 use vulkan::twin::project::Limits;
@@ -109,7 +110,10 @@ impl Scene {
     }
 
     fn total(&self) -> f64 {
-        loss(&self.rendered().picture, &self.target(), &self.exposure, &self.settings).total
+        let rendered = self.rendered();
+        let seen: Vec<f64> = self.cloud.iter().zip(&rendered.projected).filter(|(_, p)| p.is_some()).map(|(g, _)| entropy(g.opacity_logit)).collect();
+        let hesitation = seen.iter().sum::<f64>() / seen.len().max(1) as f64;
+        loss(&rendered.picture, &self.target(), &self.exposure, &self.settings).total + f64::from(self.settings.entropy) * hesitation
     }
 }
 
@@ -146,13 +150,14 @@ impl Check {
 
 /// Each term alone and all together. (L1 has a kink where x = y; with random photographs the rendering is practically never
 /// within a step of one.)
-fn terms() -> [(&'static str, LossSettings); 4] {
+fn terms() -> [(&'static str, LossSettings); 5] {
     let none = LossSettings { l1: 0.0, ssim: 0.0, depth: 0.0, freeze_shape: false, ..Default::default() };
     [
         ("l1", LossSettings { l1: 0.8, ..none }),
         ("ssim", LossSettings { ssim: 0.2, ..none }),
         ("depth", LossSettings { depth: 0.05, ..none }),
-        ("all", LossSettings { freeze_shape: false, ..Default::default() }),
+        ("entropy", LossSettings { entropy: 0.5, ..none }),
+        ("all", LossSettings { freeze_shape: false, entropy: 0.1, ..Default::default() }),
     ]
 }
 

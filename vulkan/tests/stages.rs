@@ -3,6 +3,7 @@
 
 mod scenes;
 
+use config::training::TrainSettings;
 use models::camera::{OrthographicView, Pose, PosedImage};
 use models::cloud::GaussianCloud;
 use models::picture::mask::Mask;
@@ -90,18 +91,24 @@ fn assert_same(what: &str, drawn: &Rendering, expected: &[Pixel<f32>]) {
 
 #[test]
 fn whole_steps_move_every_parameter_as_the_twin_does() {
-    steps_follow_the_twin(None);
+    steps_follow_the_twin(None, plain());
+}
+
+#[test]
+fn steps_that_weigh_the_entropy_of_opacities_move_every_parameter_as_the_twin_does() {
+    let mut settings = plain();
+    settings.loss.entropy = 2.0;
+    steps_follow_the_twin(None, settings);
 }
 
 #[test]
 fn whole_steps_on_a_masked_picture_move_every_parameter_as_the_twin_does() {
-    steps_follow_the_twin(Some(Mask::from_fn(37, 29, |x, y| !(x > 9 && x < 24 && y > 4))));
+    steps_follow_the_twin(Some(Mask::from_fn(37, 29, |x, y| !(x > 9 && x < 24 && y > 4))), plain());
 }
 
-fn steps_follow_the_twin(mask: Option<Mask>) {
+fn steps_follow_the_twin(mask: Option<Mask>, settings: TrainSettings) {
     let v = view(37, 29);
     let c = cloud(5, 40, 3);
-    let settings = plain();
     let photo = photo(5, &v);
     let Some(mut gpu) = trainer(&c, &v, &settings) else { return };
     gpu.add_view(&PosedImage { mask: mask.clone(), ..posed(&v, &photo) }, None).unwrap();

@@ -1,7 +1,7 @@
 //! Gaussians sorted by leaf, in a file without a name: a scene larger than memory is read once and written once, a leaf at a time.
 
 use std::fs::File;
-use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
+use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use crate::cloud::{GaussianCloud, sh_coefficients};
@@ -31,6 +31,14 @@ pub(super) fn row_bytes(sh_degree: u8) -> usize {
     4 * (11 + 3 * sh_coefficients(sh_degree))
 }
 
+/// The bytes of row `i`.
+fn row(cloud: &GaussianCloud, i: usize) -> impl Iterator<Item = u8> {
+    let stride = cloud.sh_stride();
+    let row = cloud.means[i].iter().chain(&cloud.log_scales[i]).chain(&cloud.rotations[i]);
+    let row = row.chain(&cloud.opacity_logits[i..=i]).chain(&cloud.sh[i * stride..(i + 1) * stride]);
+    row.flat_map(|v| v.to_le_bytes())
+}
+
 impl Scratch {
     /// Room for so many rows of each leaf, in `folder`.
     ///
@@ -54,14 +62,11 @@ impl Scratch {
     /// # Errors
     /// The operating system's.
     pub fn push(&mut self, leaf: usize, cloud: &GaussianCloud, i: usize) -> io::Result<()> {
-        let stride = cloud.sh_stride();
-        let row = cloud.means[i].iter().chain(&cloud.log_scales[i]).chain(&cloud.rotations[i]);
-        let row = row.chain(&cloud.opacity_logits[i..=i]).chain(&cloud.sh[i * stride..(i + 1) * stride]);
         let into = &mut self.leaves[leaf];
         if into.waiting.capacity() == 0 {
             into.waiting.reserve_exact(self.most_waiting);
         }
-        into.waiting.extend(row.flat_map(|v| v.to_le_bytes()));
+        into.waiting.extend(row(cloud, i));
         if into.waiting.len() + row_bytes(self.sh_degree) > self.most_waiting { self.flush(leaf) } else { Ok(()) }
     }
 
@@ -78,24 +83,47 @@ impl Scratch {
     ///
     /// # Errors
     /// The operating system's.
-    pub fn finish(mut self) -> io::Result<Sorted> {
+    pub fn finish(mut self) -> io::Result<Rows> {
         for leaf in 0..self.leaves.len() {
             self.flush(leaf)?;
             self.leaves[leaf].waiting = Vec::new();
         }
         let spans = self.leaves.iter().map(|l| (l.start, l.next)).collect();
-        Ok(Sorted { file: self.file, sh_degree: self.sh_degree, spans })
+        Ok(Rows { file: self.file, sh_degree: self.sh_degree, spans })
     }
 }
 
-/// All rows, to be read leaf by leaf.
-pub(super) struct Sorted {
+/// The rows of a scene in a file, leaf by leaf.
+#[derive(Debug)]
+pub struct Rows {
     file: File,
     sh_degree: u8,
     spans: Vec<(u64, u64)>,
 }
 
-impl Sorted {
+impl Rows {
+    /// None yet, in a file without a name in `folder`.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn create(folder: &Path, sh_degree: u8) -> io::Result<Self> {
+        Ok(Self { file: tempfile::tempfile_in(folder)?, sh_degree, spans: Vec::new() })
+    }
+
+    /// Appends the next leaf; of this SH degree.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn push(&mut self, leaf: &GaussianCloud) -> io::Result<()> {
+        let start = self.spans.last().map_or(0, |s| s.1);
+        let mut output = BufWriter::with_capacity(1 << 18, &self.file);
+        output.seek(SeekFrom::Start(start))?;
+        (0..leaf.len()).try_for_each(|i| output.write_all(&row(leaf, i).collect::<Vec<u8>>()))?;
+        output.flush()?;
+        self.spans.push((start, start + (leaf.len() * row_bytes(self.sh_degree)) as u64));
+        Ok(())
+    }
+
     /// The Gaussians of a leaf, in the order in which they came.
     ///
     /// # Errors
@@ -145,5 +173,9 @@ mod tests {
             expected.retain(|i| leaf_of(i) == leaf);
             assert_eq!(sorted.read(leaf).expect("read"), expected);
         }
+        let mut appended = Rows::create(folder.path(), 1).expect("a file");
+        let leaves = [0, 1, 2].map(|leaf| sorted.read(leaf).expect("read"));
+        leaves.iter().for_each(|leaf| appended.push(leaf).expect("written"));
+        assert_eq!([2, 0, 1].map(|leaf| appended.read(leaf).expect("read")), [2, 0, 1].map(|i: usize| leaves[i].clone()));
     }
 }

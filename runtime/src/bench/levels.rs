@@ -13,8 +13,10 @@ use models::{levels, metrics};
 use serde::Serialize;
 use vulkan::trainer::Rendering;
 
-use crate::engine::device::renderer;
 use crate::error::JobError;
+use scene::{Painter, Scene};
+
+mod scene;
 
 /// Pictures that levels are compared in, and their focal length, pixels.
 const SIZE: [u32; 2] = [640, 480];
@@ -25,8 +27,8 @@ const FINER: u32 = 4;
 pub const FARTHER: [f64; 3] = [1.0, 2.0, 4.0];
 /// How steeply they look down, degrees below the horizon.
 const DOWN_DEG: [f64; 3] = [90.0, 60.0, 40.0];
-/// Largest scene that is drawn whole to compare with.
-pub const MOST_COMPARED: usize = 2_000_000;
+/// A scene of more is compared from the first of them alone: drawing it takes long.
+const MOST_FROM_AFAR: usize = 2_000_000;
 /// Metres between neighbours of the made-up ground.
 const SPACING_M: f64 = 0.25;
 
@@ -39,7 +41,7 @@ pub struct Level {
     pub voxel_m: f64,
     /// Where such a voxel is a pixel wide, metres.
     pub distance_m: f64,
-    /// Mean PSNR against the whole scene seen from [`FARTHER`] times there, dB; empty where that was not drawn.
+    /// Mean PSNR against the whole scene seen from [`FARTHER`] times there, dB; of a large scene from there only.
     pub psnr: Vec<f64>,
 }
 
@@ -52,7 +54,7 @@ pub struct Levels {
     pub leaves: usize,
     /// Seconds until they were written.
     pub seconds: f64,
-    /// Name of the device that drew them; empty where none did.
+    /// Name of the device that drew them.
     pub device: String,
 }
 
@@ -84,58 +86,44 @@ pub fn write_scene(path: &Path, gaussians: usize) -> Result<(), FormatError> {
     write_chunks(path, &ModelHeader { mission: "levels".into(), ..Default::default() }, gaussians, 0, &rows)
 }
 
-/// Writes the levels of `model` into `folder` and compares each, as it is before it is packed, with the whole scene.
+/// Writes the levels of `model` into `folder` and compares each, as it is before it is packed, with the whole scene. Neither the scene
+/// nor a level is in memory as a whole.
 ///
 /// # Errors
 /// As `dgtr export --to streamed`; no device.
 pub fn measure(model: &Path, folder: &Path, device: Option<&str>) -> Result<Levels, JobError> {
     let start = Instant::now();
     let chunks = Chunks::open(model)?;
-    let written = levels::write(&chunks, folder, chunks.sh_degree)?;
-    let seconds = start.elapsed().as_secs_f64();
-    let sides = std::iter::once(0.0).chain(written.voxels_m.iter().copied());
-    let mut all = Levels {
-        levels: sides
-            .zip(&written.counts)
-            .map(|(voxel_m, n)| Level { gaussians: *n, voxel_m, distance_m: FOCAL * voxel_m, psnr: Vec::new() })
-            .collect(),
-        leaves: written.leaves,
-        seconds,
-        device: String::new(),
-    };
-    if chunks.count > MOST_COMPARED {
-        return Ok(all);
-    }
-    let mut whole = GaussianCloud::with_capacity(chunks.sh_degree, chunks.count);
-    chunks.each(&mut |cloud| {
-        whole.extend(cloud);
-        Ok::<(), FormatError>(())
+    let mut scenes: Vec<Scene> = Vec::new();
+    let written = levels::write_and_see(&chunks, folder, chunks.sh_degree, &mut |levels| {
+        for (level, leaf) in levels.iter().enumerate() {
+            if level == scenes.len() {
+                scenes.push(Scene::create(folder, chunks.sh_degree)?);
+            }
+            scenes[level].push(leaf)?;
+        }
+        Ok(())
     })?;
-    let distances = all.levels[1..].iter().map(|l| FARTHER.map(|f| f * l.distance_m)).collect::<Vec<_>>();
-    let views: Vec<Vec<View>> = distances.iter().map(|d| d.iter().flat_map(|d| views(&whole, *d)).collect()).collect();
-    let finer: Vec<View> = views.concat().iter().map(finer).collect();
-    let mut draw = |cloud: &GaussianCloud, views: &[View], keep: fn(&Rendering) -> Rendering| {
-        // Larger pictures are drawn in windows of this size.
-        let mut trainer = renderer(device, cloud, SIZE[0], SIZE[1])?;
-        all.device.clone_from(&trainer.gpu().info().name);
-        let mut picture = Rendering::default();
-        let drawn = views.iter().map(|view| {
-            trainer.render(view, &mut picture)?;
-            Ok(keep(&picture))
-        });
-        drawn.collect::<Result<Vec<_>, JobError>>()
-    };
-    let expected = draw(&whole, &finer, averaged)?;
-    let divided = levels::of(whole, &written.voxels_m);
-    let mut figures = Vec::new();
-    for (number, views) in views.iter().enumerate() {
-        let shown = draw(&divided[number + 1], views, Rendering::clone)?;
-        let psnr: Vec<f64> =
-            shown.iter().zip(&expected[number * views.len()..]).map(|(l, w)| psnr_of_scene(l, w)).collect();
-        figures.push(psnr.chunks(DOWN_DEG.len()).map(|p| p.iter().sum::<f64>() / p.len() as f64).collect());
+    let seconds = start.elapsed().as_secs_f64();
+    let mut painter = Painter::open(device, chunks.sh_degree, SIZE)?;
+    let farther = if chunks.count > MOST_FROM_AFAR { &FARTHER[..1] } else { &FARTHER[..] };
+    let middle = written.coarsest.middle().map(f64::from);
+    let mut all = Vec::with_capacity(scenes.len());
+    for (number, gaussians) in written.counts.iter().enumerate() {
+        let voxel_m = if number == 0 { 0.0 } else { written.voxels_m[number - 1] };
+        let mut level = Level { gaussians: *gaussians, voxel_m, distance_m: FOCAL * voxel_m, psnr: Vec::new() };
+        for distance in farther.iter().filter(|_| number > 0).map(|f| f * level.distance_m) {
+            let mut sum = 0.0;
+            for view in views(middle, distance) {
+                let expected = averaged(&painter.draw(&mut scenes[0], &finer(&view))?);
+                sum += psnr_of_scene(&painter.draw(&mut scenes[number], &view)?, &expected);
+            }
+            level.psnr.push(sum / DOWN_DEG.len() as f64);
+        }
+        tracing::info!("level {number}: {gaussians} Gaussians, {:.2?} dB", level.psnr);
+        all.push(level);
     }
-    all.levels[1..].iter_mut().zip(figures).for_each(|(level, psnr)| level.psnr = psnr);
-    Ok(all)
+    Ok(Levels { levels: all, leaves: written.leaves, seconds, device: painter.device() })
 }
 
 fn finer(view: &View) -> View {
@@ -172,9 +160,9 @@ fn psnr_of_scene(level: &Rendering, whole: &Rendering) -> f64 {
     metrics::psnr(&of(level), &of(whole))
 }
 
-/// Cameras around the middle of a scene, so far from it.
-fn views(cloud: &GaussianCloud, distance: f64) -> Vec<View> {
-    let middle = DVec3::from_array(cloud.middle().map(f64::from));
+/// Cameras around `middle`, so far from it.
+fn views(middle: [f64; 3], distance: f64) -> Vec<View> {
+    let middle = DVec3::from_array(middle);
     let [width, height] = SIZE;
     let half = [width, height].map(|n| n as f32 / 2.0);
     let intrinsics = Intrinsics { width, height, fx: FOCAL as f32, fy: FOCAL as f32, cx: half[0], cy: half[1] };

@@ -159,10 +159,33 @@ fn renderer_of(
         let what = "the model holds no Gaussians; train it first (dgtr train continues it)";
         return Err(JobError::Request(what.into()));
     }
+    let mut trainer = empty_renderer(device, (cloud.sh_degree, cloud.len()), (width, height), instances_per_pixel)?;
+    trainer.load(cloud)?;
+    Ok(trainer)
+}
+
+/// One for any clouds of at most `gaussians` of this SH degree, one after another.
+///
+/// # Errors
+/// No device, or not enough of its memory.
+pub fn renderer_of_parts(
+    device: Option<&str>,
+    sh_degree: u8,
+    gaussians: usize,
+    (width, height): (u32, u32),
+) -> Result<Trainer, JobError> {
+    empty_renderer(device, (sh_degree, gaussians), (width, height), INSTANCES_PER_PIXEL)
+}
+
+fn empty_renderer(
+    device: Option<&str>,
+    (sh_degree, gaussians): (u8, usize),
+    (width, height): (u32, u32),
+    instances_per_pixel: usize,
+) -> Result<Trainer, JobError> {
     let gpu = devices::open_known(device)?;
     let mut settings = TrainSettings::default();
-    settings.sh.degree = cloud.sh_degree;
-    let max_gaussians = Some(cloud.len());
+    settings.sh.degree = sh_degree;
     let request = DeviceRequest {
         device: None,
         device_mib: u32::MAX,
@@ -171,13 +194,11 @@ fn renderer_of(
         crops: 0,
         view_slots: None,
         folder: None,
-        max_gaussians,
+        max_gaussians: Some(gaussians),
         scene_gaussians: None,
     };
     let request = request.plan_request(&settings.sh, gpu.info().sort_lanes());
     let pixels = width as usize * height as usize;
-    let plan = Plan::with_capacities(&request, cloud.len(), cloud.len() + instances_per_pixel * pixels);
-    let mut trainer = Trainer::with_shape(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?;
-    trainer.load(cloud)?;
-    Ok(trainer)
+    let plan = Plan::with_capacities(&request, gaussians, gaussians + instances_per_pixel * pixels);
+    Ok(Trainer::with_shape(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?)
 }

@@ -2,7 +2,8 @@
 
 use std::collections::HashSet;
 
-use models::camera::{DepthPrior, View};
+use glam::DVec3;
+use models::camera::{DepthPrior, Pinhole, View};
 use models::cloud::GaussianCloud;
 use models::init::{InitReport, Initialiser, from_sfm, random};
 use models::light::Light;
@@ -117,27 +118,49 @@ fn at_random(
     Ok(random(views, range, RANDOM_POINTS.min(capacity), seed)?)
 }
 
-/// Depths between which the scene lies: of the sparse points when there are any, else around the cameras' height
-/// above the ground plane.
+/// Depths between which the scene lies: of the sparse points that each view shows when there are any (those beside a slanting view lie at
+/// any depth), else around the cameras' height above the ground plane.
 fn depth_range(views: &[View], points: &[Point]) -> Result<[f32; 2], JobError> {
     let mut depths: Vec<f32> = Vec::new();
     let step = points.len().div_ceil(512).max(1);
     for view in views {
-        let forward = view.pose.forward();
-        let depth = |p: &Point| (glam::DVec3::from_array(p.0) - view.pose.center).dot(forward) as f32;
-        depths.extend(points.iter().step_by(step).map(depth));
+        let (camera, forward) = (Pinhole::from(view), view.pose.forward());
+        let points = points.iter().step_by(step).map(|p| DVec3::from_array(p.0));
+        let shown = points.filter(|p| camera.project(*p).is_some_and(|pixel| view.intrinsics.contains(pixel)));
+        depths.extend(shown.map(|p| (p - view.pose.center).dot(forward) as f32));
     }
     depths.retain(|d| *d > 0.0 && d.is_finite());
     if depths.is_empty() {
         depths.extend(views.iter().flat_map(|v| [0.7, 1.3].map(|f| (f * v.pose.center.z) as f32)).filter(|d| *d > 0.0));
     }
     depths.sort_by(f32::total_cmp);
-    let at = |share: f64| depths.get(((depths.len().max(1) - 1) as f64 * share) as usize).copied();
+    let at = |share: f64| depths.get(((depths.len().max(1) - 1) as f64 * share).round() as usize).copied();
     match (at(0.02), at(0.98)) {
         (Some(near), Some(far)) if far > near => Ok([near, far]),
         _ => Err(JobError::Request(
             "a random start needs to know how far the scene is; give depth_m = [near, far] in [init] of --settings"
                 .into(),
         )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DQuat;
+    use models::camera::{Intrinsics, Pose};
+
+    use super::*;
+
+    #[test]
+    fn a_random_start_lies_where_the_views_show_points_not_where_others_lie() {
+        let intrinsics = Intrinsics { width: 64, height: 48, fx: 60.0, fy: 60.0, cx: 32.0, cy: 24.0 };
+        let pose = Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center: DVec3::new(0.0, 0.0, 50.0) };
+        let view = View { intrinsics, pose };
+        let shown = (0..100).map(|i| ([f64::from(i % 10) - 5.0, f64::from(i / 10) - 5.0, f64::from(i % 3)], [0; 3]));
+        let beside = (0..400).map(|i| ([900.0 + f64::from(i), 0.0, -400.0], [0; 3]));
+        let points: Vec<Point> = shown.chain(beside).collect();
+        assert_eq!(depth_range(&[view], &points).expect("a range"), [48.0, 50.0]);
+        let [near, far] = depth_range(&[view], &[]).expect("from the cameras' height");
+        assert!((near - 35.0).abs() < 1e-3 && (far - 65.0).abs() < 1e-3, "{near} {far}");
     }
 }

@@ -1,6 +1,6 @@
-//! What a running job may change between steps: fewer pixels, other rates.
+//! What a running job may change between steps: fewer pixels, other rates, another loss.
 
-use config::training::RateSettings;
+use config::training::{LossSettings, RateSettings};
 
 use super::{TrainError, Trainer};
 
@@ -18,6 +18,18 @@ impl Trainer {
     pub fn set_rates(&mut self, rates: &RateSettings) -> Result<(), TrainError> {
         let mut settings = self.settings.clone();
         settings.rates = *rates;
+        settings.check()?;
+        self.settings = settings;
+        Ok(())
+    }
+
+    /// Takes another loss from the next step on.
+    ///
+    /// # Errors
+    /// [`TrainError::Settings`] when a weight is negative or not a number; the old one then stays.
+    pub fn set_loss(&mut self, loss: &LossSettings) -> Result<(), TrainError> {
+        let mut settings = self.settings.clone();
+        settings.loss = *loss;
         settings.check()?;
         self.settings = settings;
         Ok(())

@@ -100,6 +100,7 @@ impl Trainer {
         f.exposure_gain = std::array::from_fn(|i| e[i].exp() as f32);
         f.exposure_offset = std::array::from_fn(|i| e[i + 3] as f32);
         (f.min_confidence, f.depth_weight) = (s.loss.depth_confidence, share * s.loss.depth);
+        f.entropy_weight = share * s.loss.entropy;
         f.background = [0.0; 3];
         if s.regularise.background > 0.0 {
             let rng = self.sampler.rng();

@@ -4,6 +4,7 @@ use config::training::LossSettings;
 
 use super::camera::Camera;
 use super::emit::{Instances, emit};
+use super::entropy::entropy_gradient;
 use super::gaussian::Gaussian;
 use super::loss::{Exposure, Loss, Target, loss};
 use super::project::{Culled, Limits, Projected, project};
@@ -94,6 +95,11 @@ pub fn backward<R: Real>(
                 out.pose[k] += pose[k];
             }
         }
+    }
+    let seen = out.seen.iter().filter(|seen| **seen).count();
+    let weight = R::of(f64::from(settings.entropy) / seen.max(1) as f64);
+    for (i, g) in cloud.iter().enumerate().filter(|(i, _)| out.seen[*i]) {
+        out.gaussians[i].opacity_logit += weight * entropy_gradient(g.opacity_logit);
     }
     out
 }

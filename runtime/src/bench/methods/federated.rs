@@ -1,11 +1,11 @@
 //! Merging as Fed3DGS does it (Suzuki 2024): the global model is all Gaussians of all clients; where clients overlap none is trusted at
-//! first, and distillation changes opacities alone, so that what is seen twice fades on one side. Then what is transparent goes.
+//! first, and distillation changes opacities alone, so that what is seen twice fades on one side, and after its first pass makes them decide (entropy). Then what is transparent goes.
 
 use std::collections::HashMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use config::training::{RateSettings, Strategy, TrainSettings};
+use config::training::{LossSettings, RateSettings, Strategy, TrainSettings};
 use models::camera::{Intrinsics, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
@@ -19,6 +19,8 @@ use crate::error::JobError;
 const RATE: f32 = 0.05;
 /// Passes over all clients' views.
 const EPOCHS: u32 = 5;
+/// Weight of the opacities' mean entropy, after the first pass (the authors' `build_global_model.py`).
+const ENTROPY: f32 = 0.01;
 /// Size of the pictures that are learnt from.
 const SCALE: f32 = 0.25;
 /// Opacity at most where clients overlap, before distillation.
@@ -100,7 +102,8 @@ pub fn merge(
         max_gaussians: Some(all.len()),
         scene_gaussians: None,
     };
-    let mut trainer: Trainer = request.open::<JobError>(&recipe(ground.seed, degree))?;
+    let recipe = recipe(ground.seed, degree);
+    let mut trainer: Trainer = request.open::<JobError>(&recipe)?;
     let mut lessons = Vec::with_capacity(views.len());
     let mut drawn = Rendering::default();
     for (i, (_, cloud)) in clients.iter().enumerate() {
@@ -119,11 +122,14 @@ pub fn merge(
     for lesson in &lessons {
         trainer.add_view(lesson, None)?;
     }
-    let budget = RunBudget { steps: Some(EPOCHS * lessons.len() as u32), seconds: None };
     let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
-    let run = trainer.run(&budget, &mut each)?;
-    if run.reason == StopReason::Caller {
-        return Ok(None);
+    let pass = lessons.len() as u32;
+    for (until, entropy) in [(pass, 0.0), (EPOCHS * pass, ENTROPY)] {
+        trainer.set_loss(&LossSettings { entropy, ..recipe.loss })?;
+        let run = trainer.run(&RunBudget { steps: Some(until), seconds: None }, &mut each)?;
+        if run.reason == StopReason::Caller {
+            return Ok(None);
+        }
     }
     trainer.snapshot(&mut all)?;
     let opacities: Vec<f32> = all.opacity_logits.iter().map(|l| 1.0 / (1.0 + (-l).exp())).collect();
@@ -132,7 +138,7 @@ pub fn merge(
         aircraft: "global".into(),
         origin: clients.first().and_then(|c| c.0.origin),
         views: clients.iter().flat_map(|c| c.0.views.clone()).collect(),
-        steps: run.steps.into(),
+        steps: trainer.steps().into(),
         seed: ground.seed,
         finished: true,
         ..ModelHeader::default()

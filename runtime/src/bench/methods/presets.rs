@@ -110,8 +110,8 @@ pub const METHODS: &[Method] = &[
         settings: NO_DEPTH,
         merge: Merge::Opacities,
         ablation: false,
-        what: "Fed3DGS (Suzuki 2024): all of every client's model, opacities alone distilled (rate 0.05, 5 epochs, a quarter of the size)",
-        departs: "all clients at once, not one after another; no entropy of opacities in the loss, no appearance vectors; growth as central-3dgs",
+        what: "Fed3DGS (Suzuki 2024): all of every client's model, opacities alone distilled with their entropy (rate 0.05, 5 epochs, a quarter of the size)",
+        departs: "all clients at once, not one after another; no appearance vectors; growth as central-3dgs",
     },
     Method {
         name: "dngaussian",

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::bench::figures::{markdown, write_json};
-use crate::bench::ground::{Field, measure};
+use crate::bench::ground::{field::Field, measure};
 use crate::cli::CliError;
 use crate::cli::output::outln;
 use crate::report::{Table, count};
