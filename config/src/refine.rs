@@ -51,6 +51,10 @@ table! {
         pub delay_sigma_s: f64 = 1.0, in Limits::within(0.0, 60.0);
         /// Prior of the shared relative error of the focal length; 0 = calibrated.
         pub focal_sigma: f64 = 0.0, in Limits::within(0.0, 0.5);
+        /// Prior of the shared relative error of fy / fx, which a rolling shutter causes; 0 = calibrated.
+        pub aspect_sigma: f64 = 0.0, in Limits::within(0.0, 0.1);
+        /// Prior of the shared error of the principal point, in focal lengths; 0 = calibrated.
+        pub principal_sigma: f64 = 0.0, in Limits::within(0.0, 0.5);
         /// Prior of the radial distortion (k1 and k2) that the given lens lacks; 0 = calibrated.
         pub radial_sigma: f64 = 0.0, in Limits::within(0.0, 0.5);
         /// A shared parameter is estimated when the pictures cut its standard deviation below this fraction of its prior, and

@@ -10,6 +10,7 @@
 
 mod adjust;
 mod bootstrap;
+mod calibration;
 mod control;
 mod gauge;
 mod grey;
@@ -42,7 +43,7 @@ pub use bootstrap::BootstrapReport;
 pub use control::ControlPoint;
 pub use report::{AddReport, ControlResidual, NearReport, RefineReport, RefinedPoint, SharedEstimate};
 
-use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma, PosedImage, View};
+use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use crate::frame_file::FrameFile;
 use crate::onnx::OnnxError;
 use crate::onnx::features::{FeatureNetwork, Features};
@@ -200,7 +201,7 @@ impl Refiner {
         if (image.image.width(), image.image.height()) != (lens.width, lens.height) {
             return Err(invalid(&image.name, "picture and intrinsics differ in size"));
         }
-        let camera = Pinhole::new(self.expect(&image.view.pose), &lens, self.shared.log_focal.exp());
+        let camera = self.shared.lens.camera(self.expect(&image.view.pose), &lens);
         let candidates = self.candidates(&camera, &lens, self.frames.len());
         let turns = candidates.first().map_or(0, |a| {
             let frame = &self.frames[*a as usize];
@@ -250,7 +251,7 @@ impl Refiner {
         if features.descriptors.len() != features.keypoints.len() * DESCRIPTOR {
             return Err(invalid(name, "features do not hold 64 values per key point"));
         }
-        let camera = Pinhole::new(self.expect(&view.pose), &view.intrinsics, self.shared.log_focal.exp());
+        let camera = self.shared.lens.camera(self.expect(&view.pose), &view.intrinsics);
         let candidates = self.candidates(&camera, &view.intrinsics, self.frames.len());
         let mut report = AddReport::default();
         self.insert(name, time_ns, view, sigma);
@@ -277,17 +278,16 @@ impl Refiner {
         self.by_name.get(name).is_some_and(|i| self.frames[*i as usize].tied)
     }
 
-    /// The key frame's lens with the estimated focal length.
+    /// The key frame's lens with what was estimated of focal lengths and principal point.
     pub fn intrinsics(&self, name: &str) -> Option<Intrinsics> {
         let k = self.frames[*self.by_name.get(name)? as usize].intrinsics;
-        let scale = self.shared.log_focal.exp() as f32;
-        Some(Intrinsics { fx: k.fx * scale, fy: k.fy * scale, ..k })
+        Some(self.shared.lens.intrinsics(&k))
     }
 
     /// What the pictures say that the given lens lacks, in its normalised coordinates: none where it is calibrated, or where they
     /// cannot tell.
     pub fn distortion(&self) -> Distortion {
-        self.shared.radial.distortion()
+        self.shared.lens.radial.distortion()
     }
 
     /// Depths between which 98 % of the key frame's points lie, widened by 15 %, metres along the optical axis;

@@ -4,7 +4,7 @@
 
 use config::refine::RefineSettings;
 use glam::{DQuat, DVec3};
-use models::camera::{Pose, PoseSigma, View};
+use models::camera::{Intrinsics, Pose, PoseSigma, View};
 use models::onnx::features::Features;
 use models::refine::{RefineError, Refiner};
 use pose_errors::angle_deg;
@@ -52,6 +52,25 @@ fn mount_and_delay_are_estimated_when_lines_go_both_ways() {
     }
     let (_, after) = survey.errors(&refiner);
     assert!(after.aligned_angle < 0.1 && after.position < 0.6);
+}
+
+#[test]
+fn a_focal_length_is_estimated_beside_an_aspect_that_a_rolling_shutter_causes_and_never_without_it() {
+    let stretched = |aspect_sigma| {
+        let mut survey = Survey::new(2).crossed();
+        survey.lens = Intrinsics { fx: 416.4, fy: 415.4, cx: 320.4, ..LENS };
+        let settings = RefineSettings { focal_sigma: 0.1, aspect_sigma, principal_sigma: 0.02, ..Default::default() };
+        let (refiner, report) = survey.fly(&settings);
+        let (_, after) = survey.errors(&refiner);
+        println!("{:?}", report.shared);
+        (refiner.intrinsics(&name(0)).unwrap(), report.shared, after)
+    };
+    let (lens, shared, after) = stretched(0.005);
+    assert!(shared.focal_estimated && shared.aspect_estimated);
+    assert!((lens.fx / 416.4 - 1.0).abs() < 0.005 && (lens.fy / 415.4 - 1.0).abs() < 0.005, "{lens:?}");
+    let (lens, shared, without) = stretched(0.0);
+    assert!(!shared.aspect_estimated && shared.aspect == 1.0 && lens.fx == lens.fy, "{lens:?}");
+    assert!(after.aligned_position < without.aligned_position, "{after:?} {without:?}");
 }
 
 #[test]

@@ -111,9 +111,16 @@ impl Scene {
 
     fn total(&self) -> f64 {
         let rendered = self.rendered();
-        let seen: Vec<f64> = self.cloud.iter().zip(&rendered.projected).filter(|(_, p)| p.is_some()).map(|(g, _)| entropy(g.opacity_logit)).collect();
+        let seen: Vec<f64> = self
+            .cloud
+            .iter()
+            .zip(&rendered.projected)
+            .filter(|(_, p)| p.is_some())
+            .map(|(g, _)| entropy(g.opacity_logit))
+            .collect();
         let hesitation = seen.iter().sum::<f64>() / seen.len().max(1) as f64;
-        loss(&rendered.picture, &self.target(), &self.exposure, &self.settings).total + f64::from(self.settings.entropy) * hesitation
+        loss(&rendered.picture, &self.target(), &self.exposure, &self.settings).total
+            + f64::from(self.settings.entropy) * hesitation
     }
 }
 

@@ -176,6 +176,9 @@ mod tests {
         let mut appended = Rows::create(folder.path(), 1).expect("a file");
         let leaves = [0, 1, 2].map(|leaf| sorted.read(leaf).expect("read"));
         leaves.iter().for_each(|leaf| appended.push(leaf).expect("written"));
-        assert_eq!([2, 0, 1].map(|leaf| appended.read(leaf).expect("read")), [2, 0, 1].map(|i: usize| leaves[i].clone()));
+        assert_eq!(
+            [2, 0, 1].map(|leaf| appended.read(leaf).expect("read")),
+            [2, 0, 1].map(|i: usize| leaves[i].clone())
+        );
     }
 }

@@ -1,10 +1,10 @@
 //! Levenberg–Marquardt on the reduced equations, and the question which shared parameters the pictures can tell.
 
-use super::problem::{Loss, Problem, RADIAL, SHARED};
+use super::problem::{ASPECT, FOCAL, Loss, Problem, SHARED};
 use super::reduced::Step;
 use super::schur::{FrameVec, Reduced, SharedVec, point_steps};
 use super::so3;
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use std::time::Instant;
 
 /// When to stop.
@@ -72,9 +72,12 @@ fn apply(problem: &mut Problem, step: &Step, points: &[DVec3]) {
     let s = &step.shared;
     problem.shared.mount = (problem.shared.mount * so3::exp(DVec3::new(s[0], s[1], s[2]))).normalize();
     problem.shared.delay += s[3];
-    problem.shared.log_focal += s[4];
-    problem.shared.radial.k1 += s[5];
-    problem.shared.radial.k2 += s[6];
+    let lens = &mut problem.shared.lens;
+    lens.log_focal += s[FOCAL];
+    lens.log_aspect += s[ASPECT];
+    lens.shift += DVec2::new(s[FOCAL + 2], s[FOCAL + 3]);
+    lens.radial.k1 += s[FOCAL + 4];
+    lens.radial.k2 += s[FOCAL + 5];
 }
 
 /// Standard deviation of every shared parameter if it were free, given all the rest unknown too; infinite where
@@ -82,7 +85,7 @@ fn apply(problem: &mut Problem, step: &Step, points: &[DVec3]) {
 pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
     let free = problem.free;
     problem.free =
-        std::array::from_fn(|k| problem.shared_weight[k].is_finite() && (k < RADIAL || problem.shared_weight[k] > 0.0));
+        std::array::from_fn(|k| problem.shared_weight[k].is_finite() && (k <= FOCAL || problem.shared_weight[k] > 0.0));
     let mut equations = Reduced::new(problem);
     equations.fill(problem, loss, 0.0);
     problem.free = free;
@@ -97,9 +100,10 @@ pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
 mod tests {
     use super::*;
     use crate::camera::{Intrinsics, Pose};
+    use crate::refine::calibration::Calibration;
     use crate::refine::problem::{Observation, PosePrior, Shared};
     use crate::refine::radial::Radial;
-    use glam::{DQuat, DVec2};
+    use glam::DQuat;
 
     const LENS: Intrinsics = Intrinsics { width: 640, height: 480, fx: 400.0, fy: 395.0, cx: 318.0, cy: 243.0 };
     const LOSS: Loss = Loss::Cauchy(2.0);
@@ -135,17 +139,21 @@ mod tests {
             shared: Shared {
                 mount: so3::exp(DVec3::new(0.01, -0.02, 0.015)),
                 delay: 0.1,
-                log_focal: 0.03,
-                radial: Radial { k1: -0.04, k2: 0.02 },
+                lens: Calibration {
+                    log_focal: 0.03,
+                    log_aspect: -0.01,
+                    shift: DVec2::new(0.01, 0.02),
+                    radial: Radial { k1: -0.04, k2: 0.02 },
+                },
             },
-            shared_weight: [20.0, 20.0, 20.0, 1.0, 10.0, 20.0, 20.0],
+            shared_weight: [20.0, 20.0, 20.0, 1.0, 10.0, 200.0, 50.0, 50.0, 20.0, 20.0],
             free: [true; SHARED],
             pixel_sigma: 0.4,
         };
         for point in 0..12 {
             for camera in 0..3 {
                 let at = problem.camera(camera);
-                let seen = problem.shared.radial.pixel(&at, at.local(problem.points[point]));
+                let seen = problem.shared.lens.radial.pixel(&at, at.local(problem.points[point]));
                 let seen = seen + DVec2::new(wobble(point, camera), wobble(camera, point)) * 2.0;
                 problem.observations.push(Observation { camera: camera as u32, pixel: seen.as_vec2().to_array() });
             }

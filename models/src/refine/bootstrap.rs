@@ -307,7 +307,7 @@ impl Refiner {
         }
         partners.sort_by_key(|p| std::cmp::Reverse(p.0));
         let agree = |pose: &Pose| {
-            let camera = Pinhole::new(*pose, &self.frames[b].intrinsics, self.shared.log_focal.exp());
+            let camera = self.shared.lens.camera(*pose, &self.frames[b].intrinsics);
             let near = |(world, pixel): &&(DVec3, [f32; 2])| {
                 let pixel = glam::DVec2::new(pixel[0].into(), pixel[1].into());
                 camera.project(*world).is_some_and(|q| q.distance(pixel) < limit)

@@ -60,7 +60,7 @@ impl Refiner {
                 .iter()
                 .map(|o| {
                     let camera = cameras[o.camera as usize];
-                    (camera, self.shared.radial.undistorted(&camera, o.pixel))
+                    (camera, self.shared.lens.radial.undistorted(&camera, o.pixel))
                 })
                 .collect();
             let found = triangulate(&views, MIN_ANGLE)?;

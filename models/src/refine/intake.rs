@@ -112,9 +112,9 @@ impl Refiner {
         report: &mut AddReport,
     ) {
         let newest = self.frames.len().saturating_sub(1) as u32;
-        let (focal, radial) = (self.shared.log_focal.exp(), self.shared.radial);
+        let lens = self.shared.lens;
         let Some(frame) = self.frames.last_mut() else { return };
-        frame.describe(features, turns, self.settings.max_features, (focal, &radial), self.file.as_ref());
+        frame.describe(features, turns, self.settings.max_features, &lens, self.file.as_ref());
         let (first, count) = (frame.first_node, frame.seen.len());
         report.features = count;
         frame.colors = frame

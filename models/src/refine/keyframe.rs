@@ -1,8 +1,8 @@
 //! One key frame as the refiner keeps it: key points and quantised descriptors, never the picture itself.
 
+use super::calibration::Calibration;
 use super::grey::Grey;
-use super::radial::Radial;
-use crate::camera::{Intrinsics, Pinhole, Pose, PoseSigma};
+use crate::camera::{Intrinsics, Pose, PoseSigma};
 use crate::frame_file::{AsBytes, FrameFile, Kept};
 pub(crate) use crate::onnx::features::DESCRIPTOR;
 use crate::onnx::features::Features;
@@ -126,7 +126,7 @@ impl KeyFrame {
         features: Features,
         turns: u8,
         max: usize,
-        lens: (f64, &Radial),
+        lens: &Calibration,
         file: Option<&Arc<FrameFile>>,
     ) {
         let features = spread(features, max);
@@ -134,14 +134,14 @@ impl KeyFrame {
         self.descriptors = Kept::at_best(quantise(&features.descriptors), file);
         self.settled = vec![false; features.keypoints.len()];
         self.seen = features.keypoints;
-        self.straighten(lens.0, lens.1);
+        self.straighten(lens);
     }
 
     /// Key points as the pinhole sees them, of those in the picture and what is known of the lens.
-    pub fn straighten(&mut self, focal_scale: f64, radial: &Radial) {
-        let camera = Pinhole::new(self.pose, &self.intrinsics, focal_scale);
+    pub fn straighten(&mut self, lens: &Calibration) {
+        let camera = lens.camera(self.pose, &self.intrinsics);
         self.keypoints.clear();
-        self.keypoints.extend(self.seen.iter().map(|p| radial.undistorted(&camera, *p)));
+        self.keypoints.extend(self.seen.iter().map(|p| lens.radial.undistorted(&camera, *p)));
     }
 }
 

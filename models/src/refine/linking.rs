@@ -44,7 +44,7 @@ const PAIR_GROUNDS: usize = 15;
 
 impl Refiner {
     pub(super) fn camera_of(&self, frame: &KeyFrame) -> Pinhole {
-        Pinhole::new(frame.pose, &frame.intrinsics, self.shared.log_focal.exp())
+        self.shared.lens.camera(frame.pose, &frame.intrinsics)
     }
 
     /// Ground under `frame`, as far as known.
@@ -106,7 +106,7 @@ impl Refiner {
         let length = if coarse.rotation_only { 0.0 } else { baseline };
         let rotation = (fa.pose.rotation * coarse.pose.rotation.conjugate()).normalize();
         let center = fa.pose.center - rotation * coarse.pose.translation * length;
-        let cb = Pinhole::new(Pose { rotation, center }, &fb.intrinsics, self.shared.log_focal.exp());
+        let cb = self.shared.lens.camera(Pose { rotation, center }, &fb.intrinsics);
         let predicted: Vec<_> = fb.keypoints.iter().map(|p| predict(&cb, &ca, ground, *p)).collect();
         let unguided = vec![Some(ca.c); fb.keypoints.len()];
         let known = ground.0.is_some() && !any_heading;
@@ -200,7 +200,7 @@ impl Refiner {
             })
             .collect();
         let inliers = std::mem::take(&mut found.inliers);
-        let (lens, radial) = (self.camera_of(fb), self.shared.radial);
+        let (lens, radial) = (self.camera_of(fb), self.shared.lens.radial);
         let frame = &mut self.frames[b];
         for (i, place) in inliers.into_iter().zip(places) {
             let Some(place) = place else { continue };
@@ -266,7 +266,7 @@ impl Refiner {
         let ca = self.camera_of(fa);
         let rotation: DQuat = (fa.pose.rotation * found.pose.rotation.conjugate()).normalize();
         let center = fa.pose.center - rotation * found.pose.translation * baseline;
-        let cb = Pinhole::new(Pose { rotation, center }, &fb.intrinsics, self.shared.log_focal.exp());
+        let cb = self.shared.lens.camera(Pose { rotation, center }, &fb.intrinsics);
         let mut heights: Vec<f64> = found
             .inliers
             .iter()

@@ -1,19 +1,21 @@
 //! The bundle adjustment's unknowns and residuals: key-frame poses, points, and the few parameters all frames
 //! share; reprojection errors against telemetry priors, each with a robust loss.
 
-use super::radial::Radial;
+use super::calibration::Calibration;
 use super::so3;
 use crate::camera::{Intrinsics, Pinhole, Pose};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 /// Shared parameters: mount misalignment (3), delay of positions, and the lens.
 pub(crate) const SHARED: usize = FOCAL + LENS;
+/// Index of the delay among them.
+const DELAY: usize = 3;
 /// Index of the first parameter of the lens among them.
 pub(crate) const FOCAL: usize = 4;
-/// Index of the first radial term among them.
-pub(crate) const RADIAL: usize = 5;
-/// Parameters of the lens: log focal scale and the two radial terms.
-pub(crate) const LENS: usize = 3;
+/// Index of the log aspect.
+pub(crate) const ASPECT: usize = FOCAL + 1;
+/// Parameters of the lens: log focal scale, log aspect, the principal point's shift (2), and two radial terms.
+pub(crate) const LENS: usize = 6;
 
 /// What all key frames have in common and telemetry does not know.
 #[derive(Clone, Copy, Debug)]
@@ -22,15 +24,13 @@ pub(crate) struct Shared {
     pub mount: DQuat,
     /// True position = reported position + delay · velocity; seconds (or metres, with unit velocities).
     pub delay: f64,
-    /// Natural logarithm of true over given focal length.
-    pub log_focal: f64,
     /// What the given lens lacks.
-    pub radial: Radial,
+    pub lens: Calibration,
 }
 
 impl Default for Shared {
     fn default() -> Self {
-        Self { mount: DQuat::IDENTITY, delay: 0.0, log_focal: 0.0, radial: Radial::default() }
+        Self { mount: DQuat::IDENTITY, delay: 0.0, lens: Calibration::default() }
     }
 }
 
@@ -116,7 +116,7 @@ pub(crate) struct PriorRows {
 
 impl Problem {
     pub fn camera(&self, i: usize) -> Pinhole {
-        Pinhole::new(self.poses[i], &self.intrinsics[i], self.shared.log_focal.exp())
+        self.shared.lens.camera(self.poses[i], &self.intrinsics[i])
     }
 
     pub fn sightings(&self, point: usize) -> &[Observation] {
@@ -134,7 +134,7 @@ impl Problem {
     /// Residual in pixels, when the point is in front.
     pub fn residual(&self, camera: &Pinhole, point: DVec3, o: &Observation) -> Option<DVec2> {
         let p = camera.local(point);
-        let pixel = (p.z > 1e-6).then(|| self.shared.radial.pixel(camera, p))?;
+        let pixel = (p.z > 1e-6).then(|| self.shared.lens.radial.pixel(camera, p))?;
         Some(pixel - DVec2::new(o.pixel[0].into(), o.pixel[1].into()))
     }
 
@@ -159,8 +159,9 @@ impl Problem {
     /// Whitened residuals of the shared parameters against their own priors.
     pub fn shared_residuals(&self) -> [f64; SHARED] {
         let m = so3::log(self.shared.mount);
-        let radial = self.shared.radial;
-        let v = [m.x, m.y, m.z, self.shared.delay, self.shared.log_focal, radial.k1, radial.k2];
+        let Calibration { log_focal, log_aspect, shift, radial } = self.shared.lens;
+        let delay = self.shared.delay;
+        let v = [m.x, m.y, m.z, delay, log_focal, log_aspect, shift.x, shift.y, radial.k1, radial.k2];
         std::array::from_fn(|k| v[k] * self.shared_weight[k])
     }
 
@@ -181,12 +182,16 @@ impl Problem {
         let (cost_v, weight_v) = PRIOR_LOSS.at(rp.z * rp.z);
         let rotation = |k: usize| {
             let (row, mount) = (row(&jr, k) * wr[k], row(&jl, k) * -wr[k]);
-            (re[k], [row.x, row.y, row.z, 0.0, 0.0, 0.0], [mount.x, mount.y, mount.z, 0.0, 0.0, 0.0, 0.0], weight_r)
+            let mut by_shared = [0.0; SHARED];
+            by_shared[..3].copy_from_slice(&mount.to_array());
+            (re[k], [row.x, row.y, row.z, 0.0, 0.0, 0.0], by_shared, weight_r)
         };
         let position = |k: usize, weight: f64| {
             let mut by_pose = [0.0; 6];
             by_pose[3 + k] = wp[k];
-            (rp[k], by_pose, [0.0, 0.0, 0.0, -prior.velocity[k] * wp[k], 0.0, 0.0, 0.0], weight)
+            let mut by_shared = [0.0; SHARED];
+            by_shared[DELAY] = -prior.velocity[k] * wp[k];
+            (rp[k], by_pose, by_shared, weight)
         };
         PriorRows {
             rows: [

@@ -97,10 +97,10 @@ impl Refiner {
         let Some(grey) = self.frames[i].grey().map(Cow::into_owned) else { return Ok(()) };
         let features = self.extract(&grey.picture(), size, turns, Some(&grey), report)?;
         let file = self.file.clone();
-        let (focal, radial, max) = (self.shared.log_focal.exp(), self.shared.radial, self.settings.max_features);
+        let (lens, max) = (self.shared.lens, self.settings.max_features);
         let frame = &mut self.frames[i];
         let (before, colors) = (std::mem::take(&mut frame.seen), std::mem::take(&mut frame.colors));
-        frame.describe(features, turns, max, (focal, &radial), file.as_ref());
+        frame.describe(features, turns, max, &lens, file.as_ref());
         // Colours are no longer there; that of the nearest key point is.
         let nearest = |p: &[f32; 2]| {
             let apart = |q: &[f32; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);

@@ -147,6 +147,18 @@ pub struct SharedEstimate {
     pub focal_sigma: f64,
     /// Whether it was estimated.
     pub focal_estimated: bool,
+    /// True over given fy / fx.
+    pub aspect: f64,
+    /// Standard deviation (relative) the pictures would leave.
+    pub aspect_sigma: f64,
+    /// Whether it was estimated.
+    pub aspect_estimated: bool,
+    /// True less given principal point along x and y, in focal lengths.
+    pub principal: [f64; 2],
+    /// Standard deviation the pictures would leave.
+    pub principal_sigma: [f64; 2],
+    /// Which were estimated.
+    pub principal_estimated: [bool; 2],
     /// First and second radial term that the given lens lacks (OpenCV's k1, k2).
     pub radial: [f64; 2],
     /// Standard deviation the pictures would leave.

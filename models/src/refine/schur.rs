@@ -234,14 +234,14 @@ impl PointEquation {
         let per_px = 1.0 / problem.pixel_sigma;
         let mut v = Matrix3::zeros();
         let (mut gradient, mut by_lens) = (Vector3::zeros(), SMatrix::<f64, 3, LENS>::zeros());
-        let radial = problem.shared.radial;
+        let lens = problem.shared.lens;
         for o in problem.sightings(point) {
             let camera = &cameras[o.camera as usize];
             let p = camera.local(world);
             let Some(r) = problem.residual(camera, world, o) else { continue };
             let r = r * per_px;
             let weight = loss.at(r.length_squared()).1;
-            let (du, dv) = radial.by_local(camera, p);
+            let (du, dv) = lens.radial.by_local(camera, p);
             let (du, dv) = (du * per_px, dv * per_px);
             // p turns by p × δ when the camera turns by δ about its own axes, and moves against its centre.
             let turn = skew(p).transpose();
@@ -251,7 +251,7 @@ impl PointEquation {
                 tu.x, tu.y, tu.z, -xu.x, -xu.y, -xu.z, tv.x, tv.y, tv.z, -xv.x, -xv.y, -xv.z,
             ]);
             let jx = SMatrix::<f64, 2, 3>::from_row_slice(&[xu.x, xu.y, xu.z, xv.x, xv.y, xv.z]);
-            let by = radial.by_lens(camera, p).map(|d| d * per_px);
+            let by = lens.by_lens(camera, p).map(|d| d * per_px);
             let jl = SMatrix::<f64, 2, LENS>::from_fn(|row, k| by[k][row]);
             let r = SVector::<f64, 2>::new(r.x, r.y);
             v += jx.transpose() * jx * weight;

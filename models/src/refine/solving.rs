@@ -5,7 +5,7 @@ use super::adjust::{Limits, adjust, shared_sigma};
 use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::part::Part;
-use super::problem::{FOCAL, Loss, Observation, PosePrior, Problem, SHARED};
+use super::problem::{ASPECT, FOCAL, Loss, Observation, PosePrior, Problem, SHARED};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
 use super::triangulate::{Triangulated, triangulate};
@@ -24,6 +24,8 @@ pub(super) const TIED: usize = 12;
 /// leaves in the wind, relief under a patch) shifts whole regions of a picture together: on brighton_beach (480 sightings per
 /// picture) a free focal length went 13 % off with a formal sigma of 1.3 %.
 const INDEPENDENT: f64 = 8.0;
+/// Frames that shared parameters want at least, however few of them are asked for.
+const LEAST_TIED: usize = 7;
 
 impl Refiner {
     pub(super) fn solve_all(&mut self) -> Result<RefineReport, RefineError> {
@@ -58,9 +60,7 @@ impl Refiner {
         self.take(&problem);
         let mut problem = self.problem(&tracks, &chosen, self.settings.outlier_px);
         problem.free = [false; SHARED];
-        let mut sigma = shared_sigma(&mut problem, limits.loss);
-        let per_frame = problem.observations.len() as f64 / self.frames.len().max(1) as f64;
-        sigma[FOCAL..].iter_mut().for_each(|s| *s *= (per_frame / INDEPENDENT).sqrt().max(1.0));
+        let sigma = self.shared_sigma(&mut problem, limits.loss);
         problem.free = self.observable(&sigma);
         let last = adjust(&mut problem, Limits { max_steps: 25, ..limits });
         report.steps += last.steps;
@@ -116,7 +116,6 @@ impl Refiner {
             let rotation_weight = if f.rotation_refused { DVec3::ZERO } else { per(f.sigma.rotation_rad) };
             PosePrior { pose: f.prior, velocity: f.velocity, position_weight: per(f.sigma.position_m), rotation_weight }
         });
-        let mount = weight(s.mount_sigma_deg.to_radians());
         let mut problem = Problem {
             moving: part.moving,
             intrinsics: frames().map(|f| f.intrinsics).collect(),
@@ -127,10 +126,7 @@ impl Refiner {
             observations: Vec::new(),
             anchors: Vec::new(),
             shared: self.shared,
-            shared_weight: {
-                let radial = weight(s.radial_sigma);
-                [mount, mount, mount, weight(s.delay_sigma_s), weight(s.focal_sigma), radial, radial]
-            },
+            shared_weight: self.shared_sigmas().map(weight),
             free: [false; SHARED],
             pixel_sigma: s.pixel_sigma,
         };
@@ -197,7 +193,7 @@ impl Refiner {
         }
         self.shared = problem.shared;
         for frame in &mut self.frames {
-            frame.straighten(problem.shared.log_focal.exp(), &problem.shared.radial);
+            frame.straighten(&problem.shared.lens);
         }
     }
 
@@ -255,18 +251,39 @@ impl Refiner {
         replaced
     }
 
+    /// Standard deviation of every shared parameter if it were free. Of the lens as if few sightings of a picture said something of
+    /// their own, beside priors that count in full.
+    fn shared_sigma(&self, problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
+        let mut sigma = shared_sigma(problem, loss);
+        let per_frame = problem.observations.len() as f64 / self.frames.len().max(1) as f64;
+        let own = problem.pixel_sigma;
+        problem.pixel_sigma *= (per_frame / INDEPENDENT).sqrt().max(1.0);
+        sigma[FOCAL..].copy_from_slice(&shared_sigma(problem, loss)[FOCAL..]);
+        problem.pixel_sigma = own;
+        sigma
+    }
+
+    /// Prior sigma of every shared parameter; 0: it is known.
+    fn shared_sigmas(&self) -> [f64; SHARED] {
+        let s = &self.settings;
+        let (mount, principal, radial) = (s.mount_sigma_deg.to_radians(), s.principal_sigma, s.radial_sigma);
+        let lens = [s.focal_sigma, s.aspect_sigma, principal, principal, radial, radial];
+        [mount, mount, mount, s.delay_sigma_s, lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]]
+    }
+
     /// Shared parameters whose sigma the pictures cut below the wanted fraction of its prior.
     fn observable(&self, sigma: &[f64; SHARED]) -> [bool; SHARED] {
-        let s = &self.settings;
-        let mount = s.mount_sigma_deg.to_radians();
-        let prior = [mount, mount, mount, s.delay_sigma_s, s.focal_sigma, s.radial_sigma, s.radial_sigma];
+        let prior = self.shared_sigmas();
         let tied = self.frames.iter().filter(|f| f.pairs > 0).count();
         // Fewer frames than shared parameters cannot tell them from their own errors, whatever the formula says.
-        std::array::from_fn(|k| tied > SHARED && prior[k] > 0.0 && sigma[k] < s.observable_ratio * prior[k])
+        let least = prior.iter().filter(|s| **s > 0.0).count().max(LEAST_TIED);
+        let tells = |k: usize| tied > least && prior[k] > 0.0 && sigma[k] < self.settings.observable_ratio * prior[k];
+        // A focal length that is free answers for an aspect that is not, many times over.
+        std::array::from_fn(|k| if k == ASPECT { prior[k] > 0.0 && tells(FOCAL) } else { tells(k) })
     }
 
     fn shared_estimate(&self, problem: &Problem, sigma: &[f64; SHARED]) -> SharedEstimate {
-        let m = super::so3::log(problem.shared.mount);
+        let (m, lens) = (super::so3::log(problem.shared.mount), problem.shared.lens);
         SharedEstimate {
             mount_deg: [m.x, m.y, m.z].map(f64::to_degrees),
             mount_sigma_deg: [sigma[0], sigma[1], sigma[2]].map(f64::to_degrees),
@@ -274,12 +291,18 @@ impl Refiner {
             delay_s: problem.shared.delay,
             delay_sigma_s: sigma[3],
             delay_estimated: problem.free[3],
-            focal_scale: problem.shared.log_focal.exp(),
-            focal_sigma: sigma[4],
-            focal_estimated: problem.free[4],
-            radial: [problem.shared.radial.k1, problem.shared.radial.k2],
-            radial_sigma: [sigma[5], sigma[6]],
-            radial_estimated: [problem.free[5], problem.free[6]],
+            focal_scale: lens.log_focal.exp(),
+            focal_sigma: sigma[FOCAL],
+            focal_estimated: problem.free[FOCAL],
+            aspect: lens.log_aspect.exp(),
+            aspect_sigma: sigma[ASPECT],
+            aspect_estimated: problem.free[ASPECT],
+            principal: lens.shift.to_array(),
+            principal_sigma: [sigma[FOCAL + 2], sigma[FOCAL + 3]],
+            principal_estimated: [problem.free[FOCAL + 2], problem.free[FOCAL + 3]],
+            radial: [lens.radial.k1, lens.radial.k2],
+            radial_sigma: [sigma[FOCAL + 4], sigma[FOCAL + 5]],
+            radial_estimated: [problem.free[FOCAL + 4], problem.free[FOCAL + 5]],
         }
     }
 

@@ -21,6 +21,8 @@ pub struct Survey {
     pub descriptors: Vec<[f32; 64]>,
     pub truth: Vec<Pose>,
     pub telemetry: Vec<Pose>,
+    /// The lens that takes the pictures; [`LENS`] is what is said of it.
+    pub lens: Intrinsics,
     pub rng: Pcg64Mcg,
 }
 
@@ -67,7 +69,19 @@ impl Survey {
                 center: p.center + vector(&mut rng, 0.5),
             })
             .collect();
-        Self { points, descriptors, truth, telemetry, rng }
+        Self { points, descriptors, truth, telemetry, lens: LENS, rng }
+    }
+
+    /// Three more lines, across the first ones.
+    pub fn crossed(mut self) -> Self {
+        let turn = DQuat::from_rotation_z(1.57);
+        let middle = DVec3::new(30.0, 14.0, 0.0);
+        let across = |p: &Pose| Pose { rotation: turn * p.rotation, center: middle + turn * (p.center - middle) };
+        for poses in [&mut self.truth, &mut self.telemetry] {
+            let more: Vec<Pose> = poses.iter().map(across).collect();
+            poses.extend(more);
+        }
+        self
     }
 
     /// What a feature network finds from pose `i`: key points with half a pixel of noise, one in ten with a
@@ -77,7 +91,9 @@ impl Survey {
         for (k, p) in self.points.iter().enumerate() {
             let q = pose.rotation.conjugate() * (*p - pose.center);
             let noise = DVec2::new(normal(&mut self.rng), normal(&mut self.rng)) * 0.5;
-            let at = q.truncate() / q.z * 400.0 + DVec2::new(320.0, 240.0) + noise;
+            let [f, c] = [[self.lens.fx, self.lens.fy], [self.lens.cx, self.lens.cy]]
+                .map(|v| DVec2::from_array(v.map(f64::from)));
+            let at = q.truncate() / q.z * f + c + noise;
             if q.z > 1.0 && at.x > 0.0 && at.y > 0.0 && at.x < 640.0 && at.y < 480.0 {
                 let stranger = self.rng.random_range(0..10) == 0;
                 let of = if stranger { self.rng.random_range(0..self.points.len()) } else { k };

@@ -26,6 +26,10 @@ const CONTRADICTION: (f64, f64) = (5.0, 20.0);
 
 /// Radial distortion (k1, k2) of a lens that nothing is known of: the survey cameras of the reference data have up to 0.015.
 const UNKNOWN_RADIAL: f64 = 0.05;
+/// Principal point of such a lens, in focal lengths.
+const UNKNOWN_PRINCIPAL: f64 = 0.02;
+/// How much a rolling shutter stretches pictures: 1 m/s × 30 ms × some of 60 m of ground.
+const ROLLING_SHUTTER: f64 = 0.005;
 /// A card's pictures are matched at this many times the size, and with as many more key points, than in flight, where the
 /// time is short: brighton_beach's card lies 0.80 m from its reference at 640 pixels and 0.07 m at 1,280.
 const DETAIL: u32 = 2;
@@ -184,7 +188,9 @@ fn refined(
     settings.focal_sigma = settings.focal_sigma.max(notes.focal_sigma);
     if notes.distortion_unknown {
         settings.radial_sigma = settings.radial_sigma.max(UNKNOWN_RADIAL);
+        settings.principal_sigma = settings.principal_sigma.max(UNKNOWN_PRINCIPAL);
     }
+    settings.aspect_sigma = settings.aspect_sigma.max(ROLLING_SHUTTER);
     if notes.floats {
         // Without telemetry there is nothing that could be off for all alike.
         (settings.mount_sigma_deg, settings.delay_sigma_s) = (0.0, 0.0);

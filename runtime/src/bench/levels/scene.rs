@@ -133,11 +133,7 @@ impl Frustum {
             DVec3::new(0.0, -fy, below),
         ];
         let turn = view.pose.rotation;
-        Self {
-            center: view.pose.center,
-            forward: turn * DVec3::Z,
-            sides: sides.map(|n| turn * n.normalize()),
-        }
+        Self { center: view.pose.center, forward: turn * DVec3::Z, sides: sides.map(|n| turn * n.normalize()) }
     }
 
     /// Whether a ball may be seen.
