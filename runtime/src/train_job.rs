@@ -145,9 +145,11 @@ impl TrainJob {
         let poses = if is_card { PoseSource::Dataset } else { self.poses };
         let picture_scale = self.picture_scale(&set, is_card)?;
         let settings = self.refine.then_some(&self.refine_settings);
+        let opened = began.elapsed();
         let Some(remarks) = card::settle(&mut set, &self.out, self.fresh, settings, &go_on)? else {
             return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train") });
         };
+        let settled = began.elapsed() - opened;
         let frames = set.select(&self.split, self.region.as_deref())?;
         // Matching sees telemetry's pictures whole; where nothing is matched they come at the size they are trained at.
         let refine = self.refine && poses == PoseSource::Telemetry;
@@ -196,6 +198,9 @@ impl TrainJob {
         };
         let mut engine = Reconstruction::open(settings, header, "train")?;
         engine.report.views = frames.len() as u64;
+        if is_card {
+            engine.report.stage_ms.insert("poses".into(), settled.as_secs_f64() * 1e3);
+        }
         engine.report.more.extend(remarks.into_iter().map(|(name, value)| (name.to_owned(), value)));
         if !self.resume(&mut engine, &set, &frames)? {
             if self.init != InitKind::FeedForward && !(self.init == InitKind::SparsePoints && refine) {
