@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use glam::DVec2;
+use glam::{DMat2, DVec2};
 use image::{RgbImage, imageops};
 
 use crate::frame_file::AsBytes;
@@ -68,6 +68,36 @@ impl Grey {
         range(y, self.height).all(|v| range(x, self.width).all(|u| value(u, v) != LEFT_OUT))
     }
 
+    /// Bilinear values on a grid of steps −`half`…`half` around `center`, its axes mapped by `warp`, row by row; `None` where one of them
+    /// lies outside, or beside what is left out.
+    pub fn square(&self, center: DVec2, warp: DMat2, half: i32, out: &mut [f64]) -> Option<()> {
+        let side = (2 * half + 1) as usize;
+        let places = || (-half..=half).flat_map(|y| (-half..=half).map(move |x| DVec2::new(x.into(), y.into())));
+        // Where the corners are inside all of it is.
+        let reach = f64::from(half) * (warp.x_axis.abs() + warp.y_axis.abs()) + 1.0;
+        let inside = (center - reach).cmpge(DVec2::ZERO).all()
+            && (center + reach).cmple(DVec2::new(self.width.into(), self.height.into())).all();
+        if !inside || self.masked {
+            for (value, offset) in out.iter_mut().take(side * side).zip(places()) {
+                *value = self.at(center + warp * offset)?;
+            }
+            return Some(());
+        }
+        let (d, w) = (self.data.as_slice(), self.width as usize);
+        for (value, offset) in out.iter_mut().take(side * side).zip(places()) {
+            let q = center + warp * offset - 0.5;
+            // Not negative: what is cut off is the fraction.
+            let (x, y) = (q.x as u32, q.y as u32);
+            let (u, v) = (q.x - f64::from(x), q.y - f64::from(y));
+            let i = y as usize * w + x as usize;
+            let (Some(top), Some(low)) = (d.get(i..i + 2), d.get(i + w..i + w + 2)) else { return None };
+            let top = f64::from(top[0]) * (1.0 - u) + f64::from(top[1]) * u;
+            let low = f64::from(low[0]) * (1.0 - u) + f64::from(low[1]) * u;
+            *value = top * (1.0 - v) + low * v;
+        }
+        Some(())
+    }
+
     /// Bilinear value at a place in its own pixels; `None` outside, and beside what is left out.
     pub fn at(&self, p: DVec2) -> Option<f64> {
         let q = p - 0.5;
@@ -127,5 +157,22 @@ mod tests {
         assert!(grey.keeps([46.0, 40.0]) && !grey.keeps([50.0, 40.0]) && !grey.keeps([100.0, 40.0]));
         let whole = Grey::new(&image, None, 64);
         assert!(whole.keeps([100.0, 40.0]) && whole.at(DVec2::new(50.0, 20.0)) == Some(0.0));
+    }
+
+    #[test]
+    fn a_square_has_the_values_of_its_places_and_none_at_the_edge() {
+        let image = RgbImage::from_fn(40, 30, |x, y| image::Rgb([(7 * x + 11 * y) as u8; 3]));
+        let grey = Grey::new(&image, None, 640);
+        let warp = DMat2::from_cols(DVec2::new(0.9, 0.2), DVec2::new(-0.3, 1.1));
+        let mut missing = 0;
+        for center in (0..400).map(|i| DVec2::new(f64::from(i % 20) * 2.1, f64::from(i / 20) * 1.6)) {
+            let mut values = [0.0; 25];
+            let square = grey.square(center, warp, 2, &mut values);
+            let places = (0..25).map(|k| center + warp * DVec2::new(f64::from(k % 5 - 2), f64::from(k / 5 - 2)));
+            let expected: Option<Vec<f64>> = places.map(|p| grey.at(p)).collect();
+            assert_eq!(square.map(|()| values.to_vec()), expected, "{center}");
+            missing += usize::from(expected.is_none());
+        }
+        assert!((50..350).contains(&missing), "{missing}");
     }
 }

@@ -2,7 +2,10 @@
 //! near its predicted place. That prunes some nine tenths of the work and most wrong matches with it.
 
 use super::keyframe::{DESCRIPTOR, KeyFrame};
+use std::ops::Range;
+
 use glam::{DVec2, DVec3};
+use rayon::prelude::*;
 
 /// One match: key point of the first and of the second frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,48 +40,66 @@ const CELL: f32 = 32.0;
 /// to the best is no rival.
 const SAME_PLACE: f32 = 12.0;
 
+/// Key points that are worth a thread.
+const LEAST_PART: usize = 128;
+
 /// Matches `b` against `a`.
 pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: MatchLimits) -> Vec<Match> {
     let (of_a, of_b) = (a.keypoints.len().min(limits.features), b.keypoints.len().min(limits.features));
     let (described_a, described_b) = (a.descriptors(), b.descriptors());
     let grid = Buckets::new(a, of_a);
-    let mut best_of_a = vec![(i32::MIN, u32::MAX); of_a];
-    let mut found = Vec::with_capacity(of_b);
-    let mut scored: Vec<(i32, u32)> = Vec::new();
     let r2 = guide.radius * guide.radius;
     let unit = 127.0 * 127.0;
     let least = (limits.min_cosine * unit) as i32;
     let margin = (limits.cosine_margin * unit) as i32;
-    for (j, place) in guide.predicted.iter().enumerate().take(of_b) {
-        let Some(place) = place else { continue };
-        let descriptor = described_b.of(j);
-        scored.clear();
-        for cells in grid.rows(*place, guide.radius) {
-            for &i in cells {
-                let p = a.keypoints[i as usize];
-                let p = DVec2::new(p[0].into(), p[1].into());
-                let off_line = guide.lines.is_some_and(|(lines, width)| (lines[j].dot(p.extend(1.0))).abs() > width);
-                if off_line || (p - *place).length_squared() > r2 {
-                    continue;
-                }
-                let score = dot(described_a.of(i as usize), descriptor);
-                scored.push((score, i));
-                let rival = &mut best_of_a[i as usize];
-                if score > rival.0 {
-                    *rival = (score, j as u32);
+    // Some key points of `b` after the others: their matches, and of each of `a` the best of them and its score.
+    let of_some = |some: Range<usize>| {
+        let mut best_of_a = vec![(i32::MIN, u32::MAX); of_a];
+        let mut found = Vec::with_capacity(some.len());
+        let mut scored: Vec<(i32, u32)> = Vec::new();
+        for j in some {
+            let Some(Some(place)) = guide.predicted.get(j) else { continue };
+            let descriptor = described_b.of(j);
+            scored.clear();
+            for cells in grid.rows(*place, guide.radius) {
+                for &i in cells {
+                    let p = a.keypoints[i as usize];
+                    let p = DVec2::new(p[0].into(), p[1].into());
+                    let off_line =
+                        guide.lines.is_some_and(|(lines, width)| (lines[j].dot(p.extend(1.0))).abs() > width);
+                    if off_line || (p - *place).length_squared() > r2 {
+                        continue;
+                    }
+                    let score = dot(described_a.of(i as usize), descriptor);
+                    scored.push((score, i));
+                    let rival = &mut best_of_a[i as usize];
+                    if score > rival.0 {
+                        *rival = (score, j as u32);
+                    }
                 }
             }
+            let Some(&(best, i)) = scored.iter().max_by_key(|s| (s.0, std::cmp::Reverse(s.1))) else { continue };
+            let at = a.keypoints[i as usize];
+            let elsewhere = |k: u32| {
+                let p = a.keypoints[k as usize];
+                (p[0] - at[0]).abs().max((p[1] - at[1]).abs()) > SAME_PLACE
+            };
+            let second = scored.iter().filter(|s| s.0 > best - margin && elsewhere(s.1)).count();
+            if best >= least && second == 0 {
+                found.push(Match { a: i, b: j as u32 });
+            }
         }
-        let Some(&(best, i)) = scored.iter().max_by_key(|s| (s.0, std::cmp::Reverse(s.1))) else { continue };
-        let at = a.keypoints[i as usize];
-        let elsewhere = |k: u32| {
-            let p = a.keypoints[k as usize];
-            (p[0] - at[0]).abs().max((p[1] - at[1]).abs()) > SAME_PLACE
-        };
-        let second = scored.iter().filter(|s| s.0 > best - margin && elsewhere(s.1)).count();
-        if best >= least && second == 0 {
-            found.push(Match { a: i, b: j as u32 });
-        }
+        (found, best_of_a)
+    };
+    // Parts in their order, the first of equals wins: the same however many there are.
+    let part = of_b.div_ceil(rayon::current_num_threads()).max(LEAST_PART);
+    let starts: Vec<usize> = (0..of_b).step_by(part).collect();
+    let parts: Vec<_> = starts.into_par_iter().map(|from| of_some(from..(from + part).min(of_b))).collect();
+    let mut found = Vec::with_capacity(of_b);
+    let mut best_of_a = vec![(i32::MIN, u32::MAX); of_a];
+    for (some, best) in parts {
+        found.extend(some);
+        best_of_a.iter_mut().zip(best).filter(|(all, part)| part.0 > all.0).for_each(|(all, part)| *all = part);
     }
     found.retain(|m| best_of_a[m.a as usize].1 == m.b);
     found

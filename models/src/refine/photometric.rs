@@ -22,12 +22,19 @@ const MIN_CONTRAST: f64 = 2.0;
 /// Values on the grid of a patch around `center`, its axes mapped by `warp`.
 fn patch(grey: &Grey, center: DVec2, warp: DMat2) -> Option<[f64; SAMPLES]> {
     let mut out = [0.0; SAMPLES];
-    for (k, value) in out.iter_mut().enumerate() {
-        let side = 2 * HALF + 1;
-        let offset = DVec2::new(f64::from(k as i32 % side - HALF), f64::from(k as i32 / side - HALF));
-        *value = grey.at(center + warp * offset)?;
-    }
+    grey.square(center, warp, HALF, &mut out)?;
     Some(out)
+}
+
+/// A patch and its slopes along x and y, by central differences.
+fn template(grey: &Grey, center: DVec2) -> Option<([f64; SAMPLES], [DVec2; SAMPLES])> {
+    const WIDE: usize = (2 * HALF + 3) as usize;
+    let mut wide = [0.0; WIDE * WIDE];
+    grey.square(center, DMat2::IDENTITY, HALF + 1, &mut wide)?;
+    let side = WIDE - 2;
+    let place = |k: usize| (k / side + 1) * WIDE + k % side + 1;
+    let slope = |k: usize| DVec2::new(wide[k + 1] - wide[k - 1], wide[k + WIDE] - wide[k - WIDE]) * 0.5;
+    Some((std::array::from_fn(|k| wide[place(k)]), std::array::from_fn(|k| slope(place(k)))))
 }
 
 /// One side of a match.
@@ -52,11 +59,9 @@ pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]
         return None;
     }
     let from = place(a) * a.grey.scale;
-    let (template, contrast) = normalised(patch(a.grey, from, DMat2::IDENTITY)?)?;
-    let sideways = |d: DVec2| patch(a.grey, from + d, DMat2::IDENTITY);
-    let (xp, xm) = (sideways(DVec2::X)?, sideways(-DVec2::X)?);
-    let (yp, ym) = (sideways(DVec2::Y)?, sideways(-DVec2::Y)?);
-    let slope: [DVec2; SAMPLES] = std::array::from_fn(|k| DVec2::new(xp[k] - xm[k], yp[k] - ym[k]) / (2.0 * contrast));
+    let (template, slope) = template(a.grey, from)?;
+    let (template, contrast) = normalised(template)?;
+    let slope = slope.map(|g| g / contrast);
     let mut h = DMat2::ZERO;
     for g in &slope {
         h += DMat2::from_cols(*g * g.x, *g * g.y);
