@@ -17,24 +17,30 @@ const REACH: f64 = 3.0;
 /// Normalised correlation below which two patches do not show the same thing.
 const MIN_CORRELATION: f64 = 0.7;
 /// Contrast (standard deviation of 8-bit grey) below which there is nothing to fit.
-const MIN_CONTRAST: f64 = 2.0;
+const MIN_CONTRAST: f32 = 2.0;
+/// Lanes of a sum.
+const LANES: usize = 8;
 
 /// Values on the grid of a patch around `center`, its axes mapped by `warp`.
-fn patch(grey: &Grey, center: DVec2, warp: DMat2) -> Option<[f64; SAMPLES]> {
+fn patch(grey: &Grey, center: DVec2, warp: DMat2) -> Option<[f32; SAMPLES]> {
     let mut out = [0.0; SAMPLES];
     grey.square(center, warp, HALF, &mut out)?;
     Some(out)
 }
 
 /// A patch and its slopes along x and y, by central differences.
-fn template(grey: &Grey, center: DVec2) -> Option<([f64; SAMPLES], [DVec2; SAMPLES])> {
+fn template(grey: &Grey, center: DVec2) -> Option<([f32; SAMPLES], [f32; SAMPLES], [f32; SAMPLES])> {
     const WIDE: usize = (2 * HALF + 3) as usize;
     let mut wide = [0.0; WIDE * WIDE];
     grey.square(center, DMat2::IDENTITY, HALF + 1, &mut wide)?;
     let side = WIDE - 2;
     let place = |k: usize| (k / side + 1) * WIDE + k % side + 1;
-    let slope = |k: usize| DVec2::new(wide[k + 1] - wide[k - 1], wide[k + WIDE] - wide[k - WIDE]) * 0.5;
-    Some((std::array::from_fn(|k| wide[place(k)]), std::array::from_fn(|k| slope(place(k)))))
+    let across = |k: usize, step: usize| 0.5 * (wide[place(k) + step] - wide[place(k) - step]);
+    Some((
+        std::array::from_fn(|k| wide[place(k)]),
+        std::array::from_fn(|k| across(k, 1)),
+        std::array::from_fn(|k| across(k, WIDE)),
+    ))
 }
 
 /// One side of a match.
@@ -59,14 +65,12 @@ pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]
         return None;
     }
     let from = place(a) * a.grey.scale;
-    let (template, slope) = template(a.grey, from)?;
+    let (template, mut by_x, mut by_y) = template(a.grey, from)?;
     let (template, contrast) = normalised(template)?;
-    let slope = slope.map(|g| g / contrast);
-    let mut h = DMat2::ZERO;
-    for g in &slope {
-        h += DMat2::from_cols(*g * g.x, *g * g.y);
-    }
-    let inverse = h.inverse();
+    by_x.iter_mut().chain(&mut by_y).for_each(|g| *g /= contrast);
+    let sum = |a: &[f32; SAMPLES], b: &[f32; SAMPLES]| f64::from(product(a, b));
+    let (xx, xy, yy) = (sum(&by_x, &by_x), sum(&by_x, &by_y), sum(&by_y, &by_y));
+    let inverse = DMat2::from_cols(DVec2::new(xx, xy), DVec2::new(xy, yy)).inverse();
     if !inverse.is_finite() {
         return None;
     }
@@ -75,11 +79,9 @@ pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]
     let mut correlation = 0.0;
     for _ in 0..STEPS {
         let (seen, _) = normalised(patch(b.grey, at, warp)?)?;
-        correlation = seen.iter().zip(&template).map(|(s, t)| s * t).sum::<f64>() / SAMPLES as f64;
-        let mut g = DVec2::ZERO;
-        for k in 0..SAMPLES {
-            g += slope[k] * (seen[k] - template[k]);
-        }
+        correlation = sum(&seen, &template) / SAMPLES as f64;
+        let apart: [f32; SAMPLES] = std::array::from_fn(|k| seen[k] - template[k]);
+        let g = DVec2::new(sum(&by_x, &apart), sum(&by_y, &apart));
         let shift = warp * (inverse * g);
         at -= shift;
         if !(at - start).is_finite() || (at - start).length() > REACH {
@@ -92,15 +94,26 @@ pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]
     (correlation >= MIN_CORRELATION).then(|| (at / b.grey.scale).as_vec2().to_array())
 }
 
+/// Sum of products, in lanes of its own that the compiler makes vectors of.
+fn product(a: &[f32; SAMPLES], b: &[f32; SAMPLES]) -> f32 {
+    let (a, b) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    let mut lanes = [0.0f32; LANES];
+    for (a, b) in a.0.iter().zip(b.0) {
+        (0..LANES).for_each(|k| lanes[k] += a[k] * b[k]);
+    }
+    lanes.iter().sum::<f32>() + a.1.iter().zip(b.1).map(|(a, b)| a * b).sum::<f32>()
+}
+
 /// Values less their mean over their standard deviation (given too): light and exposure drop out.
-fn normalised(mut values: [f64; SAMPLES]) -> Option<([f64; SAMPLES], f64)> {
-    let mean = values.iter().sum::<f64>() / SAMPLES as f64;
-    let variance = values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / SAMPLES as f64;
-    let contrast = variance.sqrt();
+fn normalised(mut values: [f32; SAMPLES]) -> Option<([f32; SAMPLES], f32)> {
+    let mean = product(&values, &[1.0; SAMPLES]) / SAMPLES as f32;
+    values.iter_mut().for_each(|v| *v -= mean);
+    let contrast = (product(&values, &values) / SAMPLES as f32).sqrt();
     if contrast < MIN_CONTRAST {
         return None;
     }
-    values.iter_mut().for_each(|v| *v = (*v - mean) / contrast);
+    let per = 1.0 / contrast;
+    values.iter_mut().for_each(|v| *v *= per);
     Some((values, contrast))
 }
 
