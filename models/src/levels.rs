@@ -100,7 +100,7 @@ pub fn write(model: &Chunks, folder: &Path, sh_degree: u8) -> Result<Report, For
 /// The same; `see` is given the levels of each leaf as they are before they are packed, the finest first.
 ///
 /// # Errors
-/// As [`write`]; those of `see`.
+/// As [`write()`]; those of `see`.
 pub fn write_and_see(
     model: &Chunks,
     folder: &Path,

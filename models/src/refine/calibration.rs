@@ -3,9 +3,11 @@
 
 use glam::{DVec2, DVec3};
 
-use super::problem::LENS;
 use super::radial::Radial;
 use crate::camera::{Intrinsics, Pinhole, Pose};
+
+/// Parameters of a lens: log focal scale, log aspect, the principal point's shift (2), and two radial terms.
+pub(crate) const LENS: usize = 6;
 
 /// Of any picture size: ratios, and lengths in focal lengths.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

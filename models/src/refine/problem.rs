@@ -1,7 +1,7 @@
 //! The bundle adjustment's unknowns and residuals: key-frame poses, points, and the few parameters all frames
 //! share; reprojection errors against telemetry priors, each with a robust loss.
 
-use super::calibration::Calibration;
+use super::calibration::{Calibration, LENS};
 use super::so3;
 use crate::camera::{Intrinsics, Pinhole, Pose};
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -14,8 +14,6 @@ const DELAY: usize = 3;
 pub(crate) const FOCAL: usize = 4;
 /// Index of the log aspect.
 pub(crate) const ASPECT: usize = FOCAL + 1;
-/// Parameters of the lens: log focal scale, log aspect, the principal point's shift (2), and two radial terms.
-pub(crate) const LENS: usize = 6;
 
 /// What all key frames have in common and telemetry does not know.
 #[derive(Clone, Copy, Debug)]

@@ -1,7 +1,8 @@
 //! Normal equations with the points eliminated: the 3×3 block of every point is inverted on the spot, so that
 //! only frames and shared parameters remain. Blocks exist only for pairs of frames that see a common point.
 
-use super::problem::{FOCAL, LENS, Loss, Problem, SHARED};
+use super::calibration::LENS;
+use super::problem::{FOCAL, Loss, Problem, SHARED};
 use super::so3::skew;
 use crate::camera::Pinhole;
 use glam::DVec3;
