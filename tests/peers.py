@@ -5,6 +5,7 @@ and lens, the same machine, two threads each.
     python peers.py colmap CARD REPORT --mapper incremental|global [--features N] [--neighbours N]
     python peers.py ours RUN REPORT                     of a finished `dgtr train CARD --out RUN`
     python peers.py compare CARD REPORT...              a Markdown table
+    python peers.py lens DATASET                        the focal length that COLMAP's own tracks of the key frames give, by camera model
 
 COLMAP matches what GPS says is near (its fastest matching that finds all pictures here), and maps with positions as priors.
 """
@@ -136,6 +137,29 @@ def compare(folder, reports):
         print(f"| {r['name']} | {sum(r['laps'].values()):.1f} | {r['registered']} of {len(reference)} | {r['error_px']:.2f} | {p:.3f} m, {a:.3f}° | {r['focal']:.4f} |")
 
 
+def lens(source):
+    """Bundle adjustment of DATASET/sparse/0, its key frames only, from a focal length 2 % long."""
+    import pycolmap
+
+    key = {stem(n) for n in json.loads((source / "split.json").read_text())["train"]}
+    for what, model, higher in [("two focal lengths", "PINHOLE", 0.0), ("one", "SIMPLE_PINHOLE", 0.0), ("one, principal point half a pixel higher", "SIMPLE_PINHOLE", 0.5),
+                                ("one and two radial terms, principal point half a pixel higher", "RADIAL", 0.5)]:
+        scene = pycolmap.Reconstruction(source / "sparse/0")
+        for image in list(scene.images.values()):
+            if stem(image.name) not in key:
+                scene.deregister_frame(image.frame_id)
+        camera = next(iter(scene.cameras.values()))
+        fx, fy, cx, cy = camera.params
+        place = [cx, cy - higher]
+        camera.model = getattr(pycolmap.CameraModelId, model)
+        camera.params = {"PINHOLE": [1.02 * fx, 1.02 * fy, *place], "SIMPLE_PINHOLE": [1.02 * fx, *place], "RADIAL": [1.02 * fx, *place, 0, 0]}[model]
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length, options.refine_principal_point, options.refine_extra_params = True, False, model == "RADIAL"
+        options.print_summary = False
+        pycolmap.bundle_adjustment(scene, options)
+        print(f"{what}: focal length {100 * (next(iter(scene.cameras.values())).params[0] / fx - 1):+.2f} %, {scene.compute_mean_reprojection_error():.3f} px")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -151,6 +175,8 @@ def main():
     c.add_argument("run", type=path), c.add_argument("report", type=path)
     c = commands.add_parser("compare")
     c.add_argument("card", type=path), c.add_argument("reports", type=path, nargs="+")
+    c = commands.add_parser("lens")
+    c.add_argument("source", type=path)
     a = parser.parse_args()
     match a.command:
         case "card":
@@ -159,6 +185,8 @@ def main():
             colmap(a.card, a.report, a.mapper, a.features, a.neighbours, a.threads)
         case "ours":
             ours(a.run, a.report)
+        case "lens":
+            lens(a.source)
         case _:
             compare(a.card, a.reports)
 

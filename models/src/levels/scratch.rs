@@ -1,7 +1,7 @@
 //! Gaussians sorted by leaf, in a file without a name: a scene larger than memory is read once and written once, a leaf at a time.
 
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use crate::cloud::{GaussianCloud, sh_coefficients};
@@ -116,11 +116,10 @@ impl Rows {
     /// The operating system's.
     pub fn push(&mut self, leaf: &GaussianCloud) -> io::Result<()> {
         let start = self.spans.last().map_or(0, |s| s.1);
-        let mut output = BufWriter::with_capacity(1 << 18, &self.file);
-        output.seek(SeekFrom::Start(start))?;
-        (0..leaf.len()).try_for_each(|i| output.write_all(&row(leaf, i).collect::<Vec<u8>>()))?;
-        output.flush()?;
-        self.spans.push((start, start + (leaf.len() * row_bytes(self.sh_degree)) as u64));
+        let bytes: Vec<u8> = (0..leaf.len()).flat_map(|i| row(leaf, i)).collect();
+        self.file.seek(SeekFrom::Start(start))?;
+        self.file.write_all(&bytes)?;
+        self.spans.push((start, start + bytes.len() as u64));
         Ok(())
     }
 

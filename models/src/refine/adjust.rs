@@ -1,6 +1,6 @@
 //! Levenberg–Marquardt on the reduced equations, and the question which shared parameters the pictures can tell.
 
-use super::problem::{ASPECT, FOCAL, Loss, Problem, SHARED};
+use super::problem::{ASPECT, FOCAL, Loss, PRINCIPAL, Problem, RADIAL, SHARED};
 use super::reduced::Step;
 use super::schur::{FrameVec, Reduced, SharedVec, point_steps};
 use super::so3;
@@ -75,9 +75,9 @@ fn apply(problem: &mut Problem, step: &Step, points: &[DVec3]) {
     let lens = &mut problem.shared.lens;
     lens.log_focal += s[FOCAL];
     lens.log_aspect += s[ASPECT];
-    lens.shift += DVec2::new(s[FOCAL + 2], s[FOCAL + 3]);
-    lens.radial.k1 += s[FOCAL + 4];
-    lens.radial.k2 += s[FOCAL + 5];
+    lens.shift += DVec2::new(s[PRINCIPAL], s[PRINCIPAL + 1]);
+    lens.radial.k1 += s[RADIAL];
+    lens.radial.k2 += s[RADIAL + 1];
 }
 
 /// Standard deviation of every shared parameter if it were free, given all the rest unknown too; infinite where

@@ -14,6 +14,10 @@ const DELAY: usize = 3;
 pub(crate) const FOCAL: usize = 4;
 /// Index of the log aspect.
 pub(crate) const ASPECT: usize = FOCAL + 1;
+/// Index of the principal point's shift along x; that along y follows.
+pub(crate) const PRINCIPAL: usize = FOCAL + 2;
+/// Index of the first radial term.
+pub(crate) const RADIAL: usize = FOCAL + 4;
 
 /// What all key frames have in common and telemetry does not know.
 #[derive(Clone, Copy, Debug)]

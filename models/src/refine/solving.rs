@@ -5,7 +5,7 @@ use super::adjust::{Limits, adjust, shared_sigma};
 use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::part::Part;
-use super::problem::{ASPECT, FOCAL, Loss, Observation, PosePrior, Problem, SHARED};
+use super::problem::{ASPECT, FOCAL, Loss, Observation, PRINCIPAL, PosePrior, Problem, RADIAL, SHARED};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
 use super::triangulate::{Triangulated, triangulate};
@@ -298,11 +298,11 @@ impl Refiner {
             aspect_sigma: sigma[ASPECT],
             aspect_estimated: problem.free[ASPECT],
             principal: lens.shift.to_array(),
-            principal_sigma: [sigma[FOCAL + 2], sigma[FOCAL + 3]],
-            principal_estimated: [problem.free[FOCAL + 2], problem.free[FOCAL + 3]],
+            principal_sigma: [sigma[PRINCIPAL], sigma[PRINCIPAL + 1]],
+            principal_estimated: [problem.free[PRINCIPAL], problem.free[PRINCIPAL + 1]],
             radial: [lens.radial.k1, lens.radial.k2],
-            radial_sigma: [sigma[FOCAL + 4], sigma[FOCAL + 5]],
-            radial_estimated: [problem.free[FOCAL + 4], problem.free[FOCAL + 5]],
+            radial_sigma: [sigma[RADIAL], sigma[RADIAL + 1]],
+            radial_estimated: [problem.free[RADIAL], problem.free[RADIAL + 1]],
         }
     }
 

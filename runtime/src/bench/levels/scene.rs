@@ -22,8 +22,8 @@ const MARGIN_PX: f64 = 4.0;
 /// Least side of a part, pixels.
 const LEAST_SIDE: u32 = 16;
 
-/// A sphere around a leaf, what its Gaussians reach included.
-struct Ball {
+/// Around a leaf, what its Gaussians reach included.
+struct BoundingSphere {
     middle: DVec3,
     radius: f64,
 }
@@ -31,7 +31,7 @@ struct Ball {
 /// A scene, or a level of one.
 pub struct Scene {
     rows: Rows,
-    balls: Vec<Ball>,
+    bounds: Vec<BoundingSphere>,
 }
 
 fn mean(cloud: &GaussianCloud, i: usize) -> DVec3 {
@@ -49,7 +49,7 @@ impl Scene {
     /// # Errors
     /// The operating system's.
     pub fn create(folder: &Path, sh_degree: u8) -> io::Result<Self> {
-        Ok(Self { rows: Rows::create(folder, sh_degree)?, balls: Vec::new() })
+        Ok(Self { rows: Rows::create(folder, sh_degree)?, bounds: Vec::new() })
     }
 
     /// Appends a leaf.
@@ -62,15 +62,15 @@ impl Scene {
             .fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)));
         let beyond = (0..leaf.len()).map(|i| reach(leaf, i)).fold(0.0, f64::max);
         let radius = if leaf.is_empty() { f64::NEG_INFINITY } else { 0.5 * low.distance(high) + beyond };
-        self.balls.push(Ball { middle: 0.5 * (low + high), radius });
+        self.bounds.push(BoundingSphere { middle: 0.5 * (low + high), radius });
         self.rows.push(leaf)
     }
 
     /// What a camera's part sees; `None` when it is more than can be drawn at once.
     fn seen(&mut self, frustum: &Frustum, sh_degree: u8) -> io::Result<Option<GaussianCloud>> {
         let mut seen = GaussianCloud::with_capacity(sh_degree, 0);
-        for leaf in 0..self.balls.len() {
-            if !frustum.meets(self.balls[leaf].middle, self.balls[leaf].radius) {
+        for leaf in 0..self.bounds.len() {
+            if !frustum.meets(self.bounds[leaf].middle, self.bounds[leaf].radius) {
                 continue;
             }
             let cloud = self.rows.read(leaf)?;
@@ -136,7 +136,7 @@ impl Frustum {
         Self { center: view.pose.center, forward: turn * DVec3::Z, sides: sides.map(|n| turn * n.normalize()) }
     }
 
-    /// Whether a ball may be seen.
+    /// Whether anything in a sphere may be seen.
     fn meets(&self, middle: DVec3, radius: f64) -> bool {
         let p = middle - self.center;
         p.dot(self.forward) > -radius && self.sides.iter().all(|n| p.dot(*n) > -radius)
