@@ -5,25 +5,19 @@
 
 use serde::Serialize;
 
+mod lanes;
+mod mirror;
 mod request;
 mod scene;
 
+pub use lanes::Lanes;
 pub use request::PlanRequest;
 pub use scene::BLOCK_GAUSSIANS;
 
-/// Lanes that sort and emit on a processor; each owns one histogram. How many there are says nothing about the result.
-///
-/// Enough to keep the cores of a small board busy; every lane more is one more histogram to clear, fill and sum (128
-/// lanes: counting and sorting took 1.4 times as long on lavapipe).
-pub const SORT_LANES_SOFTWARE: u32 = 32;
-/// The same on a GPU, whose many slow lanes would stand idle (chosen by counting, not yet measured on one).
-pub const SORT_LANES_GPU: u32 = 256;
-/// Bytes of the status section: 4 KiB of counters, and a cursor of 16 bytes for each sorting lane.
-pub const STATUS_BYTES: u64 = (4 << 10) + 16 * SORT_LANES_GPU as u64;
-/// Lanes of the passes that loop over the visible Gaussians; each leaves one partial sum.
-pub const LOOP_LANES: u64 = 1024;
-/// A partial sum of 32 bytes for each of them.
-pub const LANE_SUMS_BYTES: u64 = 32 * LOOP_LANES;
+/// Bytes of the status section: 4 KiB of counters, and a cursor of 16 bytes for each sorting lane there may be.
+pub const STATUS_BYTES: u64 = (4 << 10) + 16 * Lanes::CARD.sort as u64;
+/// Bytes of the partial sum that each lane of a loop leaves.
+pub const LANE_SUM_BYTES: u64 = 32;
 /// Every binding stays below this (lavapipe's and older V3DV's `maxStorageBufferRange`).
 pub const BINDING_LIMIT: u64 = 128 << 20;
 /// Sections start at multiples of this, the largest `minStorageBufferOffsetAlignment` Vulkan allows.
@@ -62,8 +56,8 @@ pub struct Plan {
     pub sh_degree: u8,
     /// Adam's moments of SH take 16 bits each instead of 32.
     pub half_moments: bool,
-    /// Lanes that sort and emit.
-    pub sort_lanes: u32,
+    /// Lanes that share the work.
+    pub lanes: Lanes,
     /// Name and bytes of every section, in the order in which they lie in memory.
     pub sections: Vec<(&'static str, u64)>,
     /// Bytes of the one device allocation.
@@ -141,7 +135,9 @@ impl Plan {
         within("views", r.views.into(), 0, 1 << 20)?;
         within("crops", r.crops.into(), 0, 1 << 20)?;
         within("sh_degree", r.sh_degree.into(), 0, 3)?;
-        within("sort_lanes", r.sort_lanes.into(), SORT_LANES_SOFTWARE.into(), SORT_LANES_GPU.into())?;
+        let (least, most) = (Lanes::SOFTWARE, Lanes::CARD);
+        within("lanes.sort", r.lanes.sort.into(), least.sort.into(), most.sort.into())?;
+        within("lanes.loops", r.lanes.loops.into(), least.loops.into(), most.loops.into())?;
         let most_gaussians = u64::from(u32::MAX) >> 4;
         within("max_gaussians", r.max_gaussians.unwrap_or(Self::LEAST_GAUSSIANS) as u64, 1, most_gaussians)?;
         within("scene_gaussians", r.scene_gaussians.unwrap_or(1) as u64, 1, most_gaussians)?;
@@ -193,12 +189,12 @@ impl Plan {
         // As do pictures in portrait or cropped ones.
         let tiles = width.div_ceil(TILE_WIDTH) * height.div_ceil(TILE_HEIGHT) + (width + height) / TILE_HEIGHT + 64;
         let sh = 16 * sh_columns(r.sh_degree) * n;
-        let lanes = u64::from(r.sort_lanes);
+        let lanes = u64::from(r.lanes.sort);
         let moment = if r.half_moments { sh / 2 } else { sh };
         let sections: Vec<(&'static str, u64)> = [
             ("frame", 16 << 10),      // uniforms and the table of deferred moments
             ("status", STATUS_BYTES), // counters read back after every step, cursors of the sorting lanes
-            ("lane_sums", LANE_SUMS_BYTES),
+            ("lane_sums", LANE_SUM_BYTES * u64::from(r.lanes.loops)),
             ("strip_sums", 32 * (p.div_ceil(8) + u64::from(r.width) + u64::from(r.height) + 64)),
             ("geometry", 144 * n), // mean+opacity, log scale+state, rotation; each with two Adam moments
             ("sh", sh),
@@ -239,7 +235,7 @@ impl Plan {
             view_slots: slots as usize,
             sh_degree: r.sh_degree,
             half_moments: r.half_moments,
-            sort_lanes: r.sort_lanes,
+            lanes: r.lanes,
             sections,
             total_bytes: total.next_multiple_of(TOTAL_ALIGNMENT),
         }
@@ -283,13 +279,16 @@ mod tests {
     }
 
     #[test]
-    fn a_gpu_s_plan_differs_from_a_processor_s_by_its_sorting_lanes_alone() {
-        let [few, many] = [SORT_LANES_SOFTWARE, SORT_LANES_GPU]
-            .map(|sort_lanes| Plan::with_capacities(&PlanRequest { sort_lanes, ..request(512) }, 1000, 10_000));
-        for (a, b) in few.sections.iter().zip(&many.sections) {
+    fn plans_of_a_processor_a_board_and_a_card_differ_by_what_their_lanes_leave_alone() {
+        let [few, board, card] = [Lanes::SOFTWARE, Lanes::BOARD, Lanes::CARD]
+            .map(|lanes| Plan::with_capacities(&PlanRequest { lanes, ..request(512) }, 1000, 10_000));
+        for ((a, b), c) in few.sections.iter().zip(&board.sections).zip(&card.sections) {
             assert_eq!(a.1 == b.1, !["digits", "tiles"].contains(&a.0), "{}", a.0);
+            assert_eq!(b.1 == c.1, b.0 != "lane_sums", "{}", b.0);
         }
-        assert!(Plan::new(&PlanRequest { sort_lanes: 512, ..request(512) }).is_err());
+        for lanes in [Lanes { sort: 512, ..Lanes::BOARD }, Lanes { loops: 1 << 20, ..Lanes::BOARD }] {
+            assert!(Plan::new(&PlanRequest { lanes, ..request(512) }).is_err());
+        }
     }
 
     #[test]

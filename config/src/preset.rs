@@ -74,7 +74,7 @@ impl std::fmt::Display for PresetValues {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plan::{Plan, PlanRequest, SORT_LANES_GPU};
+    use crate::plan::{Lanes, Plan, PlanRequest};
 
     #[test]
     fn every_preset_has_a_plan_for_forty_eight_photographs() {
@@ -91,7 +91,7 @@ mod tests {
                 max_gaussians: Some(v.max_gaussians as usize),
                 scene_gaussians: None,
                 // The more of the two.
-                sort_lanes: SORT_LANES_GPU,
+                lanes: Lanes::BOARD,
                 ..Default::default()
             });
             let plan = plan.unwrap_or_else(|e| panic!("{name}: {e}"));

@@ -198,7 +198,7 @@ impl Reconstruction {
         let mut report = RunReport::new(command);
         let host = HostPlan::new(&HostRequest {
             plan: trainer.plan(),
-            shared: trainer.gpu().info().is_cpu,
+            on_host: if trainer.gpu().info().is_cpu { trainer.device_bytes() } else { trainer.mirror_bytes() },
             initialiser: initialiser
                 .as_ref()
                 .map_or(0, |i| i.planned_bytes_at(settings.device.size, views, trainer.plan().scene)),

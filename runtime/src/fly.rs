@@ -10,7 +10,7 @@ use config::disk::bounded::{Bounded, bytes_below};
 use config::disk::plan::{DiskPlan, DiskRequest};
 use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
-use config::plan::SORT_LANES_GPU;
+use config::plan::Lanes;
 use config::upload::Encoding;
 use hal::mavlink_camera::Activity;
 use hal::time::MonotonicClock;
@@ -208,7 +208,7 @@ fn disk_plan(mission: &Mission, recording: u64) -> DiskPlan {
     let gaussians = memory.scene_gaussians.map_or(on_device, |n| on_device.max(n.into())) as usize;
     let CameraSettings { width, height, .. } = mission.camera;
     // How many lanes sort matters little; more of them leave less room.
-    let request = DeviceRequest::of_flight(mission, None).plan_request(&mission.training.sh, SORT_LANES_GPU);
+    let request = DeviceRequest::of_flight(mission, None).plan_request(&mission.training.sh, Lanes::CARD);
     DiskPlan::new(&DiskRequest {
         width,
         height,

@@ -10,7 +10,7 @@ use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
 use config::mission::{KeyframeSettings, NetworkSettings};
-use config::plan::{Plan, WORKING_SIDE};
+use config::plan::{Lanes, Plan, WORKING_SIDE};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use hal::time::MonotonicClock;
@@ -101,8 +101,8 @@ pub struct TrainJob {
 const SCALES: [f64; 9] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125];
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;
-/// Shares that a sort is done in at most; fewer need less memory.
-const MOST_SORT_LANES: u32 = 256;
+/// Lanes that share the work at most; fewer need less memory.
+const MOST_LANES: Lanes = Lanes::CARD;
 
 /// How a job ended.
 #[derive(Clone, Debug)]
@@ -267,7 +267,7 @@ impl TrainJob {
             };
             let some_in_file = DeviceRequest { view_slots: self.view_slots, ..all_on_device.clone() };
             let holds = |request: &DeviceRequest| {
-                let plan = Plan::new(&request.plan_request(&self.training.sh, MOST_SORT_LANES));
+                let plan = Plan::new(&request.plan_request(&self.training.sh, MOST_LANES));
                 plan.is_ok_and(|p| p.gaussians >= wanted)
             };
             let (w, h) = all_on_device.size;

@@ -18,6 +18,8 @@ layout(std430, set = 0, binding = 4) writeonly buffer SlotRanges { uvec2 slot_ra
 const uint MOST_LANES = 32u;
 
 shared uint widths[MOST_LANES];
+// The next Gaussians, one per lane: fetched together, they are waited for once.
+shared Spans fetched[MOST_LANES];
 
 void main() {
     // Everything is done in the first round.
@@ -27,8 +29,16 @@ void main() {
     Walk w = walk_begin(own, status.visible);
     for (uint b = 0u; b < own; b++) slot += status.lane_instances[b];
     for (uint i = w.i; i < w.end; i++) {
-        int at = int(FETCH(order, int(i)).x) * 3;
-        Spans s = spans_of(FETCH(projected, at), FETCH(projected, at + 2));
+        uint ahead = (i - w.i) % lanes;
+        if (ahead == 0u) {
+            barrier();
+            if (i + lane < w.end) {
+                int at = int(FETCH(order, int(i + lane)).x) * 3;
+                fetched[lane] = spans_of(FETCH(projected, at), FETCH(projected, at + 2));
+            }
+            barrier();
+        }
+        Spans s = fetched[ahead];
         uint begin = slot;
         for (int top = s.row; top <= s.last_row; top += int(lanes)) {
             int row = top + int(lane);

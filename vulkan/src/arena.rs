@@ -1,12 +1,16 @@
-//! The one device allocation: a buffer as large as the plan says, mapped for as long as it lives, divided into the
-//! plan's sections.
+//! The one device allocation: a buffer as large as the plan says, divided into the plan's sections.
 //!
-//! Companion computers share one memory between processor and GPU, so the host reads and writes sections in place; a
-//! discrete card without host-visible local memory is served from system memory (correct, slower).
+//! Where processor and GPU share one memory, as on companion computers, the host reads and writes sections in place; of a plan that
+//! lies in a card's own memory it has a mirror.
+
+mod memory;
+mod mirror;
 
 use crate::gpu::{Gpu, GpuError};
 use ash::vk;
 use config::plan::Plan;
+use memory::{Placement, allocate, map, placement};
+use mirror::Mirror;
 
 /// A section's place in the arena, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -15,23 +19,30 @@ pub(crate) struct Section {
     pub bytes: u64,
 }
 
+/// How the host gets at the sections.
+enum Host {
+    /// All of them, in place.
+    Mapped(*mut u8),
+    /// Those that it works on.
+    Mirrored(Box<Mirror>),
+}
+
 pub(crate) struct Arena {
+    host: Host,
     gpu: Gpu,
     pub buffer: vk::Buffer,
     memory: vk::DeviceMemory,
-    mapped: *mut u8,
     sections: Vec<(&'static str, Section)>,
     pub total_bytes: u64,
 }
 
-// SAFETY: the pointer is to memory owned by this struct; every access goes through `&self`/`&mut self` methods.
+// SAFETY: the pointers are to memory owned by this struct; every access goes through `&self`/`&mut self` methods.
 unsafe impl Send for Arena {}
 
 impl Drop for Arena {
     fn drop(&mut self) {
-        // SAFETY: the trainer waits for the device before it drops the arena; both handles are ours.
+        // SAFETY: the trainer waits for the device before it drops the arena; both handles are ours. Memory is unmapped when it is freed.
         unsafe {
-            self.gpu.device().unmap_memory(self.memory);
             self.gpu.device().destroy_buffer(self.buffer, None);
             self.gpu.device().free_memory(self.memory, None);
         }
@@ -42,23 +53,34 @@ impl Arena {
     /// # Errors
     /// The device has no such memory.
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<Self, GpuError> {
-        let device = gpu.device();
         let bytes = plan.total_bytes;
-        let buffer = buffer(gpu, plan)?;
-        // SAFETY: buffer and memory are ours; on failure the buffer is destroyed.
+        let mut made = Self {
+            host: Host::Mapped(std::ptr::null_mut()),
+            gpu: gpu.clone(),
+            buffer: buffer(gpu, plan)?,
+            memory: vk::DeviceMemory::null(),
+            sections: laid_out(plan),
+            total_bytes: bytes,
+        };
+        let placed = placement(gpu, made.buffer, plan)?;
+        let (Placement::Mapped(kind) | Placement::Mirrored { device: kind, .. }) = placed;
+        // SAFETY: `made` owns buffer and memory as soon as they exist; the memory is mapped once, where it is host-visible, and written
+        // within its bytes.
         unsafe {
-            let made = memory_kind(gpu, buffer, plan).and_then(|kind| allocate(gpu, buffer, bytes, kind));
-            let (memory, mapped) = made.inspect_err(|_| device.destroy_buffer(buffer, None))?;
-            let mut offset = 0;
-            let mut sections = Vec::with_capacity(plan.sections.len());
-            for (name, bytes) in &plan.sections {
-                sections.push((*name, Section { offset, bytes: *bytes }));
-                offset += bytes;
-            }
+            made.memory = allocate(gpu, made.buffer, bytes, kind)?;
             // Unwritten moments and margins must read as zero.
-            std::ptr::write_bytes(mapped, 0, bytes as usize);
-            Ok(Self { gpu: gpu.clone(), buffer, memory, mapped, sections, total_bytes: bytes })
+            made.host = match placed {
+                Placement::Mapped(_) => {
+                    let mapped = map(gpu, made.memory, bytes)?;
+                    std::ptr::write_bytes(mapped, 0, bytes as usize);
+                    Host::Mapped(mapped)
+                }
+                Placement::Mirrored { host, .. } => {
+                    Host::Mirrored(Box::new(Mirror::new(gpu, plan, made.buffer, &made.sections, host)?))
+                }
+            };
         }
+        Ok(made)
     }
 
     /// Whether the device has room for the plan, as far as that is known without an allocation.
@@ -67,10 +89,10 @@ impl Arena {
     /// As [`Arena::new`].
     pub fn check(gpu: &Gpu, plan: &Plan) -> Result<(), GpuError> {
         let buffer = buffer(gpu, plan)?;
-        let kind = memory_kind(gpu, buffer, plan);
+        let placed = placement(gpu, buffer, plan);
         // SAFETY: the buffer is ours and nothing refers to it.
         unsafe { gpu.device().destroy_buffer(buffer, None) };
-        kind.map(|_| ())
+        placed.map(|_| ())
     }
 
     /// The section `name`; an unknown name has no bytes (the tests bind every kernel, so a slip shows at once).
@@ -84,28 +106,96 @@ impl Arena {
         Section { offset: self.section("views").offset + slot as u64 * bytes, bytes }
     }
 
-    /// The section's content as `T`s. The device must be idle.
+    /// The section's content as `T`s. The device must be idle, and the host work on the section ([`Plan::mirrored`]).
     pub fn slice<T: bytemuck::AnyBitPattern>(&self, section: Section) -> &[T] {
-        // SAFETY: sections lie inside the mapping, are 256-byte aligned and T is plain data; the caller waits for the
-        // device first, and `&self` keeps the host from writing meanwhile.
-        unsafe {
-            std::slice::from_raw_parts(
-                self.mapped.add(section.offset as usize).cast::<T>(),
-                section.bytes as usize / size_of::<T>(),
-            )
+        let at = match &self.host {
+            // SAFETY: sections lie inside the mapping.
+            Host::Mapped(mapped) => unsafe { mapped.add(section.offset as usize) },
+            Host::Mirrored(mirror) => mirror.read(section),
+        };
+        if at.is_null() {
+            return &[];
         }
+        // SAFETY: sections lie inside the mapping, are 256-byte aligned and T is plain data; the caller waits for the device first,
+        // and `&self` keeps the host from writing meanwhile (a mirror is brought up to date where no slice of it can be: kernels
+        // have run since the last one).
+        unsafe { std::slice::from_raw_parts(at.cast::<T>(), section.bytes as usize / size_of::<T>()) }
     }
 
     /// As [`Self::slice`], to write.
     pub fn slice_mut<T: bytemuck::AnyBitPattern + bytemuck::NoUninit>(&mut self, section: Section) -> &mut [T] {
+        let at = match &self.host {
+            // SAFETY: sections lie inside the mapping.
+            Host::Mapped(mapped) => unsafe { mapped.add(section.offset as usize) },
+            Host::Mirrored(mirror) => mirror.write(section),
+        };
+        if at.is_null() {
+            return &mut [];
+        }
         // SAFETY: as in `slice`; `&mut self` makes the access exclusive on the host.
-        unsafe {
-            std::slice::from_raw_parts_mut(
-                self.mapped.add(section.offset as usize).cast::<T>(),
-                section.bytes as usize / size_of::<T>(),
-            )
+        unsafe { std::slice::from_raw_parts_mut(at.cast::<T>(), section.bytes as usize / size_of::<T>()) }
+    }
+
+    /// A copy of any section's content, the kernels' own among them. The device must be idle.
+    pub fn copied<T: bytemuck::AnyBitPattern + bytemuck::NoUninit>(&self, section: Section) -> Vec<T> {
+        match &self.host {
+            Host::Mapped(_) => self.slice(section).to_vec(),
+            Host::Mirrored(mirror) => bytemuck::pod_collect_to_vec(&mirror.copied(section)),
         }
     }
+
+    /// Records what the host wrote since the last kernels ran; true when that was anything.
+    ///
+    /// Bytes of the host's memory that the mirror takes, if there is one.
+    pub fn mirror_bytes(&self) -> u64 {
+        match &self.host {
+            Host::Mapped(_) => 0,
+            Host::Mirrored(mirror) => mirror.bytes,
+        }
+    }
+
+    /// # Errors
+    /// What kept the host from seeing what the kernels before had written.
+    ///
+    /// # Safety
+    /// `commands` is being recorded, and is submitted before the host looks at anything.
+    pub unsafe fn before_kernels(&self, commands: vk::CommandBuffer) -> Result<bool, GpuError> {
+        let Host::Mirrored(mirror) = &self.host else { return Ok(false) };
+        self.failure()?;
+        // SAFETY: by this function's contract.
+        unsafe { mirror.before_kernels(commands) };
+        Ok(true)
+    }
+
+    /// Records what lets the host see what kernels wrote into the sections of these names; it sees the others when it looks.
+    ///
+    /// # Safety
+    /// `commands` is being recorded, behind a barrier after its last kernel.
+    pub unsafe fn after_kernels(&self, commands: vk::CommandBuffer, names: &[&str]) {
+        if let Host::Mirrored(mirror) = &self.host {
+            // SAFETY: by this function's contract.
+            unsafe { mirror.after_kernels(commands, names) };
+        }
+    }
+
+    /// # Errors
+    /// What kept the host from seeing what kernels wrote, since this was last asked: what it read then is old.
+    pub fn failure(&self) -> Result<(), GpuError> {
+        match &self.host {
+            Host::Mapped(_) => Ok(()),
+            Host::Mirrored(mirror) => mirror.take_failure().map_or(Ok(()), Err),
+        }
+    }
+}
+
+/// Where each section lies.
+fn laid_out(plan: &Plan) -> Vec<(&'static str, Section)> {
+    let mut offset = 0;
+    let sections = plan.sections.iter().map(|(name, bytes)| {
+        offset += bytes;
+        (*name, Section { offset: offset - bytes, bytes: *bytes })
+    });
+    sections.collect()
 }
 
 fn named(call: &'static str, e: vk::Result, bytes: u64) -> GpuError {
@@ -124,54 +214,6 @@ fn buffer(gpu: &Gpu, plan: &Plan) -> Result<vk::Buffer, GpuError> {
     let create = vk::BufferCreateInfo::default().size(plan.buffer_bytes()).usage(usage);
     // SAFETY: the create info is complete and outlives the call.
     unsafe { gpu.device().create_buffer(&create, None) }.map_err(|e| named("vkCreateBuffer", e, plan.buffer_bytes()))
-}
-
-/// The memory type that serves the plan best: local, mapped, and what the driver wants for the buffer fits the plan.
-fn memory_kind(gpu: &Gpu, buffer: vk::Buffer, plan: &Plan) -> Result<u32, GpuError> {
-    let (needs, bytes) = (gpu.buffer_needs(buffer), plan.total_bytes);
-    if needs.size > bytes {
-        return Err(GpuError::PlanMismatch { wanted: needs.size, planned: bytes });
-    }
-    let properties = gpu.memory_properties();
-    let usable = vk::MemoryPropertyFlags::HOST_VISIBLE | vk::MemoryPropertyFlags::HOST_COHERENT;
-    let local = vk::MemoryPropertyFlags::DEVICE_LOCAL;
-    let cached = vk::MemoryPropertyFlags::HOST_CACHED;
-    let heap = |t: &vk::MemoryType| properties.memory_heaps[t.heap_index as usize].size;
-    let find = |flags: vk::MemoryPropertyFlags| {
-        properties.memory_types_as_slice().iter().enumerate().position(|(i, t)| {
-            needs.memory_type_bits & (1 << i) != 0 && t.property_flags.contains(flags) && heap(t) >= bytes
-        })
-    };
-    let kind = [usable | local | cached, usable | local, usable | cached, usable].into_iter().find_map(find);
-    kind.map(|kind| kind as u32).ok_or(GpuError::NoMemoryType { bytes })
-}
-
-/// The only `vkAllocateMemory` of the crate.
-///
-/// # Safety
-/// `buffer` was made by `gpu`, needs at most `bytes` of memory of type `kind`, and has none yet.
-unsafe fn allocate(
-    gpu: &Gpu,
-    buffer: vk::Buffer,
-    bytes: u64,
-    kind: u32,
-) -> Result<(vk::DeviceMemory, *mut u8), GpuError> {
-    let device = gpu.device();
-    // SAFETY: by this function's contract; the memory is bound once and mapped whole.
-    unsafe {
-        let info = vk::MemoryAllocateInfo::default().allocation_size(bytes).memory_type_index(kind);
-        let memory = device.allocate_memory(&info, None).map_err(|e| named("vkAllocateMemory", e, bytes))?;
-        let mapped = device
-            .bind_buffer_memory(buffer, memory, 0)
-            .and_then(|()| device.map_memory(memory, 0, vk::WHOLE_SIZE, vk::MemoryMapFlags::empty()));
-        match mapped {
-            Ok(pointer) => Ok((memory, pointer.cast::<u8>())),
-            Err(e) => {
-                device.free_memory(memory, None);
-                Err(named("vkMapMemory", e, bytes))
-            }
-        }
-    }
 }
 
 #[cfg(test)]

@@ -202,7 +202,7 @@ fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
         sh_degree: 3,
         max_gaussians: Some(GAUSSIANS),
         scene_gaussians: None,
-        sort_lanes: gpu.info().sort_lanes(),
+        lanes: gpu.info().lanes(),
         ..Default::default()
     };
     let plan = Plan::with_capacities(&request, GAUSSIANS, INSTANCES * GAUSSIANS);

@@ -105,7 +105,7 @@ impl Commands {
     ///
     /// # Errors
     /// The device fails.
-    pub fn begin<'a>(&'a self, pipelines: &'a Pipelines) -> Result<Recording<'a>, GpuError> {
+    pub fn begin<'a>(&'a self, pipelines: &'a Pipelines, arena: &'a Arena) -> Result<Recording<'a>, GpuError> {
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
         let timed = self.gpu.timestamp_ns() > 0.0 && (self.weight.get() > 0.0 || is_traced());
         // SAFETY: the buffer is not pending: `submit` waits.
@@ -117,7 +117,11 @@ impl Commands {
                 device.cmd_reset_query_pool(self.buffer, self.queries, 0, STAMPS as u32);
             }
         }
-        let recording = Recording { commands: self, pipelines, timed };
+        let recording = Recording { commands: self, pipelines, arena, timed };
+        // SAFETY: the buffer is being recorded, and a recording is submitted before the host goes on.
+        if unsafe { arena.before_kernels(self.buffer)? } {
+            recording.barrier();
+        }
         recording.stamp(Stage::Target, None);
         Ok(recording)
     }
@@ -176,6 +180,7 @@ impl Commands {
 pub(crate) struct Recording<'a> {
     commands: &'a Commands,
     pipelines: &'a Pipelines,
+    arena: &'a Arena,
     timed: bool,
 }
 
@@ -219,11 +224,17 @@ impl Recording<'_> {
     }
 
     /// Zeroes a section's first `bytes` bytes (a multiple of four).
-    pub fn clear(&self, arena: &Arena, section: Section, bytes: u64, stage: Stage) {
+    pub fn clear(&self, section: Section, bytes: u64, stage: Stage) {
         // SAFETY: the range lies inside the arena's buffer, which has TRANSFER_DST usage.
         unsafe {
             let bytes = bytes.min(section.bytes);
-            self.commands.gpu.device().cmd_fill_buffer(self.commands.buffer, arena.buffer, section.offset, bytes, 0);
+            self.commands.gpu.device().cmd_fill_buffer(
+                self.commands.buffer,
+                self.arena.buffer,
+                section.offset,
+                bytes,
+                0,
+            );
         }
         self.barrier();
         self.stamp(stage, None);
@@ -233,6 +244,7 @@ impl Recording<'_> {
         let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
         let all = vk::AccessFlags::SHADER_READ
             | vk::AccessFlags::SHADER_WRITE
+            | vk::AccessFlags::TRANSFER_READ
             | vk::AccessFlags::TRANSFER_WRITE
             | vk::AccessFlags::UNIFORM_READ;
         let memory = [vk::MemoryBarrier::default().src_access_mask(all).dst_access_mask(all)];
@@ -274,7 +286,17 @@ impl Recording<'_> {
     /// # Errors
     /// The device fails or is lost.
     pub fn submit(self) -> Result<(), GpuError> {
+        self.submit_and_read(&[])
+    }
+
+    /// As [`Self::submit`]; the host looks at the sections of these names next, which a mirror then has at once.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
         let c = self.commands;
+        // SAFETY: the buffer is being recorded, and every kernel ends with a barrier.
+        unsafe { self.arena.after_kernels(c.buffer, sections) };
         let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
         let host = [vk::MemoryBarrier::default()
             .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)

@@ -9,9 +9,9 @@ pub use error::GpuError;
 pub use limits::DeviceLimits;
 
 use ash::{Device, Entry, Instance, vk};
-use config::plan::{SORT_LANES_GPU, SORT_LANES_SOFTWARE};
+use config::plan::Lanes;
 use std::ffi::CStr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// What a device says about itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -39,9 +39,13 @@ pub struct GpuInfo {
 }
 
 impl GpuInfo {
-    /// Lanes that sort and emit on this device: what a plan for it asks for.
-    pub fn sort_lanes(&self) -> u32 {
-        if self.is_cpu { SORT_LANES_SOFTWARE } else { SORT_LANES_GPU }
+    /// Lanes that share the work on this device: what a plan for it asks for.
+    pub fn lanes(&self) -> Lanes {
+        match (self.is_cpu, self.is_integrated) {
+            (true, _) => Lanes::SOFTWARE,
+            (false, true) => Lanes::BOARD,
+            (false, false) => Lanes::CARD,
+        }
     }
 }
 
@@ -59,15 +63,13 @@ pub struct Gpu {
 struct Inner {
     info: GpuInfo,
     device: Device,
-    instance: Instance,
+    instance: &'static Instance,
     physical: vk::PhysicalDevice,
     queue: vk::Queue,
     family: u32,
     timestamp_ns: f64,
     #[cfg(test)]
     forced: Forced,
-    // The loader stays open for as long as anything made by it.
-    _entry: Entry,
 }
 
 /// Oddities of drivers that the tests' own does not have.
@@ -78,6 +80,8 @@ pub(crate) struct Forced {
     pub padding: u64,
     /// Kernels have no effect.
     pub computes_nothing: bool,
+    /// The host cannot reach the device's memory.
+    pub apart: bool,
 }
 
 impl std::fmt::Debug for Gpu {
@@ -92,7 +96,6 @@ impl Drop for Inner {
         unsafe {
             let _ = self.device.device_wait_idle();
             self.device.destroy_device(None);
-            self.instance.destroy_instance(None);
         }
     }
 }
@@ -103,11 +106,7 @@ impl Gpu {
     /// # Errors
     /// [`GpuError::NoLoader`] without a Vulkan loader, [`GpuError::NoDevice`] when there is no device.
     pub fn list() -> Result<Vec<GpuInfo>, GpuError> {
-        let (_entry, instance) = instance()?;
-        let found = devices(&instance).map(|all| all.into_iter().map(|d| d.1).collect::<Vec<_>>());
-        // SAFETY: nothing else was made from this instance.
-        unsafe { instance.destroy_instance(None) };
-        let found = found?;
+        let found: Vec<_> = devices(instance()?)?.into_iter().map(|d| d.1).collect();
         if found.is_empty() { Err(GpuError::NoDevice { wanted: None, present: String::new() }) } else { Ok(found) }
     }
 
@@ -117,31 +116,27 @@ impl Gpu {
     /// # Errors
     /// As [`Gpu::list`]; [`GpuError::NoDevice`] names what is present when nothing matches.
     pub fn open(name: Option<&str>) -> Result<Self, GpuError> {
-        let (entry, instance) = instance()?;
-        match open_in(&instance, name) {
-            Ok((physical, info, device, family, timestamp_ns)) => {
-                // SAFETY: queue 0 of `family` was requested when the device was made.
-                let queue = unsafe { device.get_device_queue(family, 0) };
-                let inner = Inner {
-                    info,
-                    device,
-                    instance,
-                    physical,
-                    queue,
-                    family,
-                    timestamp_ns,
-                    #[cfg(test)]
-                    forced: Forced::default(),
-                    _entry: entry,
-                };
-                Ok(Self { inner: Arc::new(inner) })
-            }
-            Err(e) => {
-                // SAFETY: no device was made from this instance.
-                unsafe { instance.destroy_instance(None) };
-                Err(e)
-            }
-        }
+        let instance = instance()?;
+        let (physical, info, device, family, timestamp_ns) = {
+            // One after the other: of four threads that opened NVIDIA's at once (580.159) none came back, once.
+            static OPENING: Mutex<()> = Mutex::new(());
+            let _alone = OPENING.lock().unwrap_or_else(PoisonError::into_inner);
+            open_in(instance, name)?
+        };
+        // SAFETY: queue 0 of `family` was requested when the device was made.
+        let queue = unsafe { device.get_device_queue(family, 0) };
+        let inner = Inner {
+            info,
+            device,
+            instance,
+            physical,
+            queue,
+            family,
+            timestamp_ns,
+            #[cfg(test)]
+            forced: Forced::default(),
+        };
+        Ok(Self { inner: Arc::new(inner) })
     }
 
     /// What the device says about itself.
@@ -173,6 +168,14 @@ impl Gpu {
     pub(crate) fn computes_nothing(&self) -> bool {
         #[cfg(test)]
         return self.inner.forced.computes_nothing;
+        #[cfg(not(test))]
+        false
+    }
+
+    /// Whether the device's memory counts as a card's although it is the host's.
+    pub(crate) fn is_forced_apart(&self) -> bool {
+        #[cfg(test)]
+        return self.inner.forced.apart;
         #[cfg(not(test))]
         false
     }
@@ -209,7 +212,19 @@ impl Gpu {
     }
 }
 
-fn instance() -> Result<(Entry, Instance), GpuError> {
+/// The process's one instance, made when it is first asked for and never destroyed: with the last instance the loader unloads the
+/// drivers, and NVIDIA's (580.159) must not be unloaded while a thread that used it is yet to end.
+fn instance() -> Result<&'static Instance, GpuError> {
+    static MADE: Mutex<Option<&'static (Entry, Instance)>> = Mutex::new(None);
+    let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some((_, instance)) = *made {
+        return Ok(instance);
+    }
+    let (_, instance) = *made.insert(Box::leak(Box::new(new_instance()?)));
+    Ok(instance)
+}
+
+fn new_instance() -> Result<(Entry, Instance), GpuError> {
     // SAFETY: loading the system's Vulkan loader runs its initialisers; it is the documented way to reach Vulkan.
     let entry = unsafe { Entry::load() }.map_err(|e| GpuError::NoLoader(e.to_string()))?;
     let application = vk::ApplicationInfo::default().application_name(c"dgtr").api_version(vk::API_VERSION_1_1);

@@ -23,6 +23,8 @@ pub(crate) const GROUPS: usize = Group::Scan as usize + 1;
 
 /// Lanes of a scanning workgroup (a number inside its shaders).
 pub(crate) const SCAN_LANES: u32 = 256;
+/// Lanes that sum depths; one lane merges what they leave.
+pub(crate) const DEPTH_LANES: u32 = 1024;
 
 /// A kernel as it is checked in.
 #[derive(Clone, Copy)]

@@ -2,12 +2,12 @@
 //! sums. The declarations here are the only ones: `shaders/layout.glsl` is generated from them (`DGTR_BLESS=1 cargo test
 //! -p vulkan` remakes it and the SPIR-V), and a test compares the two.
 
-use config::plan::{LOOP_LANES, SORT_LANES_GPU, STATUS_BYTES};
+use config::plan::{LANE_SUM_BYTES, Lanes, STATUS_BYTES};
 
 /// Missed steps that the table of lazy Adam updates covers; no Gaussian is left behind for longer.
 pub(crate) const DEFERRED_STEPS: usize = 512;
 /// Cursors in the status section: the largest number of sorting lanes.
-const CURSORS: usize = SORT_LANES_GPU as usize;
+const CURSORS: usize = Lanes::CARD.sort as usize;
 
 /// A type that both languages have.
 trait Glsl {
@@ -248,7 +248,7 @@ impl Default for Push {
 
 const _: () = assert!(size_of::<Status>() as u64 <= STATUS_BYTES);
 const _: () = assert!(size_of::<DepthMoments>() == size_of::<PoseSums>());
-const _: () = assert!(LOOP_LANES * size_of::<PoseSums>() as u64 == config::plan::LANE_SUMS_BYTES);
+const _: () = assert!(size_of::<PoseSums>() as u64 == LANE_SUM_BYTES);
 
 macro_rules! flags {
     ($($(#[doc = $doc:literal])* $name:ident = $value:literal;)*) => {

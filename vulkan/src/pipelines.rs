@@ -5,11 +5,13 @@ mod listed;
 
 use crate::arena::{Arena, Section};
 use crate::gpu::{DeviceLimits, Gpu, GpuError};
-use crate::kernels::{FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots};
+use crate::kernels::{
+    DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
+};
 use crate::kernels::{texel_bytes, texel_format};
 use crate::shape::KernelShape;
 use ash::vk;
-use config::plan::{LOOP_LANES, Plan, sh_columns};
+use config::plan::{Plan, sh_columns};
 
 /// Storage buffers a kernel may bind (V3DV allows eight per stage).
 const STORAGE_BINDINGS: u32 = 8;
@@ -269,8 +271,11 @@ impl Pipelines {
             local_size: local_size(kernel.group, self.shape),
             sh_columns: sh_columns(plan.sh_degree) as u32,
             sh_degree: plan.sh_degree.into(),
-            sort_lanes: plan.sort_lanes,
-            loop_lanes: LOOP_LANES as u32,
+            sort_lanes: plan.lanes.sort,
+            loop_lanes: match kernel.file {
+                "depth_sums" | "depth_finish" => DEPTH_LANES,
+                _ => plan.lanes.loops,
+            },
             own_degrees: own_degrees.into(),
             half_moments: plan.half_moments.into(),
             staged: (self.shape.fetched > 1).into(),

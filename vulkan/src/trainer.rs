@@ -44,7 +44,7 @@ use crate::pipelines::Pipelines;
 use crate::shape::KernelShape;
 use crate::stages::STAGE_NAMES;
 use bytemuck::Zeroable;
-use config::plan::{LOOP_LANES, Plan};
+use config::plan::Plan;
 use config::settings::SettingError;
 use config::training::{Strategy, TrainSettings, scene_extent};
 use std::ops::ControlFlow;
@@ -305,6 +305,11 @@ impl Trainer {
         self.arena.total_bytes
     }
 
+    /// Bytes of the host's memory beside them, where the device is a card with memory of its own.
+    pub fn mirror_bytes(&self) -> u64 {
+        self.arena.mirror_bytes()
+    }
+
     /// Times every step from here on instead of one in sixteen: for those who measure, not for those who train.
     pub fn time_every_step(&mut self) {
         self.timed_every = 1;
@@ -349,14 +354,14 @@ impl Trainer {
         let all = Push { mode: 1, ..Push::default() };
         let recording = self.take_recording()?;
         recording.run(Kernel::Project, self.gaussians, all);
-        recording.run(Kernel::Shade, LOOP_LANES as usize, all);
+        recording.run(Kernel::Shade, self.plan.lanes.loops as usize, all);
         recording.submit()?;
         self.flushed = true;
         Ok(())
     }
 
     fn take_recording(&self) -> Result<Recording<'_>, TrainError> {
-        Ok(self.commands.begin(&self.pipelines)?)
+        Ok(self.commands.begin(&self.pipelines, &self.arena)?)
     }
 
     fn write_frame(&mut self) {

@@ -3,7 +3,7 @@
 
 mod scenes;
 
-use config::plan::{Plan, PlanRequest, SORT_LANES_GPU, SORT_LANES_SOFTWARE};
+use config::plan::{Lanes, Plan, PlanRequest};
 use models::camera::DepthPrior;
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
@@ -25,13 +25,14 @@ fn gpu() -> Option<Gpu> {
 /// Everything that draws random numbers or sums over many lanes: growth, relocation, noise, depth, pose and exposure,
 /// two views, and a picture that is no multiple of any workgroup. Few `instances` are done in bands.
 fn trained(gpu: &Gpu, shape: KernelShape, instances: usize, steps: u32) -> (GaussianCloud, Rendering, u64) {
-    trained_with(gpu, shape, SORT_LANES_SOFTWARE, instances, steps)
+    trained_with(gpu, shape, (Lanes::SOFTWARE, true), instances, steps)
 }
 
+/// Where `refine` says so, poses are refined: their gradient is summed in as many parts as lanes loop.
 fn trained_with(
     gpu: &Gpu,
     shape: KernelShape,
-    sort_lanes: u32,
+    (lanes, refine): (Lanes, bool),
     instances: usize,
     steps: u32,
 ) -> (GaussianCloud, Rendering, u64) {
@@ -42,8 +43,8 @@ fn trained_with(
     settings.regularise.noise = 2.0;
     settings.regularise.opacity_decay = 0.004;
     settings.loss.depth = 0.2;
-    (settings.refine_poses, settings.refine_exposure) = (true, true);
-    let request = PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, sort_lanes, ..Default::default() };
+    (settings.refine_poses, settings.refine_exposure) = (refine, true);
+    let request = PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, 3000, instances);
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape).unwrap();
     trainer.load(&cloud(8, 1500, 3)).unwrap();
@@ -118,13 +119,15 @@ fn in_bands_the_model_is_the_same_to_the_bit_with_every_shape() {
 }
 
 #[test]
-fn a_gpu_s_number_of_sorting_lanes_leaves_the_same_bits_at_once_and_in_bands() {
+fn a_board_s_and_a_card_s_number_of_lanes_leave_the_same_bits_at_once_and_in_bands() {
     let Some(gpu) = gpu() else { return };
     let shape = KernelShape::standard(gpu.info());
     for (instances, steps) in [(200_000, 20), (3000, 4)] {
-        let (few, drawn, _) = trained_with(&gpu, shape, SORT_LANES_SOFTWARE, instances, steps);
-        let (many, other, _) = trained_with(&gpu, shape, SORT_LANES_GPU, instances, steps);
-        assert!(bits(&few) == bits(&many) && drawn.rgb == other.rgb, "{instances} instances");
+        for (lanes, refine) in [(Lanes::BOARD, true), (Lanes::CARD, false)] {
+            let (few, drawn, _) = trained_with(&gpu, shape, (Lanes::SOFTWARE, refine), instances, steps);
+            let (many, other, _) = trained_with(&gpu, shape, (lanes, refine), instances, steps);
+            assert!(bits(&few) == bits(&many) && drawn.rgb == other.rgb, "{instances} instances, {lanes:?}");
+        }
     }
 }
 

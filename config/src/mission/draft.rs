@@ -123,7 +123,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::plan::{Plan, PlanRequest, SORT_LANES_GPU};
+    use crate::plan::{Lanes, Plan, PlanRequest};
 
     fn draft() -> Draft {
         Draft {
@@ -166,7 +166,7 @@ mod tests {
                 views: mission.keyframes.max,
                 max_gaussians: mission.memory.max_gaussians.map(|n| n as usize),
                 scene_gaussians: mission.memory.scene_gaussians.map(|n| n as usize),
-                sort_lanes: SORT_LANES_GPU,
+                lanes: Lanes::BOARD,
                 ..PlanRequest::default()
             };
             Plan::new(&request).unwrap_or_else(|e| panic!("{preset:?} {picture:?}: {e}"));

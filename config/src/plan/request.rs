@@ -1,6 +1,6 @@
 //! What a job asks of the device, and which of its views find room there.
 
-use super::{BINDING_LIMIT, Plan, SORT_LANES_SOFTWARE, crop_bytes, sh_columns, view_bytes};
+use super::{BINDING_LIMIT, Lanes, Plan, crop_bytes, sh_columns, view_bytes};
 
 /// Views on the device at the least: the step's own, and the one that comes in.
 const LEAST_SLOTS: u32 = 2;
@@ -30,8 +30,8 @@ pub struct PlanRequest {
     pub scene_gaussians: Option<usize>,
     /// Adam's moments of SH in 16 bits each.
     pub half_moments: bool,
-    /// Lanes that sort and emit: [`SORT_LANES_SOFTWARE`] or [`SORT_LANES_GPU`](super::SORT_LANES_GPU).
-    pub sort_lanes: u32,
+    /// Lanes that share the work: the device's.
+    pub lanes: Lanes,
 }
 
 impl Default for PlanRequest {
@@ -48,7 +48,7 @@ impl Default for PlanRequest {
             max_gaussians: None,
             scene_gaussians: None,
             half_moments: false,
-            sort_lanes: SORT_LANES_SOFTWARE,
+            lanes: Lanes::SOFTWARE,
         }
     }
 }

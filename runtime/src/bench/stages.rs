@@ -149,7 +149,7 @@ pub fn measure(
         max_gaussians: Some(scene.cloud.len()),
         scene_gaussians: None,
     };
-    let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().sort_lanes()))?;
+    let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().lanes()))?;
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
     trainer.time_every_step();
     trainer.load(&scene.cloud)?;

@@ -182,7 +182,7 @@ fn computes(info: &GpuInfo) -> Finding {
 
 /// Whether the device takes the plan that `dgtr plan` makes by default.
 fn takes_a_plan(info: &GpuInfo) -> Finding {
-    let request = PlanRequest { sort_lanes: info.sort_lanes(), ..PlanRequest::default() };
+    let request = PlanRequest { lanes: info.lanes(), ..PlanRequest::default() };
     let plan = match Plan::new(&request) {
         Ok(plan) => plan,
         Err(e) => return Finding::missing(e, "lower memory.device_mib"),

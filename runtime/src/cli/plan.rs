@@ -6,7 +6,7 @@ use config::disk::plan::{DiskPlan, DiskRequest};
 use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::{MemorySettings, Mission, NetworkSettings};
-use config::plan::{Plan, SORT_LANES_SOFTWARE};
+use config::plan::{Lanes, Plan};
 use config::refine::RefineSettings;
 use config::training::{CropSettings, ShSettings};
 use models::dataset::{Dataset, scaled};
@@ -87,13 +87,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
         None => Job::of_arguments(&args)?,
     };
     // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
-    let (sort_lanes, lies) = match (devices::open_known(args.device.as_deref()), &args.device) {
-        (Ok(gpu), _) => (gpu.info().sort_lanes(), device_memory(gpu.info())),
+    let (lanes, lies) = match (devices::open_known(args.device.as_deref()), &args.device) {
+        (Ok(gpu), _) => (gpu.info().lanes(), device_memory(gpu.info())),
         // A bound that is too large ends no flight.
-        (Err(_), None) => (SORT_LANES_SOFTWARE, DeviceMemory::Shared),
+        (Err(_), None) => (Lanes::SOFTWARE, DeviceMemory::Shared),
         (Err(e), Some(_)) => return Err(e.into()),
     };
-    let request = job.device.plan_request(&job.sh, sort_lanes);
+    let request = job.device.plan_request(&job.sh, lanes);
     let plan = Plan::new(&request)?;
     if args.systemd {
         let processors = std::thread::available_parallelism().map_or(1, usize::from);
@@ -120,7 +120,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         plan.gaussians,
         plan.instances,
         plan.tiles,
-        plan.sort_lanes
+        plan.lanes.sort
     );
     if plan.is_paged() {
         outln!(

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use config::mission::Mission;
-use config::plan::{Plan, PlanError, PlanRequest};
+use config::plan::{Lanes, Plan, PlanError, PlanRequest};
 use config::training::{ShSettings, TrainSettings};
 use models::camera::Intrinsics;
 use models::cloud::GaussianCloud;
@@ -61,8 +61,8 @@ pub struct DeviceRequest {
 }
 
 impl DeviceRequest {
-    /// The request that [`Plan`] is made of; `sort_lanes` are the device's.
-    pub fn plan_request(&self, sh: &ShSettings, sort_lanes: u32) -> PlanRequest {
+    /// The request that [`Plan`] is made of; `lanes` are the device's.
+    pub fn plan_request(&self, sh: &ShSettings, lanes: Lanes) -> PlanRequest {
         PlanRequest {
             device_mib: self.device_mib,
             width: self.size.0,
@@ -74,7 +74,7 @@ impl DeviceRequest {
             max_gaussians: self.max_gaussians,
             scene_gaussians: self.scene_gaussians,
             half_moments: sh.half_moments,
-            sort_lanes,
+            lanes,
         }
     }
 
@@ -101,7 +101,7 @@ impl DeviceRequest {
     /// No device, or a plan that does not fit into it or into `device_mib`.
     pub fn open<E: From<PlanError> + From<TrainError>>(&self, training: &TrainSettings) -> Result<Trainer, E> {
         let gpu = devices::open(self.device.as_deref()).map_err(TrainError::from)?;
-        let request = self.plan_request(&training.sh, gpu.info().sort_lanes());
+        let request = self.plan_request(&training.sh, gpu.info().lanes());
         let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
         if request.view_file_bytes() > 0 {
             trainer.keep_views_in(self.scratch(request.view_file_bytes())?);
@@ -197,7 +197,7 @@ fn empty_renderer(
         max_gaussians: Some(gaussians),
         scene_gaussians: None,
     };
-    let request = request.plan_request(&settings.sh, gpu.info().sort_lanes());
+    let request = request.plan_request(&settings.sh, gpu.info().lanes());
     let pixels = width as usize * height as usize;
     let plan = Plan::with_capacities(&request, gaussians, gaussians + instances_per_pixel * pixels);
     Ok(Trainer::with_shape(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?)

@@ -27,8 +27,9 @@ const DIVIDED_BYTES: u64 = 40;
 pub struct HostRequest<'a> {
     /// Plan of the device.
     pub plan: &'a Plan,
-    /// The device's memory is the host's (a software renderer).
-    pub shared: bool,
+    /// Bytes of the host's memory that the device takes: all of its plan where it is a software renderer, a mirror of what the host
+    /// works on where it is a card.
+    pub on_host: u64,
     /// The initialiser's own plan, bytes.
     pub initialiser: u64,
     /// `[refine]`, when poses are refined.
@@ -83,7 +84,7 @@ impl HostPlan {
                     false => 0,
                 }),
             ),
-            ("device", if r.shared { r.plan.total_bytes } else { 0 }),
+            ("device", r.on_host),
         ];
         Self { sections }
     }
@@ -119,7 +120,7 @@ mod tests {
         let refine = RefineSettings::default();
         let mut request = HostRequest {
             plan,
-            shared: false,
+            on_host: 0,
             initialiser: 100 << 20,
             refine: Some(&refine),
             refine_in_file: false,
@@ -141,7 +142,7 @@ mod tests {
     fn every_term_of_the_host_plan_counts_and_a_software_device_lies_on_the_host() {
         let plan = Plan::new(&PlanRequest::default()).unwrap();
         let before = total(&plan, |_| {});
-        assert_eq!(total(&plan, |r| r.shared = true) - before, plan.total_bytes);
+        assert_eq!(total(&plan, |r| r.on_host = plan.total_bytes) - before, plan.total_bytes);
         assert_eq!(total(&plan, |r| r.ahead += 1) - before, 3 * plan.pixels as u64);
         assert_eq!(total(&plan, |r| r.ahead_in_memory = true) - before, 4 * 3 * 640 * 480);
         assert_eq!(total(&plan, |r| r.camera_pixels += 1000) - before, 6000);
@@ -165,7 +166,7 @@ mod tests {
         // On a software device, with a camera of 12 megapixels; the initialiser's plan as `dgtr fly` names it, and as many
         // pictures decoded ahead as it asks for, rounded up.
         let defaults = |r: &mut HostRequest<'_>| {
-            (r.shared, r.initialiser, r.camera_pixels, r.ahead) = (true, 909 << 20, 4056 * 3040, 24);
+            (r.on_host, r.initialiser, r.camera_pixels, r.ahead) = (plan.total_bytes, 909 << 20, 4056 * 3040, 24);
             r.map = config::map::MapSettings::default().host_bytes();
         };
         let bytes = total(&plan, defaults);

@@ -19,6 +19,8 @@ pub(super) enum Kind {
     CopyKernel,
     /// `vkCmdCopyBuffer` over the whole buffer.
     CopyCommand,
+    /// `vkCmdFillBuffer` over the whole buffer with something else than zeros, which some devices do not move.
+    Fill,
     /// `ceiling_fma.comp`.
     Fma { lanes: u32, turns: u32 },
 }
@@ -73,7 +75,7 @@ fn two_buffers(bytes: u64) -> Plan {
         view_slots: 0,
         sh_degree: 0,
         half_moments: false,
-        sort_lanes: 0,
+        lanes: config::plan::Lanes::SOFTWARE,
         sections: vec![("source", bytes), ("into", bytes)],
         total_bytes: 2 * bytes,
     }
@@ -99,7 +101,6 @@ impl Probe {
             gpu: gpu.clone(),
         };
         let source = made.arena.section("source");
-        made.arena.slice_mut::<f32>(source).fill(0.5);
         let device = gpu.device();
         let binding = |i: u32, kind: vk::DescriptorType| {
             vk::DescriptorSetLayoutBinding::default()
@@ -142,6 +143,7 @@ impl Probe {
             made.pipelines[1] = made.pipeline("ceiling_fma", include_bytes!("../../shaders/spirv/ceiling_fma.spv"))?;
         }
         made.bind();
+        made.run(Kind::Fill, 1)?;
         Ok(made)
     }
 
@@ -217,6 +219,12 @@ impl Probe {
                     [vk::BufferCopy { src_offset: source.offset, dst_offset: into.offset, size: source.bytes }];
                 // SAFETY: both ranges lie inside the buffer, which may be copied from and to, and do not overlap.
                 unsafe { device.cmd_copy_buffer(self.buffer, self.arena.buffer, self.arena.buffer, &region) };
+                return;
+            }
+            Kind::Fill => {
+                let half = 0.5f32.to_bits();
+                // SAFETY: the range lies inside the buffer, which may be filled.
+                unsafe { device.cmd_fill_buffer(self.buffer, self.arena.buffer, source.offset, source.bytes, half) };
                 return;
             }
             Kind::CopyKernel => (self.pipelines[0], COPY_GROUPS, 0),

@@ -2,7 +2,7 @@
 //! made from the list of kernels. `DGTR_BLESS=1` remakes it.
 
 use super::*;
-use config::plan::SORT_LANES_GPU;
+use config::plan::Lanes;
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -28,7 +28,8 @@ fn lines() -> BTreeSet<String> {
                 let name = format!("{}{suffix}", kernel.file);
                 let chosen = [("", 1), ("+half", half), ("+staged", staged)];
                 let label: String = chosen.iter().filter(|c| c.1 == 1).map(|c| c.0).collect();
-                let constants = format!("{lanes} {} 3 {SORT_LANES_GPU} {LOOP_LANES} 0 {half} {staged}", sh_columns(3));
+                let board = Lanes::BOARD;
+                let constants = format!("{lanes} {} 3 {} {} 0 {half} {staged}", sh_columns(3), board.sort, board.loops);
                 lines.insert(format!("{name}:{lanes}{label} {name}.spv {constants}"));
                 if kernel.spirv.storage.is_some() && shape == one && half == 0 {
                     lines.insert(format!("{name}:{lanes}+storage {name}.storage.spv {constants}"));

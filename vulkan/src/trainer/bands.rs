@@ -6,10 +6,12 @@ use crate::gpu::GpuError;
 use crate::kernels::Kernel;
 use crate::layout::{FLAG_ORTHOGRAPHIC, Push};
 use crate::stages::Stage;
-use config::plan::LOOP_LANES;
 
 /// Rounds of counting and emitting to begin with; more are taken, and kept, when a frame needs them.
 pub(crate) const WALK_ROUNDS: u32 = 2;
+
+/// What counting leaves for the host.
+pub(super) const COUNTS: [&str; 2] = ["status", "tile_starts"];
 
 /// Tiles [first, last).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,7 +31,7 @@ impl Trainer {
     /// Depth sort, colours, instances per tile; everything up to where the number of instances is needed.
     pub(super) fn record_counting(&self, recording: &Recording<'_>) {
         recording.run(Kernel::Project, self.gaussians, Push::default());
-        let blocks = self.plan.sort_lanes as usize;
+        let blocks = self.plan.lanes.sort as usize;
         for pass in 0..4 {
             let push = Push { pass, ..Push::default() };
             let (count, scatter) = if pass % 2 == 0 {
@@ -41,7 +43,7 @@ impl Trainer {
             recording.run(Kernel::SortScan, 256, push);
             recording.run(scatter, blocks, push);
         }
-        recording.run(Kernel::Shade, LOOP_LANES as usize, Push::default());
+        recording.run(Kernel::Shade, self.plan.lanes.loops as usize, Push::default());
         self.record_tiles(recording);
     }
 
@@ -49,9 +51,9 @@ impl Trainer {
     pub(super) fn record_tiles(&self, recording: &Recording<'_>) {
         let tiles = self.frame.tiles();
         let all = Push { first: 0, last: tiles, ..Push::default() };
-        let bytes = 4 * u64::from(tiles) * u64::from(self.plan.sort_lanes);
-        recording.clear(&self.arena, self.arena.section("tiles"), bytes, Stage::Count);
-        recording.run_rounds(Kernel::Count, self.plan.sort_lanes as usize, all, self.walk_rounds);
+        let bytes = 4 * u64::from(tiles) * u64::from(self.plan.lanes.sort);
+        recording.clear(self.arena.section("tiles"), bytes, Stage::Count);
+        recording.run_rounds(Kernel::Count, self.plan.lanes.sort as usize, all, self.walk_rounds);
         recording.run(Kernel::TilePrefix, tiles as usize, all);
         recording.run(Kernel::TileScan, 256, all);
     }
@@ -60,9 +62,9 @@ impl Trainer {
     pub(super) fn record_emit(&self, recording: &Recording<'_>, band: Band, single: bool) {
         let push = Push { first: band.first, last: band.last, mode: 1, pass: 0 };
         if !single {
-            recording.run_rounds(Kernel::Count, self.plan.sort_lanes as usize, push, self.walk_rounds);
+            recording.run_rounds(Kernel::Count, self.plan.lanes.sort as usize, push, self.walk_rounds);
         }
-        recording.run_rounds(Kernel::Emit, self.plan.sort_lanes as usize, push, self.walk_rounds);
+        recording.run_rounds(Kernel::Emit, self.plan.lanes.sort as usize, push, self.walk_rounds);
     }
 
     pub(super) fn record_blend(&self, recording: &Recording<'_>, band: Band) {
@@ -87,7 +89,7 @@ impl Trainer {
             self.walk_rounds = self.walk_rounds.saturating_mul(2);
             let recording = self.take_recording()?;
             self.record_tiles(&recording);
-            recording.submit()?;
+            recording.submit_and_read(&COUNTS)?;
         }
         let (visible, total) = (self.status().visible as usize, self.status().instances);
         let starts = self.arena.slice::<u32>(self.arena.section("tile_starts"));
@@ -102,7 +104,7 @@ impl Trainer {
     }
 
     fn walk_is_complete(&self) -> bool {
-        self.status().lane_counted[..self.plan.sort_lanes as usize].iter().all(|counted| *counted == 1)
+        self.status().lane_counted[..self.plan.lanes.sort as usize].iter().all(|counted| *counted == 1)
     }
 }
 

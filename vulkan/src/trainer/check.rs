@@ -26,8 +26,8 @@ const TRIED: usize = 200;
 /// [`GpuError::ComputesNothing`], [`GpuError::ComputesWrong`], or what the driver says, as [`TrainError::Gpu`].
 pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
     let (v, c) = (view(64, 48), cloud(3, TRIED, 0));
-    let sort_lanes = gpu.info().sort_lanes();
-    let request = PlanRequest { width: 64, height: 48, views: 0, sh_degree: 0, sort_lanes, ..Default::default() };
+    let lanes = gpu.info().lanes();
+    let request = PlanRequest { width: 64, height: 48, views: 0, sh_degree: 0, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, TRIED, TRIED);
     let shape = KernelShape::standard(gpu.info());
     let mut trainer = Trainer::with_kernels(gpu, &plan, &plain(), shape, &[Kernel::Project])?;
@@ -39,9 +39,9 @@ pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
     let recording = trainer.take_recording()?;
     recording.run(Kernel::Project, TRIED, Push::default());
     recording.submit()?;
-    let keys = &trainer.arena.slice::<u32>(trainer.arena.section("keys"))[..TRIED];
-    let projected = trainer.arena.slice::<[f32; 4]>(trainer.arena.section("projected"));
-    if keys.iter().all(|k| *k == 0) {
+    let keys = trainer.arena.copied::<u32>(trainer.arena.section("keys"));
+    let projected = trainer.arena.copied::<[f32; 4]>(trainer.arena.section("projected"));
+    if keys[..TRIED].iter().all(|k| *k == 0) {
         return Err(GpuError::ComputesNothing.into());
     }
     let camera = Camera::<f32>::of(&v);
@@ -86,8 +86,8 @@ pub struct TrainingCheck {
 pub fn check_training(gpu: &Gpu, shape: KernelShape, steps: u32) -> Result<TrainingCheck, TrainError> {
     let (v, c, settings) = (view(64, 48), cloud(5, TRIED, 3), plain());
     let photo = photo(5, &v);
-    let sort_lanes = gpu.info().sort_lanes();
-    let request = PlanRequest { width: 64, height: 48, views: 1, sort_lanes, ..Default::default() };
+    let lanes = gpu.info().lanes();
+    let request = PlanRequest { width: 64, height: 48, views: 1, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, TRIED, 64 * TRIED);
     let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
     trainer.load(&c)?;

@@ -1,5 +1,6 @@
 //! Rendering any camera at any size, in windows when it is larger than planned and in bands when it is too crowded.
 
+use super::bands::COUNTS;
 use super::frame::Window;
 use super::views::is_usable;
 use super::{TrainError, Trainer};
@@ -114,14 +115,14 @@ impl Trainer {
     fn render_window(&mut self) -> Result<(), TrainError> {
         let r = self.take_recording()?;
         self.record_counting(&r);
-        r.submit()?;
+        r.submit_and_read(&COUNTS)?;
         self.cut_bands()?;
         let single = self.bands.len() == 1;
         for band in &self.bands {
             let r = self.take_recording()?;
             self.record_emit(&r, *band, single);
             self.record_blend(&r, *band);
-            r.submit()?;
+            r.submit_and_read(&["image", "transmittance"])?;
         }
         Ok(())
     }

@@ -1,14 +1,13 @@
 //! One training step.
 
-use super::bands::Counted;
+use super::bands::{COUNTS, Counted};
 use super::frame::flags_of;
 use super::scene::Blocks;
 use super::slots::Picture;
 use super::{StepReport, TrainError, Trainer};
 use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
-use crate::kernels::Kernel;
+use crate::kernels::{DEPTH_LANES, Kernel};
 use crate::layout::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, LossSums, PoseSums, Push};
-use config::plan::LOOP_LANES;
 use rand::Rng;
 use std::time::Instant;
 
@@ -133,7 +132,7 @@ impl Trainer {
         let push = Push { first: first_pixel, ..Push::default() };
         commands.run_view(Kernel::Target, slot, self.frame.pixels(), push);
         self.record_counting(&commands);
-        commands.submit()?;
+        commands.submit_and_read(&COUNTS)?;
         self.cut_bands()
     }
 
@@ -143,7 +142,7 @@ impl Trainer {
         let depth = self.frame.has(FLAG_DEPTH);
         let single = self.bands.len() == 1;
         let backward = if depth { Kernel::RasteriseBackwardDepth } else { Kernel::RasteriseBackward };
-        let lanes = LOOP_LANES as usize;
+        let lanes = self.plan.lanes.loops as usize;
         let visible = self.status().visible as usize;
         let mut r = self.take_recording()?;
         for (i, band) in self.bands.iter().enumerate() {
@@ -157,7 +156,7 @@ impl Trainer {
         let (width, height) = (self.frame.size[0] as usize, self.frame.size[1] as usize);
         let (rows, columns) = (width.div_ceil(STRIP) * height, height.div_ceil(STRIP) * width);
         if depth {
-            r.run(Kernel::DepthSums, lanes, Push::default());
+            r.run(Kernel::DepthSums, DEPTH_LANES as usize, Push::default());
             r.run(Kernel::DepthFinish, 1, Push::default());
         }
         r.run(Kernel::SsimRows, rows, Push::default());
@@ -181,7 +180,7 @@ impl Trainer {
             r.run(Kernel::Reduce, visible, push);
         }
         r.run(Kernel::Optimise, lanes, Push { mode: u32::from(self.gradients_only), ..Push::default() });
-        r.submit()?;
+        r.submit_and_read(&["status", "tile_starts", "lane_sums", "strip_sums"])?;
         Ok(())
     }
 
@@ -250,7 +249,7 @@ impl Trainer {
     pub(super) fn partial_sums(&self) -> PartialSums {
         let mut sums = PartialSums::default();
         let lanes = self.arena.slice::<PoseSums>(self.arena.section("lane_sums"));
-        for p in &lanes[..LOOP_LANES as usize] {
+        for p in &lanes[..self.plan.lanes.loops as usize] {
             for i in 0..3 {
                 sums.pose[i] += f64::from(p.turn[i]);
                 sums.pose[i + 3] += f64::from(p.shift[i]);

@@ -343,7 +343,7 @@ mod tests {
                 t.frame.principal_point,
                 [v.intrinsics.cx / divisor as f32 - x as f32, v.intrinsics.cy / divisor as f32 - y as f32]
             );
-            let words = t.arena.slice::<[u32; 2]>(t.arena.section("target"));
+            let words = t.arena.copied::<[u32; 2]>(t.arena.section("target"));
             for (i, [word, _]) in words[..(width * height) as usize].iter().enumerate() {
                 let (left, top) = (divisor * (x + i as u32 % width), divisor * (y + i as u32 / width));
                 let block =
