@@ -25,6 +25,7 @@ mod near;
 mod overlap;
 mod part;
 mod photometric;
+mod placing;
 mod problem;
 mod radial;
 mod reduced;

@@ -5,10 +5,11 @@ use super::adjust::{Limits, adjust, shared_sigma};
 use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::part::Part;
+use super::placing::Placed;
 use super::problem::{ASPECT, FOCAL, Loss, Observation, PRINCIPAL, PosePrior, Problem, RADIAL, SHARED};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
-use super::triangulate::{Triangulated, triangulate};
+use super::triangulate::Triangulated;
 use super::{RefineError, RefineReport, RefinedPoint, Refiner, SharedEstimate};
 use crate::camera::{Pinhole, Pose};
 use glam::DVec3;
@@ -130,19 +131,15 @@ impl Refiner {
             free: [false; SHARED],
             pixel_sigma: s.pixel_sigma,
         };
-        let cameras = self.cameras();
-        let mut views = Vec::new();
-        for t in chosen {
-            let mut seen = self.sightings(tracks, *t);
-            seen.retain(|s| part.at(s.frame).is_some());
-            if let Some(point) = self.robust_point(&cameras, &mut seen, max_px, &mut views) {
-                problem.points.push(point.world);
-                problem.observations.extend(seen.iter().filter_map(|s| {
-                    let pixel = self.frames[s.frame as usize].seen[s.feature as usize];
-                    Some(Observation { camera: part.at(s.frame)?, pixel })
-                }));
-                problem.starts.push(problem.observations.len() as u32);
-            }
+        let within = |s: &Sighting| part.at(s.frame).is_some();
+        let placed = self.placed(&self.cameras(), tracks, chosen, max_px, within);
+        for (point, seen) in placed.into_iter().filter_map(|p| p.found) {
+            problem.points.push(point.world);
+            problem.observations.extend(seen.iter().filter_map(|s| {
+                let pixel = self.frames[s.frame as usize].seen[s.feature as usize];
+                Some(Observation { camera: part.at(s.frame)?, pixel })
+            }));
+            problem.starts.push(problem.observations.len() as u32);
         }
         self.anchor(&mut problem);
         problem
@@ -150,38 +147,6 @@ impl Refiner {
 
     pub(super) fn cameras(&self) -> Vec<Pinhole> {
         self.frames.iter().map(|f| self.camera_of(f)).collect()
-    }
-
-    /// Triangulates a track; while it does not fit, the sighting furthest off is left out, down to two.
-    pub(super) fn robust_point(
-        &self,
-        cameras: &[Pinhole],
-        seen: &mut Vec<Sighting>,
-        max_px: f64,
-        views: &mut Vec<(Pinhole, [f32; 2])>,
-    ) -> Option<Triangulated> {
-        let min_angle = self.settings.min_angle_deg.to_radians();
-        loop {
-            views.clear();
-            views.extend(seen.iter().map(|s| {
-                let frame = s.frame as usize;
-                (cameras[frame], self.frames[frame].keypoints[s.feature as usize])
-            }));
-            let found = triangulate(views, min_angle)?;
-            let error = |v: &(Pinhole, [f32; 2])| match v.0.project(found.world) {
-                Some(q) => (q - glam::DVec2::new(v.1[0].into(), v.1[1].into())).length(),
-                None => f64::INFINITY,
-            };
-            let worst = views.iter().map(error).enumerate().max_by(|a, b| a.1.total_cmp(&b.1))?;
-            if worst.1 <= max_px {
-                return Some(found);
-            }
-            // Two rays always nearly meet somewhere; a third must agree before one of three is dropped.
-            if seen.len() <= 3 {
-                return None;
-            }
-            seen.remove(worst.0);
-        }
     }
 
     /// Writes adjusted poses and shared parameters back.
@@ -328,17 +293,16 @@ impl Refiner {
         let mut heights: Vec<Vec<f64>> = vec![Vec::new(); self.frames.len()];
         let mut errors = Vec::new();
         self.points.clear();
-        let mut views = Vec::new();
-        for t in 0..tracks.len() {
-            let mut seen = self.sightings(tracks, t as u32);
-            let all = seen.len();
-            let Some(p) = self.robust_point(&cameras, &mut seen, self.settings.outlier_px, &mut views) else {
+        let every: Vec<u32> = (0..tracks.len() as u32).collect();
+        for Placed { all, found } in self.placed(&cameras, tracks, &every, self.settings.outlier_px, |_| true) {
+            let Some((p, seen)) = found else {
                 report.outlier_observations += all;
                 continue;
             };
             report.outlier_observations += all - seen.len();
-            for (s, (camera, pixel)) in seen.iter().zip(&views) {
+            for s in &seen {
                 let frame = s.frame as usize;
+                let (camera, pixel) = (&cameras[frame], self.frames[frame].keypoints[s.feature as usize]);
                 depths[frame].push(camera.local(p.world).z as f32);
                 heights[frame].push(p.world.z);
                 if let Some(q) = camera.project(p.world) {

@@ -22,8 +22,10 @@ use super::admission::{Admission, Refusals};
 use super::folder::FolderInlet;
 use super::offer::{Offer, OfferError};
 use super::transport::{Inlet, Patience};
+use sight::Sight;
 use slot::{Advance, Link, Slot};
 
+mod sight;
 mod slot;
 
 /// Longest wait for everything that is not a chunk: two ways over a link of some seconds.
@@ -133,6 +135,8 @@ pub struct Receiver {
     link: Arc<Link>,
     dir: PathBuf,
     seats: Vec<Seat>,
+    /// What the last look saw.
+    sight: Sight,
     /// Whose turn it is when not all can be at work at once.
     turn: usize,
     wake: Wake<()>,
@@ -185,6 +189,7 @@ impl Receiver {
             link: Arc::new(link),
             dir: dir.into(),
             seats,
+            sight: Sight::default(),
             turn: 0,
             wake,
             _waker: waker,
@@ -308,18 +313,14 @@ impl Receiver {
 
     /// Reads the offers of every inlet and chooses a target for each aircraft that is not at work.
     fn look(&mut self) {
-        let mut seen: Vec<(Offer, usize)> = Vec::new();
+        let before = std::mem::take(&mut self.sight);
         let Link { settings, admission, inlets, stop } = &*self.link;
         for (index, inlet) in inlets.iter().enumerate() {
             let outcome = inlet.offers(Patience { limit: ANSWER, stop }, &mut |bytes| {
-                match admission.offer(bytes, settings) {
-                    // Any number of the same, and the newest ones of each aircraft: more would be a flood.
-                    Ok(offer) if seen.iter().any(|(o, i)| *i == index && *o == offer) => {}
-                    Ok(offer) => keep_newest(&mut seen, offer, index),
-                    Err(e) => {
-                        self.counters.count_refusal(&e);
-                        self.refusals.count(e.to_string());
-                    }
+                let let_in = |bytes: &[u8]| admission.offer(bytes, settings);
+                if let Err(e) = self.sight.see(&before, bytes, index, let_in) {
+                    self.counters.count_refusal(&e);
+                    self.refusals.count(e.to_string());
                 }
             });
             if let Err(e) = outcome {
@@ -327,33 +328,14 @@ impl Receiver {
                 tracing::debug!("serve: {}: {e}", inlet.name());
             }
         }
-        // By aircraft, each one's in the order they were seen.
-        seen.sort_by(|a, b| a.0.aircraft.cmp(&b.0.aircraft));
         for seat in &mut self.seats {
             if let Place::Here(slot) = &mut seat.place {
-                let from = seen.partition_point(|(o, _)| o.aircraft < seat.id);
-                let to = seen.partition_point(|(o, _)| o.aircraft <= seat.id);
-                slot.choose(seen[from..to].iter(), &mut self.counters);
+                slot.choose(self.sight.of(&seat.id), &mut self.counters);
                 seat.progress = slot.progress();
                 (seat.is_over, seat.is_told) = (slot.is_over(), slot.is_told());
             }
         }
     }
-}
-
-/// Different offers of one aircraft that one inlet may show: an honest one shows one, replays of older ones may come with it.
-const PER_AIRCRAFT: usize = 4;
-
-fn keep_newest(seen: &mut Vec<(Offer, usize)>, offer: Offer, index: usize) {
-    let same = |(o, i): &(Offer, usize)| *i == index && o.aircraft == offer.aircraft;
-    if seen.iter().filter(|s| same(s)).count() >= PER_AIRCRAFT {
-        let oldest = seen.iter().enumerate().filter(|(_, s)| same(s)).min_by_key(|(_, s)| s.0.order).map(|(at, _)| at);
-        match oldest {
-            Some(at) if seen[at].0.order < offer.order => _ = seen.swap_remove(at),
-            _ => return,
-        }
-    }
-    seen.push((offer, index));
 }
 
 /// Transfers under way must not outlive us: the next receiver works in the same folders.

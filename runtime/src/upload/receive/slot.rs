@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use config::disk::Disk;
 use config::upload::UploadSettings;
 
+use super::sight::Shown;
 use super::{ANSWER, ReceiveCounters, Received};
 use crate::keys::{Domain, SignatureBytes};
 use crate::upload::admission::{Admission, ModelRefusal, Refusals};
@@ -121,11 +122,8 @@ impl Slot {
 
     /// Newest offer wins; but a transfer under way is finished first unless the newer one is the last of the flight or
     /// nobody holds the older one any more: over a slow link, chasing every checkpoint would never complete one.
-    pub(super) fn choose<'a>(
-        &mut self,
-        offers: impl Iterator<Item = &'a (Offer, usize)> + Clone,
-        counters: &mut ReceiveCounters,
-    ) {
+    pub(super) fn choose(&mut self, offers: &[Shown], counters: &mut ReceiveCounters) {
+        let offers = offers.iter();
         let usable = offers.clone().filter(|(o, _)| !self.refused_offers.contains(&o.digest()));
         let Some((best, _)) = usable.max_by_key(|(o, _)| o.order) else { return };
         if let Some(done) = self.store.complete() {
@@ -149,7 +147,7 @@ impl Slot {
         let overtakes = |now: &Target| now.gone || (best.finished && best.order > now.offer.order);
         match &mut self.target {
             Some(now) if now.offer.model == best.model => {
-                now.offer = best.clone();
+                now.offer = Offer::clone(best);
                 now.from = from;
             }
             Some(now) if !overtakes(now) => {
@@ -159,7 +157,7 @@ impl Slot {
             }
             _ => {
                 self.store.keep_only(Some(best));
-                self.target = Some(Target { offer: best.clone(), from, counted: false, gone: false });
+                self.target = Some(Target { offer: Offer::clone(best), from, counted: false, gone: false });
                 self.failures = 0;
                 self.not_before = Instant::now();
                 self.last_word_refused = false;
