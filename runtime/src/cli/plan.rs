@@ -134,6 +134,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
         outln!("  {name:<18} {:>9.2} MiB", mib(*bytes));
     }
     outln!("  {:<18} {:>9.2} MiB in one allocation", "total", mib(plan.total_bytes));
+    if lies == DeviceMemory::Separate {
+        outln!(
+            "  {:<18} {:>9.2} MiB of the host's memory: what it reads and writes of them",
+            "mirror",
+            mib(plan.mirror_bytes())
+        );
+    }
     let disk = DiskPlan::new(&DiskRequest {
         width: job.picture.0,
         height: job.picture.1,

@@ -242,7 +242,8 @@ impl Trainer {
             Held::InFile(record) => push_record(cloud, plan, record),
         });
         self.record = record;
-        done
+        done?;
+        Ok(self.arena.failure()?)
     }
 }
 

@@ -95,7 +95,7 @@ impl Trainer {
         self.write_frame();
         self.render_window()?;
         self.copy_out(into);
-        Ok(())
+        Ok(self.arena.failure()?)
     }
 
     fn rows_per_window(&self, whole: &Window, width: u32) -> Result<u32, TrainError> {

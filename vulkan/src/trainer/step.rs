@@ -52,6 +52,7 @@ impl Trainer {
         self.deferred.push(self.steps, self.frame.mean_rate, self.settings.rates.decay(progress));
         self.elapsed_s += start.elapsed().as_secs_f64();
         let mut report = self.read_loss(picture, counted, divisor, progress);
+        self.arena.failure()?;
         self.control_density(progress)?;
         self.raise_degrees(progress)?;
         if !self.settings.skips.deferred_moments {
