@@ -121,6 +121,12 @@ impl Distortion {
     /// out would be drawn a second time, mirrored; infinite for most lenses.
     fn fold(&self, within: f64) -> f64 {
         const SAMPLES: u32 = 64;
+        // The slope is 1 + 3 k₁r² + 5 k₂r⁴ + …; where even all of the terms together do not undo the 1 there is nothing to look for.
+        let r2 = within * within;
+        let terms = r2 * (3.0 * self.k1.abs() + r2 * (5.0 * self.k2.abs() + r2 * (7.0 * self.k3.abs() + r2 * 9.0 * self.k4.abs())));
+        if terms < 1.0 && [self.q1, self.q2, self.q3] == [0.0; 3] {
+            return f64::INFINITY;
+        }
         let radial = Self { fisheye: false, p1: 0.0, p2: 0.0, sx1: 0.0, sy1: 0.0, ..*self };
         let at = |i: u32| within * f64::from(i) / f64::from(SAMPLES);
         let image = |i| radial.distort(at(i), 0.0).0;
@@ -228,6 +234,22 @@ mod tests {
     fn at(rgb: &[u8], x: usize, y: usize) -> [u8; 3] {
         let i = 3 * (y * SIDE + x);
         [rgb[i], rgb[i + 1], rgb[i + 2]]
+    }
+
+    #[test]
+    fn a_weak_lens_never_turns_back_and_a_strong_one_does_where_its_slope_is_zero() {
+        // 1 + 3 k₁r² is zero at r = 1 / √(−3 k₁).
+        for k1 in [-0.3f64, -0.9] {
+            let lens = Distortion { k1, ..Distortion::default() };
+            let turns = (-3.0 * k1).sqrt().recip();
+            assert_eq!(lens.fold(0.99 * turns), f64::INFINITY, "{k1}");
+            assert!((lens.fold(1.5 * turns) / turns - 1.0).abs() < 0.03, "{k1}");
+        }
+        // What a later term makes good again does turn back all the same.
+        let lens = Distortion { k1: -0.5, k2: 0.2, ..Distortion::default() };
+        let falls = |r: f64| lens.distort(r + 1e-6, 0.0).0 < lens.distort(r, 0.0).0;
+        let folds = (1..2000).map(|i| f64::from(i) * 1e-3).find(|r| falls(*r));
+        assert_eq!(folds.is_some(), lens.fold(2.0).is_finite());
     }
 
     #[test]

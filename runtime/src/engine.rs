@@ -12,13 +12,12 @@ use config::disk::Disk;
 use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::NetworkSettings;
-use config::plan::PlanRequest;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
-use models::init::{Initialiser, most_frame_bytes};
+use models::init::Initialiser;
 use models::light::PictureLight;
 use models::onnx::depth::DepthNetwork;
 use models::refine::{RefineReport, Refiner};
@@ -41,6 +40,7 @@ mod rebuild;
 mod reconstruct;
 mod rounding;
 pub mod source;
+mod waiting;
 
 use device::DeviceRequest;
 use first_gaussians::{FirstGaussians, feed_forward};
@@ -48,31 +48,7 @@ pub use first_gaussians::{InitKind, Point};
 use host::{HostPlan, HostRequest};
 pub use reconstruct::Reconstruct;
 pub use source::PictureSource;
-
-/// Pictures and depths that wait for the initialiser in memory, bytes, and as many of what matching keeps of them; more of either wait
-/// in a file.
-const FRAMES_IN_MEMORY: u64 = 256 << 20;
-
-/// Bytes of the file of what waits: none while it fits into memory.
-fn waiting_bytes(views: u64, each: u64) -> u64 {
-    Some(views * each).filter(|waiting| *waiting > FRAMES_IN_MEMORY).unwrap_or(0)
-}
-
-/// Bytes of the scratch files of a job: views and cells that find no room on the device, what waits for the initialiser, and what
-/// matching keeps.
-pub fn scratch_bytes(
-    request: &PlanRequest,
-    init: &InitSettings,
-    network: &NetworkSettings,
-    refine: Option<&RefineSettings>,
-) -> u64 {
-    let each = most_frame_bytes(init, (request.width, request.height), network.pair.is_some());
-    let waiting = |each: u64| waiting_bytes(request.views.into(), each);
-    request.view_file_bytes()
-        + request.scene_file_bytes()
-        + waiting(each)
-        + refine.map_or(0, |refine| waiting(refine.kept_bytes()))
-}
+pub use waiting::{file_of, matching_bytes, scratch_bytes};
 
 /// What the engine needs to know before the first picture.
 #[derive(Clone, Debug)]
@@ -185,15 +161,15 @@ impl Reconstruction {
             _ => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
         };
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
-        if let Some(initialiser) = &mut initialiser
-            && let waiting @ 1.. = waiting_bytes(views as u64, initialiser.frame_bytes_at(settings.device.size))
-        {
-            initialiser.keep_frames_in(settings.device.scratch(waiting)?);
+        let folder = settings.device.scratch_folder();
+        if let Some(initialiser) = &mut initialiser {
+            let waiting = waiting::bytes(views as u64, initialiser.frame_bytes_at(settings.device.size));
+            file_of(&folder, waiting)?.into_iter().for_each(|file| initialiser.keep_frames_in(file));
         }
         let mut refiner: Option<Refiner> = refiner.transpose()?;
-        let matched = settings.refine.as_ref().map_or(0, |refine| waiting_bytes(views as u64, refine.kept_bytes()));
-        if let (Some(refiner), 1..) = (&mut refiner, matched) {
-            refiner.keep_frames_in(settings.device.scratch(matched)?);
+        let matched = settings.refine.as_ref().map_or(0, |refine| matching_bytes(views as u64, refine));
+        if let (Some(refiner), Some(file)) = (&mut refiner, file_of(&folder, matched)?) {
+            refiner.keep_frames_in(file);
         }
         let mut report = RunReport::new(command);
         let host = HostPlan::new(&HostRequest {

@@ -14,6 +14,11 @@ const LEFT_OUT: u8 = 0;
 /// picture, and descriptors come from cells of 8 pixels.
 const MARGIN: i32 = 8;
 
+/// Bits of a place beyond whole pixels: over a square of 13 they add up to a ten-thousandth of a pixel.
+const PLACE_BITS: i32 = 16;
+/// Of which so many share a value out between two pixels: what two of them and 8 bits of grey make fits into 31.
+const SHARE_BITS: i32 = 11;
+
 /// Luma of a key frame.
 #[derive(Clone)]
 pub(crate) struct Grey {
@@ -68,10 +73,10 @@ impl Grey {
         range(y, self.height).all(|v| range(x, self.width).all(|u| value(u, v) != LEFT_OUT))
     }
 
-    /// Bilinear values on a grid of steps −`half`…`half` around `center`, its axes mapped by `warp`, row by row; `None` where one of them
-    /// lies outside, or beside what is left out.
-    pub fn square(&self, center: DVec2, warp: DMat2, half: i32, out: &mut [f32]) -> Option<()> {
-        let side = (2 * half + 1) as usize;
+    /// Bilinear values on a grid of `SIDE` × `SIDE` steps around `center`, its axes mapped by `warp`, row by row; `None` where one of
+    /// them lies outside, or beside what is left out.
+    pub fn square<const SIDE: usize>(&self, center: DVec2, warp: DMat2, out: &mut [f32]) -> Option<()> {
+        let half = SIDE as i32 / 2;
         // Where the corners are inside all of it is.
         let reach = f64::from(half) * (warp.x_axis.abs() + warp.y_axis.abs()) + 1.0;
         let inside = (center - reach).cmpge(DVec2::ZERO).all()
@@ -83,26 +88,32 @@ impl Grey {
             }
             return Some(());
         }
-        // Counted from the lowest pixel that is needed, in whole pixels and what is left, none of it negative.
+        // In 65,536ths of a pixel, counted from the lowest pixel that is needed: whole numbers are cheap to cut in two.
         let low = (center - reach).floor();
         let from = low.y as usize * self.width as usize + low.x as usize;
-        let data = self.data.get(from..)?;
-        let (first, width) = ((center - low - 0.5).as_vec2(), self.width as usize);
-        let (right, down) = (warp.x_axis.as_vec2(), warp.y_axis.as_vec2());
-        for (row, y) in out.chunks_exact_mut(side).zip(-half..) {
-            let start = first + y as f32 * down;
-            for (value, x) in row.iter_mut().zip(-half..) {
-                let q = start + x as f32 * right;
-                let (x, y) = (q.x as u32, q.y as u32);
-                let (u, v) = (q.x - x as f32, q.y - y as f32);
-                let i = y as usize * width + x as usize;
-                let (Some(top), Some(low)) = (data.get(i..i + 2), data.get(i + width..i + width + 2)) else {
-                    return None;
-                };
-                let [a, b, c, d] = [top[0], top[1], low[0], low[1]].map(f32::from);
-                let (top, low) = (a + (b - a) * u, c + (d - c) * u);
-                *value = top + (low - top) * v;
+        let (data, width) = (self.data.get(from..)?, self.width as usize);
+        let fixed = |v: DVec2| (v * f64::from(1 << PLACE_BITS)).as_ivec2();
+        let (right, down) = (fixed(warp.x_axis), fixed(warp.y_axis));
+        let mut start = fixed(center - low - 0.5 - f64::from(half) * (warp.x_axis + warp.y_axis));
+        for row in out.as_chunks_mut::<SIDE>().0 {
+            let mut seen = [[0u8; 4]; SIDE];
+            let mut part = [[0i32; 2]; SIDE];
+            let mut at = start;
+            for (seen, part) in seen.iter_mut().zip(&mut part) {
+                let i = (at.y >> PLACE_BITS) as usize * width + (at.x >> PLACE_BITS) as usize;
+                let around = data.get(i..)?.get(..width + 2)?;
+                *seen = [around[0], around[1], around[width], around[width + 1]];
+                *part = [at.x, at.y].map(|v| (v >> (PLACE_BITS - SHARE_BITS)) & ((1 << SHARE_BITS) - 1));
+                at = at.wrapping_add(right);
             }
+            for ((value, seen), [u, v]) in row.iter_mut().zip(&seen).zip(&part) {
+                let [a, b, c, d] = seen.map(i32::from);
+                let top = (a << SHARE_BITS).wrapping_add((b.wrapping_sub(a)).wrapping_mul(*u));
+                let low = (c << SHARE_BITS).wrapping_add((d.wrapping_sub(c)).wrapping_mul(*u));
+                let sum = (top << SHARE_BITS).wrapping_add(low.wrapping_sub(top).wrapping_mul(*v));
+                *value = sum as f32 * (1.0 / (1 << (2 * SHARE_BITS)) as f32);
+            }
+            start = start.wrapping_add(down);
         }
         Some(())
     }
@@ -176,7 +187,7 @@ mod tests {
         let mut missing = 0;
         for center in (0..400).map(|i| DVec2::new(f64::from(i % 20) * 2.1, f64::from(i / 20) * 1.6)) {
             let mut values = [0.0; 25];
-            let square = grey.square(center, warp, 2, &mut values);
+            let square = grey.square::<5>(center, warp, &mut values);
             let places = (0..25).map(|k| center + warp * DVec2::new(f64::from(k % 5 - 2), f64::from(k / 5 - 2)));
             let expected: Option<Vec<f64>> = places.map(|p| grey.at(p)).collect();
             assert_eq!(square.is_some(), expected.is_some(), "{center}");

@@ -69,7 +69,7 @@ impl Refiner {
         for group in &groups {
             for &i in group {
                 for j in self.most_alike(i, &most) {
-                    self.try_pair(i.min(j), i.max(j), false, true, &mut report);
+                    self.try_pairs(&[(i.min(j), false)], i.max(j), true, &mut report);
                 }
             }
         }

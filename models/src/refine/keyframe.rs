@@ -151,7 +151,8 @@ pub(crate) fn quantise(descriptors: &[f32]) -> Descriptors {
     for d in descriptors.chunks_exact(DESCRIPTOR) {
         let norm = d.iter().map(|x| x * x).sum::<f32>().sqrt();
         let scale = if norm.is_finite() && norm > 1e-12 { 127.0 / norm } else { 0.0 };
-        out.extend(d.iter().map(|x| if scale > 0.0 { (x * scale).round() as i8 } else { 0 }));
+        // Rounded by cutting off: `round` is a call of a library where a processor has no instruction for it.
+        out.extend(d.iter().map(|x| if scale > 0.0 { (x * scale + 0.5f32.copysign(*x)) as i8 } else { 0 }));
     }
     Descriptors(out)
 }

@@ -22,6 +22,16 @@ pub(crate) struct Pair {
     pub rotation_only: bool,
 }
 
+/// What frame `a` and another one seem to have in common.
+struct Proposal {
+    a: usize,
+    /// Where the other one stood, by what they have in common.
+    cb: Pinhole,
+    ground: Ground,
+    matches: Vec<Match>,
+    found: TwoView,
+}
+
 /// Believed rotation error of a frame once it is linked to others, and once it is adjusted, radians: the drift
 /// within a strip of linked frames, and what remains after bundle adjustment with a margin.
 pub(crate) const LINKED_SIGMA: f64 = 0.03;
@@ -70,33 +80,51 @@ impl Refiner {
 
     /// Links frame `b` to `candidates` by guided search; stops at the wanted number of pairs.
     pub(super) fn link_guided(&mut self, b: usize, candidates: &[u32], report: &mut AddReport) {
-        for a in candidates.iter().take(2 * self.settings.max_pairs) {
-            if report.pairs_verified >= self.settings.max_pairs {
-                break;
-            }
+        let mut waiting = &candidates[..candidates.len().min(2 * self.settings.max_pairs)];
+        while !waiting.is_empty() && report.pairs_verified < self.settings.max_pairs {
+            let wanted = self.settings.max_pairs - report.pairs_verified;
+            // The first pair narrows down where the others are looked for.
+            let at_once = if self.frames[b].rotation_sigma > LINKED_SIGMA { 1 } else { wanted.min(waiting.len()) };
+            let (now, later) = waiting.split_at(at_once);
             // Before anything is known of the ground a prediction is worthless.
-            let guided = self.ground.is_some() || self.grounds[*a as usize].is_some();
-            self.try_pair(*a as usize, b, guided, false, report);
+            let guided = |a: u32| self.ground.is_some() || self.grounds[a as usize].is_some();
+            let pairs: Vec<(usize, bool)> = now.iter().map(|a| (*a as usize, guided(*a))).collect();
+            self.try_pairs(&pairs, b, false, report);
+            waiting = later;
         }
     }
 
     /// Links the newest frame without trusting any pose: for telemetry that is badly wrong.
     pub(super) fn link_wide(&mut self, candidates: &[u32], report: &mut AddReport) {
         let b = self.frames.len() - 1;
-        for a in candidates.iter().take(WIDE_TRIES) {
-            self.try_pair(*a as usize, b, false, true, report);
+        let pairs: Vec<(usize, bool)> = candidates.iter().take(WIDE_TRIES).map(|a| (*a as usize, false)).collect();
+        self.try_pairs(&pairs, b, true, report);
+    }
+
+    /// Frame `b` against others, each guided by what is known or not. All are compared at once, and what they propose is taken in
+    /// their order, so that it does not matter how many processors there are.
+    pub(super) fn try_pairs(&mut self, pairs: &[(usize, bool)], b: usize, any_heading: bool, report: &mut AddReport) {
+        let this = &*self;
+        let proposals: Vec<_> =
+            pairs.par_iter().map(|(a, guided)| this.propose(*a, b, *guided, any_heading)).collect();
+        for (matches, proposal) in proposals {
+            report.pairs_tried += 1;
+            report.matches += matches;
+            if let Some(proposal) = proposal {
+                let (a, matches, found) = self.settle(b, proposal);
+                report.unsettled += matches.len() - found.inliers.len();
+                if found.inliers.len() >= self.settings.min_inliers / 2 {
+                    self.accept(a, b, &matches, &found, report);
+                }
+            }
         }
     }
 
-    /// Two passes: the best key points, guided by telemetry, give a relative pose; that pose then guides all of them
-    /// along their epipolar lines.
-    pub(super) fn try_pair(&mut self, a: usize, b: usize, guided: bool, any_heading: bool, report: &mut AddReport) {
-        report.pairs_tried += 1;
+    /// How many key points match, and a relative pose that enough of them agree on, if any. Two passes: the best key points, guided by
+    /// telemetry, give a relative pose; that pose then guides all of them along their epipolar lines.
+    fn propose(&self, a: usize, b: usize, guided: bool, any_heading: bool) -> (usize, Option<Proposal>) {
         let (matches, coarse) = self.coarse(a, b, guided, any_heading);
-        let Some(coarse) = coarse else {
-            report.matches += matches;
-            return;
-        };
+        let Some(coarse) = coarse else { return (matches, None) };
         let (fa, fb) = (&self.frames[a], &self.frames[b]);
         let ca = self.camera_of(fa);
         let ground = self.ground_at(a);
@@ -118,18 +146,11 @@ impl Refiner {
             lines: (!coarse.rotation_only).then_some((&lines, 2.0 * self.settings.epipolar_px)),
         };
         let matches = match_frames(fa, fb, &guide, MatchLimits { features: usize::MAX, ..first });
-        report.matches += matches.len();
-        let rays = |matches: &[Match]| rays(&self.frames, (a, &ca), (b, &cb), matches);
         let limits = TwoViewLimits { any_heading: false, rounds: 0, ..limits };
         // The telemetry's weight is in the coarse pose already; its own error is what matters now.
         let fine = TwoViewLimits { rotation_sigma: 0.05, direction_sigma: 0.3, ..limits };
-        if let Some(found) = verify(&rays(&matches), coarse.pose, fine) {
-            let (matches, found) = self.settle(a, b, &cb, ground, matches, found);
-            report.unsettled += matches.len() - found.inliers.len();
-            if found.inliers.len() >= self.settings.min_inliers / 2 {
-                self.accept(a, b, &matches, &found, report);
-            }
-        }
+        let found = verify(&rays(&self.frames, (a, &ca), (b, &cb), &matches), coarse.pose, fine);
+        (matches.len(), found.map(|found| Proposal { a, cb, ground, matches, found }))
     }
 
     /// What may match between two frames, and what a relative pose of them must keep to.
@@ -177,17 +198,10 @@ impl Refiner {
 
     /// Drops inliers whose surroundings differ and moves the others' key points in `b` to where the pictures agree.
     /// A key point that an earlier pair has moved stays, so that a track has one place in every picture.
-    fn settle(
-        &mut self,
-        a: usize,
-        b: usize,
-        cb: &Pinhole,
-        ground: Ground,
-        matches: Vec<Match>,
-        mut found: TwoView,
-    ) -> (Vec<Match>, TwoView) {
+    fn settle(&mut self, b: usize, proposal: Proposal) -> (usize, Vec<Match>, TwoView) {
+        let Proposal { a, cb, ground, matches, mut found } = proposal;
         let (fa, fb) = (&self.frames[a], &self.frames[b]);
-        let (Some(ga), Some(gb)) = (fa.grey(), fb.grey()) else { return (matches, found) };
+        let (Some(ga), Some(gb)) = (fa.grey(), fb.grey()) else { return (a, matches, found) };
         let ca = self.camera_of(fa);
         let places: Vec<Option<[f32; 2]>> = found
             .inliers
@@ -196,7 +210,7 @@ impl Refiner {
             .map(|i| {
                 let m = matches[*i as usize];
                 let from = Side { grey: &ga, camera: &ca, at: fa.seen[m.a as usize] };
-                align_patch(&from, &Side { grey: &gb, camera: cb, at: fb.seen[m.b as usize] }, ground)
+                align_patch(&from, &Side { grey: &gb, camera: &cb, at: fb.seen[m.b as usize] }, ground)
             })
             .collect();
         let inliers = std::mem::take(&mut found.inliers);
@@ -216,7 +230,7 @@ impl Refiner {
             }
             found.inliers.push(i);
         }
-        (matches, found)
+        (a, matches, found)
     }
 
     fn accept(&mut self, a: usize, b: usize, matches: &[Match], found: &TwoView, report: &mut AddReport) {

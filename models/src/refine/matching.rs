@@ -47,7 +47,7 @@ const LEAST_PART: usize = 128;
 pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: MatchLimits) -> Vec<Match> {
     let (of_a, of_b) = (a.keypoints.len().min(limits.features), b.keypoints.len().min(limits.features));
     let (described_a, described_b) = (a.descriptors(), b.descriptors());
-    let grid = Buckets::new(a, of_a);
+    let grid = Buckets::of(&a.keypoints[..of_a], (a.intrinsics.width, a.intrinsics.height));
     let r2 = guide.radius * guide.radius;
     let unit = 127.0 * 127.0;
     let least = (limits.min_cosine * unit) as i32;
@@ -60,13 +60,13 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
         for j in some {
             let Some(Some(place)) = guide.predicted.get(j) else { continue };
             let descriptor = described_b.of(j);
+            let line = guide.lines.map(|(lines, width)| (lines[j], width));
             scored.clear();
-            for cells in grid.rows(*place, guide.radius) {
+            for cells in grid.rows(*place, guide.radius, line) {
                 for &i in cells {
                     let p = a.keypoints[i as usize];
                     let p = DVec2::new(p[0].into(), p[1].into());
-                    let off_line =
-                        guide.lines.is_some_and(|(lines, width)| (lines[j].dot(p.extend(1.0))).abs() > width);
+                    let off_line = line.is_some_and(|(line, width)| line.dot(p.extend(1.0)).abs() > width);
                     if off_line || (p - *place).length_squared() > r2 {
                         continue;
                     }
@@ -106,11 +106,11 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
 }
 
 fn dot(a: &[i8], b: &[i8]) -> i32 {
-    // Fixed length, so that the compiler unrolls it into multiply-add pairs.
+    // Fixed length and no check for overflow (64 · 127² is a million), so that the compiler makes multiply-add pairs of it.
     let (Some(a), Some(b)) = (a.first_chunk::<DESCRIPTOR>(), b.first_chunk::<DESCRIPTOR>()) else { return i32::MIN };
     let mut sum = 0i32;
     for k in 0..DESCRIPTOR {
-        sum += i32::from(a[k]) * i32::from(b[k]);
+        sum = sum.wrapping_add(i32::from(a[k]).wrapping_mul(i32::from(b[k])));
     }
     sum
 }
@@ -124,24 +124,24 @@ struct Buckets {
 }
 
 impl Buckets {
-    fn new(frame: &KeyFrame, count: usize) -> Self {
-        let columns = (frame.intrinsics.width as f32 / CELL).ceil().max(1.0) as usize;
-        let rows = (frame.intrinsics.height as f32 / CELL).ceil().max(1.0) as usize;
+    fn of(places: &[[f32; 2]], (width, height): (u32, u32)) -> Self {
+        let columns = (width as f32 / CELL).ceil().max(1.0) as usize;
+        let rows = (height as f32 / CELL).ceil().max(1.0) as usize;
         let cell = |p: &[f32; 2]| {
             let x = ((p[0] / CELL) as usize).min(columns - 1);
             let y = ((p[1] / CELL) as usize).min(rows - 1);
             y * columns + x
         };
         let mut starts = vec![0u32; columns * rows + 1];
-        for p in &frame.keypoints[..count] {
+        for p in places {
             starts[cell(p) + 1] += 1;
         }
         for i in 1..starts.len() {
             starts[i] += starts[i - 1];
         }
         let mut next = starts.clone();
-        let mut order = vec![0u32; count];
-        for (i, p) in frame.keypoints[..count].iter().enumerate() {
+        let mut order = vec![0u32; places.len()];
+        for (i, p) in places.iter().enumerate() {
             let slot = &mut next[cell(p)];
             order[*slot as usize] = i as u32;
             *slot += 1;
@@ -149,8 +149,9 @@ impl Buckets {
         Self { columns, rows, starts, order }
     }
 
-    /// Key points of the cells around `place`, one slice per row of cells.
-    fn rows(&self, place: DVec2, radius: f64) -> impl Iterator<Item = &[u32]> {
+    /// Key points of the cells around `place`, one slice per row of cells: all within `radius` of it and, where there is a line, all
+    /// within its width of that.
+    fn rows(&self, place: DVec2, radius: f64, line: Option<(DVec3, f64)>) -> impl Iterator<Item = &[u32]> {
         let range = |at: f64, count: usize| {
             let low = ((at - radius) / f64::from(CELL)).floor().clamp(0.0, count as f64) as usize;
             let high = ((at + radius) / f64::from(CELL)).floor().clamp(-1.0, count as f64 - 1.0) + 1.0;
@@ -158,9 +159,63 @@ impl Buckets {
         };
         let columns = range(place.x, self.columns);
         range(place.y, self.rows).map(move |y| {
-            let from = self.starts[y * self.columns + columns.start] as usize;
-            let to = self.starts[y * self.columns + columns.end] as usize;
+            let near = line.map_or(0..self.columns, |line| self.columns_of(line, y));
+            let low = columns.start.max(near.start);
+            let from = self.starts[y * self.columns + low] as usize;
+            let to = self.starts[y * self.columns + columns.end.min(near.end).max(low)] as usize;
             &self.order[from..to]
         })
+    }
+
+    /// Columns in which row `y` of cells comes within `width` of `line`. The outermost cells hold what lies beyond them, too.
+    fn columns_of(&self, (line, width): (DVec3, f64), y: usize) -> Range<usize> {
+        let edge = |row: usize| row as f64 * f64::from(CELL);
+        let low = if y == 0 { f64::NEG_INFINITY } else { edge(y) };
+        let high = if y + 1 == self.rows { f64::INFINITY } else { edge(y + 1) };
+        // line.x · x lies between these.
+        let sides = [-line.y * low - line.z, -line.y * high - line.z];
+        let (least, most) = (sides[0].min(sides[1]) - width, sides[0].max(sides[1]) + width);
+        let ends = [least / line.x, most / line.x];
+        if !ends.iter().all(|x| x.is_finite()) {
+            return 0..self.columns;
+        }
+        let column = |x: f64| (x / f64::from(CELL)).floor().clamp(0.0, self.columns as f64 - 1.0) as usize;
+        column(ends[0].min(ends[1]))..column(ends[0].max(ends[1])) + 1
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_along_a_line_hold_every_key_point_within_its_width() {
+        // Points all over a picture of 300 × 200 and beyond its edges, sorted into cells as key points are.
+        let places: Vec<[f32; 2]> =
+            (0..4000).map(|i| [(i * 7919 % 3600) as f32 / 10.0 - 30.0, (i * 104_729 % 2600) as f32 / 10.0 - 30.0]).collect();
+        let grid = Buckets::of(&places, (300, 200));
+        for k in 0..360 {
+            let angle = f64::from(k).to_radians();
+            let normal = DVec2::new(angle.cos(), angle.sin());
+            let through = DVec2::new(150.0 + f64::from(k % 50) * 3.0, 100.0 - f64::from(k % 31) * 5.0);
+            let line = (normal.extend(-normal.dot(through)), 3.0);
+            let (place, radius) = (through, [40.0, 100.0, f64::INFINITY][k as usize % 3]);
+            let is_near = |i: &&u32| {
+                let p = DVec2::from(places[**i as usize].map(f64::from));
+                line.0.dot(p.extend(1.0)).abs() <= line.1
+            };
+            let sorted = |rows: Vec<&[u32]>| {
+                let mut near: Vec<u32> = rows.into_iter().flatten().filter(is_near).copied().collect();
+                near.sort_unstable();
+                near
+            };
+            let clipped: Vec<&[u32]> = grid.rows(place, radius, Some(line)).collect();
+            let looked_at: usize = clipped.iter().map(|r| r.len()).sum();
+            let all: Vec<&[u32]> = grid.rows(place, radius, None).collect();
+            let of_all: usize = all.iter().map(|r| r.len()).sum();
+            assert_eq!(sorted(clipped), sorted(all), "{k}");
+            assert!(radius < 50.0 || 2 * looked_at < of_all, "{k}: {looked_at} of {of_all}");
+        }
     }
 }

@@ -7,9 +7,9 @@ use super::overlap::{Ground, predict};
 use crate::camera::Pinhole;
 use glam::{DMat2, DVec2};
 
-/// Half the side of a patch, pixels: 11 × 11.
-const HALF: i32 = 5;
-const SAMPLES: usize = ((2 * HALF + 1) * (2 * HALF + 1)) as usize;
+/// Side of a patch, pixels.
+const SIDE: usize = 11;
+const SAMPLES: usize = SIDE * SIDE;
 /// Steps at most; most patches come to rest in three.
 const STEPS: usize = 6;
 /// A patch that wants to go further than this was a wrong match, pixels.
@@ -24,17 +24,16 @@ const LANES: usize = 8;
 /// Values on the grid of a patch around `center`, its axes mapped by `warp`.
 fn patch(grey: &Grey, center: DVec2, warp: DMat2) -> Option<[f32; SAMPLES]> {
     let mut out = [0.0; SAMPLES];
-    grey.square(center, warp, HALF, &mut out)?;
+    grey.square::<SIDE>(center, warp, &mut out)?;
     Some(out)
 }
 
 /// A patch and its slopes along x and y, by central differences.
 fn template(grey: &Grey, center: DVec2) -> Option<([f32; SAMPLES], [f32; SAMPLES], [f32; SAMPLES])> {
-    const WIDE: usize = (2 * HALF + 3) as usize;
+    const WIDE: usize = SIDE + 2;
     let mut wide = [0.0; WIDE * WIDE];
-    grey.square(center, DMat2::IDENTITY, HALF + 1, &mut wide)?;
-    let side = WIDE - 2;
-    let place = |k: usize| (k / side + 1) * WIDE + k % side + 1;
+    grey.square::<WIDE>(center, DMat2::IDENTITY, &mut wide)?;
+    let place = |k: usize| (k / SIDE + 1) * WIDE + k % SIDE + 1;
     let across = |k: usize, step: usize| 0.5 * (wide[place(k) + step] - wide[place(k) - step]);
     Some((
         std::array::from_fn(|k| wide[place(k)]),

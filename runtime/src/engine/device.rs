@@ -104,24 +104,30 @@ impl DeviceRequest {
         let request = self.plan_request(&training.sh, gpu.info().lanes());
         let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
         if request.view_file_bytes() > 0 {
-            trainer.keep_views_in(self.scratch(request.view_file_bytes())?);
+            trainer.keep_views_in(scratch_file(&self.scratch_folder(), request.view_file_bytes())?);
         }
         if trainer.plan().is_paged() {
-            trainer.keep_scene_in(self.scratch(trainer.plan().scene_file_bytes())?);
+            trainer.keep_scene_in(scratch_file(&self.scratch_folder(), trainer.plan().scene_file_bytes())?);
         }
         Ok(trainer)
     }
 
-    /// A scratch file of so many bytes in the job's folder.
-    pub(super) fn scratch(&self, bytes: u64) -> Result<File, TrainError> {
-        let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
-        scratch_file(&folder, bytes)
-            .map_err(|e| TrainError::ViewFile(format!("{} MiB in {}: {e}", bytes >> 20, folder.display())))
+    /// Where the job's scratch files lie.
+    pub(super) fn scratch_folder(&self) -> PathBuf {
+        self.folder.clone().unwrap_or_else(std::env::temp_dir)
     }
 }
 
 /// A file without a name in `folder`, as large as it will ever be: it goes with the process, however that ends.
-fn scratch_file(folder: &Path, bytes: u64) -> std::io::Result<File> {
+///
+/// # Errors
+/// The folder cannot be made or written to, or has no room.
+pub(super) fn scratch_file(folder: &Path, bytes: u64) -> Result<File, TrainError> {
+    allocated(folder, bytes)
+        .map_err(|e| TrainError::ViewFile(format!("{} MiB in {}: {e}", bytes >> 20, folder.display())))
+}
+
+fn allocated(folder: &Path, bytes: u64) -> std::io::Result<File> {
     std::fs::create_dir_all(folder)?;
     let file = tempfile::tempfile_in(folder)?;
     match fallocate(&file, FallocateFlags::empty(), 0, bytes) {

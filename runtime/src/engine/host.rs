@@ -14,7 +14,8 @@ use crate::error::JobError;
 
 /// Program, driver and Vulkan loader, resident (measured on x86-64 with lavapipe: 60 MiB, rounded up).
 const PROGRAM_BYTES: u64 = 96 << 20;
-/// The feature network, once upright and once on its side (measured: 26 MiB a session).
+/// The feature network, once upright and once on its side, on pictures of 640 pixels (measured: 26 MiB a session); maps of larger ones
+/// take more in proportion.
 const FEATURES_BYTES: u64 = 2 * (32 << 20);
 /// The trainer's own lists per Gaussian: density control and SH degrees.
 const LISTS_BYTES: u64 = 20;
@@ -48,6 +49,19 @@ pub struct HostRequest<'a> {
     pub map: u64,
 }
 
+/// Bytes of matching so many key frames: per feature 100, 64 of them its descriptor's, per observation 250 ([`RefineSettings`]).
+fn matching(s: &RefineSettings, keyframes: u64, in_file: bool) -> u64 {
+    let kept = if in_file { 0 } else { s.kept_bytes() };
+    let observations = (s.max_observations as u64).min(keyframes * s.max_features as u64);
+    let side = u64::from(s.feature_side);
+    (FEATURES_BYTES * side * side / (640 * 640)).max(FEATURES_BYTES) + keyframes * (s.max_features as u64 * 36 + kept) + observations * 250
+}
+
+/// Host memory of settling a card's poses, before a device is opened: `ahead` pictures of `pixels` are at hand at once.
+pub fn settling_bytes(s: &RefineSettings, pictures: u64, in_file: bool, (ahead, pixels): (u64, u64)) -> u64 {
+    PROGRAM_BYTES + matching(s, pictures, in_file) + ahead * 3 * pixels
+}
+
 /// Bytes by what holds them, in the order of the formula.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HostPlan {
@@ -60,14 +74,7 @@ impl HostPlan {
     pub fn new(r: &HostRequest<'_>) -> Self {
         let (n, v, p) = (r.plan.scene as u64, r.plan.views as u64, r.plan.pixels as u64);
         let coefficients = (u64::from(r.plan.sh_degree) + 1).pow(2);
-        let matching = r.refine.map_or(0, |s| {
-            // Per feature 100 bytes, 64 of them its descriptor's, per observation 250 (`RefineSettings`).
-            let keyframes = v.max(s.max_keyframes.min(r.plan.views) as u64);
-            let kept = if r.refine_in_file { 0 } else { s.kept_bytes() };
-            let per_keyframe = s.max_features as u64 * 36 + kept;
-            let observations = (s.max_observations as u64).min(keyframes * s.max_features as u64);
-            FEATURES_BYTES + keyframes * per_keyframe + observations * 250
-        });
+        let matching = r.refine.map_or(0, |s| matching(s, v, r.refine_in_file));
         let sections = vec![
             ("program", PROGRAM_BYTES),
             ("initialisation", r.initialiser),
@@ -115,6 +122,7 @@ mod tests {
     use config::plan::PlanRequest;
 
     use super::*;
+    use crate::engine::matching_bytes;
 
     fn total(plan: &Plan, of: impl Fn(&mut HostRequest<'_>)) -> u64 {
         let refine = RefineSettings::default();
@@ -155,6 +163,18 @@ mod tests {
         let larger = Plan::new(&PlanRequest { device_mib: 1024, ..PlanRequest::default() }).unwrap();
         let more = (larger.gaussians - plan.gaussians) as u64;
         assert_eq!(total(&larger, |_| {}) - before, more * (2 * 4 * (11 + 48) + 20));
+    }
+
+    #[test]
+    fn what_matching_keeps_of_a_card_s_pictures_waits_in_a_file_beyond_a_quarter_of_a_gibibyte() {
+        let refine = RefineSettings { feature_side: 1280, max_features: 2000, ..RefineSettings::default() };
+        let each = refine.kept_bytes();
+        assert_eq!(matching_bytes(100, &refine), 0, "{} MiB stay in memory", (100 * each) >> 20);
+        assert_eq!(matching_bytes(1000, &refine), 1000 * each);
+        let settling = |pictures, in_file| settling_bytes(&refine, pictures, in_file, (3, 3_000_000));
+        // In a file a picture more is its key points and nothing else.
+        assert_eq!(settling(1000, true) - settling(900, true), 100 * 36 * 2000);
+        assert_eq!(settling(1000, false) - settling(1000, true), 1000 * each);
     }
 
     #[test]

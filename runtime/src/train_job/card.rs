@@ -14,6 +14,8 @@ use models::formats::transforms;
 use models::refine::Refiner;
 
 use crate::console::Progress;
+use crate::engine::host::settling_bytes;
+use crate::engine::{file_of, matching_bytes};
 use crate::error::JobError;
 use crate::evaluate::surveyed;
 
@@ -42,6 +44,9 @@ const FLOATING_LOOKS: usize = 3;
 
 /// What settling a card is to be remembered for, in run.json.
 pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
+
+/// Bytes of the host's memory that settling poses was planned to take, in run.json.
+pub(super) const SETTLING_PLANNED: &str = "host_bytes_planned_poses";
 
 /// Says what was taken from the card and what not.
 fn announce(set: &Dataset, notes: &CardNotes) {
@@ -85,7 +90,7 @@ pub(super) fn settle(
             let stated = |f: &DatasetFrame| Settled { view: f.view, distortion: f.distortion };
             set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
         }
-        Some(settings) => match refined(set, &notes, settings, go_on, &mut remarks)? {
+        Some(settings) => match refined(set, &notes, settings, out, go_on, &mut remarks)? {
             Some((settled, fixed)) => {
                 set.origin = set.origin.or(fixed);
                 settled
@@ -179,6 +184,7 @@ fn refined(
     set: &Dataset,
     notes: &CardNotes,
     settings: &RefineSettings,
+    out: &Path,
     go_on: &dyn Fn() -> bool,
     remarks: &mut Remarks,
 ) -> Result<Option<Agreed>, JobError> {
@@ -202,6 +208,11 @@ fn refined(
     let largest = all.iter().map(longer).max().unwrap_or(1);
     let scale = (f64::from(settings.feature_side) / f64::from(largest)).min(1.0);
     let mut refiner = Refiner::open(&settings)?;
+    let file = file_of(out, matching_bytes(all.len() as u64, &settings))?;
+    let pixels = all.iter().map(|i| set.frames[*i].view.intrinsics.pixels() as u64).max().unwrap_or(0);
+    let held = settling_bytes(&settings, all.len() as u64, file.is_some(), (settings.threads as u64 + 1, pixels));
+    remarks.push((SETTLING_PLANNED, held.into()));
+    file.into_iter().for_each(|file| refiner.keep_frames_in(file));
     let mut progress = Progress::new("poses", all.len() as u64);
     let (mut done, mut stopped) = (0, false);
     let mut skipped = Vec::new();
