@@ -83,8 +83,8 @@ impl Refiner {
         let mut waiting = &candidates[..candidates.len().min(2 * self.settings.max_pairs)];
         while !waiting.is_empty() && report.pairs_verified < self.settings.max_pairs {
             let wanted = self.settings.max_pairs - report.pairs_verified;
-            // The first pair narrows down where the others are looked for.
-            let at_once = if self.frames[b].rotation_sigma > LINKED_SIGMA { 1 } else { wanted.min(waiting.len()) };
+            // Until an adjustment has placed the frame each pair tells where the next one is to be looked for.
+            let at_once = if self.frames[b].adjusted { wanted.min(waiting.len()) } else { 1 };
             let (now, later) = waiting.split_at(at_once);
             // Before anything is known of the ground a prediction is worthless.
             let guided = |a: u32| self.ground.is_some() || self.grounds[a as usize].is_some();
@@ -97,8 +97,9 @@ impl Refiner {
     /// Links the newest frame without trusting any pose: for telemetry that is badly wrong.
     pub(super) fn link_wide(&mut self, candidates: &[u32], report: &mut AddReport) {
         let b = self.frames.len() - 1;
-        let pairs: Vec<(usize, bool)> = candidates.iter().take(WIDE_TRIES).map(|a| (*a as usize, false)).collect();
-        self.try_pairs(&pairs, b, true, report);
+        for a in candidates.iter().take(WIDE_TRIES) {
+            self.try_pairs(&[(*a as usize, false)], b, true, report);
+        }
     }
 
     /// Frame `b` against others, each guided by what is known or not. All are compared at once, and what they propose is taken in
