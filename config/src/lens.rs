@@ -123,7 +123,9 @@ impl Distortion {
         const SAMPLES: u32 = 64;
         // The slope is 1 + 3 k₁r² + 5 k₂r⁴ + …; where even all of the terms together do not undo the 1 there is nothing to look for.
         let r2 = within * within;
-        let terms = r2 * (3.0 * self.k1.abs() + r2 * (5.0 * self.k2.abs() + r2 * (7.0 * self.k3.abs() + r2 * 9.0 * self.k4.abs())));
+        let terms = r2
+            * (3.0 * self.k1.abs()
+                + r2 * (5.0 * self.k2.abs() + r2 * (7.0 * self.k3.abs() + r2 * 9.0 * self.k4.abs())));
         if terms < 1.0 && [self.q1, self.q2, self.q3] == [0.0; 3] {
             return f64::INFINITY;
         }

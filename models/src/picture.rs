@@ -24,6 +24,9 @@ use crate::formats::reconstruction::{Focal, LensDescription};
 /// Largest picture edge taken; 16384² × 3 bytes is also what a decoder may allocate at most.
 const MAX_EDGE: u32 = 16_384;
 
+/// Largest JPEG file taken, bytes: 16,384² pixels of a byte each, more than any camera writes.
+const MAX_FILE: u64 = 256 << 20;
+
 /// How a stored picture is turned to have the camera's top at its top (EXIF tag 274): mirrored first, then turned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Orientation {
@@ -192,8 +195,15 @@ fn scaled_jpeg(path: &Path, (width, height): (u32, u32)) -> Result<Option<RgbIma
     if file.read_exact(&mut magic).is_err() || magic != [0xFF, 0xD8, 0xFF] || width.max(height) > MAX_EDGE {
         return Ok(None);
     }
+    let size = file.metadata().map_err(io)?.len();
+    if size > MAX_FILE {
+        return Err(bad(path, format!("has {} MB; at most {} can be taken", size >> 20, MAX_FILE >> 20)));
+    }
+    // As a whole: the decoder asks byte by byte, which costs a third of its time through a reader's buffer.
+    let mut bytes = Vec::with_capacity(size as usize);
     file.seek(SeekFrom::Start(0)).map_err(io)?;
-    let mut decoder = Decoder::new(BufReader::with_capacity(1 << 16, file));
+    file.take(MAX_FILE).read_to_end(&mut bytes).map_err(io)?;
+    let mut decoder = Decoder::new(bytes.as_slice());
     decoder.set_max_decoding_buffer_size(MAX_EDGE as usize * MAX_EDGE as usize * 3);
     decoder.read_info().map_err(damaged)?;
     let Some(info) = decoder.info() else { return Ok(None) };

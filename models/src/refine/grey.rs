@@ -192,7 +192,9 @@ mod tests {
             let expected: Option<Vec<f64>> = places.map(|p| grey.at(p)).collect();
             assert_eq!(square.is_some(), expected.is_some(), "{center}");
             let apart = |(a, b): (&f64, &f32)| (a - f64::from(*b)).abs();
-            assert!(expected.iter().flatten().zip(&values).map(apart).fold(0.0, f64::max) < 0.01, "{center}");
+            // A place is cut down to a 2,048th of a pixel, both ways, over which the steepest edges there are change by so much.
+            let cut = 2.0 * 255.0 / f64::from(1 << SHARE_BITS);
+            assert!(expected.iter().flatten().zip(&values).map(apart).fold(0.0, f64::max) < cut + 0.01, "{center}");
             missing += usize::from(expected.is_none());
         }
         assert!((50..350).contains(&missing), "{missing}");

@@ -106,8 +106,7 @@ impl Refiner {
     /// their order, so that it does not matter how many processors there are.
     pub(super) fn try_pairs(&mut self, pairs: &[(usize, bool)], b: usize, any_heading: bool, report: &mut AddReport) {
         let this = &*self;
-        let proposals: Vec<_> =
-            pairs.par_iter().map(|(a, guided)| this.propose(*a, b, *guided, any_heading)).collect();
+        let proposals: Vec<_> = pairs.par_iter().map(|(a, guided)| this.propose(*a, b, *guided, any_heading)).collect();
         for (matches, proposal) in proposals {
             report.pairs_tried += 1;
             report.matches += matches;

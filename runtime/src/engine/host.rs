@@ -54,7 +54,9 @@ fn matching(s: &RefineSettings, keyframes: u64, in_file: bool) -> u64 {
     let kept = if in_file { 0 } else { s.kept_bytes() };
     let observations = (s.max_observations as u64).min(keyframes * s.max_features as u64);
     let side = u64::from(s.feature_side);
-    (FEATURES_BYTES * side * side / (640 * 640)).max(FEATURES_BYTES) + keyframes * (s.max_features as u64 * 36 + kept) + observations * 250
+    (FEATURES_BYTES * side * side / (640 * 640)).max(FEATURES_BYTES)
+        + keyframes * (s.max_features as u64 * 36 + kept)
+        + observations * 250
 }
 
 /// Host memory of settling a card's poses, before a device is opened: `ahead` pictures of `pixels` are at hand at once.
