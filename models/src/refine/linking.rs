@@ -83,8 +83,10 @@ impl Refiner {
         let mut waiting = &candidates[..candidates.len().min(2 * self.settings.max_pairs)];
         while !waiting.is_empty() && report.pairs_verified < self.settings.max_pairs {
             let wanted = self.settings.max_pairs - report.pairs_verified;
-            // Until an adjustment has placed the frame each pair tells where the next one is to be looked for.
-            let at_once = if self.frames[b].adjusted { wanted.min(waiting.len()) } else { 1 };
+            // Until an adjustment has placed the frame each pair tells where the next one is to be looked for; and what nothing but its
+            // pairs holds together bends.
+            let placed = self.frames[b].adjusted && !self.floating;
+            let at_once = if placed { wanted.min(waiting.len()) } else { 1 };
             let (now, later) = waiting.split_at(at_once);
             // Before anything is known of the ground a prediction is worthless.
             let guided = |a: u32| self.ground.is_some() || self.grounds[a as usize].is_some();
