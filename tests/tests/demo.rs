@@ -14,7 +14,7 @@ fn json(folder: &std::path::Path, arguments: &[&str]) -> Value {
 #[test]
 fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the_naive_guesses() {
     let dir = tempfile::tempdir().expect("tempdir");
-    let output = support::run(dir.path(), &["demo", "--out", "demo", "--seconds", "15", "--process-mib", "704"]);
+    let output = support::run(dir.path(), &["demo", "--out", "demo", "--seconds", "15", "--process-mib", "640"]);
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
     println!("{text}");

@@ -218,6 +218,8 @@ pub fn distil(
         trainer.add_view(&lesson.picture(), None)?;
     }
     let of_row: Vec<Option<u16>> = part.means.iter().map(|mean| seams.index_of(mean)).collect();
+    // The union has them still, and this is where the ground holds most at once.
+    drop(part);
     trainer.hold(|row| of_row[row].is_none());
     let steps = recipe.epochs.saturating_mul(taught.len() as u32);
     let budget = RunBudget { steps: Some(steps), seconds: recipe.seconds };
@@ -233,7 +235,8 @@ pub fn distil(
 
     // A cell beside one that was not taken over is another surrounding than it was trained in: what is taken over is asked again.
     let takes = |row: usize| of_row[row].is_some_and(|cell| accepted[usize::from(cell)]);
-    let mixed = mixed(&part, &trained, takes);
+    let mut mixed = trained;
+    take_back(&mut mixed, &rows, &merged.cloud, |row| !takes(row));
     trainer.load(&mixed)?;
     let after = Shown::of(&mut trainer, &kept_back, models, seams.cells.len())?;
     let psnr = |shown: &Shown| psnr_of(shown.errors().sum());
@@ -315,11 +318,11 @@ fn closer(before: &Errors, after: &Errors) -> Vec<bool> {
     before.0.iter().zip(&after.0).map(|(b, a)| a[0] < b[0]).collect()
 }
 
-/// `untouched` with the rows of `trained` for which `takes` says so.
-fn mixed(untouched: &GaussianCloud, trained: &GaussianCloud, takes: impl Fn(usize) -> bool) -> GaussianCloud {
-    let mut mixed = untouched.clone();
-    (0..mixed.len()).filter(|row| takes(*row)).for_each(|row| mixed.set_row(row, trained, row));
-    mixed
+/// Makes those rows of `trained`, the `rows` of `untouched`, for which `returns` says so what they were.
+fn take_back(trained: &mut GaussianCloud, rows: &[u32], untouched: &GaussianCloud, returns: impl Fn(usize) -> bool) {
+    for (i, row) in rows.iter().enumerate().filter(|(i, _)| returns(*i)) {
+        trained.set_row(i, untouched, *row as usize);
+    }
 }
 
 /// The views with the most seam in them, of as many aircraft as the report can show.
@@ -353,11 +356,15 @@ mod tests {
         let accepted = closer(&before, &after);
         assert_eq!(accepted, [true, false, false, false], "worse, equal and unseen ones are not");
         let untouched = carpet([0.0, 0.0], [4.0, 1.0], 1.0);
-        let mut trained = untouched.clone();
-        trained.opacity_logits.iter_mut().for_each(|o| *o += 1.0);
-        let taken = mixed(&untouched, &trained, |row| accepted[row]);
+        let rows = [3, 1, 0, 2];
+        let mut taken = untouched.rows(&rows);
+        for (logit, mean) in taken.opacity_logits.iter_mut().zip(&mut taken.means) {
+            (*logit, mean[2]) = (*logit + 1.0, 9.0);
+        }
+        take_back(&mut taken, &rows, &untouched, |row| !accepted[row]);
         assert_eq!(taken.opacity_logits, [4.0, 3.0, 3.0, 3.0]);
-        assert_eq!(taken.means, untouched.means);
+        assert_eq!(taken.means[1..], untouched.rows(&rows).means[1..]);
+        assert!(taken.means[0] != untouched.means[3] && taken.means[0][..2] == untouched.means[3][..2]);
     }
 
     #[test]
