@@ -14,10 +14,10 @@ const LEFT_OUT: u8 = 0;
 /// picture, and descriptors come from cells of 8 pixels.
 const MARGIN: i32 = 8;
 
-/// Bits of a place beyond whole pixels: over a square of 13 they add up to a ten-thousandth of a pixel.
-const PLACE_BITS: i32 = 16;
-/// Of which so many share a value out between two pixels: what two of them and 8 bits of grey make fits into 31.
-const SHARE_BITS: i32 = 11;
+/// Bits of a place beyond whole pixels: what is cut off adds up to a hundred-thousandth of a pixel over a square of 13.
+const PLACE_BITS: i32 = 20;
+/// Farther than this from its middle a square is drawn pixel by pixel: places up to twice as far, and a half, fit beside those bits.
+const FIXED_REACH: f64 = 512.0;
 
 /// Luma of a key frame.
 #[derive(Clone)]
@@ -81,21 +81,22 @@ impl Grey {
         let reach = f64::from(half) * (warp.x_axis.abs() + warp.y_axis.abs()) + 1.0;
         let inside = (center - reach).cmpge(DVec2::ZERO).all()
             && (center + reach).cmple(DVec2::new(self.width.into(), self.height.into())).all();
-        if !inside || self.masked {
+        if !inside || self.masked || reach.max_element() > FIXED_REACH {
             let places = (-half..=half).flat_map(|y| (-half..=half).map(move |x| DVec2::new(x.into(), y.into())));
             for (value, offset) in out.iter_mut().zip(places) {
                 *value = self.at(center + warp * offset)? as f32;
             }
             return Some(());
         }
-        // In 65,536ths of a pixel, counted from the lowest pixel that is needed: whole numbers are cheap to cut in two.
+        // Counted from the lowest pixel that is needed, in whole numbers: those are cheap to cut into a pixel and the rest of it.
         let low = (center - reach).floor();
         let from = low.y as usize * self.width as usize + low.x as usize;
         let (data, width) = (self.data.get(from..)?, self.width as usize);
-        let fixed = |v: DVec2| (v * f64::from(1 << PLACE_BITS)).as_ivec2();
+        let fixed = |v: DVec2| (v * f64::from(1 << PLACE_BITS)).round().as_ivec2();
         let (right, down) = (fixed(warp.x_axis), fixed(warp.y_axis));
         let mut start = fixed(center - low - 0.5 - f64::from(half) * (warp.x_axis + warp.y_axis));
         for row in out.as_chunks_mut::<SIDE>().0 {
+            // Four pixels and where between them, apart from what is made of them: the second loop is one of vectors.
             let mut seen = [[0u8; 4]; SIDE];
             let mut part = [[0i32; 2]; SIDE];
             let mut at = start;
@@ -103,15 +104,14 @@ impl Grey {
                 let i = (at.y >> PLACE_BITS) as usize * width + (at.x >> PLACE_BITS) as usize;
                 let around = data.get(i..)?.get(..width + 2)?;
                 *seen = [around[0], around[1], around[width], around[width + 1]];
-                *part = [at.x, at.y].map(|v| (v >> (PLACE_BITS - SHARE_BITS)) & ((1 << SHARE_BITS) - 1));
+                *part = [at.x, at.y].map(|v| v & ((1 << PLACE_BITS) - 1));
                 at = at.wrapping_add(right);
             }
-            for ((value, seen), [u, v]) in row.iter_mut().zip(&seen).zip(&part) {
-                let [a, b, c, d] = seen.map(i32::from);
-                let top = (a << SHARE_BITS).wrapping_add((b.wrapping_sub(a)).wrapping_mul(*u));
-                let low = (c << SHARE_BITS).wrapping_add((d.wrapping_sub(c)).wrapping_mul(*u));
-                let sum = (top << SHARE_BITS).wrapping_add(low.wrapping_sub(top).wrapping_mul(*v));
-                *value = sum as f32 * (1.0 / (1 << (2 * SHARE_BITS)) as f32);
+            for ((value, seen), part) in row.iter_mut().zip(&seen).zip(&part) {
+                let [a, b, c, d] = seen.map(f32::from);
+                let [u, v] = part.map(|p| p as f32 * (1.0 / (1 << PLACE_BITS) as f32));
+                let (top, low) = (a + (b - a) * u, c + (d - c) * u);
+                *value = top + (low - top) * v;
             }
             start = start.wrapping_add(down);
         }
@@ -192,9 +192,7 @@ mod tests {
             let expected: Option<Vec<f64>> = places.map(|p| grey.at(p)).collect();
             assert_eq!(square.is_some(), expected.is_some(), "{center}");
             let apart = |(a, b): (&f64, &f32)| (a - f64::from(*b)).abs();
-            // A place is cut down to a 2,048th of a pixel, both ways, over which the steepest edges there are change by so much.
-            let cut = 2.0 * 255.0 / f64::from(1 << SHARE_BITS);
-            assert!(expected.iter().flatten().zip(&values).map(apart).fold(0.0, f64::max) < cut + 0.01, "{center}");
+            assert!(expected.iter().flatten().zip(&values).map(apart).fold(0.0, f64::max) < 0.01, "{center}");
             missing += usize::from(expected.is_none());
         }
         assert!((50..350).contains(&missing), "{missing}");
