@@ -1,6 +1,10 @@
 //! Both real transports, end to end, in one process.
 
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
+
+use config::upload::Encoding;
+use models::formats::model;
 
 use super::*;
 use crate::keys::Identity;
