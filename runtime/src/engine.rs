@@ -48,7 +48,7 @@ pub use first_gaussians::{InitKind, Point};
 use host::{HostPlan, HostRequest};
 pub use reconstruct::Reconstruct;
 pub use source::PictureSource;
-pub use waiting::{file_of, matching_bytes, scratch_bytes};
+pub use waiting::{matching_file_bytes, scratch_bytes, waiting_file};
 
 /// What the engine needs to know before the first picture.
 #[derive(Clone, Debug)]
@@ -163,12 +163,14 @@ impl Reconstruction {
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
         let folder = settings.device.scratch_folder();
         if let Some(initialiser) = &mut initialiser {
-            let waiting = waiting::bytes(views as u64, initialiser.frame_bytes_at(settings.device.size));
-            file_of(&folder, waiting)?.into_iter().for_each(|file| initialiser.keep_frames_in(file));
+            let waiting = waiting::file_bytes(views as u64, initialiser.frame_bytes_at(settings.device.size));
+            if let Some(file) = waiting_file(&folder, waiting)? {
+                initialiser.keep_frames_in(file);
+            }
         }
         let mut refiner: Option<Refiner> = refiner.transpose()?;
-        let matched = settings.refine.as_ref().map_or(0, |refine| matching_bytes(views as u64, refine));
-        if let (Some(refiner), Some(file)) = (&mut refiner, file_of(&folder, matched)?) {
+        let matched = settings.refine.as_ref().map_or(0, |refine| matching_file_bytes(views as u64, refine));
+        if let (Some(refiner), Some(file)) = (&mut refiner, waiting_file(&folder, matched)?) {
             refiner.keep_frames_in(file);
         }
         let mut report = RunReport::new(command);

@@ -50,7 +50,7 @@ pub struct HostRequest<'a> {
 }
 
 /// Bytes of matching so many key frames: per feature 100, 64 of them its descriptor's, per observation 250 ([`RefineSettings`]).
-fn matching(s: &RefineSettings, keyframes: u64, in_file: bool) -> u64 {
+fn matching_bytes(s: &RefineSettings, keyframes: u64, in_file: bool) -> u64 {
     let kept = if in_file { 0 } else { s.kept_bytes() };
     let observations = (s.max_observations as u64).min(keyframes * s.max_features as u64);
     let side = u64::from(s.feature_side);
@@ -61,7 +61,7 @@ fn matching(s: &RefineSettings, keyframes: u64, in_file: bool) -> u64 {
 
 /// Host memory of settling a card's poses, before a device is opened: `ahead` pictures of `pixels` are at hand at once.
 pub fn settling_bytes(s: &RefineSettings, pictures: u64, in_file: bool, (ahead, pixels): (u64, u64)) -> u64 {
-    PROGRAM_BYTES + matching(s, pictures, in_file) + ahead * 3 * pixels
+    PROGRAM_BYTES + matching_bytes(s, pictures, in_file) + ahead * 3 * pixels
 }
 
 /// Bytes by what holds them, in the order of the formula.
@@ -76,7 +76,7 @@ impl HostPlan {
     pub fn new(r: &HostRequest<'_>) -> Self {
         let (n, v, p) = (r.plan.scene as u64, r.plan.views as u64, r.plan.pixels as u64);
         let coefficients = (u64::from(r.plan.sh_degree) + 1).pow(2);
-        let matching = r.refine.map_or(0, |s| matching(s, v, r.refine_in_file));
+        let matching = r.refine.map_or(0, |s| matching_bytes(s, v, r.refine_in_file));
         let sections = vec![
             ("program", PROGRAM_BYTES),
             ("initialisation", r.initialiser),
@@ -124,7 +124,7 @@ mod tests {
     use config::plan::PlanRequest;
 
     use super::*;
-    use crate::engine::matching_bytes;
+    use crate::engine::matching_file_bytes;
 
     fn total(plan: &Plan, of: impl Fn(&mut HostRequest<'_>)) -> u64 {
         let refine = RefineSettings::default();
@@ -171,8 +171,8 @@ mod tests {
     fn what_matching_keeps_of_a_card_s_pictures_waits_in_a_file_beyond_a_quarter_of_a_gibibyte() {
         let refine = RefineSettings { feature_side: 1280, max_features: 2000, ..RefineSettings::default() };
         let each = refine.kept_bytes();
-        assert_eq!(matching_bytes(100, &refine), 0, "{} MiB stay in memory", (100 * each) >> 20);
-        assert_eq!(matching_bytes(1000, &refine), 1000 * each);
+        assert_eq!(matching_file_bytes(100, &refine), 0, "{} MiB stay in memory", (100 * each) >> 20);
+        assert_eq!(matching_file_bytes(1000, &refine), 1000 * each);
         let settling = |pictures, in_file| settling_bytes(&refine, pictures, in_file, (3, 3_000_000));
         // In a file a picture more is its key points and nothing else.
         assert_eq!(settling(1000, true) - settling(900, true), 100 * 36 * 2000);

@@ -17,20 +17,20 @@ use crate::error::JobError;
 const FRAMES_IN_MEMORY: u64 = 256 << 20;
 
 /// Bytes of the file of what waits of so many pictures: none while it fits into memory.
-pub(super) fn bytes(pictures: u64, each: u64) -> u64 {
+pub(super) fn file_bytes(pictures: u64, each: u64) -> u64 {
     Some(pictures * each).filter(|waiting| *waiting > FRAMES_IN_MEMORY).unwrap_or(0)
 }
 
-/// The same of what matching keeps.
-pub fn matching_bytes(pictures: u64, refine: &RefineSettings) -> u64 {
-    bytes(pictures, refine.kept_bytes())
+/// The same of the file for what matching keeps.
+pub fn matching_file_bytes(pictures: u64, refine: &RefineSettings) -> u64 {
+    file_bytes(pictures, refine.kept_bytes())
 }
 
-/// A file of so many bytes in `folder`; none of none.
+/// A file in `folder` for so many bytes; none where nothing waits in one.
 ///
 /// # Errors
 /// The folder cannot be written to or has no room.
-pub fn file_of(folder: &Path, bytes: u64) -> Result<Option<File>, JobError> {
+pub fn waiting_file(folder: &Path, bytes: u64) -> Result<Option<File>, JobError> {
     match bytes {
         0 => Ok(None),
         bytes => Ok(Some(scratch_file(folder, bytes)?)),
@@ -48,6 +48,6 @@ pub fn scratch_bytes(
     let each = most_frame_bytes(init, (request.width, request.height), network.pair.is_some());
     request.view_file_bytes()
         + request.scene_file_bytes()
-        + bytes(request.views.into(), each)
-        + refine.map_or(0, |refine| matching_bytes(request.views.into(), refine))
+        + file_bytes(request.views.into(), each)
+        + refine.map_or(0, |refine| matching_file_bytes(request.views.into(), refine))
 }

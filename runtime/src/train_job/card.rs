@@ -15,7 +15,7 @@ use models::refine::Refiner;
 
 use crate::console::Progress;
 use crate::engine::host::settling_bytes;
-use crate::engine::{file_of, matching_bytes};
+use crate::engine::{matching_file_bytes, waiting_file};
 use crate::error::JobError;
 use crate::evaluate::surveyed;
 
@@ -44,9 +44,6 @@ const FLOATING_LOOKS: usize = 3;
 
 /// What settling a card is to be remembered for, in run.json.
 pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
-
-/// Bytes of the host's memory that settling poses was planned to take, in run.json.
-pub(super) const SETTLING_PLANNED: &str = "host_bytes_planned_poses";
 
 /// Says what was taken from the card and what not.
 fn announce(set: &Dataset, notes: &CardNotes) {
@@ -208,11 +205,13 @@ fn refined(
     let largest = all.iter().map(longer).max().unwrap_or(1);
     let scale = (f64::from(settings.feature_side) / f64::from(largest)).min(1.0);
     let mut refiner = Refiner::open(&settings)?;
-    let file = file_of(out, matching_bytes(all.len() as u64, &settings))?;
+    let file = waiting_file(out, matching_file_bytes(all.len() as u64, &settings))?;
     let pixels = all.iter().map(|i| set.frames[*i].view.intrinsics.pixels() as u64).max().unwrap_or(0);
-    let held = settling_bytes(&settings, all.len() as u64, file.is_some(), (settings.threads as u64 + 1, pixels));
-    remarks.push((SETTLING_PLANNED, held.into()));
-    file.into_iter().for_each(|file| refiner.keep_frames_in(file));
+    let planned = settling_bytes(&settings, all.len() as u64, file.is_some(), (settings.threads as u64 + 1, pixels));
+    remarks.push(("host_bytes_planned_poses", planned.into()));
+    if let Some(file) = file {
+        refiner.keep_frames_in(file);
+    }
     let mut progress = Progress::new("poses", all.len() as u64);
     let (mut done, mut stopped) = (0, false);
     let mut skipped = Vec::new();
