@@ -1,12 +1,24 @@
 //! Groups of pictures that the order of capture leaves apart (the next line, a second flight) are found to belong together by what
 //! they look like.
 
+use glam::DQuat;
+
 use super::{AddReport, RefineError, Refiner};
 
 /// Pictures of other groups that each picture is compared with, most alike first.
 const ALIKE: usize = 3;
 /// Pictures of a group that say how it is turned against the others.
 const REPRESENTATIVES: usize = 4;
+
+/// How a picture has to be turned to match another.
+pub(super) struct Turn {
+    /// Matches that agree.
+    pub inliers: usize,
+    /// Quarter turns more than it was turned by.
+    pub quarters: u8,
+    /// Its rotation then, camera axes → world.
+    pub rotation: DQuat,
+}
 
 impl Refiner {
     /// The largest group that pairs join, and the others.
@@ -37,15 +49,10 @@ impl Refiner {
         for group in groups {
             let mut best = (0, 0);
             for &i in group.iter().step_by(group.len().div_ceil(REPRESENTATIVES)) {
-                let as_it_was = self.frames[i].turns;
-                for more in 0..4 {
-                    self.extract_turned(i, (as_it_was + more) % 4, &mut report)?;
-                    for j in self.most_alike(i, &most) {
-                        let agree = self.coarse(j, i, false, true).1.map_or(0, |found| found.inliers.len());
-                        best = best.max((agree, more));
-                    }
+                let like = |this: &Self| this.most_alike(i, &most);
+                if let Some(turn) = self.best_turn(i, &like, &mut report)? {
+                    best = best.max((turn.inliers, turn.quarters));
                 }
-                self.extract_turned(i, as_it_was, &mut report)?;
             }
             if best.0 > 0 && best.1 > 0 {
                 turned = true;
@@ -59,6 +66,31 @@ impl Refiner {
             self.link_anew(&mut AddReport::default());
         }
         Ok(())
+    }
+
+    /// How picture `i` has to be turned to match one of `others` (of its features as they are then) best; nothing where it matches none
+    /// of them, whichever way it is turned.
+    pub(super) fn best_turn(
+        &mut self,
+        i: usize,
+        others: &dyn Fn(&Self) -> Vec<usize>,
+        report: &mut AddReport,
+    ) -> Result<Option<Turn>, RefineError> {
+        let as_it_was = self.frames[i].turns;
+        let mut best: Option<Turn> = None;
+        for quarters in 0..4 {
+            self.extract_turned(i, (as_it_was + quarters) % 4, report)?;
+            for j in others(self) {
+                let Some(found) = self.coarse(j, i, false, true).1 else { continue };
+                let inliers = found.inliers.len();
+                if best.as_ref().is_none_or(|b| inliers > b.inliers) {
+                    let rotation = (self.frames[j].pose.rotation * found.pose.rotation.conjugate()).normalize();
+                    best = Some(Turn { inliers, quarters, rotation });
+                }
+            }
+        }
+        self.extract_turned(i, as_it_was, report)?;
+        Ok(best)
     }
 
     /// Links groups of pictures that the order of capture leaves apart (another line, a second flight) by those that look most

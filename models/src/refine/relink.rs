@@ -13,6 +13,8 @@ use super::{AddReport, RefineError, RefineReport, Refiner, upright};
 
 /// How far a chain of pictures without positions may have bent, a tenth of its height.
 const BENT: f64 = 0.1 * HEIGHT;
+/// Tied pictures that one which nothing ties is compared with.
+const AROUND: usize = 3;
 /// Positions that the adjustment moved further than this from telemetry's are searched for as if they were not known,
 /// standard deviations.
 const DOUBT: f64 = 3.0;
@@ -31,8 +33,9 @@ impl Refiner {
         }
         // What is doubted now may go back to where telemetry had it.
         self.anchored = false;
-        if self.floating {
-            self.reach_untied();
+        match self.floating {
+            true => self.reach_untied(),
+            false => self.turn_untied(&mut report)?,
         }
         self.extract_upright(&mut report)?;
         for frame in &mut self.frames {
@@ -70,6 +73,28 @@ impl Refiner {
         }
         report.match_seconds = clock.elapsed().as_secs_f64();
         self.totals.absorb(report);
+    }
+
+    /// What nothing ties was linked to little, and that may have been chance: it is turned as the tied pictures that telemetry has
+    /// around it want it. (One of 305 without attitudes had a single pair that was wrong by a quarter turn, and no second look ever
+    /// compared it otherwise.)
+    fn turn_untied(&mut self, report: &mut AddReport) -> Result<(), RefineError> {
+        if self.networks.is_none() {
+            return Ok(());
+        }
+        for i in (0..self.frames.len()).filter(|i| !self.frames[*i].tied).collect::<Vec<_>>() {
+            let frame = &mut self.frames[i];
+            frame.pose.rotation = (frame.prior.rotation * self.shared.mount).normalize();
+            let frame = &self.frames[i];
+            let camera = self.shared.lens.camera(self.expect(&frame.prior), &frame.intrinsics);
+            let mut around = self.candidates(&camera, &frame.intrinsics, self.frames.len());
+            around.retain(|j| self.frames[*j as usize].tied);
+            let around: Vec<usize> = around.into_iter().take(AROUND).map(|j| j as usize).collect();
+            if let Some(turn) = self.best_turn(i, &|_| around.clone(), report)? {
+                self.frames[i].pose.rotation = turn.rotation;
+            }
+        }
+        Ok(())
     }
 
     /// Extracts features anew where a picture was not turned as the others are.
@@ -123,5 +148,63 @@ fn doubt(frame: &mut KeyFrame) {
         frame.position_sigma = widest.max(away.length() / 2.0).min(30.0);
         frame.pose.center = frame.prior.center;
         frame.adjusted = false;
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use config::refine::RefineSettings;
+    use glam::{DQuat, DVec3};
+    use image::{Rgb, RgbImage};
+
+    use super::*;
+    use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
+
+    /// Ground of random fields a metre across, from 40 m above (x, 0), north up: a pixel is 0.1 m.
+    fn picture(x: f64) -> PosedImage {
+        let value = |u: i32, v: i32| {
+            let mixed = u.wrapping_mul(0x27D4_EB2D) ^ v.wrapping_mul(0x1656_67B1);
+            (mixed.wrapping_mul(0x2C1B_3C6D) >> 15) as u8
+        };
+        let field = |p: f64| (p / 10.0).floor() as i32;
+        let image =
+            RgbImage::from_fn(400, 300, |u, v| Rgb([value(field(f64::from(u) + 10.0 * x), field(f64::from(v))); 3]));
+        PosedImage {
+            name: format!("{x}.jpg"),
+            time_ns: (x * 1e8) as u64,
+            image,
+            mask: None,
+            view: View {
+                intrinsics: Intrinsics { width: 400, height: 300, fx: 400.0, fy: 400.0, cx: 200.0, cy: 150.0 },
+                pose: Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center: DVec3::new(x, 0.0, 40.0) },
+            },
+            // Without an attitude: down, somehow.
+            sigma: PoseSigma { position_m: [1.0; 3], rotation_rad: [0.2, 0.2, 2.0] },
+        }
+    }
+
+    #[test]
+    fn a_picture_that_chance_linked_a_quarter_turn_off_is_turned_back_and_tied() {
+        if crate::onnx::session::find_library().is_err() {
+            return println!("skipped: no ONNX Runtime");
+        }
+        let mut refiner = Refiner::open(&RefineSettings { solve_seconds: 120.0, ..RefineSettings::default() }).unwrap();
+        for x in 0..7 {
+            refiner.add(&picture(6.0 * f64::from(x))).unwrap();
+        }
+        assert_eq!(refiner.solve().unwrap().frames_tied, 7);
+        // As a wrong pair leaves it.
+        let frame = &mut refiner.frames[3];
+        let told = frame.prior.rotation;
+        (frame.tied, frame.pairs) = (false, 1);
+        frame.pose.rotation *= DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2);
+        // And what it says of itself is as wrong.
+        frame.prior.rotation = frame.pose.rotation;
+        refiner.extract_turned(3, 1, &mut AddReport::default()).unwrap();
+        refiner.relink().unwrap();
+        let report = refiner.solve().unwrap();
+        let off = refiner.frames[3].pose.rotation.angle_between(told).to_degrees();
+        assert!(report.frames_tied == 7 && off < 1.0, "{} tied, {off}°", report.frames_tied);
     }
 }
