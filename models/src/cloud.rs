@@ -42,7 +42,7 @@ pub fn sh_basis([x, y, z]: [f64; 3]) -> [f64; 15] {
 }
 
 /// N Gaussians, column by column; every column has the same N.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct GaussianCloud {
     /// Highest SH degree stored, 0…3.
     pub sh_degree: u8,
@@ -56,6 +56,24 @@ pub struct GaussianCloud {
     pub opacity_logits: Vec<f32>,
     /// N × D × 3 floats, D = [`sh_coefficients`]: for each Gaussian D coefficients, each r, g, b.
     pub sh: Vec<f32>,
+}
+
+impl Clone for GaussianCloud {
+    fn clone(&self) -> Self {
+        let mut of = Self::default();
+        of.clone_from(self);
+        of
+    }
+
+    /// Into the memory that is there: what was taken for a flight stays its own.
+    fn clone_from(&mut self, from: &Self) {
+        self.sh_degree = from.sh_degree;
+        self.means.clone_from(&from.means);
+        self.log_scales.clone_from(&from.log_scales);
+        self.rotations.clone_from(&from.rotations);
+        self.opacity_logits.clone_from(&from.opacity_logits);
+        self.sh.clone_from(&from.sh);
+    }
 }
 
 impl GaussianCloud {
@@ -302,6 +320,17 @@ mod tests {
         assert_eq!(a.len(), 2);
         assert_eq!(&a.sh[..12], &[1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         assert_eq!(&a.sh[12..], &[2.0; 12]);
+    }
+
+    #[test]
+    fn a_copy_goes_into_the_memory_that_was_taken_for_it() {
+        let mut planned = GaussianCloud::with_memory(1, 100);
+        let places = |c: &GaussianCloud| (c.means.as_ptr(), c.rotations.as_ptr(), c.sh.as_ptr(), c.sh.capacity());
+        let taken = places(&planned);
+        let mut model = one(1.0, 1);
+        model.extend(&one(2.0, 1));
+        planned.clone_from(&model);
+        assert_eq!((places(&planned), &planned), (taken, &model));
     }
 
     #[test]

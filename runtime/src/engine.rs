@@ -239,7 +239,7 @@ impl Reconstruction {
         let told = RunReport::read(out).ok().and_then(|run| run.more.get("train_seconds")?.as_f64());
         self.train_s = told.unwrap_or(header.train_seconds);
         self.header.steps = header.steps;
-        self.cloud = cloud;
+        self.cloud.clone_from(&cloud);
         let names = header.views.iter().map(|(name, _)| name.clone());
         self.resumed_lights = names.zip(header.lights).collect();
         self.resumed = header.views.into_iter().collect();

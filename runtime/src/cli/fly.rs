@@ -14,6 +14,7 @@ use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
 use crate::interrupt::Interrupt;
 use crate::ortho::keep_scratch_in;
 use crate::report::{REPORT, ReportData, Timing, count, seconds};
+use crate::resources::return_freed_memory;
 use crate::run_json::RunReport;
 use crate::service::Supervisor;
 use crate::session::{Owner, Session};
@@ -55,6 +56,7 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
+    return_freed_memory();
     let started = Instant::now();
     let mission = Mission::read(&args.mission)?;
     let mut aircraft = mission.aircraft(args.aircraft.as_deref())?.clone();

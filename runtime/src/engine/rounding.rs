@@ -21,8 +21,10 @@ impl Reconstruction {
     /// Rounds what gives a Gaussian its shape, as its delivery will, and trains colours alone from here on. The schedule goes on.
     pub(super) fn round(&mut self) -> Result<(), JobError> {
         self.trainer.snapshot(&mut self.cloud)?;
-        self.cloud = delivery::round_shapes(&self.cloud, &Rounding::default())
+        let rounded = delivery::round_shapes(&self.cloud, &Rounding::default())
             .map_err(|e| FormatError::Invalid { path: "the model".into(), what: format!("not rounded: {e}") })?;
+        self.cloud.clone_from(&rounded);
+        drop(rounded);
         let (steps, seconds) = self.trainer.spent();
         self.trainer.load(&self.cloud)?;
         self.trainer.continue_from(steps, seconds);
