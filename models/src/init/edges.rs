@@ -87,10 +87,12 @@ impl<'a> Pictures<'a> {
                 let row = &self.reference[(y + dy - HALF) * w + x - HALF..][..SIDE];
                 let mut at = start;
                 for value in row {
-                    sum += (value - s.plane[(at.y >> 16) as usize * w + (at.x >> 16) as usize]).abs();
-                    at += right;
+                    // Within the picture, as was seen above: not checked for overflow again.
+                    let [column, line] = [at.x >> 16, at.y >> 16].map(|c| c as usize);
+                    sum += (value - s.plane[line.wrapping_mul(w).wrapping_add(column)]).abs();
+                    at = at.wrapping_add(right);
                 }
-                start += down;
+                start = start.wrapping_add(down);
                 if sum >= most {
                     break;
                 }

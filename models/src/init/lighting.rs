@@ -10,6 +10,8 @@ use crate::light::{Light, PictureLight, Ratio, Solved, off_axis, solve};
 
 /// Places that a picture is compared with another at, at most.
 const PLACES: usize = 128;
+/// Depths of a picture that are looked for in another, at most: so many that places are left where a twentieth of them is seen.
+const TRIED: usize = 20 * PLACES;
 /// Confidence of a depth whose colour is compared.
 const SURE: f32 = 0.2;
 /// Half the side of the patch whose mean is compared, pixels of the network's picture: a misplaced texture averages out.
@@ -26,7 +28,9 @@ pub(super) fn ratios(frames: &[DepthFrame], i: usize, others: &[usize], toleranc
     let Some(own) = frames[i].depth()? else { return Ok(Vec::new()) };
     let image = frames[i].image()?;
     let unproject = Unprojector::new(&frames[i].view);
-    let sure: Vec<usize> = (0..own.depth.len()).filter(|k| own.confidence[*k] > SURE).collect();
+    let mut sure: Vec<usize> = (0..own.depth.len()).filter(|k| own.confidence[*k] > SURE).collect();
+    let every = sure.len().div_ceil(TRIED).max(1);
+    sure = sure.into_iter().step_by(every).collect();
     let mut ratios = Vec::new();
     for &j in others {
         let Some(theirs) = frames[j].depth()? else { continue };
