@@ -90,6 +90,13 @@ mod tests {
         assert!(peak_rss_bytes().expect("procfs") + (1 << 20) >= now && now > 1 << 20);
     }
 
+    /// This program once more, for one test that is left out otherwise.
+    fn child(test: &str) -> std::process::Command {
+        let mut command = std::process::Command::new(std::env::current_exe().expect("this program"));
+        command.args([test, "--exact", "--ignored", "--test-threads=1"]);
+        command
+    }
+
     const TOLD: &str = "DGTR_TOLD_TO_RETURN";
 
     /// Not a test of its own: what the next one starts, so that nothing was allocated before.
@@ -112,9 +119,7 @@ mod tests {
     #[cfg(target_env = "gnu")]
     fn a_large_block_is_a_mapping_of_its_own_whatever_was_freed_before() {
         for told in ["yes", "no"] {
-            let mut command = std::process::Command::new(std::env::current_exe().expect("this program"));
-            command.args(["resources::tests::block_child", "--exact", "--ignored", "--test-threads=1"]).env(TOLD, told);
-            let output = command.output().expect("starts");
+            let output = child("resources::tests::block_child").env(TOLD, told).output().expect("starts");
             let said = String::from_utf8_lossy(&output.stdout);
             assert!(output.status.success() && said.contains("1 passed"), "{told}: {said}");
         }
@@ -142,8 +147,7 @@ mod tests {
         use std::os::unix::process::ExitStatusExt;
         let dir = tempfile::tempdir().expect("folder");
         let run = |name: &str| {
-            let mut command = std::process::Command::new(std::env::current_exe().expect("this program"));
-            command.args(["resources::tests::limited_child", "--exact", "--ignored", "--test-threads=1"]);
+            let mut command = child("resources::tests::limited_child");
             command.env(LIMITED, dir.path().join(name)).stdout(std::process::Stdio::null());
             command.stderr(std::process::Stdio::null()).status().expect("starts")
         };

@@ -28,9 +28,8 @@ pub(super) fn ratios(frames: &[DepthFrame], i: usize, others: &[usize], toleranc
     let Some(own) = frames[i].depth()? else { return Ok(Vec::new()) };
     let image = frames[i].image()?;
     let unproject = Unprojector::new(&frames[i].view);
-    let mut sure: Vec<usize> = (0..own.depth.len()).filter(|k| own.confidence[*k] > SURE).collect();
+    let sure: Vec<usize> = (0..own.depth.len()).filter(|k| own.confidence[*k] > SURE).collect();
     let every = sure.len().div_ceil(TRIED).max(1);
-    sure = sure.into_iter().step_by(every).collect();
     let mut ratios = Vec::new();
     for &j in others {
         let Some(theirs) = frames[j].depth()? else { continue };
@@ -41,7 +40,8 @@ pub(super) fn ratios(frames: &[DepthFrame], i: usize, others: &[usize], toleranc
             let (u, v, z) = project.project(unproject.at(x, y, own.depth[at]))?;
             agrees(&theirs, (u, v, z), tolerance).then_some((u, v))
         };
-        let both: Vec<(usize, (f32, f32))> = sure.iter().filter_map(|&at| Some((at, seen(at)?))).collect();
+        let both: Vec<(usize, (f32, f32))> =
+            sure.iter().step_by(every).filter_map(|&at| Some((at, seen(at)?))).collect();
         for (at, (u, v)) in both.iter().step_by(both.len().div_ceil(PLACES).max(1)) {
             let (x, y) = own.pixel(at % own.width, at / own.width);
             let (Some(here), Some(there)) = (patch(&image, x, y), patch(&their_image, *u, *v)) else { continue };

@@ -90,6 +90,9 @@ impl Refiner {
             let mut around = self.candidates(&camera, &frame.intrinsics, self.frames.len());
             around.retain(|j| self.frames[*j as usize].tied);
             let around: Vec<usize> = around.into_iter().take(AROUND).map(|j| j as usize).collect();
+            if around.is_empty() {
+                continue;
+            }
             if let Some(turn) = self.best_turn(i, &|_| around.clone(), report)? {
                 self.frames[i].pose.rotation = turn.rotation;
             }
