@@ -72,6 +72,13 @@ impl TrainSettings {
         let by_time = self.seconds.map_or(0.0, |s| elapsed_s / s.max(1e-3));
         by_steps.max(by_time).clamp(0.0, 1.0) as f32
     }
+
+    /// Length of the schedule for so many pictures, where neither steps nor seconds are given: [`Self::steps`], unless each view
+    /// is visited [`often enough`](ViewSettings::visits) before.
+    pub fn steps_for(&self, views: usize) -> u32 {
+        let visits = u64::from(self.views.visits).saturating_mul(views.max(1) as u64);
+        u64::from(self.steps).min(visits) as u32
+    }
 }
 
 table! {
@@ -139,6 +146,13 @@ pub fn scene_extent(means: &[[f32; 3]], centers: &[[f64; 3]]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn few_pictures_get_a_hundred_visits_each_and_many_the_papers_steps() {
+        let s = TrainSettings::default();
+        let got = [0, 1, 15, 86, 100, 1000, usize::MAX].map(|views| s.steps_for(views));
+        assert_eq!(got, [100, 100, 1500, 8600, 10_000, 10_000, 10_000]);
+    }
 
     #[test]
     fn an_empty_table_is_the_default_and_an_unknown_key_is_refused() {

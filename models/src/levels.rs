@@ -12,7 +12,7 @@ use crate::formats::FormatError;
 use crate::formats::model::Chunks;
 use crate::formats::sog::streamed::Writer;
 use leaves::{Counts, Ground};
-use merge::coarser;
+pub(crate) use merge::coarser;
 pub use scratch::Rows;
 use scratch::Scratch;
 

@@ -40,7 +40,8 @@ fn a_file_in_cells_is_sent_in_pieces_that_are_its_cells() {
         .for_each(|i| changed.sh[12 * i] += 0.4);
     let after = write(&changed);
     let new = after.iter().filter(|piece| !before.contains(piece)).count();
-    assert!((2..=4).contains(&new), "{new} of {} pieces are new: the index and what changed", after.len());
+    // The index, and both layers of what changed.
+    assert!((3..=7).contains(&new), "{new} of {} pieces are new", after.len());
     let exact = dir.path().join("exact.dgtr");
     model::write(&exact, &ModelHeader::default(), &changed).unwrap();
     assert_eq!(model::pieces(&exact).unwrap(), None);
@@ -68,6 +69,72 @@ fn no_damage_to_a_file_in_cells_goes_unseen() {
         assert!(!refused.contains('\n'), "{refused}");
     }
     assert!(read(&[&bytes[..], &[0; 4]].concat()).is_err());
+}
+
+#[test]
+fn whatever_part_of_a_file_in_layers_is_there_shows_the_whole_scene() {
+    let dir = tempfile::tempdir().unwrap();
+    let (path, all) = (dir.path().join("m.dgtr"), cloud(40_000));
+    model::write_rounded(&Default::default(), &path, &ModelHeader::default(), &all, &Rounding::default()).unwrap();
+    let (bytes, pieces) = (std::fs::read(&path).unwrap(), model::pieces(&path).unwrap().unwrap());
+    let whole = model::read_what_is_there(&path).unwrap();
+    assert_eq!((whole.1.len(), whole.2), (40_000, None));
+    let cells = pieces.len() / 2;
+    let (index, coarse) = (pieces[0] as usize, pieces[..=cells].iter().sum::<u64>() as usize);
+    assert!(cells > 4 && 10 * coarse < bytes.len(), "{coarse} of {} bytes for {cells} coarse layers", bytes.len());
+    let part = |n: usize| {
+        std::fs::write(&path, &bytes[..n]).unwrap();
+        assert!(model::read(&path).is_err(), "who goes on with a model is not given a part of one");
+        let (header, cloud, part) = model::read_what_is_there(&path).unwrap();
+        assert_eq!(header, ModelHeader::default());
+        (cloud, part.unwrap())
+    };
+    let covered = |cloud: &GaussianCloud| (0..cloud.len()).map(|i| cloud.covered_m2(i)).sum::<f64>();
+    assert_eq!(part(index), (GaussianCloud::with_capacity(1, 0), model::Partial { cells, whole: 0, coarse: 0 }));
+    // Merged, what they cover stays.
+    let (merged, there) = part(coarse);
+    assert_eq!(there, model::Partial { cells, whole: 0, coarse: cells });
+    assert!((1000..8000).contains(&merged.len()), "{}", merged.len());
+    let share = covered(&merged) / covered(&all);
+    assert!((0.5..1.5).contains(&share), "{share}");
+    // Cells take their layers' places one by one, and half a cell is none.
+    let second = pieces[..=cells + 2].iter().sum::<u64>() as usize;
+    assert_eq!(part(second).1, model::Partial { cells, whole: 2, coarse: cells - 2 });
+    assert_eq!(part(second - 1).1, model::Partial { cells, whole: 1, coarse: cells - 1 });
+    let counts: Vec<usize> = (coarse..bytes.len()).step_by(bytes.len() / 9).map(|n| part(n).0.len()).collect();
+    assert!(counts.is_sorted() && counts[0] < counts[counts.len() - 1], "{counts:?}");
+    // What is cut before the index is whole is refused, as is damage in what is there.
+    std::fs::write(&path, &bytes[..index - 1]).unwrap();
+    assert!(model::read_what_is_there(&path).is_err());
+    let mut spoilt = bytes[..second].to_vec();
+    for at in [index / 2, index + 5, coarse + 5] {
+        spoilt[at] ^= 0x41;
+        std::fs::write(&path, &spoilt).unwrap();
+        assert!(model::read_what_is_there(&path).is_err(), "byte {at}");
+        spoilt[at] ^= 0x41;
+    }
+}
+
+/// As `rounded_v2.dgtr`, which the dgtr of version 3 read and wrote in cells (`dgtr export rounded_v2.dgtr --to delivery`).
+#[test]
+fn a_model_in_cells_of_version_3_is_read_as_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, include_bytes!("data/cells_v3.dgtr")).unwrap();
+    let (_, cloud) = model::read(&path).unwrap();
+    let pieces = model::pieces(&path).unwrap().unwrap();
+    assert_eq!((cloud.len(), pieces.len(), pieces.iter().sum::<u64>()), (114, 2, 1526));
+    // The same Gaussians, rounded once more: where and how opaque they are stays as it was.
+    let v2 = dir.path().join("v2.dgtr");
+    std::fs::write(&v2, include_bytes!("data/rounded_v2.dgtr")).unwrap();
+    let (_, first) = model::read(&v2).unwrap();
+    for (mean, logit) in cloud.means.iter().zip(&cloud.opacity_logits) {
+        let near = |i: &usize| first.means[*i].iter().zip(mean).all(|(a, b)| (a - b).abs() < 0.2);
+        assert!((0..first.len()).filter(near).any(|i| (first.opacity_logits[i] - logit).abs() < 0.01), "{mean:?}");
+    }
+    // What is cut short has no layers to show.
+    std::fs::write(&path, &include_bytes!("data/cells_v3.dgtr")[..1000]).unwrap();
+    assert!(model::read_what_is_there(&path).is_err());
 }
 
 /// Written by the dgtr of version 2 (`dgtr export s.dgtr --to delivery`), 114 of 120 random Gaussians of SH degree 1.

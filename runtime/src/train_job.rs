@@ -171,7 +171,7 @@ impl TrainJob {
             map: None,
             scale,
             network: self.network.clone(),
-            training: self.settings(),
+            training: self.settings(frames.len()),
             init: self.init_settings.clone(),
             refine: refine.then(|| self.refine_settings.clone()),
             start: self.init,
@@ -198,7 +198,7 @@ impl TrainJob {
         }
         let built = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
         let ready = built && engine.look_closer(&mut source, &go_on)?;
-        let finished = ready && self.optimise(&mut engine, &stop)?;
+        let finished = ready && self.optimise(&mut engine, frames.len(), &stop)?;
         if finished && self.evaluate {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
@@ -227,9 +227,10 @@ impl TrainJob {
         Ok(Outcome { finished, steps, report })
     }
 
-    fn settings(&self) -> TrainSettings {
-        let (steps, seconds) = (self.steps.unwrap_or(self.training.steps), self.seconds.or(self.training.seconds));
-        TrainSettings { steps, seconds, ..self.training.clone() }
+    fn settings(&self, views: usize) -> TrainSettings {
+        let seconds = self.seconds.or(self.training.seconds);
+        let unasked = if seconds.is_some() { self.training.steps } else { self.training.steps_for(views) };
+        TrainSettings { steps: self.steps.unwrap_or(unasked), seconds, ..self.training.clone() }
     }
 
     /// Takes up the model in `out` when it is of the same pictures and holds Gaussians; a model of other pictures is an
@@ -282,9 +283,9 @@ impl TrainJob {
     }
 
     /// Trains to the goal; false when asked to stop before it.
-    fn optimise(&self, engine: &mut Reconstruction, stop: &Interrupt) -> Result<bool, JobError> {
+    fn optimise(&self, engine: &mut Reconstruction, views: usize, stop: &Interrupt) -> Result<bool, JobError> {
         self.save(engine, false)?;
-        let settings = self.settings();
+        let settings = self.settings(views);
         let failsafe = self.failsafe.as_ref().map(|limits| {
             // Nothing bounds the host's memory here.
             Failsafe::new(Health::new(*limits, u32::MAX, &self.out), limits)

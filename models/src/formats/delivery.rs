@@ -29,7 +29,7 @@ mod predict;
 mod shape;
 mod view_basis;
 
-pub use cells::{CodedCell, CodedCells, encode_cells, round_shapes};
+pub use cells::{CodedCell, CodedCells, Layer, encode_cells, round_shapes};
 pub use coder::Garbled;
 
 /// Host memory that encoding takes at most per Gaussian of SH degree 3, the cloud that is encoded not counted (measured:

@@ -10,6 +10,9 @@
 //! version 3, in cells: side f32 · cells u32 · per cell, the most important first: level u8 · y i32 · x i32 · Gaussians u32 ·
 //!     words u32 · importance f32 · BLAKE3 of its words (32)
 //! BLAKE3 of everything before (32) · the cells' words, u32
+//!
+//! version 4, in layers: as version 3, but each cell of the index goes on: Gaussians u32 · words u32 · BLAKE3 (32) of its coarse layer; those words
+//!     come first, of all cells, so that whatever part of the file is there shows the whole scene ([`read_what_is_there`])
 //! ```
 //!
 //! All little-endian. The magic's line ends betray a transfer as text, what is allocated follows from the fixed part and
@@ -38,17 +41,21 @@ mod chunks;
 pub mod columns;
 mod hashing;
 mod opening;
+mod partial;
 
 pub use celled::{pieces, write_cells};
 pub use chunks::{Chunks, write_chunks, write_columns};
+pub use partial::{Partial, read_what_is_there};
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.
 const EXACT: u32 = 1;
 /// The delivery encoding in one piece: read, no longer written.
 const ROUNDED: u32 = 2;
-/// The delivery encoding, cell by cell.
+/// The delivery encoding, cell by cell: read, no longer written.
 const CELLED: u32 = 3;
+/// The same, the coarse layers of all cells before them.
+const LAYERED: u32 = 4;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 130 bytes per view; this is room for 100,000 of them and long names.
@@ -222,7 +229,9 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
     let (mut coded, mut cells) = (Vec::new(), None);
     match body {
         Body::Words(words) => coded = read_words(&mut input, words, u32::from_le_bytes).map_err(failed)?,
-        Body::Cells => cells = Some(Cells::read(path, &mut input, count, size - FIXED - header.len() as u64)?),
+        Body::Cells { layered } => {
+            cells = Some(Cells::read(path, &mut input, layered, count, size - FIXED - header.len() as u64)?);
+        }
         Body::Columns => cloud = read_cloud(&mut input, sh_degree, count).map_err(failed)?,
     }
     let hash = compare(path, &mut input)?;
@@ -309,10 +318,11 @@ mod tests {
     #[test]
     fn the_page_on_formats_states_these_versions() {
         let row = format!(
-            "| `.dgtr` model file | {} exact, {} rounded (read only), {} rounded in cells |",
+            "| `.dgtr` model file | {} exact, {} rounded (read only), {} rounded in cells (read only), {} in cells and layers |",
             super::EXACT,
             super::ROUNDED,
-            super::CELLED
+            super::CELLED,
+            super::LAYERED
         );
         assert!(include_str!("../../FORMATS.md").contains(&row), "{row}");
     }

@@ -33,6 +33,7 @@ mod assemble;
 mod depths;
 mod growth;
 mod memory;
+mod strips;
 mod unposed_pairs;
 
 pub use memory::most_frame_bytes;

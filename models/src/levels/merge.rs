@@ -21,7 +21,7 @@ const THINNEST: f64 = 1e-3;
 
 /// One Gaussian for each voxel with edges of `side` metres: what lies in it, merged. A Gaussian larger than its voxel stays as it is. Rows that are not
 /// valid are left out. The same cloud gives the same rows, in the order of their voxels.
-pub(super) fn coarser(cloud: &GaussianCloud, side: f64) -> GaussianCloud {
+pub(crate) fn coarser(cloud: &GaussianCloud, side: f64) -> GaussianCloud {
     // Casts saturate: what lies beyond 2³¹ voxels shares the last.
     let voxel = |m: [f32; 3]| m.map(|v| (f64::from(v) / side).floor() as i32);
     let large = |i: usize| cloud.log_scales[i].iter().any(|s| f64::from(*s).exp() > side);

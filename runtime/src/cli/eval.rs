@@ -82,7 +82,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if frames.is_empty() {
         return Err(CliError::input(format!("{}: split {:?} holds no pictures", dataset.display(), args.split)));
     }
-    let (header, cloud) = model::read(&args.model)?;
+    let (header, cloud, _) = model::read_what_is_there(&args.model)?;
     let (width, height) = largest(&set, &frames, args.scale)?;
     let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
     let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;

@@ -130,7 +130,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if args.format == Format::Streamed {
         return streamed(&args, &out);
     }
-    let (header, mut cloud) = model::read(&args.model)?;
+    let (header, mut cloud, _) = model::read_what_is_there(&args.model)?;
     if args.format.is_scene() {
         cloud.lower_sh_degree(args.sh_degree.unwrap_or(cloud.sh_degree));
         return scene(&args, &out, &header, &cloud);

@@ -50,7 +50,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         cameras.shots.iter().map(|s| Ok((stem(&s.path), view(&args.cameras, s)?))).collect::<Result<_, CliError>>()?;
     let width = views.iter().map(|v| v.1.intrinsics.width).max().unwrap_or(1);
     let height = views.iter().map(|v| v.1.intrinsics.height).max().unwrap_or(1);
-    let (_, cloud) = model::read(&args.model)?;
+    let (_, cloud, _) = model::read_what_is_there(&args.model)?;
     let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
     let stop = interrupt::Interrupt::install()?;
     let mut progress = console::Progress::new("rendering", views.len() as u64);

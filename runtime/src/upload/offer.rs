@@ -211,6 +211,11 @@ impl Offer {
             .map_err(|source| OfferError::Forged { aircraft: self.aircraft.clone(), source })
     }
 
+    /// Whether its chunks are the pieces of a model in cells.
+    pub fn is_in_pieces(&self) -> bool {
+        self.version == PIECES
+    }
+
     /// Bytes of chunk `index`.
     pub fn chunk_len(&self, index: usize) -> u64 {
         if self.version == PIECES {

@@ -1,8 +1,8 @@
 //! What the ground has on disk of one aircraft: chunks as they arrive, then the verified model.
 //!
 //! `<dir>/chunk/<blake3>` survive a restart, so an interrupted transfer continues where it was; the finished model is
-//! `<dir>/model.dgtr` with the offer it came from beside it. Chunks of that model are not fetched again for the next one: a
-//! cell that did not change is taken from where it lies. The model is replaced by renaming only after every chunk and the whole
+//! `<dir>/model.dgtr` with the offer it came from beside it; until then `<dir>/preview.dgtr` is what has come of it, to be looked at.
+//! Chunks of a complete model are not fetched again for the next one: a cell that did not change is taken from where it lies. The model is replaced by renaming only after every chunk and the whole
 //! have the promised hashes.
 
 use std::collections::HashMap;
@@ -179,6 +179,32 @@ impl Store {
         self.disk.replace(&path, |out| out.write_all(bytes)).map_err(|e| io(&path)(e.into()))
     }
 
+    /// Writes what has come of a model in cells, up to the first chunk that is missing, as [`Self::preview_path`]: something to look at
+    /// while a slow link brings the rest. Gives its bytes; nothing is written while that is not a quarter more than `before`.
+    ///
+    /// # Errors
+    /// The disk.
+    pub fn preview(&self, offer: &Offer, before: u64) -> Result<u64, StoreError> {
+        let missing = self.missing(offer).into_iter().min().unwrap_or(0);
+        let bytes = (0..missing).map(|i| offer.chunk_len(i)).sum::<u64>();
+        if !offer.is_in_pieces() || bytes <= before + before / 4 {
+            return Ok(before);
+        }
+        let path = self.preview_path();
+        let fill = |out: &mut dyn Write| {
+            // One that went bad ends it; `assemble` sees to it.
+            let mut chunks = (0..missing).map_while(|i| self.chunk(&offer.chunks[i], offer.chunk_len(i)));
+            chunks.try_for_each(|chunk| out.write_all(&chunk))
+        };
+        self.disk.replace(&path, fill).map_err(|e| io(&path)(e.into()))?;
+        Ok(bytes)
+    }
+
+    /// Where [`Self::preview`] lies until the model is complete.
+    pub fn preview_path(&self) -> PathBuf {
+        self.dir.join("preview.dgtr")
+    }
+
     /// Puts the model together, verifies it, and makes it the complete one if it may count; else the one before stays.
     /// Chunks that went bad on disk are removed, so that the next [`Store::missing`] names them.
     ///
@@ -222,6 +248,8 @@ impl Store {
         written.map_err(|e| io(&path)(e.into()))??;
         self.note(offer)?;
         self.keep_only(None);
+        // There may have been none.
+        let _ = self.disk.remove(&self.preview_path());
         Ok(())
     }
 

@@ -18,6 +18,10 @@ pub(crate) struct Sampler {
     rng: Pcg64Mcg,
     order: Vec<u32>,
     by_loss: Vec<u32>,
+    /// How often each view was chosen.
+    visits: Vec<u32>,
+    /// While views came some were chosen more often than others: the next epoch begins with those chosen least.
+    uneven: bool,
 }
 
 impl Sampler {
@@ -30,6 +34,8 @@ impl Sampler {
             rng: Pcg64Mcg::seed_from_u64(seed),
             order,
             by_loss: Vec::with_capacity(capacity),
+            visits: vec![0; capacity],
+            uneven: false,
         }
     }
 
@@ -49,6 +55,7 @@ impl Sampler {
     pub fn look_at_newest(&mut self, on: bool) {
         if std::mem::replace(&mut self.newest, on) != on {
             self.order.clear();
+            self.uneven = !on;
         }
     }
 
@@ -96,8 +103,14 @@ impl Sampler {
                 let j = self.rng.random_range(0..=i);
                 self.order.swap(i, j);
             }
+            if std::mem::take(&mut self.uneven) {
+                let visits = |view: &u32| self.visits.get(*view as usize).copied().unwrap_or(0);
+                self.order.sort_by_key(|view| std::cmp::Reverse(visits(view)));
+            }
         }
-        self.order.pop().map_or(0, |v| v as usize)
+        let view = self.order.pop().map_or(0, |v| v as usize);
+        self.visits.get_mut(view).into_iter().for_each(|visits| *visits = visits.saturating_add(1));
+        view
     }
 }
 
@@ -145,6 +158,22 @@ mod tests {
         let mut seen = vec![0; 100];
         (0..2000).for_each(|_| seen[sampler.next(100, 0.0, |_| 0.0)] += 1);
         assert!(seen.iter().all(|n| *n > 0), "{seen:?}");
+    }
+
+    #[test]
+    fn when_no_more_views_come_those_looked_at_least_have_the_first_turns() {
+        let (views, mut sampler) = (100, Sampler::new(3, 100));
+        sampler.look_at_newest(true);
+        let mut before = vec![0; views];
+        (0..400).for_each(|_| before[sampler.next(views, 0.0, |_| 0.0)] += 1);
+        // As a load after the landing does it.
+        sampler.look_at_newest(false);
+        sampler.reset();
+        let turns: Vec<i32> = (0..views).map(|_| before[sampler.next(views, 0.0, |_| 0.0)]).collect();
+        assert!(turns.is_sorted() && turns[0] < turns[99], "{turns:?}");
+        // From then on every epoch is shuffled.
+        let next: Vec<i32> = (0..views).map(|_| before[sampler.next(views, 0.0, |_| 0.0)]).collect();
+        assert!(!next.is_sorted());
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! A cloud as cells of ground, each encoded on its own: what does not change keeps its words, whatever happens elsewhere.
+//! A cloud as cells of ground, each encoded on its own: what does not change keeps its words, whatever happens elsewhere. Each in two
+//! layers: its Gaussians merged to a few of one colour each, which stand for them until they are there, and all of them.
 
 use std::collections::BTreeMap;
 
@@ -7,11 +8,18 @@ use super::{Form, Given, LEAST_BYTES, Rounding, Scope, code, encode_rows};
 use crate::camera::View;
 use crate::cloud::GaussianCloud;
 use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
+use crate::levels::coarser;
 
 /// Gaussians that a cell of the finest level should hold about: fewer cost more for each, more come back as one.
 const USUAL: f64 = 6000.0;
 /// Fewer than so many belong to the next level's cell.
 const LEAST: usize = 512;
+/// A coarse layer has at most this share of its cell's Gaussians.
+const COARSE_SHARE: f64 = 1.0 / 16.0;
+/// Voxels along a cell's side with which that is tried first, how they grow, and how often.
+const COARSE_VOXELS: f64 = 24.0;
+const COARSER: f64 = 1.25;
+const TRIES: i32 = 20;
 /// Standard deviations up to which a Gaussian is said to reach.
 const REACH: f32 = 3.0;
 /// Outermost share of the means, on each side, that does not count to the ground when cells are sized.
@@ -19,17 +27,26 @@ const STRAY: usize = 20;
 /// Binary logarithms of the sides that cells may have, metres.
 const SIDES: (f64, f64) = (-10.0, 14.0);
 
+/// Some Gaussians' words.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Layer {
+    /// How many they are.
+    pub count: u32,
+    /// Their delivery encoding.
+    pub words: Vec<u32>,
+}
+
 /// One cell's words.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CodedCell {
     /// Which square of ground.
     pub key: CellKey,
-    /// Gaussians in it.
-    pub count: u32,
-    /// Square metres that they cover, by opacity.
+    /// Square metres that its Gaussians cover, by opacity.
     pub importance: f32,
-    /// Their delivery encoding.
-    pub words: Vec<u32>,
+    /// They, merged, of SH degree 0; none where that is not worth its bytes.
+    pub coarse: Layer,
+    /// All of them.
+    pub whole: Layer,
 }
 
 /// All cells of a cloud.
@@ -58,13 +75,45 @@ pub fn encode_cells(
         if !wanted(grid, key) {
             continue;
         }
-        let mut words = encode_rows(cloud, views, rounding, &scope, &rows, Form::Cell)?;
-        words.resize(words.len().max((rows.len() * LEAST_BYTES as usize).div_ceil(4)), 0);
+        let whole = Layer::of(cloud, views, rounding, &scope, &rows)?;
+        let coarse = match coarse(cloud, &rows, grid.side_at(key.level).into()) {
+            Some(coarse) => {
+                let scope = Scope::of(&coarse, rounding);
+                Layer::of(&coarse, &[], rounding, &scope, &scope.rows)?
+            }
+            None => Layer::default(),
+        };
         let importance = rows.iter().map(|i| cloud.covered_m2(*i as usize)).sum::<f64>() as f32;
-        cells.push(CodedCell { key, count: rows.len() as u32, importance, words });
+        cells.push(CodedCell { key, importance, coarse, whole });
     }
     cells.sort_by(|a, b| b.importance.total_cmp(&a.importance).then(a.key.cmp(&b.key)));
     Ok(CodedCells { grid, cells })
+}
+
+impl Layer {
+    fn of(
+        cloud: &GaussianCloud,
+        views: &[View],
+        rounding: &Rounding,
+        scope: &Scope,
+        rows: &[u32],
+    ) -> Result<Self, Garbled> {
+        let mut words = encode_rows(cloud, views, rounding, scope, rows, Form::Cell)?;
+        words.resize(words.len().max((rows.len() * LEAST_BYTES as usize).div_ceil(4)), 0);
+        Ok(Self { count: rows.len() as u32, words })
+    }
+}
+
+/// Rows of a cell of `side` metres merged in voxels, of SH degree 0; `None` where they do not become few.
+fn coarse(cloud: &GaussianCloud, rows: &[u32], side: f64) -> Option<GaussianCloud> {
+    let (mut own, stride) = (GaussianCloud::with_capacity(0, rows.len()), cloud.sh_stride());
+    for i in rows.iter().map(|i| *i as usize) {
+        let color = &cloud.sh[i * stride..][..3];
+        own.push(cloud.means[i], cloud.log_scales[i], cloud.rotations[i], cloud.opacity_logits[i], color);
+    }
+    let most = (COARSE_SHARE * rows.len() as f64).ceil() as usize;
+    let voxels = |n: i32| side / COARSE_VOXELS * COARSER.powi(n);
+    (0..TRIES).map(|n| coarser(&own, voxels(n))).find(|merged| merged.len() <= most)
 }
 
 /// The cloud with places, sizes, rotations and opacities as its cells will have them, and colours as they are. Encoded with the same

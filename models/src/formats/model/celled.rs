@@ -1,4 +1,5 @@
-//! Version 3 of the file: cells of ground, each in words of its own and named by their hash, behind an index of all of them.
+//! Versions 3 and 4 of the file: cells of ground, each in words of its own and named by their hash, behind an index of all of them; in
+//! version 4 a coarse layer of each comes before.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Write};
@@ -7,26 +8,33 @@ use std::path::Path;
 use config::disk::Disk;
 
 use super::hashing::Hashing;
-use super::{Body, CELLED, FIXED, FormatError, HASH, ModelHeader, begin, check_columns, encode_header, finish, open};
+use super::{Body, FIXED, FormatError, HASH, LAYERED, ModelHeader, begin, check_columns, encode_header, finish, open};
 use super::{columns::read_words, read_header_of};
 use crate::camera::View;
 use crate::cloud::GaussianCloud;
-use crate::formats::delivery::{self, CodedCells, Form, Rounding};
+use crate::formats::delivery::{self, CodedCells, Form, Layer, Rounding};
 use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
 
-/// Cells of a file at most: what an offer on the wire can name.
-const MOST_CELLS: u64 = 1 << 15;
-/// Bytes of the index before its entries, and of an entry.
+/// Cells of a file at most: what an offer on the wire can name, with two layers each.
+const MOST_CELLS: u64 = 1 << 14;
+/// Bytes of the index before its entries, of an entry, and of its coarse layer.
 const HEAD: u64 = 8;
 const ENTRY: u64 = 53;
+const LAYER: u64 = 40;
+
+/// Words that lie together.
+pub(super) struct Piece {
+    count: u32,
+    words: u32,
+    hash: [u8; HASH as usize],
+}
 
 /// A cell as the index has it.
 struct Entry {
     key: CellKey,
-    count: u32,
-    words: u32,
     importance: f32,
-    hash: [u8; HASH as usize],
+    whole: Piece,
+    coarse: Option<Piece>,
 }
 
 /// The index of a file.
@@ -52,43 +60,50 @@ pub fn write_cells(
         return Err(FormatError::invalid(path, format!("not written: {} cells of {MOST_CELLS} at most", cells.len())));
     }
     let head = encode_header(path, header)?;
-    let n = cells.iter().map(|cell| cell.count as usize).sum();
-    let coded: Vec<Vec<u8>> = cells.iter().map(|c| c.words.iter().flat_map(|w| w.to_le_bytes()).collect()).collect();
+    let n = cells.iter().map(|cell| cell.whole.count as usize).sum();
+    let bytes = |layer: &Layer| -> Vec<u8> { layer.words.iter().flat_map(|w| w.to_le_bytes()).collect() };
     disk.replace(path, |file| {
-        let mut out = begin(file, CELLED, &head, n, cloud.sh_degree)?;
+        let mut out = begin(file, LAYERED, &head, n, cloud.sh_degree)?;
         out.write_all(&grid.side.to_le_bytes())?;
         out.write_all(&(cells.len() as u32).to_le_bytes())?;
-        for (cell, bytes) in cells.iter().zip(&coded) {
+        for cell in &cells {
             out.write_all(&[cell.key.level])?;
             out.write_all(&cell.key.y.to_le_bytes())?;
             out.write_all(&cell.key.x.to_le_bytes())?;
-            out.write_all(&cell.count.to_le_bytes())?;
-            out.write_all(&(cell.words.len() as u32).to_le_bytes())?;
+            out.write_all(&cell.whole.count.to_le_bytes())?;
+            out.write_all(&(cell.whole.words.len() as u32).to_le_bytes())?;
             out.write_all(&cell.importance.to_le_bytes())?;
-            out.write_all(blake3::hash(bytes).as_bytes())?;
+            out.write_all(blake3::hash(&bytes(&cell.whole)).as_bytes())?;
+            out.write_all(&cell.coarse.count.to_le_bytes())?;
+            out.write_all(&(cell.coarse.words.len() as u32).to_le_bytes())?;
+            out.write_all(blake3::hash(&bytes(&cell.coarse)).as_bytes())?;
         }
         let file = finish(out)?;
-        coded.iter().try_for_each(|bytes| file.write_all(bytes))
+        cells.iter().try_for_each(|cell| file.write_all(&bytes(&cell.coarse)))?;
+        cells.iter().try_for_each(|cell| file.write_all(&bytes(&cell.whole)))
     })
     .map_err(|e| FormatError::disk(path, e))?;
     Ok(n)
 }
 
-/// The lengths of the pieces that a file is best sent in: everything up to the cells, then each cell, the most important first.
-/// `None`: not in cells, any cut is as good.
+/// The lengths of the pieces that a file is best sent in: everything up to the cells, then their coarse layers, then each cell, the
+/// most important first. `None`: not in cells, any cut is as good.
 ///
 /// # Errors
 /// As [`super::read_header`].
 pub fn pieces(path: &Path) -> Result<Option<Vec<u64>>, FormatError> {
     let mut opened = open(path)?;
-    if opened.body != Body::Cells {
-        return Ok(None);
-    }
+    let Body::Cells { layered } = opened.body else { return Ok(None) };
     read_header_of(path, &mut opened)?;
     let before = FIXED + opened.header_len as u64;
-    let cells = Cells::read(path, &mut opened.input, opened.count, opened.size - before)?.0;
-    let head = before + HEAD + ENTRY * cells.len() as u64 + HASH;
-    Ok(Some(std::iter::once(head).chain(cells.iter().map(|c| 4 * u64::from(c.words)).filter(|n| *n > 0)).collect()))
+    let cells = Cells::read(path, &mut opened.input, layered, opened.count, opened.size - before)?;
+    let head = before + index_bytes(layered, cells.0.len() as u64) + HASH;
+    let pieces = cells.pieces().map(|piece| piece.bytes()).filter(|n| *n > 0);
+    Ok(Some(std::iter::once(head).chain(pieces).collect()))
+}
+
+fn index_bytes(layered: bool, cells: u64) -> u64 {
+    HEAD + cells * (ENTRY + if layered { LAYER } else { 0 })
 }
 
 impl Cells {
@@ -96,16 +111,37 @@ impl Cells {
     pub fn read(
         path: &Path,
         input: &mut Hashing<BufReader<File>>,
+        layered: bool,
         count: usize,
         left: u64,
     ) -> Result<Self, FormatError> {
+        let (index, room) = Self::read_index(path, input, layered, count, left)?;
+        match index.pieces().map(Piece::bytes).sum::<u64>() {
+            bytes if bytes == room => Ok(index),
+            bytes if bytes > room => Err(FormatError::Truncated { path: path.to_owned(), at: room, what: "its cells" }),
+            bytes => {
+                let what = format!("its cells take {bytes} of {room} bytes (damaged file?)");
+                Err(FormatError::invalid(path, what))
+            }
+        }
+    }
+
+    /// The index alone, and how many bytes of the cells are there.
+    pub fn read_index(
+        path: &Path,
+        input: &mut Hashing<BufReader<File>>,
+        layered: bool,
+        count: usize,
+        left: u64,
+    ) -> Result<(Self, u64), FormatError> {
         let failed = |e| FormatError::io(path, "reading", e);
         let bad = |what: String| Err(FormatError::invalid(path, format!("{what} (damaged file?)")));
         let mut head = [0; HEAD as usize];
         input.read_exact(&mut head).map_err(failed)?;
         let [a, b, c, d, cells @ ..] = head;
         let (side, cells) = (f32::from_le_bytes([a, b, c, d]), u64::from(u32::from_le_bytes(cells)));
-        let Some(room) = left.checked_sub(HEAD + HASH + ENTRY * cells).filter(|_| cells <= MOST_CELLS) else {
+        let room = left.checked_sub(HASH + index_bytes(layered, cells)).filter(|_| cells <= MOST_CELLS);
+        let Some(room) = room else {
             return bad(format!("its index names {cells} cells, for which it has no room"));
         };
         if !(side.is_finite() && side > 0.0) {
@@ -115,23 +151,30 @@ impl Cells {
         for i in 0..cells {
             let mut bytes = [0; ENTRY as usize];
             input.read_exact(&mut bytes).map_err(failed)?;
-            let entry = Entry::of(&bytes);
-            let most = delivery::most_gaussians(Form::Cell, 4 * u64::from(entry.words));
-            let Entry { key: CellKey { level, .. }, count: own, .. } = entry;
-            if level > MOST_LEVEL || u64::from(own) > most || entry.importance.is_nan() {
-                return bad(format!("cell {i} of level {level} with {own} Gaussians in {} words", entry.words));
+            let mut entry = Entry::of(&bytes);
+            if layered {
+                let mut bytes = [0; LAYER as usize];
+                input.read_exact(&mut bytes).map_err(failed)?;
+                entry.coarse = Some(Piece::of([&bytes[..8], &bytes[8..]]));
+            }
+            let whole = &entry.whole;
+            let too_many = entry.coarse.iter().chain([whole]).any(Piece::is_absurd);
+            if entry.key.level > MOST_LEVEL || too_many || entry.importance.is_nan() {
+                let what = format!("cell {i} of level {} with {} Gaussians", entry.key.level, whole.count);
+                return bad(format!("{what} in {} words", whole.words));
             }
             entries.push(entry);
         }
-        let sum = |of: fn(&Entry) -> u32| entries.iter().map(|e| u64::from(of(e))).sum::<u64>();
-        let (gaussians, bytes) = (sum(|e| e.count), 4 * sum(|e| e.words));
-        match (gaussians == count as u64, bytes == room) {
-            (true, true) => Ok(Self(entries)),
-            (true, false) if bytes > room => {
-                Err(FormatError::Truncated { path: path.to_owned(), at: room, what: "its cells" })
-            }
-            _ => bad(format!("its cells hold {gaussians} of {count} Gaussians in {bytes} of {room} bytes")),
+        let gaussians = entries.iter().map(|e| u64::from(e.whole.count)).sum::<u64>();
+        match gaussians == count as u64 {
+            true => Ok((Self(entries), room)),
+            false => bad(format!("its cells hold {gaussians} of {count} Gaussians")),
         }
+    }
+
+    /// All pieces in the file's order, and so many are coarse layers.
+    fn pieces(&self) -> impl Iterator<Item = &Piece> {
+        self.0.iter().filter_map(|e| e.coarse.as_ref()).chain(self.0.iter().map(|e| &e.whole))
     }
 
     /// Gives the Gaussians of each cell to `each`.
@@ -145,31 +188,109 @@ impl Cells {
         sh_degree: u8,
         each: &mut dyn FnMut(GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
+        for coarse in self.0.iter().filter_map(|e| e.coarse.as_ref()) {
+            coarse.words(path, input)?;
+        }
         for entry in self.0 {
-            let mut hashing = Hashing { inner: &mut *input, hasher: blake3::Hasher::new() };
-            let words = read_words(&mut hashing, entry.words as usize, u32::from_le_bytes);
-            let words = words.map_err(|e| FormatError::io(path, "reading", e))?;
-            if hashing.hasher.finalize() != blake3::Hash::from_bytes(entry.hash) {
-                return Err(FormatError::Damaged { path: path.to_owned() }.into());
-            }
-            let cell = delivery::decode(Form::Cell, words, entry.count as usize, sh_degree);
-            each(cell.map_err(|e| FormatError::invalid(path, e.to_string()))?)?;
+            each(entry.whole.read(path, input, sh_degree)?)?;
         }
         Ok(())
+    }
+
+    /// What `room` bytes of the cells show: each as it is where it is there, else its coarse layer. How many of them are there, and how many
+    /// coarse layers.
+    ///
+    /// # Errors
+    /// A damaged cell, the operating system's.
+    pub fn there(
+        self,
+        path: &Path,
+        input: &mut BufReader<File>,
+        sh_degree: u8,
+        room: u64,
+    ) -> Result<(GaussianCloud, [usize; 2]), FormatError> {
+        let (mut left, mut coarse) = (room, Vec::new());
+        let mut fits = |piece: &Piece| {
+            let rest = left.checked_sub(piece.bytes());
+            // What comes after a piece that ends early is not there either.
+            left = rest.unwrap_or(0);
+            rest.is_some()
+        };
+        for piece in self.0.iter().filter_map(|e| e.coarse.as_ref()) {
+            if !fits(piece) {
+                break;
+            }
+            coarse.push(piece.read(path, input, 0)?);
+        }
+        let (coarse_there, mut whole) = (coarse.len(), 0);
+        let mut cloud = GaussianCloud::with_capacity(sh_degree, 0);
+        let mut coarse = coarse.into_iter();
+        let mut ends = coarse_there < self.0.len();
+        for entry in &self.0 {
+            let own = coarse.next();
+            ends |= !fits(&entry.whole);
+            if ends {
+                own.iter().for_each(|own| cloud.extend(own));
+            } else {
+                cloud.extend(&entry.whole.read(path, input, sh_degree)?);
+                whole += 1;
+            }
+        }
+        Ok((cloud, [whole, coarse_there]))
+    }
+
+    /// How many cells there are.
+    pub fn count(&self) -> usize {
+        self.0.len()
+    }
+}
+
+impl Piece {
+    fn of([numbers, hash]: [&[u8]; 2]) -> Self {
+        let word = |at: usize| u32::from_le_bytes([numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]]);
+        let mut own = [0; HASH as usize];
+        own.copy_from_slice(hash);
+        Self { count: word(0), words: word(4), hash: own }
+    }
+
+    fn bytes(&self) -> u64 {
+        4 * u64::from(self.words)
+    }
+
+    /// More Gaussians than its words can hold.
+    fn is_absurd(&self) -> bool {
+        u64::from(self.count) > delivery::most_gaussians(Form::Cell, self.bytes())
+    }
+
+    /// Its words, when their hash is right.
+    fn words(&self, path: &Path, input: &mut BufReader<File>) -> Result<Vec<u32>, FormatError> {
+        let mut hashing = Hashing { inner: &mut *input, hasher: blake3::Hasher::new() };
+        let words = read_words(&mut hashing, self.words as usize, u32::from_le_bytes);
+        let words = words.map_err(|e| FormatError::io(path, "reading", e))?;
+        match hashing.hasher.finalize() == blake3::Hash::from_bytes(self.hash) {
+            true => Ok(words),
+            false => Err(FormatError::Damaged { path: path.to_owned() }),
+        }
+    }
+
+    fn read(&self, path: &Path, input: &mut BufReader<File>, sh_degree: u8) -> Result<GaussianCloud, FormatError> {
+        let words = self.words(path, input)?;
+        if self.count == 0 {
+            return Ok(GaussianCloud::with_capacity(sh_degree, 0));
+        }
+        let cloud = delivery::decode(Form::Cell, words, self.count as usize, sh_degree);
+        cloud.map_err(|e| FormatError::invalid(path, e.to_string()))
     }
 }
 
 impl Entry {
     fn of(bytes: &[u8; ENTRY as usize]) -> Self {
         let word = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
-        let mut hash = [0; HASH as usize];
-        hash.copy_from_slice(&bytes[21..]);
         Self {
             key: CellKey { level: bytes[0], y: i32::from_le_bytes(word(1)), x: i32::from_le_bytes(word(5)) },
-            count: u32::from_le_bytes(word(9)),
-            words: u32::from_le_bytes(word(13)),
             importance: f32::from_le_bytes(word(17)),
-            hash,
+            whole: Piece::of([&bytes[9..17], &bytes[21..]]),
+            coarse: None,
         }
     }
 }

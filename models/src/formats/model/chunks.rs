@@ -62,7 +62,7 @@ impl Chunks {
         match opened.body {
             Body::Columns => self.columns(header.len(), &mut valid)?,
             Body::Words(_) => valid(read(&self.path)?.1)?,
-            Body::Cells => self.cells(opened, header.len(), &mut valid)?,
+            Body::Cells { layered } => self.cells(opened, layered, header.len(), &mut valid)?,
         }
         Ok(dropped)
     }
@@ -104,11 +104,12 @@ impl Chunks {
     fn cells<E: From<FormatError>>(
         &self,
         opened: Opened,
+        layered: bool,
         header: usize,
         each: &mut dyn FnMut(GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
         let Opened { mut input, count, size, .. } = opened;
-        let cells = Cells::read(&self.path, &mut input, count, size - FIXED - header as u64)?;
+        let cells = Cells::read(&self.path, &mut input, layered, count, size - FIXED - header as u64)?;
         compare(&self.path, &mut input)?;
         cells.each(&self.path, &mut input.inner, self.sh_degree, each)
     }

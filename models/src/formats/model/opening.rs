@@ -5,7 +5,7 @@ use std::io::{BufReader, Read};
 use std::path::Path;
 
 use super::hashing::Hashing;
-use super::{CELLED, EXACT, FIXED, FormatError, HASH, MAGIC, MAX_HEADER, ROUNDED, exact_bytes};
+use super::{CELLED, EXACT, FIXED, FormatError, HASH, LAYERED, MAGIC, MAX_HEADER, ROUNDED, exact_bytes};
 use crate::formats::delivery::{self, Form};
 
 /// A file whose fixed part is read and holds with its size; the header comes next.
@@ -25,8 +25,8 @@ pub(super) enum Body {
     Columns,
     /// In so many words of the delivery encoding.
     Words(usize),
-    /// In the delivery encoding, cell by cell.
-    Cells,
+    /// In the delivery encoding, cell by cell; each with a coarse layer before all of them.
+    Cells { layered: bool },
 }
 
 /// Opens a model and takes its fixed part; nothing is allocated yet for what it says.
@@ -34,6 +34,11 @@ pub(super) enum Body {
 /// # Errors
 /// As [`super::read`], of what the fixed part and the file's size tell.
 pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
+    open_to(path, true)
+}
+
+/// As [`open`]; what is not `whole` may end before its Gaussians do, when they lie in layers.
+pub(super) fn open_to(path: &Path, whole: bool) -> Result<Opened, FormatError> {
     let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let mut input = Hashing { inner: BufReader::with_capacity(1 << 16, file), hasher: blake3::Hasher::new() };
@@ -48,9 +53,9 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     }
     let word = |at: usize| u32::from_le_bytes([fixed[at], fixed[at + 1], fixed[at + 2], fixed[at + 3]]);
     let version = word(8);
-    if ![EXACT, ROUNDED, CELLED].contains(&version) {
+    if ![EXACT, ROUNDED, CELLED, LAYERED].contains(&version) {
         let what = format!(
-            "model file version {version}; this dgtr reads versions {EXACT} to {CELLED}: use the dgtr that wrote it"
+            "model file version {version}; this dgtr reads versions {EXACT} to {LAYERED}: use the dgtr that wrote it"
         );
         return Err(FormatError::invalid(path, what));
     }
@@ -71,11 +76,14 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
         };
         let form = if version == ROUNDED { Form::Whole } else { Form::Cell };
         let limit = delivery::most_gaussians(form, coded);
-        if count > limit {
+        if count > limit && (whole || version != LAYERED) {
             let what = "its number of Gaussians";
             return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
         }
-        let body = if version == ROUNDED { Body::Words(coded as usize / 4) } else { Body::Cells };
+        let body = match version {
+            ROUNDED => Body::Words(coded as usize / 4),
+            _ => Body::Cells { layered: version == LAYERED },
+        };
         if version == ROUNDED && coded % 4 != 0 {
             return Err(truncated("its Gaussians"));
         }

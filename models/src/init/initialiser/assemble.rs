@@ -6,8 +6,10 @@ use std::time::Instant;
 use config::init::InitSettings;
 use rayon::prelude::*;
 
+use super::strips::Strips;
 use super::{Initialiser, VOXELS_PER_GAUSSIAN};
 use crate::camera::{DepthPrior, Pinhole};
+use crate::cloud::GaussianCloud;
 use crate::init::consistency::{ConsistencyCount, resolve};
 use crate::init::fill::continued;
 use crate::init::lighting::measure;
@@ -22,6 +24,8 @@ use crate::light::{Light, PictureLight};
 pub(super) const AHEAD: usize = 2;
 /// Views that a depth is compared with.
 pub(super) const WITNESSES: usize = 6;
+/// Voxels at once; what needs more is merged strip of ground by strip.
+pub(super) const MOST_VOXELS: usize = 600_000;
 /// Edge of the finest voxels, in sample spacings.
 const VOXEL: f32 = 0.7;
 /// A cell's Gaussian reaches this many spreads of its samples: a square's is 0.29 edges, and 0.5 edges close the gaps.
@@ -36,65 +40,84 @@ impl Initialiser {
         prior: &mut dyn FnMut(&str, DepthPrior),
     ) -> Result<Initialisation, InitError> {
         let started = Instant::now();
-        let mut spacing = Vec::new();
-        let mut center = glam::DVec3::ZERO;
+        let (mut spacing, mut looked_at) = (Vec::new(), Vec::new());
         for &i in pictures {
             let frame = &self.frames[i];
             let k = &frame.view.intrinsics;
             if let Some(depth) = self.typical_depth(i) {
                 spacing.push((depth as f32 * self.settings.stride as f32 / k.fx.max(k.fy), depth as f32));
-                center += Pinhole::from(&frame.view).unproject([k.cx, k.cy], depth) / pictures.len() as f64;
+                looked_at.push(Pinhole::from(&frame.view).unproject([k.cx, k.cy], depth));
             }
         }
+        let center = looked_at.iter().fold(glam::DVec3::ZERO, |sum, p| sum + *p / pictures.len() as f64);
         spacing.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (edge, global_scale) = spacing.get(spacing.len() / 2).copied().unwrap_or((1.0, 1.0));
-        let capacity = max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN);
-        let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), capacity);
+        let voxels = max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN);
+        let mut strips = Strips::over(&looked_at, voxels.div_ceil(MOST_VOXELS));
         let report = &mut self.report;
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
-        (report.consistency_ms, report.samples_ms, report.voxels_ms) = (0.0, 0.0, 0.0);
-        let with_depth: Vec<usize> = pictures.iter().copied().filter(|&i| self.frames[i].has_depth()).collect();
-        // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
-        let mut waiting: Vec<Checked> = Vec::new();
-        for next in with_depth.chunks(AHEAD).map(Some).chain([None]) {
-            let this = &*self;
-            let check = || -> Result<Vec<Checked>, InitError> {
-                let checked = next.unwrap_or(&[]).par_iter().map(|&i| this.check(i, global_scale).transpose());
-                checked.flatten_iter().collect()
-            };
-            let sort = || {
-                let started = Instant::now();
-                waiting.iter().flat_map(|c| &c.samples).for_each(|s| merge.push(*s));
-                started.elapsed().as_secs_f64() * 1e3
-            };
-            let (checked, voxels_ms) = rayon::join(check, sort);
-            let report = &mut self.report;
-            report.voxels_ms += voxels_ms;
-            for done in std::mem::replace(&mut waiting, checked?) {
-                report.consistency_ms += done.consistency_ms;
-                report.samples_ms += done.samples_ms;
-                report.samples += done.samples.len();
-                report.supported += done.count.supported;
-                report.alone += done.count.alone;
-                report.removed += done.count.removed;
-                report.filled += done.count.filled;
-                prior(&self.frames[done.index].name, done.prior);
+        (report.consistency_ms, report.samples_ms, report.voxels_ms, report.cloud_ms) = (0.0, 0.0, 0.0, 0.0);
+        (report.voxels, report.voxel_m, report.dropped_samples, report.abnormal) = (0, 0.0, 0, 0);
+        // Pictures that show each strip: the first pass goes through all of them and finds out.
+        let mut showing = vec![Vec::new(); strips.count()];
+        showing[0] = pictures.iter().copied().filter(|&i| self.frames[i].has_depth()).collect();
+        let mut cloud = GaussianCloud::with_capacity(0, if strips.count() > 1 { max_gaussians } else { 0 });
+        for strip in 0..strips.count() {
+            let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), voxels.min(MOST_VOXELS));
+            let frames = std::mem::take(&mut showing[strip]);
+            // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
+            let mut waiting: Vec<Checked> = Vec::new();
+            for next in frames.chunks(AHEAD).map(Some).chain([None]) {
+                let this = &*self;
+                let check = || -> Result<Vec<Checked>, InitError> {
+                    let checked = next.unwrap_or(&[]).par_iter().map(|&i| this.check(i, global_scale).transpose());
+                    checked.flatten_iter().collect()
+                };
+                let sort = || {
+                    let started = Instant::now();
+                    for checked in &waiting {
+                        let found = strips.sort(&checked.samples, strip, |s| merge.push(s));
+                        if strip == 0 {
+                            strips.count_in(&found);
+                            let others = found.iter().enumerate().skip(1).filter(|(_, samples)| **samples > 0);
+                            others.for_each(|(other, _)| showing[other].push(checked.index));
+                        }
+                    }
+                    started.elapsed().as_secs_f64() * 1e3
+                };
+                let (checked, voxels_ms) = rayon::join(check, sort);
+                let report = &mut self.report;
+                report.voxels_ms += voxels_ms;
+                for done in std::mem::replace(&mut waiting, checked?) {
+                    report.consistency_ms += done.consistency_ms;
+                    report.samples_ms += done.samples_ms;
+                    if strip == 0 {
+                        report.samples += done.samples.len();
+                        report.supported += done.count.supported;
+                        report.alone += done.count.alone;
+                        report.removed += done.count.removed;
+                        report.filled += done.count.filled;
+                        prior(&self.frames[done.index].name, done.prior);
+                    }
+                }
             }
+            let (report, cutting) = (&mut self.report, Instant::now());
+            report.voxels += merge.len();
+            report.voxel_m = report.voxel_m.max(merge.edge());
+            report.dropped_samples += merge.dropped();
+            let spread = if self.settings.local_scale { SPREAD } else { 0.0 };
+            let merged = merge.finish(strips.share(strip, max_gaussians), spread);
+            let (part, abnormal) = finish::cloud(&merged, self.settings.max_scale_ratio);
+            report.abnormal += abnormal;
+            match strips.count() {
+                1 => cloud = part,
+                _ => cloud.extend(&part),
+            }
+            report.cloud_ms += cutting.elapsed().as_secs_f64() * 1e3;
         }
-        let report = &mut self.report;
-        let cutting = Instant::now();
-        report.voxels = merge.len();
-        report.voxel_m = merge.edge();
-        report.dropped_samples = merge.dropped();
-        let spread = if self.settings.local_scale { SPREAD } else { 0.0 };
-        let merged = merge.finish(max_gaussians, spread);
-        let (cloud, abnormal) = finish::cloud(&merged, self.settings.max_scale_ratio);
-        report.abnormal = abnormal;
-        report.gaussians = cloud.len();
-        report.cloud_ms = cutting.elapsed().as_secs_f64() * 1e3;
-        report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
-        let planned = self.planned_bytes(self.frames.len(), max_gaussians);
-        self.report.planned_bytes = planned;
+        self.report.gaussians = cloud.len();
+        self.report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
+        self.report.planned_bytes = self.planned_bytes(self.frames.len(), max_gaussians);
         Ok(Initialisation { cloud, light: self.light.clone(), report: self.report.clone() })
     }
 

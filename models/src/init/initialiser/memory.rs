@@ -2,7 +2,7 @@
 
 use config::init::InitSettings;
 
-use super::assemble::{AHEAD, WITNESSES};
+use super::assemble::{AHEAD, MOST_VOXELS, WITNESSES};
 use super::{Initialiser, Pairs, VOXELS_PER_GAUSSIAN};
 use crate::init::merge::VoxelMerge;
 use crate::init::unposed;
@@ -76,7 +76,7 @@ impl Initialiser {
             + features
             + super::super::range::MAX_POINTS as u64 * RANGE_BYTES
             + 2 * AHEAD as u64 * samples * WORK_BYTES
-            + VoxelMerge::planned_bytes(max_gaussians * VOXELS_PER_GAUSSIAN, max_gaussians)
+            + VoxelMerge::planned_bytes(max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN).min(MOST_VOXELS), max_gaussians)
             + max_gaussians as u64 * CLOUD_BYTES
     }
 }

@@ -46,6 +46,8 @@ struct Target {
     counted: bool,
     /// Nobody holds it any more.
     gone: bool,
+    /// Bytes of it that lie there to be looked at.
+    previewed: u64,
 }
 
 pub(super) struct Slot {
@@ -157,7 +159,8 @@ impl Slot {
             }
             _ => {
                 self.store.keep_only(Some(best));
-                self.target = Some(Target { offer: Offer::clone(best), from, counted: false, gone: false });
+                self.target =
+                    Some(Target { offer: Offer::clone(best), from, counted: false, gone: false, previewed: 0 });
                 self.failures = 0;
                 self.not_before = Instant::now();
                 self.last_word_refused = false;
@@ -190,6 +193,13 @@ impl Slot {
                 self.failures = self.failures.saturating_add(1);
                 self.source = self.source.wrapping_add(1);
                 tracing::debug!("serve: {}: {why}; next attempt in {pause:.1} s", self.id);
+            }
+        }
+        if let Some(target) = &mut self.target {
+            match self.store.preview(&target.offer, target.previewed) {
+                Ok(bytes) => target.previewed = bytes,
+                // Nothing depends on it.
+                Err(e) => tracing::debug!("serve: {}: no preview: {e}", self.id),
             }
         }
         done

@@ -11,7 +11,7 @@ fn coded(cloud: &GaussianCloud) -> CodedCells {
 fn decoded(coded: &CodedCells, sh_degree: u8) -> GaussianCloud {
     let mut cloud = GaussianCloud { sh_degree, ..Default::default() };
     for cell in &coded.cells {
-        cloud.extend(&decode(Form::Cell, cell.words.clone(), cell.count as usize, sh_degree).unwrap());
+        cloud.extend(&decode(Form::Cell, cell.whole.words.clone(), cell.whole.count as usize, sh_degree).unwrap());
     }
     cloud
 }
@@ -70,10 +70,33 @@ fn the_most_important_cells_come_first_and_unwanted_ones_not_at_all() {
     let cloud = ground(40_000, 0);
     let all = coded(&cloud);
     assert!(all.cells.is_sorted_by(|a, b| a.importance >= b.importance));
-    assert_eq!(all.cells.iter().map(|c| c.count).sum::<u32>(), 40_000);
+    assert_eq!(all.cells.iter().map(|c| c.whole.count).sum::<u32>(), 40_000);
     let some = encode_cells(&cloud, &[], &Rounding::default(), &|_, key| key.x >= 0).unwrap();
     let east: Vec<_> = all.cells.iter().filter(|c| c.key.x >= 0).cloned().collect();
     assert!(some.cells == east && !east.is_empty() && east.len() < all.cells.len());
+}
+
+#[test]
+fn a_coarse_layer_is_a_sixteenth_of_its_cell_and_covers_the_same_ground_in_the_same_colour() {
+    let cloud = ground(40_000, 1);
+    let coded = coded(&cloud);
+    let (mut coarse, mut bytes, mut all) = (GaussianCloud::with_capacity(0, 0), 0, 0);
+    for CodedCell { coarse: layer, whole, .. } in &coded.cells {
+        assert!(layer.count > 0 && 16 * layer.count <= whole.count + 16, "{} of {}", layer.count, whole.count);
+        coarse.extend(&decode(Form::Cell, layer.words.clone(), layer.count as usize, 0).unwrap());
+        (bytes, all) = (bytes + layer.words.len(), all + whole.words.len());
+    }
+    assert!(10 * bytes < all, "{bytes} of {all} words");
+    let of = |cloud: &GaussianCloud| {
+        let (mut area, mut red) = (0.0, 0.0);
+        for i in 0..cloud.len() {
+            area += cloud.covered_m2(i);
+            red += cloud.covered_m2(i) * f64::from(cloud.sh[i * cloud.sh_stride()]);
+        }
+        (area, red / area)
+    };
+    let ((area, red), (whole, own)) = (of(&coarse), of(&cloud));
+    assert!((0.5..1.5).contains(&(area / whole)) && (red - own).abs() < 0.05, "{area} of {whole} m2, {red} for {own}");
 }
 
 #[test]
@@ -84,8 +107,7 @@ fn a_few_gaussians_are_one_cell_and_equal_ones_fill_what_their_reader_takes() {
         cloud.push([1.0, 2.0, 3.0], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 1.0, &[0.2; 3]);
     }
     let equal = coded(&cloud);
-    let least =
-        |c: &CodedCell| u64::from(c.count) <= super::super::most_gaussians(Form::Cell, 4 * c.words.len() as u64);
-    assert!(equal.cells.iter().all(least));
+    let least = |l: &Layer| u64::from(l.count) <= super::super::most_gaussians(Form::Cell, 4 * l.words.len() as u64);
+    assert!(equal.cells.iter().all(|cell| least(&cell.whole) && least(&cell.coarse)));
     assert_eq!(decoded(&equal, 0).len(), 20_000);
 }
