@@ -70,6 +70,14 @@ impl Disk {
         Self(Arc::new(operations))
     }
 
+    /// Takes so many bytes of a bound on the disk for a file without a name.
+    ///
+    /// # Errors
+    /// There is a bound and it does not leave them.
+    pub fn reserve(&self, bytes: u64) -> io::Result<()> {
+        self.0.reserve(bytes)
+    }
+
     /// Writes a whole file: whatever happens, the name holds the old content or the new.
     ///
     /// # Errors

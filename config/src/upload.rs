@@ -94,9 +94,10 @@ impl UploadSettings {
         u64::from(self.max_model_mib) << 20
     }
 
-    /// Most chunks a model of the largest size may be cut into by any sender.
+    /// Most chunks a model of the largest size may be cut into by any sender: twice as many as its bytes say, for the cells that end
+    /// before a chunk does.
     pub fn max_chunks(&self) -> u64 {
-        self.max_model_bytes().div_ceil(u64::from(*CHUNK_KIB.start()) * 1024)
+        2 * self.max_model_bytes().div_ceil(u64::from(*CHUNK_KIB.start()) * 1024)
     }
 
     /// UDP lost replies without a word when measured, QUIC and others are not built in; encryption is all or nothing.

@@ -7,8 +7,10 @@
 
 use serde::{Deserialize, Serialize};
 
+pub(crate) use coarser::coarser;
 pub use turn::ShTurn;
 
+mod coarser;
 mod turn;
 
 /// Number of SH coefficients per colour channel for a degree 0…3.

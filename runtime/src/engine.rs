@@ -161,34 +161,23 @@ impl Reconstruction {
             _ => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
         };
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
-        let folder = settings.device.scratch_folder();
-        if let Some(initialiser) = &mut initialiser {
-            let waiting = waiting::file_bytes(views as u64, initialiser.frame_bytes_at(settings.device.size));
-            if let Some(file) = waiting_file(&folder, waiting)? {
-                initialiser.keep_frames_in(file);
-            }
-        }
         let mut refiner: Option<Refiner> = refiner.transpose()?;
-        let matched = settings.refine.as_ref().map_or(0, |refine| matching_file_bytes(views as u64, refine));
-        if let (Some(refiner), Some(file)) = (&mut refiner, waiting_file(&folder, matched)?) {
-            refiner.keep_frames_in(file);
-        }
+        let plan = |initialiser: u64, refine_in_file: bool| {
+            HostPlan::new(&HostRequest {
+                plan: trainer.plan(),
+                on_host: if trainer.gpu().info().is_cpu { trainer.device_bytes() } else { trainer.mirror_bytes() },
+                initialiser,
+                refine: settings.refine.as_ref(),
+                refine_in_file,
+                camera_pixels: settings.camera_pixels,
+                ahead: settings.ahead as u64,
+                ahead_in_memory: settings.ahead_in_memory,
+                delivers: settings.delivers,
+                map: settings.map.map_or(0, |m| m.host_bytes()),
+            })
+        };
+        let host = waiting::place(&settings, trainer.plan(), initialiser.as_mut(), refiner.as_mut(), &plan)?;
         let mut report = RunReport::new(command);
-        let host = HostPlan::new(&HostRequest {
-            plan: trainer.plan(),
-            on_host: if trainer.gpu().info().is_cpu { trainer.device_bytes() } else { trainer.mirror_bytes() },
-            initialiser: initialiser
-                .as_ref()
-                .map_or(0, |i| i.planned_bytes_at(settings.device.size, views, trainer.plan().scene)),
-            refine: settings.refine.as_ref(),
-            refine_in_file: matched > 0,
-            camera_pixels: settings.camera_pixels,
-            ahead: settings.ahead as u64,
-            ahead_in_memory: settings.ahead_in_memory,
-            delivers: settings.delivers,
-            map: settings.map.map_or(0, |m| m.host_bytes()),
-        });
-        host.fits(settings.host_mib)?;
         report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
         report.device = trainer.gpu().info().name.clone();
         report.seed = header.seed;

@@ -60,6 +60,13 @@ impl<T: Operations> Operations for Bounded<T> {
     fn sync_folder(&self, path: &Path) -> io::Result<()> {
         self.inner.sync_folder(path)
     }
+
+    fn reserve(&self, bytes: u64) -> io::Result<()> {
+        let used = bytes_below(&self.root);
+        let rest = |limit: u64| limit.checked_sub(bytes).filter(|rest| *rest >= used);
+        let taken = self.limit.fetch_update(Ordering::Relaxed, Ordering::Relaxed, rest);
+        taken.map(drop).map_err(|_| ErrorKind::QuotaExceeded.into())
+    }
 }
 
 #[derive(Debug)]

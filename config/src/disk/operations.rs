@@ -42,6 +42,13 @@ pub trait Operations: fmt::Debug + Send + Sync {
     /// # Errors
     /// The system's.
     fn sync_folder(&self, path: &Path) -> io::Result<()>;
+    /// Takes so many bytes of a bound for a file that is not written through these operations.
+    ///
+    /// # Errors
+    /// There is a bound and it does not leave them.
+    fn reserve(&self, _bytes: u64) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// A file being written.

@@ -127,3 +127,17 @@ fn beside_other_processes_only_what_ended_ones_left_is_swept() {
     assert_eq!(Disk::default().sweep_abandoned(dir.path()), 1);
     assert_eq!(names(dir.path()), [running.as_str(), ".dgtr-x", "a1.flight"]);
 }
+
+#[test]
+fn what_is_reserved_for_a_file_without_a_name_is_missing_to_the_others_and_never_more_than_there_is() {
+    let dir = tempfile::tempdir().unwrap();
+    let disk = Disk::new(Bounded::new(System, dir.path(), Arc::new(AtomicU64::new(1000))));
+    let write = |name: &str, bytes: usize| disk.replace(&dir.path().join(name), |out| out.write_all(&vec![7; bytes]));
+    write("a", 300).unwrap();
+    assert_eq!(disk.reserve(701).unwrap_err().kind(), io::ErrorKind::QuotaExceeded);
+    disk.reserve(600).unwrap();
+    write("b", 100).unwrap();
+    assert!(write("c", 1).is_err());
+    // Where there is no bound, the file system alone says no.
+    assert!(Disk::default().reserve(u64::MAX).is_ok());
+}

@@ -44,8 +44,8 @@ pub struct Merged {
 
 /// Octree levels above the finest; eight finest edges are the coarsest.
 const LEVELS: usize = 4;
-/// Samples collected before they are sorted into the cells.
-const BUFFER: usize = 1 << 19;
+/// Samples collected before they are sorted into the cells, where memory is no matter.
+pub const BUFFER: usize = 1 << 19;
 
 /// The merging voxels; memory never exceeds [`VoxelMerge::planned_bytes`].
 #[derive(Debug)]
@@ -56,21 +56,25 @@ pub struct VoxelMerge {
     spare: Vec<Cell>,
     buffer: Vec<(u64, Sample)>,
     capacity: usize,
+    /// Samples collected before they are sorted into the cells.
+    collected: usize,
     outside: usize,
     coarsened: u32,
 }
 
 impl VoxelMerge {
-    /// Voxels of `edge` metres around `center`, at most `capacity` of them: when more are needed the edge doubles.
-    pub fn new(edge: f32, center: Vec3, capacity: usize) -> Self {
+    /// Voxels of `edge` metres around `center`, at most `capacity` of them: when more are needed the edge doubles. Samples are sorted
+    /// into them `collected` at a time.
+    pub fn new(edge: f32, center: Vec3, capacity: usize, collected: usize) -> Self {
         let half = edge * (1u32 << (BITS - 1)) as f32;
         Self {
             edge,
             origin: center - Vec3::splat(half),
             cells: Vec::new(),
             spare: Vec::new(),
-            buffer: Vec::with_capacity(BUFFER),
+            buffer: Vec::with_capacity(collected),
             capacity: capacity.max(1),
+            collected,
             outside: 0,
             coarsened: 0,
         }
@@ -78,10 +82,10 @@ impl VoxelMerge {
 
     /// Host bytes for a capacity: two cell arrays (merging writes into the second; the coarser levels of the tree later
     /// take its place), the sample buffer, and `budget` Gaussians at the end.
-    pub fn planned_bytes(capacity: usize, budget: usize) -> u64 {
-        let cells = 2 * (capacity + BUFFER) as u64 * size_of::<Cell>() as u64;
+    pub fn planned_bytes(capacity: usize, collected: usize, budget: usize) -> u64 {
+        let cells = 2 * (capacity + collected) as u64 * size_of::<Cell>() as u64;
         cells
-            + BUFFER as u64 * (size_of::<(u64, Sample)>() + size_of::<(u64, u32)>()) as u64
+            + collected as u64 * (size_of::<(u64, Sample)>() + size_of::<(u64, u32)>()) as u64
             + (budget * size_of::<Merged>()) as u64
     }
 
@@ -99,7 +103,7 @@ impl VoxelMerge {
             return;
         }
         self.buffer.push((morton(cell.x as u32, cell.y as u32, cell.z as u32), sample));
-        if self.buffer.len() == BUFFER {
+        if self.buffer.len() == self.collected {
             self.flush();
         }
     }

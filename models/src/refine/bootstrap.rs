@@ -146,7 +146,7 @@ impl Refiner {
                 let of = |frame| tracks.get(*t as usize).iter().find(|s| s.frame == frame);
                 if let (Some(x), Some(y)) = (of(p.a), of(p.b)) {
                     let ray = |s: &Sighting, camera: &Pinhole| {
-                        camera.ray(self.frames[s.frame as usize].keypoints[s.feature as usize])
+                        camera.ray(self.frames[s.frame as usize].keypoints()[s.feature as usize])
                     };
                     angles.push((p.pose.rotation * ray(x, &a)).angle_between(ray(y, &b)).to_degrees());
                 }
@@ -218,7 +218,7 @@ impl Refiner {
                 let ground = |t: u32| {
                     let seen = self.sightings(tracks, t).first().copied()?;
                     let frame = &self.frames[seen.frame as usize];
-                    Some(Ground(self.ground).meet(&self.camera_of(frame), frame.keypoints[seen.feature as usize]))
+                    Some(Ground(self.ground).meet(&self.camera_of(frame), frame.keypoints()[seen.feature as usize]))
                 };
                 Some((*b, self.place(*b, tracks, web, ROUGH_PX, &ground)?))
             });
@@ -286,7 +286,7 @@ impl Refiner {
         let mut points = Vec::new();
         for t in &web.seen_by[b] {
             let sighting = tracks.get(*t as usize).iter().find(|s| s.frame as usize == b)?;
-            points.extend(known(*t).map(|world| (world, self.frames[b].keypoints[sighting.feature as usize])));
+            points.extend(known(*t).map(|world| (world, self.frames[b].keypoints()[sighting.feature as usize])));
         }
         if points.len() < PLACED_FROM {
             return None;

@@ -93,7 +93,7 @@ impl Refiner {
             turns: 0,
             pairs: 0,
             depths: None,
-            keypoints: Vec::new(),
+            straight: Vec::new(),
             seen: Vec::new(),
             colors: Vec::new(),
             settled: Vec::new(),

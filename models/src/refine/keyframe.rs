@@ -72,10 +72,10 @@ pub(crate) struct KeyFrame {
     pub pairs: u32,
     /// Depth below which 1 % and above which 1 % of the frame's points lie, metres.
     pub depths: Option<(f32, f32)>,
-    /// Pixels of the picture as a pinhole would have taken it.
-    pub keypoints: Vec<[f32; 2]>,
-    /// Pixels of the picture as it is: what the lens is estimated from.
+    /// Key points, in pixels of the picture as it is: what the lens is estimated from.
     pub seen: Vec<[f32; 2]>,
+    /// The same as a pinhole would have seen them; none while the lens bends nothing.
+    pub straight: Vec<[f32; 2]>,
     pub colors: Vec<[u8; 3]>,
     /// Key points whose place photometric alignment has settled.
     pub settled: Vec<bool>,
@@ -106,7 +106,12 @@ impl KeyFrame {
     /// Bytes it takes of the memory.
     pub fn bytes(&self) -> usize {
         let kept = self.descriptors.bytes_in_memory() + self.grey.as_ref().map_or(0, Kept::bytes_in_memory);
-        kept + self.keypoints.len() * 20
+        kept + self.seen.len() * 12 + self.straight.len() * 8
+    }
+
+    /// Key points as a pinhole would have seen them, pixels.
+    pub fn keypoints(&self) -> &[[f32; 2]] {
+        if self.straight.is_empty() { &self.seen } else { &self.straight }
     }
 
     /// What the picture looks like on the whole: the mean of its descriptors, of unit length.
@@ -140,8 +145,10 @@ impl KeyFrame {
     /// Key points as the pinhole sees them, of those in the picture and what is known of the lens.
     pub fn straighten(&mut self, lens: &Calibration) {
         let camera = lens.camera(self.pose, &self.intrinsics);
-        self.keypoints.clear();
-        self.keypoints.extend(self.seen.iter().map(|p| lens.radial.undistorted(&camera, *p)));
+        self.straight.clear();
+        if !lens.radial.is_none() {
+            self.straight.extend(self.seen.iter().map(|p| lens.radial.undistorted(&camera, *p)));
+        }
     }
 }
 

@@ -137,11 +137,11 @@ impl Refiner {
         let rotation = (fa.pose.rotation * coarse.pose.rotation.conjugate()).normalize();
         let center = fa.pose.center - rotation * coarse.pose.translation * length;
         let cb = self.shared.lens.camera(Pose { rotation, center }, &fb.intrinsics);
-        let predicted: Vec<_> = fb.keypoints.iter().map(|p| predict(&cb, &ca, ground, *p)).collect();
-        let unguided = vec![Some(ca.c); fb.keypoints.len()];
+        let predicted: Vec<_> = fb.keypoints().iter().map(|p| predict(&cb, &ca, ground, *p)).collect();
+        let unguided = vec![Some(ca.c); fb.keypoints().len()];
         let known = ground.0.is_some() && !any_heading;
         let radius = if known { search_radius(&ca, &cb, ADJUSTED_SIGMA, 0.1 * length, ground) } else { f64::INFINITY };
-        let lines = epipolar_lines(&coarse.pose, &ca, &cb, &fb.keypoints);
+        let lines = epipolar_lines(&coarse.pose, &ca, &cb, fb.keypoints());
         let guide = Guide {
             predicted: if known { &predicted } else { &unguided },
             radius,
@@ -185,8 +185,8 @@ impl Refiner {
         let rotation_sigma = fa.rotation_sigma.hypot(fb.rotation_sigma);
         let position_sigma = fa.position_sigma.hypot(fb.position_sigma);
         let predicted: Vec<_> = match guided {
-            true => fb.keypoints.iter().map(|p| predict(&cb, &ca, ground, *p)).collect(),
-            false => vec![Some(ca.c); fb.keypoints.len()],
+            true => fb.keypoints().iter().map(|p| predict(&cb, &ca, ground, *p)).collect(),
+            false => vec![Some(ca.c); fb.keypoints().len()],
         };
         let radius =
             if guided { search_radius(&ca, &cb, rotation_sigma, position_sigma, ground) } else { f64::INFINITY };
@@ -227,7 +227,9 @@ impl Refiner {
             }
             if !frame.settled[k] {
                 frame.seen[k] = place;
-                frame.keypoints[k] = radial.undistorted(&lens, place);
+                if let Some(straight) = frame.straight.get_mut(k) {
+                    *straight = radial.undistorted(&lens, place);
+                }
                 frame.settled[k] = true;
             }
             found.inliers.push(i);
@@ -288,7 +290,7 @@ impl Refiner {
             .iter()
             .filter_map(|i| {
                 let m = matches[*i as usize];
-                let views = [(ca, fa.keypoints[m.a as usize]), (cb, fb.keypoints[m.b as usize])];
+                let views = [(ca, fa.keypoints()[m.a as usize]), (cb, fb.keypoints()[m.b as usize])];
                 triangulate(&views, self.settings.min_angle_deg.to_radians()).map(|t| t.world.z)
             })
             .collect();
@@ -300,7 +302,7 @@ impl Refiner {
 }
 
 fn rays(frames: &[KeyFrame], a: (usize, &Pinhole), b: (usize, &Pinhole), matches: &[Match]) -> Vec<RayPair> {
-    let ray = |(i, camera): (usize, &Pinhole), k: u32| camera.ray(frames[i].keypoints[k as usize]);
+    let ray = |(i, camera): (usize, &Pinhole), k: u32| camera.ray(frames[i].keypoints()[k as usize]);
     matches.iter().map(|m| RayPair { a: ray(a, m.a), b: ray(b, m.b) }).collect()
 }
 

@@ -45,9 +45,9 @@ const LEAST_PART: usize = 128;
 
 /// Matches `b` against `a`.
 pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: MatchLimits) -> Vec<Match> {
-    let (of_a, of_b) = (a.keypoints.len().min(limits.features), b.keypoints.len().min(limits.features));
+    let (of_a, of_b) = (a.keypoints().len().min(limits.features), b.keypoints().len().min(limits.features));
     let (described_a, described_b) = (a.descriptors(), b.descriptors());
-    let grid = Buckets::of(&a.keypoints[..of_a], (a.intrinsics.width, a.intrinsics.height));
+    let grid = Buckets::of(&a.keypoints()[..of_a], (a.intrinsics.width, a.intrinsics.height));
     let r2 = guide.radius * guide.radius;
     let unit = 127.0 * 127.0;
     let least = (limits.min_cosine * unit) as i32;
@@ -64,7 +64,7 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
             scored.clear();
             for cells in grid.rows(*place, guide.radius, line) {
                 for &i in cells {
-                    let p = a.keypoints[i as usize];
+                    let p = a.keypoints()[i as usize];
                     let p = DVec2::new(p[0].into(), p[1].into());
                     let off_line = line.is_some_and(|(line, width)| line.dot(p.extend(1.0)).abs() > width);
                     if off_line || (p - *place).length_squared() > r2 {
@@ -79,9 +79,9 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
                 }
             }
             let Some(&(best, i)) = scored.iter().max_by_key(|s| (s.0, std::cmp::Reverse(s.1))) else { continue };
-            let at = a.keypoints[i as usize];
+            let at = a.keypoints()[i as usize];
             let elsewhere = |k: u32| {
-                let p = a.keypoints[k as usize];
+                let p = a.keypoints()[k as usize];
                 (p[0] - at[0]).abs().max((p[1] - at[1]).abs()) > SAME_PLACE
             };
             let second = scored.iter().filter(|s| s.0 > best - margin && elsewhere(s.1)).count();

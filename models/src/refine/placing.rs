@@ -50,7 +50,7 @@ impl Refiner {
             views.clear();
             views.extend(seen.iter().map(|s| {
                 let frame = s.frame as usize;
-                (cameras[frame], self.frames[frame].keypoints[s.feature as usize])
+                (cameras[frame], self.frames[frame].keypoints()[s.feature as usize])
             }));
             let found = triangulate(views, min_angle)?;
             let error = |v: &(Pinhole, [f32; 2])| match v.0.project(found.world) {

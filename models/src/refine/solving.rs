@@ -200,7 +200,7 @@ impl Refiner {
             if let Some(p) = self.robust_point(&cameras, &mut others, FINE_PX, &mut views) {
                 for s in own {
                     seen_by[s.frame as usize]
-                        .push((p.world, self.frames[s.frame as usize].keypoints[s.feature as usize]));
+                        .push((p.world, self.frames[s.frame as usize].keypoints()[s.feature as usize]));
                 }
             }
         }
@@ -302,7 +302,7 @@ impl Refiner {
             report.outlier_observations += all - seen.len();
             for s in &seen {
                 let frame = s.frame as usize;
-                let (camera, pixel) = (&cameras[frame], self.frames[frame].keypoints[s.feature as usize]);
+                let (camera, pixel) = (&cameras[frame], self.frames[frame].keypoints()[s.feature as usize]);
                 depths[frame].push(camera.local(p.world).z as f32);
                 heights[frame].push(p.world.z);
                 if let Some(q) = camera.project(p.world) {

@@ -142,7 +142,7 @@ impl Tracks {
         let mut all = vec![Sighting { frame: 0, feature: 0 }; total as usize];
         let mut next = place.clone();
         for (f, frame) in frames.iter().enumerate() {
-            for feature in 0..frame.keypoints.len() as u32 {
+            for feature in 0..frame.keypoints().len() as u32 {
                 let root = union.find(frame.first_node + feature) as usize;
                 if next[root] != u32::MAX {
                     all[next[root] as usize] = Sighting { frame: f as u32, feature };

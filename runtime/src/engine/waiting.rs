@@ -1,15 +1,19 @@
-//! What waits of pictures for the initialiser and for matching: in memory while that is little, else in a file of its own.
+//! What waits of pictures for the initialiser and for matching: in memory while that is little and the host has room for it, else in a
+//! file of its own.
 
 use std::fs::File;
 use std::path::Path;
 
 use config::init::InitSettings;
 use config::mission::NetworkSettings;
-use config::plan::PlanRequest;
+use config::plan::{Plan, PlanRequest};
 use config::refine::RefineSettings;
-use models::init::most_frame_bytes;
+use models::init::{Initialiser, most_frame_bytes};
+use models::refine::Refiner;
 
+use super::EngineSettings;
 use super::device::scratch_file;
+use super::host::HostPlan;
 use crate::error::JobError;
 
 /// Pictures and depths that wait for the initialiser in memory, bytes, and as many of what matching keeps of them; more of either wait
@@ -35,6 +39,51 @@ pub fn waiting_file(folder: &Path, bytes: u64) -> Result<Option<File>, JobError>
         0 => Ok(None),
         bytes => Ok(Some(scratch_file(folder, bytes)?)),
     }
+}
+
+/// Decides where it waits, and gives what the host will hold: `plan` says that of the initialiser's bytes and of whether matching keeps its
+/// pictures in a file.
+///
+/// # Errors
+/// Even with files the host has too little memory; a file cannot be made or finds no room.
+pub(super) fn place(
+    settings: &EngineSettings,
+    device: &Plan,
+    mut initialiser: Option<&mut Initialiser>,
+    mut refiner: Option<&mut Refiner>,
+    plan: &dyn Fn(u64, bool) -> HostPlan,
+) -> Result<HostPlan, JobError> {
+    let (size, pictures) = (settings.device.size, device.views as u64);
+    let folder = settings.device.scratch_folder();
+    let frames = initialiser.as_ref().map_or(0, |i| pictures * i.frame_bytes_at(size));
+    let kept = refiner.as_ref().and(settings.refine.as_ref()).map_or(0, |refine| pictures * refine.kept_bytes());
+    let much = |bytes: u64| bytes > FRAMES_IN_MEMORY;
+    if let (Some(initialiser), true) = (&mut initialiser, much(frames)) {
+        initialiser.keep_frames_in(scratch_file(&folder, frames)?);
+    }
+    if let (Some(refiner), true) = (&mut refiner, much(kept)) {
+        refiner.keep_frames_in(scratch_file(&folder, kept)?);
+    }
+    let planned = |initialiser: &Option<&mut Initialiser>, in_file: bool| {
+        plan(initialiser.as_ref().map_or(0, |i| i.planned_bytes_at(size, device.views, device.scene)), in_file)
+    };
+    // The disk's plan does not know of these.
+    let file = |bytes: u64| {
+        settings.disk.reserve(bytes).map_err(JobError::io(&folder))?;
+        tracing::info!("{} MiB of pictures wait in a file: the host's memory has no room for them", bytes >> 20);
+        Ok::<_, JobError>(scratch_file(&folder, bytes)?)
+    };
+    let mut host = planned(&initialiser, much(kept));
+    if let (Some(own), true) = (&mut initialiser, host.fits(settings.host_mib).is_err() && !much(frames)) {
+        own.keep_frames_in(file(frames)?);
+        host = planned(&initialiser, much(kept));
+    }
+    if let (Some(refiner), true) = (&mut refiner, host.fits(settings.host_mib).is_err() && !much(kept)) {
+        refiner.keep_frames_in(file(kept)?);
+        host = planned(&initialiser, true);
+    }
+    host.fits(settings.host_mib)?;
+    Ok(host)
 }
 
 /// Bytes of the scratch files of a job: views and cells that find no room on the device, what waits for the initialiser, and what

@@ -6,9 +6,8 @@ use std::collections::BTreeMap;
 use super::coder::{Encoder, Garbled};
 use super::{Form, Given, LEAST_BYTES, Rounding, Scope, code, encode_rows};
 use crate::camera::View;
-use crate::cloud::GaussianCloud;
+use crate::cloud::{GaussianCloud, coarser};
 use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
-use crate::levels::coarser;
 
 /// Gaussians that a cell of the finest level should hold about: fewer cost more for each, more come back as one.
 const USUAL: f64 = 6000.0;

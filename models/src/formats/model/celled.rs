@@ -22,6 +22,9 @@ const HEAD: u64 = 8;
 const ENTRY: u64 = 53;
 const LAYER: u64 = 40;
 
+/// Bytes below which a piece is not worth its name on the wire.
+const LEAST_PIECE: u64 = 8 << 10;
+
 /// Words that lie together.
 pub(super) struct Piece {
     count: u32,
@@ -87,7 +90,7 @@ pub fn write_cells(
 }
 
 /// The lengths of the pieces that a file is best sent in: everything up to the cells, then their coarse layers, then each cell, the
-/// most important first. `None`: not in cells, any cut is as good.
+/// most important first; what is small goes with what comes next. `None`: not in cells, any cut is as good.
 ///
 /// # Errors
 /// As [`super::read_header`].
@@ -98,8 +101,18 @@ pub fn pieces(path: &Path) -> Result<Option<Vec<u64>>, FormatError> {
     let before = FIXED + opened.header_len as u64;
     let cells = Cells::read(path, &mut opened.input, layered, opened.count, opened.size - before)?;
     let head = before + index_bytes(layered, cells.0.len() as u64) + HASH;
-    let pieces = cells.pieces().map(|piece| piece.bytes()).filter(|n| *n > 0);
-    Ok(Some(std::iter::once(head).chain(pieces).collect()))
+    let mut pieces = vec![head];
+    for layer in cells.layers() {
+        let mut open = false;
+        for bytes in layer.into_iter().map(Piece::bytes).filter(|n| *n > 0) {
+            match pieces.last_mut().filter(|_| open) {
+                Some(last) => *last += bytes,
+                None => pieces.push(bytes),
+            }
+            open = pieces.last().is_some_and(|last| *last < LEAST_PIECE);
+        }
+    }
+    Ok(Some(pieces))
 }
 
 fn index_bytes(layered: bool, cells: u64) -> u64 {
@@ -116,7 +129,7 @@ impl Cells {
         left: u64,
     ) -> Result<Self, FormatError> {
         let (index, room) = Self::read_index(path, input, layered, count, left)?;
-        match index.pieces().map(Piece::bytes).sum::<u64>() {
+        match index.layers().concat().into_iter().map(Piece::bytes).sum::<u64>() {
             bytes if bytes == room => Ok(index),
             bytes if bytes > room => Err(FormatError::Truncated { path: path.to_owned(), at: room, what: "its cells" }),
             bytes => {
@@ -172,9 +185,9 @@ impl Cells {
         }
     }
 
-    /// All pieces in the file's order, and so many are coarse layers.
-    fn pieces(&self) -> impl Iterator<Item = &Piece> {
-        self.0.iter().filter_map(|e| e.coarse.as_ref()).chain(self.0.iter().map(|e| &e.whole))
+    /// What lies in the file, in its order: coarse layers, where there are any, then whole cells.
+    fn layers(&self) -> [Vec<&Piece>; 2] {
+        [self.0.iter().filter_map(|e| e.coarse.as_ref()).collect(), self.0.iter().map(|e| &e.whole).collect()]
     }
 
     /// Gives the Gaussians of each cell to `each`.

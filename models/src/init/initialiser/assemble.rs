@@ -6,7 +6,7 @@ use std::time::Instant;
 use config::init::InitSettings;
 use rayon::prelude::*;
 
-use super::strips::Strips;
+use super::strips::{AtOnce, Strips};
 use super::{Initialiser, VOXELS_PER_GAUSSIAN};
 use crate::camera::{DepthPrior, Pinhole};
 use crate::cloud::GaussianCloud;
@@ -24,8 +24,6 @@ use crate::light::{Light, PictureLight};
 pub(super) const AHEAD: usize = 2;
 /// Views that a depth is compared with.
 pub(super) const WITNESSES: usize = 6;
-/// Voxels at once; what needs more is merged strip of ground by strip.
-pub(super) const MOST_VOXELS: usize = 600_000;
 /// Edge of the finest voxels, in sample spacings.
 const VOXEL: f32 = 0.7;
 /// A cell's Gaussian reaches this many spreads of its samples: a square's is 0.29 edges, and 0.5 edges close the gaps.
@@ -53,7 +51,8 @@ impl Initialiser {
         spacing.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (edge, global_scale) = spacing.get(spacing.len() / 2).copied().unwrap_or((1.0, 1.0));
         let voxels = max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN);
-        let mut strips = Strips::over(&looked_at, voxels.div_ceil(MOST_VOXELS));
+        let held = AtOnce::of(voxels);
+        let mut strips = Strips::over(&looked_at, voxels.div_ceil(held.voxels));
         let report = &mut self.report;
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
         (report.consistency_ms, report.samples_ms, report.voxels_ms, report.cloud_ms) = (0.0, 0.0, 0.0, 0.0);
@@ -63,7 +62,7 @@ impl Initialiser {
         showing[0] = pictures.iter().copied().filter(|&i| self.frames[i].has_depth()).collect();
         let mut cloud = GaussianCloud::with_capacity(0, if strips.count() > 1 { max_gaussians } else { 0 });
         for strip in 0..strips.count() {
-            let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), voxels.min(MOST_VOXELS));
+            let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), held.voxels, held.samples);
             let frames = std::mem::take(&mut showing[strip]);
             // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
             let mut waiting: Vec<Checked> = Vec::new();

@@ -2,7 +2,8 @@
 
 use config::init::InitSettings;
 
-use super::assemble::{AHEAD, MOST_VOXELS, WITNESSES};
+use super::assemble::{AHEAD, WITNESSES};
+use super::strips::AtOnce;
 use super::{Initialiser, Pairs, VOXELS_PER_GAUSSIAN};
 use crate::init::merge::VoxelMerge;
 use crate::init::unposed;
@@ -68,6 +69,7 @@ impl Initialiser {
             // Each thread's picture and its sources or witnesses, and the one that comes in.
             Some(_) => self.settings.threads.max(AHEAD) * (1 + WITNESSES.max(self.pairs.sources())) + 1,
         };
+        let merged = AtOnce::of(max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN));
         in_memory as u64 * frame_bytes(&self.settings, pixels)
             // Priors on their way out, and the caller's copy of one.
             + (2 * AHEAD as u64 + 1) * 8 * samples
@@ -76,7 +78,7 @@ impl Initialiser {
             + features
             + super::super::range::MAX_POINTS as u64 * RANGE_BYTES
             + 2 * AHEAD as u64 * samples * WORK_BYTES
-            + VoxelMerge::planned_bytes(max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN).min(MOST_VOXELS), max_gaussians)
+            + VoxelMerge::planned_bytes(merged.voxels, merged.samples, max_gaussians)
             + max_gaussians as u64 * CLOUD_BYTES
     }
 }

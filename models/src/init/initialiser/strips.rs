@@ -2,7 +2,28 @@
 
 use glam::DVec3;
 
-use crate::init::merge::Sample;
+use crate::init::merge::{BUFFER, Sample};
+
+/// Voxels up to which the whole ground is merged at once.
+const MOST_VOXELS: usize = 600_000;
+
+/// What is held at once while samples are merged.
+pub(super) struct AtOnce {
+    /// Voxels of a strip.
+    pub voxels: usize,
+    /// Samples that are collected before they are sorted into them.
+    pub samples: usize,
+}
+
+impl AtOnce {
+    /// All of so many voxels, or strips of them in half of the memory and with more work.
+    pub fn of(voxels: usize) -> Self {
+        match voxels <= MOST_VOXELS {
+            true => Self { voxels: voxels.max(1), samples: BUFFER },
+            false => Self { voxels: MOST_VOXELS * 2 / 3, samples: BUFFER / 4 },
+        }
+    }
+}
 
 /// Strips across the longer axis of what the pictures look at, as many pictures in each.
 #[derive(Debug)]

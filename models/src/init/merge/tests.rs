@@ -6,7 +6,7 @@ fn sample(position: Vec3, color: f32) -> Sample {
 
 #[test]
 fn a_plane_becomes_flat_gaussians_within_the_budget() {
-    let mut merge = VoxelMerge::new(0.2, Vec3::new(100.0, -50.0, 0.0), 100_000);
+    let mut merge = VoxelMerge::new(0.2, Vec3::new(100.0, -50.0, 0.0), 100_000, BUFFER);
     for i in 0..200 {
         for j in 0..200 {
             merge.push(sample(Vec3::new(100.0 + i as f32 * 0.1, -50.0 + j as f32 * 0.1, 3.0), 0.5));
@@ -22,7 +22,7 @@ fn a_plane_becomes_flat_gaussians_within_the_budget() {
 
 #[test]
 fn the_budget_goes_where_the_colour_varies() {
-    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 100_000);
+    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 100_000, BUFFER);
     for i in 0..200 {
         for j in 0..200 {
             let checker = ((i + j) % 2) as f32;
@@ -37,7 +37,7 @@ fn the_budget_goes_where_the_colour_varies() {
 
 #[test]
 fn more_voxels_than_room_are_coarsened_and_nothing_is_lost() {
-    let mut merge = VoxelMerge::new(0.01, Vec3::ZERO, 1000);
+    let mut merge = VoxelMerge::new(0.01, Vec3::ZERO, 1000, BUFFER);
     for i in 0..20_000 {
         merge.push(sample(Vec3::new(i as f32 * 0.01, 0.0, 0.0), 0.3));
     }
@@ -53,7 +53,7 @@ fn more_voxels_than_room_are_coarsened_and_nothing_is_lost() {
 #[test]
 fn merging_is_the_same_bit_for_bit_every_time() {
     let run = || {
-        let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 5000);
+        let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 5000, BUFFER);
         for i in 0..600_000u32 {
             let h = i.wrapping_mul(2_654_435_761);
             let p = Vec3::new((h & 0xff) as f32, (h >> 8 & 0xff) as f32, (h >> 16 & 0xff) as f32) * 0.03;
@@ -66,7 +66,7 @@ fn merging_is_the_same_bit_for_bit_every_time() {
 
 #[test]
 fn zero_budget_and_no_samples_give_nothing() {
-    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 10);
+    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 10, BUFFER);
     assert!(merge.finish(10, 1.0).is_empty());
     merge.push(sample(Vec3::ZERO, 0.1));
     assert!(merge.finish(0, 1.0).is_empty());

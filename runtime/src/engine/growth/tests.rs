@@ -55,6 +55,11 @@ fn flight() -> Vec<PosedImage> {
 
 /// An engine in flight; `None`, with a word about it, where device or ONNX Runtime are missing.
 fn engine() -> Option<Reconstruction> {
+    engine_in(None).map(|engine| engine.expect("opens"))
+}
+
+/// The same in so much of the host's memory, MiB.
+fn engine_in(host_mib: Option<u32>) -> Option<Result<Reconstruction, JobError>> {
     if Gpu::list().is_err() || models::onnx::session::find_library().is_err() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers), or no ONNX Runtime");
         return None;
@@ -72,7 +77,7 @@ fn engine() -> Option<Reconstruction> {
             max_gaussians: Some(30_000),
             scene_gaussians: None,
         },
-        host_mib: None,
+        host_mib,
         camera_pixels: LENS.pixels() as u64,
         ahead: 0,
         ahead_in_memory: false,
@@ -87,7 +92,23 @@ fn engine() -> Option<Reconstruction> {
         incremental: true,
     };
     let region = vec![[-78.0, -27.0], [78.0, -27.0], [78.0, 27.0], [-78.0, 27.0]];
-    Some(Reconstruction::open(settings, ModelHeader { region, ..ModelHeader::default() }, "fly").expect("opens"))
+    Some(Reconstruction::open(settings, ModelHeader { region, ..ModelHeader::default() }, "fly"))
+}
+
+#[test]
+fn what_waits_of_few_pictures_goes_to_a_file_when_the_host_has_no_room_for_it() {
+    let planned = |engine: &Reconstruction| engine.report.more["host_bytes_planned"].as_u64().expect("bytes");
+    let Some(roomy) = engine() else { return };
+    let bytes = planned(&roomy);
+    drop(roomy);
+    let mib = |bytes: u64| Some((bytes >> 20) as u32);
+    // A little less: one of the two files does. As little as both save: the other, too. Less than that is refused.
+    let little = engine_in(mib(bytes - (1 << 20))).expect("as before").expect("fits");
+    assert!(planned(&little) < bytes - (1 << 20));
+    let least = planned(&engine_in(mib(planned(&little) - (1 << 20))).expect("as before").expect("fits"));
+    assert!(least < planned(&little) - (1 << 20));
+    let refused = engine_in(mib(least - (1 << 20))).expect("as before").map(drop);
+    assert!(matches!(refused, Err(JobError::HostMemory { .. })), "{refused:?}");
 }
 
 /// What one growth did.
