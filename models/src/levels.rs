@@ -1,6 +1,6 @@
 //! Levels of detail: a scene of any size as something that viewers stream.
 //!
-//! Each level has one Gaussian for every voxel in which the one below has several, merged, never picked ([`coarser`]): a quarter of a surface's Gaussians, or less
+//! Each level has one Gaussian for every voxel in which the one below has several, merged, never picked (`coarser`): a quarter of a surface's Gaussians, or less
 //! of what lies in layers. Voxels double, at least, from level to level; a level stands for the one below where a voxel is as small as a
 //! pixel. The scene is sorted into leaves of ground in a file (`scratch`), and each leaf is divided into levels on its own: memory does not grow with
 //! the scene, only the index does, by some hundred bytes a leaf.
