@@ -7,8 +7,7 @@
 
 use std::path::Path;
 
-use crate::cloud::GaussianCloud;
-use crate::cloud::coarser;
+use crate::cloud::{GaussianCloud, coarser};
 use crate::formats::FormatError;
 use crate::formats::model::Chunks;
 use crate::formats::sog::streamed::Writer;

@@ -65,7 +65,7 @@ table! {
     pub struct ViewSettings {
         /// Most visits to each view where nobody says how many steps or seconds there are: few pictures are learnt by heart.
         pub visits: u32 = 100, in Limits::within(1.0, 1e6),
-            from "fox gains 1.0 dB from 50 visits to 100 and 0.4 from 100 to 200, 43 pictures nothing, 18 lose 0.2 dB (BENCHMARKS)";
+            from "fox gains 1.0 dB from 50 visits to 100 and 0.4 from 100 to 200; sheffield_cross loses 0.1, brighton_beach 0.2 (BENCHMARKS)";
         /// Share of extra visits per epoch that go to the views with the largest last loss.
         pub residual_share: f32 = 0.0, in Limits::within(0.0, 1.0);
     }

@@ -92,8 +92,8 @@ pub struct Args {
     /// models that go out by `dgtr export --to delivery`.
     #[arg(long)]
     for_delivery: bool,
-    /// Optimiser steps; with neither --steps nor --seconds as many as [training] says: 100 for each
-    /// picture, 10,000 at the most.
+    /// Optimiser steps; with neither --steps nor --seconds the recipe's own number ([training] steps, or
+    /// [training.views] visits to each picture where those are fewer).
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
     steps: Option<u32>,
     /// Seconds of training; with --steps, whichever comes first.

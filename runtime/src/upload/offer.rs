@@ -10,7 +10,7 @@
 //! ```
 //!
 //! A model in cells is cut where its cells end (version 3), so that a cell that did not change is a chunk the ground has; its
-//! first chunk is its index, the others follow by importance. Any other file is cut evenly (version 2).
+//! first chunk is its index, coarse layers and cells follow by importance, small ones together. Any other file is cut evenly (version 2).
 
 use std::fs::File;
 use std::io::Read;

@@ -200,7 +200,7 @@ impl Store {
         Ok(bytes)
     }
 
-    /// Where [`Self::preview`] lies until the model is complete.
+    /// Where [`Self::preview`] lies until the model is complete, refused or overtaken.
     pub fn preview_path(&self) -> PathBuf {
         self.dir.join("preview.dgtr")
     }
@@ -248,8 +248,6 @@ impl Store {
         written.map_err(|e| io(&path)(e.into()))??;
         self.note(offer)?;
         self.keep_only(None);
-        // There may have been none.
-        let _ = self.disk.remove(&self.preview_path());
         Ok(())
     }
 
@@ -271,8 +269,10 @@ impl Store {
         self.disk.replace(&note, |out| out.write_all(&offer.encode())).map_err(|e| io(&note)(e.into()))
     }
 
-    /// Removes chunks that belong to no model being fetched.
+    /// Removes chunks that belong to no model being fetched, and the preview of the one that was.
     pub fn keep_only(&self, offer: Option<&Offer>) {
+        // There may be none.
+        let _ = self.disk.remove(&self.preview_path());
         let keep: std::collections::HashSet<String> = offer.iter().flat_map(|o| &o.chunks).map(hex).collect();
         let Ok(entries) = std::fs::read_dir(self.dir.join("chunk")) else { return };
         for entry in entries.flatten() {

@@ -68,6 +68,22 @@ fn what_has_come_of_a_model_can_be_looked_at_until_it_is_complete() {
 }
 
 #[test]
+fn of_a_model_that_another_overtakes_nothing_is_left_to_look_at() {
+    let b = Bench::new();
+    let preview = b.dir.path().join("received/a1/preview.dgtr");
+    b.publish(in_cells(&b, 0.2, 1, false).0);
+    b.fake.quota.store(4, Ordering::SeqCst);
+    let mut r = b.receiver();
+    b.rounds(&mut r, 1);
+    assert!(preview.exists());
+    // The last word of the flight, of which nothing comes.
+    b.publish(b.model(&noise(100_000, 3), 2, true));
+    b.fake.quota.store(0, Ordering::SeqCst);
+    b.rounds(&mut r, 1);
+    assert!(!preview.exists());
+}
+
+#[test]
 fn cells_of_a_model_that_is_damaged_meanwhile_are_fetched_after_all() {
     let b = Bench::new();
     let ((first, old), (second, bytes)) = (in_cells(&b, 0.2, 1, false), in_cells(&b, 0.9, 2, true));
