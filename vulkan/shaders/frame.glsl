@@ -1,4 +1,4 @@
-// What every kernel includes: the constants, what it shares with the host, and the hash.
+// What every kernel includes: the constants, what it shares with the host, the hash and the sigmoid.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 #include "constants.glsl"
@@ -47,4 +47,8 @@ uint pcg(uint v) {
 float uniform_hash(uint gaussian, uint channel) {
     uint h = pcg(gaussian + pcg(frame.step + pcg(frame.seed + channel * 0x9E3779B9u)));
     return float(h >> 8) * (1.0 / 16777216.0);
+}
+
+float sigmoid(float x) {
+    return 1.0 / (1.0 + exp(-x));
 }

@@ -56,7 +56,9 @@ Projection project_gaussian(vec3 mean, vec3 log_scale, vec4 rotation) {
     vec3 scale = exp(min(log_scale, vec3(80.0)));
     s.scale = min(scale, vec3(limit));
     s.scale_clamped = greaterThan(scale, vec3(limit));
-    for (int k = 0; k < 3; k++) s.axes[k] = to_camera(s.rotation[k]) * s.scale[k];
+    s.axes[0] = to_camera(s.rotation[0]) * s.scale.x;
+    s.axes[1] = to_camera(s.rotation[1]) * s.scale.y;
+    s.axes[2] = to_camera(s.rotation[2]) * s.scale.z;
     vec2 f = frame.focal * inverse_z;
     vec3 ax = vec3(s.axes[0].x, s.axes[1].x, s.axes[2].x);
     vec3 ay = vec3(s.axes[0].y, s.axes[1].y, s.axes[2].y);
@@ -68,8 +70,4 @@ Projection project_gaussian(vec3 mean, vec3 log_scale, vec4 rotation) {
     s.cov = vec3(aa + LOW_PASS, dot(s.a, s.b), bb + LOW_PASS);
     s.det = dot(c, c) + LOW_PASS * (aa + bb) + LOW_PASS * LOW_PASS;
     return s;
-}
-
-float sigmoid(float x) {
-    return 1.0 / (1.0 + exp(-x));
 }

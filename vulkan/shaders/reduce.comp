@@ -6,6 +6,7 @@
 
 TEXELS(uvec2, 9, slot_ranges)
 TEXELS(vec4, 10, slots)
+TEXELS(vec4, 11, shaded)
 struct Sums {
     vec4 line, square;
     vec3 colour;
@@ -48,6 +49,10 @@ void main() {
             if (i + j < end) add_slot(i + j, depth, a, b, c);
         }
     }
+    // Where the colour was clamped there is no gradient.
+    vec3 shown = FETCH(shaded, int(r) * 3 + 2).xyz;
+    c = mix(c, vec3(0.0), lessThanEqual(shown, vec3(0.0)));
+    c = mix(c, vec3(0.0), greaterThanEqual(shown, vec3(COLOUR_MAX)));
     reduced[r].line = a;
     reduced[r].square = b;
     reduced[r].colour = c;

@@ -129,9 +129,11 @@ kernels! {
         ["shaded" "instances" "image" "image_gradient"];
     RasteriseBackwardDepth "rasterise_backward_depth" RasteriseBackward Tiles ["tile_starts" "slots"]
         ["shaded" "instances" "image" "image_gradient"];
-    Reduce "reduce" Reduce Wide ["reduced" "status"] ["slot_ranges" "slots"];
-    Optimise "optimise" Optimise Wide ["order" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "lane_sums"]
+    Reduce "reduce" Reduce Wide ["reduced" "status"] ["slot_ranges" "slots" "shaded"];
+    OptimiseSh "optimise_sh" Optimise Wide ["order" "status" "reduced" "sh" "sh_first_moment" "sh_second_moment"]
         ["reduced" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
+    ProjectBackward "project_backward" Optimise Wide ["order" "status" "projected" "lane_sums"] ["reduced" "geometry"];
+    Optimise "optimise" Optimise Wide ["order" "status" "geometry"] ["projected" "geometry"];
 }
 
 /// A number that changes whenever any kernel does (FNV-1a over names and SPIR-V): what was measured with other kernels

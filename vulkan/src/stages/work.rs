@@ -50,8 +50,9 @@ pub fn work(stage: Stage, load: &Load) -> Work {
         Stage::Loss => (p * (24 + 6 * 48 + 40), p * (2 * 2 * 11 * (12 + 9) + 200)),
         Stage::RasteriseBackward => (104 * m + 32 * p, 75 * e),
         Stage::Reduce => (48 * m + 56 * v, 12 * m),
-        // Sum, nine vec4 of geometry and three columns of SH state in; the latter two out again.
-        Stage::Optimise => (v * (52 + 2 * 144 + 6 * 16 * c), v * (650 + 14 * (12 + 4 * c))),
+        // Three columns of SH state in and out with what a colour needs; sum and three vec4 of geometry in, its gradient out; that and
+        // nine vec4 of geometry in, the latter out again.
+        Stage::Optimise => (v * (84 + 6 * 16 * c + 148 + 52 + 2 * 144), v * (560 + 14 * (12 + 4 * c))),
     };
     Work { bytes, operations }
 }

@@ -180,7 +180,10 @@ impl Trainer {
             r.run(backward, self.frame.places(*band), push);
             r.run(Kernel::Reduce, visible, push);
         }
-        r.run(Kernel::Optimise, lanes, Push { mode: u32::from(self.gradients_only), ..Push::default() });
+        let push = Push { mode: u32::from(self.gradients_only), ..Push::default() };
+        r.run(Kernel::OptimiseSh, lanes, push);
+        r.run(Kernel::ProjectBackward, lanes, push);
+        r.run(Kernel::Optimise, lanes, push);
         r.submit_and_read(&["status", "tile_starts", "lane_sums", "strip_sums"])?;
         Ok(())
     }
