@@ -33,11 +33,15 @@ use scale::largest;
 use slices::{REST, Slices};
 
 mod card;
+mod first;
 mod ground;
 pub mod log;
 mod scale;
 mod slices;
 mod surveyed;
+
+/// Means that the heights of the ground are told by at most, where the scene is larger than the memory.
+const MOST_MEANS: usize = 1 << 20;
 
 /// Everything a training needs to know; see `dgtr train --help`.
 #[derive(Clone, Debug)]
@@ -58,6 +62,8 @@ pub struct TrainJob {
     pub failsafe: Option<FailsafeSettings>,
     /// First Gaussians.
     pub init: InitKind,
+    /// The model that they are taken from, where `init` says so.
+    pub from: Option<PathBuf>,
     /// Poses.
     pub poses: PoseSource,
     /// Whether telemetry poses are refined from the pictures.
@@ -123,10 +129,12 @@ impl TrainJob {
         let began = Instant::now();
         let stop = Interrupt::install()?;
         let go_on = || !stop.requested();
+        let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
         let mut set = match self.folders.as_slice() {
             [folder] if self.card == CardOptions::default() => Dataset::open(folder)?,
             folders => Dataset::open_card(folders, &self.card)?,
         };
+        from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
         let is_card = set.card.is_some();
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
         let poses = if is_card { PoseSource::Dataset } else { self.poses };
@@ -161,7 +169,7 @@ impl TrainJob {
                 view_slots: self.view_slots,
                 folder: Some(self.out.clone()),
                 max_gaussians: self.max_gaussians,
-                scene_gaussians: self.scene_gaussians,
+                scene_gaussians: self.scene_gaussians.or(from.as_ref().map(|model| model.count.max(1))),
             },
             host_mib: None,
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
@@ -190,7 +198,9 @@ impl TrainJob {
         }
         engine.report.more.extend(remarks.into_iter().map(|(name, value)| (name.to_owned(), value)));
         if !self.resume(&mut engine, &set, &frames)? {
-            if self.init != InitKind::FeedForward && !(self.init == InitKind::SparsePoints && refine) {
+            if let Some(model) = from {
+                engine.begin_with(model);
+            } else if self.init != InitKind::FeedForward && !(self.init == InitKind::SparsePoints && refine) {
                 engine.hint_points(self.sparse_points(&set, &frames)?);
             }
             // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
@@ -206,7 +216,13 @@ impl TrainJob {
             surveyed::measure(&mut engine, &set, picture_scale)?;
         }
         let steps = engine.header().steps;
-        let covered = ground::coverage(engine.header(), engine.cloud(), self.coverage).filter(|_| finished);
+        let covered = match finished {
+            true => {
+                let means = engine.means(MOST_MEANS)?;
+                ground::coverage(engine.header(), &means, self.coverage)
+            }
+            false => None,
+        };
         let mut report = engine.report;
         if let Some(covered) = covered {
             covered.write(&Disk::default(), &self.out)?;

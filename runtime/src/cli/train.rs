@@ -82,6 +82,10 @@ pub struct Args {
     /// Where the first Gaussians come from.
     #[arg(long, value_enum, default_value = "feed-forward")]
     init: Init,
+    /// The first Gaussians are those of this model, in the frame of the data set, however many: those that find no room on the device wait
+    /// in a file in --out, and none are ever all in memory. The schedule begins anew.
+    #[arg(long, value_name = "MODEL", conflicts_with = "init")]
+    from: Option<PathBuf>,
     /// Where camera poses come from.
     #[arg(long, value_enum, default_value = "dataset")]
     poses: Poses,
@@ -212,10 +216,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
         keyframes: args.keyframes.then_some(settings.keyframes),
         failsafe: args.failsafe.then_some(settings.failsafe),
         init: match args.init {
+            _ if args.from.is_some() => InitKind::Model,
             Init::FeedForward => InitKind::FeedForward,
             Init::Sfm => InitKind::SparsePoints,
             Init::Random => InitKind::Random,
         },
+        from: args.from,
         poses: match args.poses {
             Poses::Dataset => PoseSource::Dataset,
             Poses::Telemetry => PoseSource::Telemetry,
