@@ -36,7 +36,7 @@ mod growth;
 pub mod host;
 mod light;
 mod map;
-mod pieces;
+pub mod pieces;
 mod rebuild;
 mod reconstruct;
 mod rounding;

@@ -7,6 +7,7 @@ mod levels;
 mod map;
 mod memory;
 mod methods;
+mod scene;
 mod skips;
 mod stages;
 mod stress;
@@ -41,6 +42,8 @@ enum Command {
     Memory(memory::Args),
     /// The field's methods beside ours, on the same pictures, poses, steps, Gaussians, memory and seed.
     Methods(methods::Args),
+    /// A scene larger than device and host: trained out of a file and into one, drawn, and compared with an unpaged rendering.
+    Scene(scene::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
     Skips(skips::Args),
     /// Numbers that broke other renderers: the promise, the outcome, what was counted.
@@ -77,6 +80,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Levels(args) => levels::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Methods(args) => methods::run(args),
+        Command::Scene(args) => scene::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),
         Command::TimeError(args) => time_error::run(args),

@@ -5,6 +5,7 @@ use std::cell::Cell;
 use std::io;
 use std::path::Path;
 
+use config::disk::Disk;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, Chunks, ModelHeader};
 use vulkan::trainer::{LoadReport, TrainError, Trainer};
@@ -52,6 +53,44 @@ impl From<TrainError> for NotWritten {
     }
 }
 
+/// Gives the Gaussians of a model to the trainer, of which the host holds a piece at a time.
+///
+/// # Errors
+/// The model is damaged or cannot be read any more; those of [`Trainer::load_pieces`].
+pub fn load(trainer: &mut Trainer, model: &Chunks) -> Result<LoadReport, JobError> {
+    let left_out = Cell::new(0);
+    let loaded = trainer.load_pieces::<JobError>(&|take| {
+        left_out.set(model.each(take)?);
+        Ok(())
+    })?;
+    Ok(LoadReport { dropped_non_finite: loaded.dropped_non_finite + left_out.get() as usize, ..loaded })
+}
+
+/// Writes the trainer's Gaussians as a checkpoint, of which the host holds a piece at a time; how many there are.
+///
+/// # Errors
+/// The device cannot be read, the file of the cells neither, or the disk not written; the file written before stays.
+pub fn save(trainer: &mut Trainer, disk: &Disk, path: &Path, header: &ModelHeader) -> Result<usize, JobError> {
+    let (count, sh_degree) = (trainer.gaussians(), trainer.plan().sh_degree);
+    let mut failed = None;
+    let mut pieces = |write: &mut dyn FnMut(&GaussianCloud) -> io::Result<()>| {
+        let written = trainer.each_piece::<NotWritten>(&mut |piece| write(piece).map_err(NotWritten::Disk));
+        written.map_err(|e| match e {
+            NotWritten::Disk(e) => e,
+            NotWritten::Trainer(e) => {
+                let said = io::Error::other(e.to_string());
+                failed = Some(e);
+                said
+            }
+        })
+    };
+    let written = model::write_checkpoint_pieces(disk, path, header, (count, sh_degree), &mut pieces);
+    match (failed, written) {
+        (Some(e), _) => Err(e.into()),
+        (None, written) => Ok(written.map(|()| count)?),
+    }
+}
+
 impl Reconstruction {
     /// Training begins with the Gaussians of this model, as they are.
     pub fn begin_with(&mut self, model: Chunks) {
@@ -70,14 +109,7 @@ impl Reconstruction {
     /// Gives the trainer the Gaussians that it begins with.
     pub(super) fn load_first(&mut self) -> Result<LoadReport, JobError> {
         let loaded = match self.first.take() {
-            Some(model) => {
-                let left_out = Cell::new(0);
-                let loaded = self.trainer.load_pieces::<JobError>(&|take| {
-                    left_out.set(model.each(take)?);
-                    Ok(())
-                })?;
-                LoadReport { dropped_non_finite: loaded.dropped_non_finite + left_out.get() as usize, ..loaded }
-            }
+            Some(model) => load(&mut self.trainer, &model)?,
             None => self.trainer.load(&self.cloud)?,
         };
         self.let_go();
@@ -93,25 +125,7 @@ impl Reconstruction {
 
     /// Writes the trained Gaussians as a checkpoint; how many there are.
     pub(super) fn write_pieces(&mut self, path: &Path) -> Result<usize, JobError> {
-        let (count, sh_degree) = (self.trainer.gaussians(), self.trainer.plan().sh_degree);
-        let (trainer, mut failed) = (&mut self.trainer, None);
-        let mut pieces = |write: &mut dyn FnMut(&GaussianCloud) -> io::Result<()>| {
-            let written = trainer.each_piece::<NotWritten>(&mut |piece| write(piece).map_err(NotWritten::Disk));
-            written.map_err(|e| match e {
-                NotWritten::Disk(e) => e,
-                NotWritten::Trainer(e) => {
-                    let said = io::Error::other(e.to_string());
-                    failed = Some(e);
-                    said
-                }
-            })
-        };
-        let disk = &self.settings.disk;
-        let written = model::write_checkpoint_pieces(disk, path, &self.header, (count, sh_degree), &mut pieces);
-        match (failed, written) {
-            (Some(e), _) => Err(e.into()),
-            (None, written) => Ok(written.map(|()| count)?),
-        }
+        save(&mut self.trainer, &self.settings.disk, path, &self.header)
     }
 
     /// Means of the model as of the last checkpoint; of one in pieces, every so many, at most `most`.
@@ -131,3 +145,6 @@ impl Reconstruction {
         Ok(means)
     }
 }
+
+#[cfg(test)]
+mod tests;

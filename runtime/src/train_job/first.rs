@@ -31,9 +31,12 @@ pub(super) fn open(from: &Path, out: &Path, fresh: bool) -> Result<Chunks, JobEr
 /// Their frames have different origins.
 pub(super) fn check(model: &Chunks, set: &Dataset) -> Result<(), JobError> {
     match (model.header.origin, set.origin) {
-        (Some(model), Some(set)) if model != set => Err(JobError::Request(format!(
-            "--from: the model's frame lies at {model:?}, that of the pictures at {set:?}; give a model of the same data set"
-        ))),
+        (Some(from), Some(set)) if from != set => {
+            let [from, set] = [from, set].map(|o| format!("{}, {}, {} m", o.lat_deg, o.lon_deg, o.alt_m));
+            Err(JobError::Request(format!(
+                "--from: the model's frame begins at {from}, that of the pictures at {set}; give a model of the same frame"
+            )))
+        }
         _ => Ok(()),
     }
 }
