@@ -178,8 +178,8 @@ fn a_source_that_fails_or_changes_is_an_error_and_the_next_scene_is_whole() {
                 take(&rest)
             });
             match loaded {
-                // It was read less often, or was the same every time; where Gaussians lie matters from the second time on.
-                Ok(_) => assert!(read.get() <= readings || change > 0 && readings < 2 || on_device == 1300),
+                // It was read less often, or was the same every time; where Gaussians lie matters at the last two readings.
+                Ok(_) => assert!(read.get() <= readings || change == 3 || change > 0 && readings == 0),
                 Err(e) => {
                     assert_eq!(e, if change == 0 { TrainError::NoViews } else { TrainError::SceneChanged });
                     noticed[change] += 1;

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use config::disk::Disk;
+use config::plan::{Lanes, Plan};
 use config::training::TrainSettings;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
@@ -33,6 +34,8 @@ const ALONG: u32 = 4;
 const SEEN_SHARE: f64 = 0.125;
 /// Height of the made-up ground's hills, metres.
 const HILLS_M: f64 = 12.0;
+/// More than any plan of such pictures takes, MiB: what binds an unpaged one is how much of it a kernel can see at once.
+const UNPAGED_MIB: u32 = 1 << 14;
 /// The ground is so much narrower than the picture that shows all of it.
 const MARGIN: f64 = 1.05;
 
@@ -60,7 +63,7 @@ pub struct Drawn {
     pub seconds: f64,
     /// Gaussians that may show in it.
     pub seen: usize,
-    /// Whether a trainer that has those on the device draws the same bits; `None`: they do not fit there.
+    /// Whether a trainer that has all of those on the device draws the same bits; `None`: no device holds so many.
     pub same: Option<bool>,
 }
 
@@ -238,10 +241,14 @@ fn compare(
         seen += piece.len();
         Ok(())
     })?;
-    let mut trainer: Trainer = device_request(request, out, 1, None).open::<JobError>(&settings(request))?;
-    if seen == 0 || seen > trainer.plan().gaussians {
+    // As much of the device as it takes: the paged one is what is bounded.
+    let wanted =
+        DeviceRequest { device_mib: UNPAGED_MIB, max_gaussians: Some(seen), ..device_request(request, out, 1, None) };
+    let settings = settings(request);
+    if seen == 0 || Plan::new(&wanted.plan_request(&settings.sh, Lanes::CARD))?.gaussians < seen {
         return Ok((seen, None));
     }
+    let mut trainer: Trainer = wanted.open::<JobError>(&settings)?;
     trainer.load_pieces(&each)?;
     let mut unpaged = Rendering::default();
     trainer.render(view, &mut unpaged)?;

@@ -81,7 +81,7 @@ fn table(all: &Figures) -> Table {
         let same = match drawn.same {
             Some(true) => "the unpaged one to the bit",
             Some(false) => "NOT the unpaged one",
-            None => "more than the device holds: not compared",
+            None => "more than any device holds: not compared",
         };
         let name = drawn.path.file_name().unwrap_or_default().to_string_lossy();
         let seen = count(drawn.seen as u64);

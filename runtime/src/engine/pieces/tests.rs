@@ -76,6 +76,13 @@ fn trained(engine: &mut Reconstruction) -> GaussianCloud {
     cloud
 }
 
+/// Cells are chosen anew for what is loaded, and have an order of their own.
+fn sorted(cloud: &GaussianCloud) -> GaussianCloud {
+    let mut rows: Vec<u32> = (0..cloud.len() as u32).collect();
+    rows.sort_by_key(|i| cloud.means[*i as usize].map(f32::to_bits));
+    cloud.rows(&rows)
+}
+
 fn has_device() -> bool {
     let found = Gpu::list().is_ok();
     if !found {
@@ -108,12 +115,12 @@ fn a_checkpoint_in_pieces_is_the_file_of_the_whole_and_is_continued_as_it_was() 
     let mut second = engine(120, InitKind::Random);
     assert_eq!(second.resume(dir.path()).expect("read").map(|views| views.len()), Some(3));
     take(&mut second);
-    assert!(trained(&mut second) == cloud, "other Gaussians than were saved");
+    assert!(sorted(&trained(&mut second)) == sorted(&cloud), "other Gaussians than were saved");
     assert_eq!(second.trainer.spent().0, 5);
     let mut third = engine(120, InitKind::Model);
     third.begin_with(Chunks::open(&path).expect("a model"));
     take(&mut third);
-    assert!(trained(&mut third) == cloud && third.trainer.spent().0 == 0, "a schedule of its own");
+    assert!(sorted(&trained(&mut third)) == sorted(&cloud) && third.trainer.spent().0 == 0, "a schedule of its own");
     train(&mut third, 3);
 }
 
@@ -124,6 +131,7 @@ fn giving_up_gaussians_of_a_scene_in_pieces_leaves_none_of_it_in_memory() {
     }
     let mut engine = engine(120, InitKind::Random);
     take(&mut engine);
+    train(&mut engine, 4);
     let before = engine.gaussians();
     engine.shrink().expect("the device works");
     assert!(engine.gaussians() < before && engine.cloud.is_empty());
