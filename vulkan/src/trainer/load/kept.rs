@@ -10,6 +10,9 @@ const ROWS: usize = 16 << 10;
 /// Weights are counted by half of their bits, then by the other half.
 const HALF: usize = 1 << 16;
 
+/// What is done with rows of a piece.
+type Take<'a, E> = &'a mut dyn FnMut(&GaussianCloud, &[u32]) -> Result<(), E>;
+
 /// A scene, and which of its Gaussians are kept.
 pub(crate) struct Kept<'a, E> {
     pieces: Pieces<'a, E>,
@@ -65,7 +68,7 @@ impl<'a, E: From<TrainError>> Kept<'a, E> {
     }
 
     /// Gives every Gaussian that is kept, in order: a piece and its rows, a bounded number of them at a time.
-    pub fn each(&self, take: &mut dyn FnMut(&GaussianCloud, &[u32]) -> Result<(), E>) -> Result<(), E> {
+    pub fn each(&self, take: Take<'_, E>) -> Result<(), E> {
         let mut ties = self.least.map_or(0, |least| least.ties);
         let mut rows = Vec::with_capacity(ROWS);
         let mut is_kept = |cloud: &GaussianCloud, i: usize| {
