@@ -73,7 +73,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let end =
         EndOfFlight { silence: seconds(silence, "silence")?, patience: (!patience.is_zero()).then_some(patience) };
     let interrupt = Interrupt::install()?;
-    let chosen = preset::of_flight(&mut mission, &aircraft, &args.out)?;
+    let chosen = preset::of_flight(&mut mission, &aircraft, &args.out);
     let watch = Watch::of(&mission, &[&aircraft.id], "opening the device and the networks", &args.out);
     watch.update(|page| page.title = format!("Aircraft {}, mission {}", aircraft.id, mission.name));
     let _server = args.http.serve(&mission.http, &watch)?;
@@ -86,6 +86,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
         picture: [lens.width, lens.height],
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    if let Some(chosen) = &chosen {
+        chosen.keep(&args.out)?;
+    }
     keep_scratch_in(&args.out);
     let recording = args.record.as_deref().map(|path| Recording::create(path, mission.origin)).transpose()?;
     let (recording, recorder) = recording.unzip();

@@ -12,26 +12,26 @@ use super::{Choice, Room, Wanted, shown};
 use crate::cost::model::CostModel;
 use crate::engine::device::DeviceRequest;
 use crate::engine::model_path;
-use crate::error::JobError;
-use crate::{cost, devices, kernels};
+use crate::{cost, devices, kernels, session};
 
 /// Fills what the mission leaves to its device, and says what was chosen; `None` where the mission gives its numbers, and where nothing may
-/// be or was measured: then the defaults of the mission file hold. A device that was never measured is, which takes seconds.
-///
-/// # Errors
-/// The choice cannot be kept in `out`.
-pub fn of_flight(mission: &mut Mission, aircraft: &Aircraft, out: &Path) -> Result<Option<Choice>, JobError> {
+/// be or was measured: then the defaults of the mission file hold. A device that was never measured is, which takes seconds. Whoever owns
+/// `out` [keeps](Choice::keep) the choice there.
+pub fn of_flight(mission: &mut Mission, aircraft: &Aircraft, out: &Path) -> Option<Choice> {
     if !mission.memory.is_auto() {
-        return Ok(None);
+        return None;
     }
-    if let Some(kept) = Choice::kept(out) {
+    // Another flight's files will be put aside: nothing of it goes on.
+    let goes_on =
+        session::owner(out).is_none_or(|o| (o.mission, o.aircraft) == (mission.name.clone(), aircraft.id.clone()));
+    if let Some(kept) = Choice::kept(out).filter(|_| goes_on) {
         tracing::info!("{kept} (as this flight began)");
         fill(mission, &kept);
-        return Ok(Some(kept));
+        return Some(kept);
     }
     // One that began without a choice, by an earlier version or unmeasured, keeps the sizes it began with.
-    if model_path(out).exists() || out.join("keyframes/transforms.json").exists() {
-        return Ok(None);
+    if goes_on && (model_path(out).exists() || out.join("keyframes/transforms.json").exists()) {
+        return None;
     }
     let Some(choice) = measured(mission, aircraft) else {
         if mission.memory.preset == Some(Preset::Auto) {
@@ -39,12 +39,11 @@ pub fn of_flight(mission: &mut Mission, aircraft: &Aircraft, out: &Path) -> Resu
                 "auto: what a step costs here is not known; the defaults of [memory] and [training] are used"
             );
         }
-        return Ok(None);
+        return None;
     };
-    choice.keep(out)?;
     tracing::info!("{choice}");
     fill(mission, &choice);
-    Ok(Some(choice))
+    Some(choice)
 }
 
 fn measured(mission: &Mission, aircraft: &Aircraft) -> Option<Choice> {

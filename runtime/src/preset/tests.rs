@@ -203,6 +203,7 @@ mod flights {
 
     use super::*;
     use crate::preset::flight::choose;
+    use crate::session;
 
     fn mission(more: &str) -> Mission {
         let text = format!(
@@ -246,22 +247,32 @@ region_enu = [[0.0, 0.0], [60.0, 0.0], [60.0, 40.0], [0.0, 40.0]]
         let aircraft = m.aircraft[0].clone();
         let choice = choose(&m, &m.region(&aircraft), &device("V3D"), &PROCESSOR).unwrap();
         choice.keep(dir.path()).unwrap();
-        assert_eq!(of_flight(&mut m, &aircraft, dir.path()).unwrap(), Some(choice));
+        assert_eq!(of_flight(&mut m, &aircraft, dir.path()), Some(choice));
         assert_eq!(m.memory.device_mib, Some(choice.device_mib));
         assert_eq!(m.memory.max_gaussians, Some(choice.max_gaussians));
         assert_eq!(m.memory.image_scale, Some(choice.image_scale as f32));
         // A number in the mission file wins, a mission with numbers and no preset is left alone.
         let mut said = mission("memory = { preset = \"auto\", max_gaussians = 777 }\ntraining = { seconds = 5.0 }");
-        of_flight(&mut said, &aircraft, dir.path()).unwrap();
+        of_flight(&mut said, &aircraft, dir.path());
         assert_eq!((said.memory.max_gaussians, said.training.seconds), (Some(777), Some(5.0)));
         let mut numbers = mission("memory = { max_gaussians = 777 }");
-        assert_eq!(of_flight(&mut numbers, &aircraft, dir.path()).unwrap(), None);
+        assert_eq!(of_flight(&mut numbers, &aircraft, dir.path()), None);
         assert_eq!(numbers, mission("memory = { max_gaussians = 777 }"));
+        // Another mission's folder says nothing.
+        let owner = session::Owner {
+            command: "fly".into(),
+            mission: "quarry".into(),
+            aircraft: "a".into(),
+            origin: [0.0; 3],
+            picture: [64, 48],
+        };
+        drop(session::Session::begin(&config::disk::Disk::default(), dir.path(), &owner).unwrap());
+        assert_ne!(of_flight(&mut mission(""), &aircraft, dir.path()), Some(choice));
         // One that began before there was a choice.
         let older = tempfile::tempdir().unwrap();
         std::fs::write(older.path().join("model.dgtr"), b"").unwrap();
         let mut m = mission("");
-        assert_eq!(of_flight(&mut m, &aircraft, older.path()).unwrap(), None);
+        assert_eq!(of_flight(&mut m, &aircraft, older.path()), None);
         assert_eq!(m, mission(""));
     }
 }

@@ -24,11 +24,14 @@ impl TrainJob {
         if !self.auto {
             return Ok(None);
         }
-        if let Some(kept) = Choice::kept(&self.out).filter(|_| !self.fresh) {
+        let frames = set.select(&self.split, self.region.as_deref())?;
+        let picture = largest(set, &frames, 1.0)?;
+        let of_these = |kept: &Choice| (kept.picture, kept.views) == (picture, frames.len());
+        if let Some(kept) = Choice::kept(&self.out).filter(|kept| !self.fresh && of_these(kept)) {
             tracing::info!("{kept} (as this training began)");
             return Ok(Some(kept));
         }
-        let choice = self.measured(set)?;
+        let choice = self.measured(set, &frames, picture)?;
         match &choice {
             Some(choice) => {
                 choice.keep(&self.out)?;
@@ -39,14 +42,12 @@ impl TrainJob {
         Ok(choice)
     }
 
-    fn measured(&self, set: &Dataset) -> Result<Option<Choice>, JobError> {
+    fn measured(&self, set: &Dataset, frames: &[usize], picture: (u32, u32)) -> Result<Option<Choice>, JobError> {
         if kernels::choice() == KernelChoice::Standard {
             return Ok(None);
         }
         let gpu = devices::open(self.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
         let Some(cost) = cost::of(&gpu, kernels::shape_of(&gpu)) else { return Ok(None) };
-        let frames = set.select(&self.split, self.region.as_deref())?;
-        let picture = largest(set, &frames, 1.0)?;
         let seconds = self.seconds.or(self.training.seconds);
         let device = DeviceRequest {
             device: None,
@@ -63,7 +64,7 @@ impl TrainJob {
             picture,
             most_side: most_side(picture, seconds),
             views: frames.len(),
-            share: share(set, &frames)?,
+            share: share(set, frames)?,
             device,
             sh: self.training.sh,
             schedule: self.training.steps_for(frames.len()),
