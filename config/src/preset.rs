@@ -26,7 +26,7 @@ choice! {
 
 /// Visits to each picture that a point needs: of sheffield_cross (43 pictures, scored at full size) pictures of half the size gain more
 /// of the same time up to then. 2 visits to whole pictures against 6 to halves, both 100,000 Gaussians: 22.94 and 23.74 dB, 5 against 15:
-/// 24.03 and 24.37; 12 to whole ones: 24.50, 15 (`short`): 24.7 (`dgtr train sheffield_cross --max-gaussians 100000 --scale 1 --steps N`,
+/// 24.03 and 24.37; 10 to whole ones: 24.50, 15 (`short`): 24.7 (`dgtr train sheffield_cross --max-gaussians 100000 --scale 1 --steps N`,
 /// and `--scale 0.5` with three times the steps, `dgtr eval … --split test`).
 pub const VISITS: u32 = 15;
 /// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000

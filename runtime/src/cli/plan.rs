@@ -88,7 +88,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let job = match &args.mission {
         Some(path) => {
             let mut mission = Mission::read(path)?;
-            if let Some(choice) = gpu.as_ref().ok().and_then(|gpu| preset::foresee(&mut mission, gpu)) {
+            // What a service may take must hold for whatever a flight chooses.
+            let measured = gpu.as_ref().ok().filter(|_| !args.systemd);
+            if let Some(choice) = measured.and_then(|gpu| preset::foresee(&mut mission, gpu)) {
                 tracing::info!("{choice}");
             }
             Job::of_flight(mission)
