@@ -9,7 +9,7 @@ use config::coverage::CoverageSettings;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
-use config::mission::{KeyframeSettings, NetworkSettings};
+use config::mission::{DEVICE_MIB, KeyframeSettings, NetworkSettings};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use hal::time::MonotonicClock;
@@ -28,11 +28,13 @@ use crate::evaluate::{self, IntoModel};
 use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
+use crate::preset::Choice;
 use crate::run_json::RunReport;
 use scale::largest;
 use slices::{REST, Slices};
 
 mod card;
+mod choose;
 mod first;
 mod ground;
 pub mod log;
@@ -72,8 +74,10 @@ pub struct TrainJob {
     pub steps: Option<u32>,
     /// Seconds, over all continuations.
     pub seconds: Option<f64>,
+    /// What is not given of memory, Gaussians, scale and seconds is chosen by what a step costs on the device.
+    pub auto: bool,
     /// Device memory, MiB.
-    pub budget_mib: u32,
+    pub budget_mib: Option<u32>,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
     /// Gaussians of the whole scene; `None`: those on the device.
@@ -128,12 +132,26 @@ impl TrainJob {
     pub fn run(&self) -> Result<Outcome, JobError> {
         let began = Instant::now();
         let stop = Interrupt::install()?;
-        let go_on = || !stop.requested();
-        let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
-        let mut set = match self.folders.as_slice() {
+        let set = match self.folders.as_slice() {
             [folder] if self.card == CardOptions::default() => Dataset::open(folder)?,
             folders => Dataset::open_card(folders, &self.card)?,
         };
+        let Some(chosen) = self.chosen(&set)? else { return self.run_on(set, began, &stop, None) };
+        let mut job = self.clone();
+        job.fill(&chosen);
+        job.run_on(set, began, &stop, Some(chosen))
+    }
+
+    /// The same, with every number known that anybody will say.
+    fn run_on(
+        &self,
+        mut set: Dataset,
+        began: Instant,
+        stop: &Interrupt,
+        chosen: Option<Choice>,
+    ) -> Result<Outcome, JobError> {
+        let go_on = || !stop.requested();
+        let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
         from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
         let is_card = set.card.is_some();
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
@@ -162,7 +180,7 @@ impl TrainJob {
             disk: Disk::default(),
             device: DeviceRequest {
                 device: self.device.clone(),
-                device_mib: self.budget_mib,
+                device_mib: self.budget_mib(),
                 size,
                 views: frames.len(),
                 crops,
@@ -208,7 +226,7 @@ impl TrainJob {
         }
         let built = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
         let ready = built && engine.look_closer(&mut source, &go_on)?;
-        let finished = ready && self.optimise(&mut engine, frames.len(), &stop)?;
+        let finished = ready && self.optimise(&mut engine, frames.len(), stop)?;
         if finished && self.evaluate {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
@@ -239,8 +257,16 @@ impl TrainJob {
                 report.skip(&format!("pictures_{name}"), count.into());
             }
         }
+        if let Some(chosen) = chosen {
+            chosen.note(&mut report);
+        }
         report.write(&self.out)?;
         Ok(Outcome { finished, steps, report })
+    }
+
+    /// Device memory, MiB.
+    fn budget_mib(&self) -> u32 {
+        self.budget_mib.unwrap_or(DEVICE_MIB)
     }
 
     fn settings(&self, views: usize) -> TrainSettings {

@@ -55,6 +55,31 @@ fn stages_have_time_work_and_a_ceiling() {
 }
 
 #[test]
+fn a_forecast_stands_beside_what_was_measured() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("forecast.json");
+    let text = held(&bench(&["forecast", "--sizes", "1", "--steps", "1", "--json", &file.to_string_lossy()]));
+    assert!(text.contains("10000 270×480") && text.contains("ratio"), "{text}");
+    let sizes = json(&file)["sizes"].as_array().unwrap().clone();
+    assert!(sizes.len() == 1 && sizes[0]["forecast_ms"].as_f64().unwrap() > 0.0, "{sizes:?}");
+}
+
+#[test]
+#[ignore = "ratios of times, on a quiet machine only: LP_NUM_THREADS=1 and 2"]
+fn a_forecast_is_within_a_quarter_of_what_is_measured_at_every_size() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("forecast.json");
+    let text = held(&bench(&["forecast", "--json", &file.to_string_lossy()]));
+    for size in json(&file)["sizes"].as_array().unwrap() {
+        let ratio = size["forecast_ms"].as_f64().unwrap() / size["measured_ms"].as_f64().unwrap();
+        assert!((0.75..=1.25).contains(&ratio), "{text}");
+    }
+}
+
+#[test]
 fn a_budget_is_what_is_allocated_and_one_too_small_is_a_row_that_says_so() {
     if !has_device() {
         return;

@@ -2,6 +2,7 @@
 
 mod detail;
 mod device;
+mod forecast;
 mod ground;
 mod levels;
 mod map;
@@ -34,6 +35,8 @@ enum Command {
     Detail(detail::Args),
     /// All that a board or a card can tell in ten minutes, as a report to send in.
     Device(device::Args),
+    /// What preset auto forecasts of a step against what it takes, at three sizes.
+    Forecast(forecast::Args),
     /// A ground station of many simulated aircraft: seconds for each, memory, how well they meet.
     Ground(ground::Args),
     /// Levels of detail: how many Gaussians each has, and what it shows from its own distance against the whole scene.
@@ -76,6 +79,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Map(args) => map::run(args),
         Command::Detail(args) => detail::run(args),
         Command::Device(args) => device::run(args),
+        Command::Forecast(args) => forecast::run(args),
         Command::Ground(args) => ground::run(args),
         Command::Levels(args) => levels::run(args),
         Command::Memory(args) => memory::run(args),

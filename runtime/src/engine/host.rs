@@ -195,7 +195,7 @@ mod tests {
     fn the_defaults_of_a_mission_fit_into_its_default_host_memory() {
         let memory = config::mission::MemorySettings::default();
         let views = config::mission::KeyframeSettings::default().max;
-        let request = PlanRequest { device_mib: memory.device_mib, views, ..PlanRequest::default() };
+        let request = PlanRequest { device_mib: memory.device_mib(), views, ..PlanRequest::default() };
         let plan = Plan::new(&request).unwrap();
         // On a software device, with a camera of 12 megapixels; the initialiser's plan as `dgtr fly` names it, and as many
         // pictures decoded ahead as it asks for, rounded up.
