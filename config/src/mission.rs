@@ -37,7 +37,7 @@ pub use camera::{CameraSettings, CameraSource, MountAttitude, MountSettings};
 pub use draft::Draft;
 pub use error::MissionError;
 pub use keyframes::KeyframeSettings;
-pub use memory::MemorySettings;
+pub use memory::{DEVICE_MIB, MemorySettings};
 pub use reference::reference;
 pub use validate::MAX_AIRCRAFT;
 
@@ -187,7 +187,7 @@ impl Mission {
     pub fn parse(text: &str, folder: &Path) -> Result<Self, MissionError> {
         let mut mission: Self = crate::settings::parse(text)?;
         mission.anchor_paths(folder);
-        let preset = mission.memory.preset.map(Preset::values);
+        let preset = mission.memory.preset.and_then(Preset::values);
         mission.training.seconds = mission.training.seconds.or(preset.map(|p| p.seconds));
         mission.check()?;
         Ok(mission)
@@ -356,7 +356,7 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
             let text = GOOD.replace("name = \"park\"", &table);
             Mission::parse(&text, Path::new("/m")).expect("parses").training.seconds
         };
-        assert_eq!(seconds(""), Some(Preset::Tiny.values().seconds));
+        assert_eq!(seconds(""), Preset::Tiny.values().map(|v| v.seconds));
         assert_eq!(seconds("training = { seconds = 7.0 }"), Some(7.0));
     }
 

@@ -1,7 +1,8 @@
 //! Presets: budgets of a size of job, each a point of the measured front of run time against error. No board has been
 //! measured: a preset says how large the problem is, not how long a board then takes.
 //!
-//! A preset only fills what nobody said: a number in the mission file or on the command line always wins.
+//! A preset only fills what nobody said: a number in the mission file or on the command line always wins. `auto` is the one that knows
+//! the device: the point is chosen by what a step costs there, from the figures below.
 
 use crate::settings::choice;
 
@@ -18,8 +19,25 @@ choice! {
         Long = "long",
         /// Whole pictures, minutes of training: for a machine on mains power.
         Longest = "longest",
+        /// The largest point of the front that this device reaches in the time there is, by what a step costs on it.
+        Auto = "auto",
     }
 }
+
+/// Visits to each picture that a point needs: of sheffield_cross (43 pictures, scored at full size) pictures of half the size gain more
+/// of the same time up to then. 2 visits to whole pictures against 6 to halves, both 100,000 Gaussians: 22.94 and 23.74 dB, 5 against 15:
+/// 24.03 and 24.37; 10 to whole ones: 24.50, 15 (`short`): 24.7 (`dgtr train sheffield_cross --max-gaussians 100000 --scale 1 --steps N`,
+/// and `--scale 0.5` with three times the steps, `dgtr eval … --split test`).
+pub const VISITS: u32 = 15;
+/// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000
+/// Gaussians, of which a picture of 640×480 sees 29 %), and half as many, which at half the size cost 0.15 dB.
+pub const DENSITIES: [f64; 2] = [0.05, 0.1];
+/// Seconds for which a size is chosen where nobody says how long: those of [`Preset::Longest`]. Twice as many brought 0.03 dB more
+/// (25.00 and 25.03 after 300 and 600 s, tests/BENCHMARKS.md, "Run time against error").
+pub const SECONDS: f64 = 300.0;
+/// Pictures of a survey that show each place; one of so many shows that share of the scene, where nothing else says how much it does. Of
+/// sheffield_cross's 43 pictures each shows 20 to 30 %.
+pub const SHOWN_BY: f64 = 10.0;
 
 /// What a preset stands for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,15 +59,15 @@ impl Preset {
     }
 
     /// Its budgets. Each row names the point of `dgtr bench time-error sheffield_cross --init feed-forward` that it is (43 key
-    /// frames, an idle lavapipe on two cores, PSNR at the row's scale; all lie on the front).
-    pub fn values(self) -> PresetValues {
+    /// frames, an idle lavapipe on two cores, PSNR at the row's scale; all lie on the front). `None`: they are the device's to say.
+    pub fn values(self) -> Option<PresetValues> {
         let row = |device_mib, max_gaussians, image_scale, seconds| PresetValues {
             device_mib,
             max_gaussians,
             image_scale,
             seconds,
         };
-        match self {
+        Some(match self {
             // --scale 0.5 --budgets-mib 96 --max-gaussians 12000 --seconds 10: 23.88 dB, 12.3 s.
             Self::Tiny => row(96, 12_000, 0.5, 10.0),
             // --budgets-mib 512 --max-gaussians 100000 --seconds 40: 24.09 dB, 44.7 s.
@@ -59,8 +77,9 @@ impl Preset {
             // The same with --seconds 160: 24.81 dB, 166 s.
             Self::Long => row(512, 100_000, 1.0, 160.0),
             // The same with --seconds 300: 25.00 dB, 306 s.
-            Self::Longest => row(512, 100_000, 1.0, 300.0),
-        }
+            Self::Longest => row(512, 100_000, 1.0, SECONDS),
+            Self::Auto => return None,
+        })
     }
 }
 
@@ -80,7 +99,7 @@ mod tests {
     fn every_preset_has_a_plan_for_forty_eight_photographs() {
         for &(name, preset) in Preset::ALL {
             assert_eq!(Preset::named(name), Some(preset));
-            let v = preset.values();
+            let Some(v) = preset.values() else { continue };
             let side = |full: u32| (full as f32 * v.image_scale) as u32;
             let plan = Plan::new(&PlanRequest {
                 device_mib: v.device_mib,

@@ -64,7 +64,7 @@ region_wgs84 = [[28.0, -82.0], [28.0, -81.999], [28.001, -81.999], [28.001, -82.
 fn usable(mission: &Mission) -> bool {
     let (camera, memory) = (&mission.camera, &mission.memory);
     let device = Plan::new(&PlanRequest {
-        device_mib: memory.device_mib,
+        device_mib: memory.device_mib(),
         width: camera.width,
         height: camera.height,
         views: mission.keyframes.max,

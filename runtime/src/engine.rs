@@ -16,7 +16,7 @@ use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
-use models::formats::model::{self, ModelHeader};
+use models::formats::model::{Chunks, ModelHeader};
 use models::init::Initialiser;
 use models::light::PictureLight;
 use models::onnx::depth::DepthNetwork;
@@ -36,6 +36,7 @@ mod growth;
 pub mod host;
 mod light;
 mod map;
+pub mod pieces;
 mod rebuild;
 mod reconstruct;
 mod rounding;
@@ -100,7 +101,12 @@ pub struct Reconstruction {
     /// The user's own network for the depth loss.
     depth: Option<DepthNetwork>,
     trainer: Trainer,
+    /// As of the last checkpoint; none where the scene is in pieces.
     cloud: GaussianCloud,
+    /// All Gaussians are in the trainer's file only.
+    in_pieces: bool,
+    /// The model whose Gaussians are the first.
+    first: Option<Chunks>,
     /// Key frames with lens and pose as they are known now, in the order of the trainer's views.
     views: Vec<(String, View)>,
     /// Number of each by its name.
@@ -157,10 +163,11 @@ impl Reconstruction {
         // Another start asks the network for depths only.
         let wants_depths = init.depth_priors && depth.is_none() && settings.training.loss.depth > 0.0;
         let mut initialiser = match settings.start {
-            InitKind::SparsePoints | InitKind::Random if !wants_depths => None,
+            InitKind::SparsePoints | InitKind::Random | InitKind::Model if !wants_depths => None,
             _ => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
         };
         let trainer: Trainer = settings.device.open::<JobError>(&settings.training)?;
+        let in_pieces = pieces::is_in_pieces(&settings, &trainer);
         let mut refiner: Option<Refiner> = refiner.transpose()?;
         let plan = |initialiser: u64, refine_in_file: bool| {
             HostPlan::new(&HostRequest {
@@ -173,6 +180,7 @@ impl Reconstruction {
                 ahead: settings.ahead as u64,
                 ahead_in_memory: settings.ahead_in_memory,
                 delivers: settings.delivers,
+                from_file: in_pieces && settings.start == InitKind::Model,
                 map: settings.map.map_or(0, |m| m.host_bytes()),
             })
         };
@@ -186,7 +194,12 @@ impl Reconstruction {
             refiner,
             initialiser,
             depth,
-            cloud: GaussianCloud::with_memory(settings.training.sh.degree, trainer.plan().scene),
+            cloud: match in_pieces {
+                true => GaussianCloud::with_capacity(settings.training.sh.degree, 0),
+                false => GaussianCloud::with_memory(settings.training.sh.degree, trainer.plan().scene),
+            },
+            in_pieces,
+            first: None,
             trainer,
             views: Vec::with_capacity(views),
             index: HashMap::with_capacity(views),
@@ -218,17 +231,21 @@ impl Reconstruction {
     /// A damaged model file that cannot be set aside.
     pub fn resume(&mut self, out: &Path) -> Result<Option<&HashMap<String, View>>, JobError> {
         let path = model_path(out);
-        let Some((header, cloud)) = model::read_checkpoint(&self.settings.disk, &path)? else { return Ok(None) };
+        let Some(earlier) = self.earlier(out)? else { return Ok(None) };
+        let (header, gaussians) = (earlier.header().clone(), earlier.gaussians());
         let same = header.mission == self.header.mission && header.aircraft == self.header.aircraft;
-        if !same || cloud.is_empty() {
+        if !same || gaussians == 0 {
             return Ok(None);
         }
-        tracing::info!("continuing {} ({} Gaussians) after {} steps", path.display(), cloud.len(), header.steps);
+        tracing::info!("continuing {} ({gaussians} Gaussians) after {} steps", path.display(), header.steps);
         // Models of earlier versions say it themselves.
         let told = RunReport::read(out).ok().and_then(|run| run.more.get("train_seconds")?.as_f64());
         self.train_s = told.unwrap_or(header.train_seconds);
         self.header.steps = header.steps;
-        self.cloud.clone_from(&cloud);
+        match earlier {
+            pieces::Earlier::Whole(_, cloud) => self.cloud.clone_from(&cloud),
+            pieces::Earlier::Pieces(model) => self.first = Some(model),
+        }
         let names = header.views.iter().map(|(name, _)| name.clone());
         self.resumed_lights = names.zip(header.lights).collect();
         self.resumed = header.views.into_iter().collect();
@@ -255,11 +272,6 @@ impl Reconstruction {
     /// What the model file says of itself, as of the last checkpoint.
     pub fn header(&self) -> &ModelHeader {
         &self.header
-    }
-
-    /// The model's Gaussians, as of the last checkpoint.
-    pub fn cloud(&self) -> &GaussianCloud {
-        &self.cloud
     }
 
     /// Seconds of training over all continuations.
@@ -317,7 +329,9 @@ impl Reconstruction {
         }
         self.initialise_waiting(self.views.len())?;
         let share = (self.flying && self.can_grow()).then(|| self.share());
-        let capacity = self.trainer.plan().scene;
+        // Where the first Gaussians are there already, those that come with the depths are thrown away.
+        let plan = self.trainer.plan();
+        let capacity = if self.first.is_some() { plan.gaussians } else { plan.scene };
         if let Some(initialiser) = &mut self.initialiser {
             let capacity = share.map_or(capacity, |share| share.of(initialiser.ground_m2()));
             let index = &self.index;

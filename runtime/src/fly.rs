@@ -203,7 +203,7 @@ fn disk_plan(mission: &Mission, recording: u64) -> DiskPlan {
     let (memory, sh_degree) = (&mission.memory, mission.training.sh.degree);
     // At least this much of the device's memory goes with every Gaussian: its floats, their two moments and gradient.
     let each = 16 * (11 + 3 * (u64::from(sh_degree) + 1).pow(2));
-    let held = (u64::from(memory.device_mib) << 20) / each;
+    let held = (u64::from(memory.device_mib()) << 20) / each;
     let on_device = memory.max_gaussians.map_or(held, u64::from).min(held);
     let gaussians = memory.scene_gaussians.map_or(on_device, |n| on_device.max(n.into())) as usize;
     let CameraSettings { width, height, .. } = mission.camera;

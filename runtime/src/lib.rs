@@ -6,6 +6,7 @@ pub mod bench;
 pub mod capture;
 pub mod cli;
 pub mod console;
+pub mod cost;
 pub mod coverage;
 #[cfg(feature = "lab")]
 pub mod demo;
@@ -23,6 +24,7 @@ pub mod keys;
 pub mod ortho;
 #[cfg(test)]
 mod power_cut;
+pub mod preset;
 pub mod report;
 pub mod resources;
 pub mod run_json;

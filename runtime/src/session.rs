@@ -114,6 +114,11 @@ impl Session {
     }
 }
 
+/// Whose `out` was, as far as it says.
+pub fn owner(out: &Path) -> Option<Owner> {
+    read_owner(&out.join(FILE)).ok()
+}
+
 fn read_owner(path: &Path) -> Result<Owner, FormatError> {
     let bytes = read_bounded(path, LIMIT)?;
     serde_json::from_slice(&bytes)

@@ -9,7 +9,7 @@ use config::coverage::CoverageSettings;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
-use config::mission::{KeyframeSettings, NetworkSettings};
+use config::mission::{DEVICE_MIB, KeyframeSettings, NetworkSettings};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use hal::time::MonotonicClock;
@@ -28,16 +28,22 @@ use crate::evaluate::{self, IntoModel};
 use crate::failsafe::Failsafe;
 use crate::health::Health;
 use crate::interrupt::Interrupt;
+use crate::preset::Choice;
 use crate::run_json::RunReport;
 use scale::largest;
 use slices::{REST, Slices};
 
 mod card;
+mod choose;
+mod first;
 mod ground;
 pub mod log;
 mod scale;
 mod slices;
 mod surveyed;
+
+/// Means that the heights of the ground are told by at most, where the scene is larger than the memory.
+const MOST_MEANS: usize = 1 << 20;
 
 /// Everything a training needs to know; see `dgtr train --help`.
 #[derive(Clone, Debug)]
@@ -58,6 +64,8 @@ pub struct TrainJob {
     pub failsafe: Option<FailsafeSettings>,
     /// First Gaussians.
     pub init: InitKind,
+    /// The model that they are taken from, where `init` says so.
+    pub from: Option<PathBuf>,
     /// Poses.
     pub poses: PoseSource,
     /// Whether telemetry poses are refined from the pictures.
@@ -66,8 +74,10 @@ pub struct TrainJob {
     pub steps: Option<u32>,
     /// Seconds, over all continuations.
     pub seconds: Option<f64>,
+    /// What is not given of memory, Gaussians, scale and seconds is chosen by what a step costs on the device.
+    pub auto: bool,
     /// Device memory, MiB.
-    pub budget_mib: u32,
+    pub budget_mib: Option<u32>,
     /// Cap below what the budget holds.
     pub max_gaussians: Option<usize>,
     /// Gaussians of the whole scene; `None`: those on the device.
@@ -122,11 +132,27 @@ impl TrainJob {
     pub fn run(&self) -> Result<Outcome, JobError> {
         let began = Instant::now();
         let stop = Interrupt::install()?;
-        let go_on = || !stop.requested();
-        let mut set = match self.folders.as_slice() {
+        let set = match self.folders.as_slice() {
             [folder] if self.card == CardOptions::default() => Dataset::open(folder)?,
             folders => Dataset::open_card(folders, &self.card)?,
         };
+        let Some(chosen) = self.chosen(&set)? else { return self.run_on(set, began, &stop, None) };
+        let mut job = self.clone();
+        job.fill(&chosen);
+        job.run_on(set, began, &stop, Some(chosen))
+    }
+
+    /// The same, with every number known that anybody will say.
+    fn run_on(
+        &self,
+        mut set: Dataset,
+        began: Instant,
+        stop: &Interrupt,
+        chosen: Option<Choice>,
+    ) -> Result<Outcome, JobError> {
+        let go_on = || !stop.requested();
+        let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
+        from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
         let is_card = set.card.is_some();
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
         let poses = if is_card { PoseSource::Dataset } else { self.poses };
@@ -154,14 +180,14 @@ impl TrainJob {
             disk: Disk::default(),
             device: DeviceRequest {
                 device: self.device.clone(),
-                device_mib: self.budget_mib,
+                device_mib: self.budget_mib(),
                 size,
                 views: frames.len(),
                 crops,
                 view_slots: self.view_slots,
                 folder: Some(self.out.clone()),
                 max_gaussians: self.max_gaussians,
-                scene_gaussians: self.scene_gaussians,
+                scene_gaussians: self.scene_gaussians.or(from.as_ref().map(|model| model.count.max(1))),
             },
             host_mib: None,
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
@@ -190,7 +216,9 @@ impl TrainJob {
         }
         engine.report.more.extend(remarks.into_iter().map(|(name, value)| (name.to_owned(), value)));
         if !self.resume(&mut engine, &set, &frames)? {
-            if self.init != InitKind::FeedForward && !(self.init == InitKind::SparsePoints && refine) {
+            if let Some(model) = from {
+                engine.begin_with(model);
+            } else if self.init != InitKind::FeedForward && !(self.init == InitKind::SparsePoints && refine) {
                 engine.hint_points(self.sparse_points(&set, &frames)?);
             }
             // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
@@ -198,7 +226,7 @@ impl TrainJob {
         }
         let built = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
         let ready = built && engine.look_closer(&mut source, &go_on)?;
-        let finished = ready && self.optimise(&mut engine, frames.len(), &stop)?;
+        let finished = ready && self.optimise(&mut engine, frames.len(), stop)?;
         if finished && self.evaluate {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
@@ -206,7 +234,13 @@ impl TrainJob {
             surveyed::measure(&mut engine, &set, picture_scale)?;
         }
         let steps = engine.header().steps;
-        let covered = ground::coverage(engine.header(), engine.cloud(), self.coverage).filter(|_| finished);
+        let covered = match finished {
+            true => {
+                let means = engine.means(MOST_MEANS)?;
+                ground::coverage(engine.header(), &means, self.coverage)
+            }
+            false => None,
+        };
         let mut report = engine.report;
         if let Some(covered) = covered {
             covered.write(&Disk::default(), &self.out)?;
@@ -223,8 +257,16 @@ impl TrainJob {
                 report.skip(&format!("pictures_{name}"), count.into());
             }
         }
+        if let Some(chosen) = chosen {
+            chosen.note(&mut report);
+        }
         report.write(&self.out)?;
         Ok(Outcome { finished, steps, report })
+    }
+
+    /// Device memory, MiB.
+    fn budget_mib(&self) -> u32 {
+        self.budget_mib.unwrap_or(DEVICE_MIB)
     }
 
     fn settings(&self, views: usize) -> TrainSettings {

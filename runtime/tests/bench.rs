@@ -55,6 +55,31 @@ fn stages_have_time_work_and_a_ceiling() {
 }
 
 #[test]
+fn a_forecast_stands_beside_what_was_measured() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("forecast.json");
+    let text = held(&bench(&["forecast", "--sizes", "1", "--steps", "1", "--json", &file.to_string_lossy()]));
+    assert!(text.contains("10000 270×480") && text.contains("ratio"), "{text}");
+    let sizes = json(&file)["sizes"].as_array().unwrap().clone();
+    assert!(sizes.len() == 1 && sizes[0]["forecast_ms"].as_f64().unwrap() > 0.0, "{sizes:?}");
+}
+
+#[test]
+#[ignore = "ratios of times, on a quiet machine only: LP_NUM_THREADS=1 and 2"]
+fn a_forecast_is_within_a_quarter_of_what_is_measured_at_every_size() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("forecast.json");
+    let text = held(&bench(&["forecast", "--json", &file.to_string_lossy()]));
+    for size in json(&file)["sizes"].as_array().unwrap() {
+        let ratio = size["forecast_ms"].as_f64().unwrap() / size["measured_ms"].as_f64().unwrap();
+        assert!((0.75..=1.25).contains(&ratio), "{text}");
+    }
+}
+
+#[test]
 fn a_budget_is_what_is_allocated_and_one_too_small_is_a_row_that_says_so() {
     if !has_device() {
         return;
@@ -74,6 +99,31 @@ fn a_budget_is_what_is_allocated_and_one_too_small_is_a_row_that_says_so() {
     }
     let refused = bench(&["memory", "--budgets", "1", "--steps", "2", "--init", "random"]);
     assert!(held(&refused).contains("too few"), "a refused budget is a row");
+}
+
+#[test]
+fn a_scene_larger_than_the_device_is_trained_saved_and_drawn_as_one_that_fits() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    // The first is in cells, the second on the device as a whole.
+    for (gaussians, in_cells) in [(30_000, true), (15_000, false)] {
+        let (out, file, number) = (path("out"), path("scene.json"), gaussians.to_string());
+        let arguments = ["scene", "--gaussians", &number, "--device-mib", "128", "--steps", "5", "--out", &out];
+        let text = held(&bench(&[&arguments[..], &["--json", &file]].concat()));
+        assert!(text.contains("the unpaged one to the bit") && !text.contains("NOT"), "{text}");
+        let all = json(&dir.path().join("scene.json"));
+        assert_eq!(all["gaussians"][0], gaussians);
+        assert_eq!(all["cells"][1].as_u64().unwrap() > 0, in_cells, "{all}");
+        assert_eq!(all["device_bytes"][0], all["device_bytes"][1]);
+        assert!([0, 1].iter().all(|i| all["drawn"][*i]["same"] == true), "{all}");
+        assert_eq!(all["drawn"][1]["seen"], gaussians);
+        let model = models::formats::model::Chunks::open(&dir.path().join("out/model.dgtr")).unwrap();
+        assert_eq!((model.count, model.sh_degree, model.header.steps), (gaussians, 3, 5));
+        assert!(["near.png", "whole.png"].iter().all(|name| dir.path().join("out").join(name).is_file()));
+    }
 }
 
 #[test]

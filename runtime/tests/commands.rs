@@ -14,6 +14,8 @@ use models::formats::flight_plan::{FlightPlan, Waypoint};
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms::pose_to_opengl;
 
+#[path = "commands/begun.rs"]
+mod begun;
 #[path = "commands/first_steps.rs"]
 mod first_steps;
 #[path = "commands/ground.rs"]

@@ -12,7 +12,7 @@ fn every_level_shows_the_scene_from_the_distance_where_its_voxels_are_pixels() {
     }
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("scene.dgtr");
-    write_scene(&scene, 200_000).unwrap();
+    write_scene(&scene, 200_000, 0).unwrap();
     let all = measure(&scene, &folder.path().join("streamed"), None).unwrap();
     assert!(all.levels.len() >= 3, "{all:?}");
     for level in &all.levels[1..] {

@@ -59,12 +59,13 @@ impl Draft {
         let preset = self.preset.and_then(|p| Preset::ALL.iter().find(|a| a.1 == p));
         // The presets and the defaults of [memory] were chosen with pictures of this side, and the presets with 48 of them.
         let side = f64::from(WORKING_SIDE) / f64::from(self.picture[0].max(self.picture[1]));
-        let scale = side.min(1.0) * preset.map_or(1.0, |p| f64::from(p.1.values().image_scale));
+        let values = preset.and_then(|p| p.1.values());
         let mut memory: Vec<_> = preset.iter().map(|p| ("preset", quoted(p.0))).collect();
-        if scale < 1.0 {
+        // Without a preset pictures are trained at that side whether it is written or not, and what is written is not `auto`'s to choose.
+        if let Some(scale) = values.map(|v| side.min(1.0) * f64::from(v.image_scale)).filter(|s| *s < 1.0) {
             memory.push(("image_scale", format!("{:?}", (scale * 1e4).round() / 1e4)));
         }
-        let keyframes: Vec<_> = preset.iter().map(|_| ("max", MEASURED_VIEWS.to_string())).collect();
+        let keyframes: Vec<_> = values.iter().map(|_| ("max", MEASURED_VIEWS.to_string())).collect();
         for table in SHOWN {
             match table {
                 "memory" => section(&mut out, &all, table, &memory, true),
@@ -145,7 +146,7 @@ mod tests {
         let regions = m.aircraft.iter().map(|a| m.region(a)).collect::<Vec<_>>();
         assert_eq!(regions[0], [[-100.0, -50.0], [0.0, -50.0], [0.0, 50.0], [-100.0, 50.0]]);
         assert_eq!(regions[1][0], [0.0, -50.0]);
-        assert_eq!((m.memory.device_mib, m.training.seconds), (96, Some(10.0)));
+        assert_eq!((m.memory.device_mib(), m.training.seconds), (96, Some(10.0)));
         assert_eq!((m.memory.image_scale, m.keyframes.max), (Some(0.0789), 48));
     }
 
@@ -160,7 +161,7 @@ mod tests {
                 Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{preset:?} {picture:?}: {e}"));
             let (width, height) = mission.memory.training_size((picture[0], picture[1]));
             let request = PlanRequest {
-                device_mib: mission.memory.device_mib,
+                device_mib: mission.memory.device_mib(),
                 width,
                 height,
                 views: mission.keyframes.max,
@@ -170,6 +171,15 @@ mod tests {
                 ..PlanRequest::default()
             };
             Plan::new(&request).unwrap_or_else(|e| panic!("{preset:?} {picture:?}: {e}"));
+        }
+    }
+
+    #[test]
+    fn a_draft_leaves_to_the_device_what_nobody_said() {
+        for preset in [Some(Preset::Auto), None] {
+            let mission = Mission::parse(&Draft { preset, ..draft() }.text(), Path::new("/m")).expect("a mission");
+            assert_eq!((mission.memory.preset, mission.memory.image_scale), (preset, None));
+            assert!(mission.memory.is_auto());
         }
     }
 

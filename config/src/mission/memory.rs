@@ -11,10 +11,11 @@ table! {
     #[derive(Copy)]
     #[serde(from = "Given")]
     pub struct MemorySettings {
-        /// Fills what is not given: here, and `seconds` of `[training]`.
+        /// Fills what is not given: here, and `seconds` of `[training]`; absent = `auto` for a flight whose mission gives none of
+        /// `device_mib`, `max_gaussians` and `image_scale`.
         pub preset: Option<Preset> = None;
-        /// The one device allocation.
-        pub device_mib: u32 = 512, in Limits::within(16.0, 131_072.0);
+        /// The one device allocation; absent = 512, or what the preset says.
+        pub device_mib: Option<u32> = None, in Limits::within(16.0, 131_072.0);
         /// Bound on the host's resident memory (refused at start when the plan exceeds it).
         pub host_mib: u32 = 2048, in Limits::within(64.0, 1_048_576.0);
         /// Training views on the device at once, the others waiting in a file in the output folder; absent = all while they leave
@@ -33,7 +34,21 @@ table! {
     }
 }
 
+/// The one device allocation where nobody says another, MiB.
+pub const DEVICE_MIB: u32 = 512;
+
 impl MemorySettings {
+    /// The one device allocation, MiB.
+    pub fn device_mib(&self) -> u32 {
+        self.device_mib.unwrap_or(DEVICE_MIB)
+    }
+
+    /// Whether a flight's sizes are chosen by what its device can do: the mission says so, or gives none of them.
+    pub fn is_auto(&self) -> bool {
+        let given = self.device_mib.is_some() || self.max_gaussians.is_some() || self.image_scale.is_some();
+        self.preset == Some(Preset::Auto) || (self.preset.is_none() && !given)
+    }
+
     /// The size at which pictures of a camera are trained.
     pub fn training_size(&self, (width, height): (u32, u32)) -> (u32, u32) {
         let scale =
@@ -60,12 +75,12 @@ struct Given {
 impl From<Given> for MemorySettings {
     fn from(given: Given) -> Self {
         let mut all = Self { preset: given.preset, ..Self::default() };
-        if let Some(values) = given.preset.map(Preset::values) {
-            all.device_mib = values.device_mib;
+        if let Some(values) = given.preset.and_then(Preset::values) {
+            all.device_mib = Some(values.device_mib);
             all.max_gaussians = Some(values.max_gaussians);
             all.image_scale = Some(values.image_scale);
         }
-        all.device_mib = given.device_mib.unwrap_or(all.device_mib);
+        all.device_mib = given.device_mib.or(all.device_mib);
         all.host_mib = given.host_mib.unwrap_or(all.host_mib);
         all.view_slots = given.view_slots;
         all.max_gaussians = given.max_gaussians.or(all.max_gaussians);
@@ -84,14 +99,26 @@ mod tests {
     fn a_preset_fills_only_what_is_not_given() {
         let of = |text: &str| toml::from_str::<MemorySettings>(text).unwrap();
         assert_eq!(of(""), MemorySettings::default());
-        let values = Preset::Medium.values();
+        let values = Preset::Medium.values().unwrap();
         let all = of("preset = \"medium\"");
-        assert_eq!((all.device_mib, all.image_scale), (values.device_mib, Some(values.image_scale)));
+        assert_eq!((all.device_mib(), all.image_scale), (values.device_mib, Some(values.image_scale)));
         assert_eq!(all.max_gaussians, Some(values.max_gaussians));
         let some = of("preset = \"medium\"\ndevice_mib = 100");
-        assert_eq!((some.device_mib, some.max_gaussians), (100, Some(values.max_gaussians)));
+        assert_eq!((some.device_mib(), some.max_gaussians), (100, Some(values.max_gaussians)));
         assert!(toml::from_str::<MemorySettings>("preset = \"toaster\"").is_err());
         assert!(toml::from_str::<MemorySettings>("devce_mib = 3").is_err());
+    }
+
+    #[test]
+    fn sizes_are_the_devices_to_choose_where_the_mission_says_so_or_nothing() {
+        let auto = |text: &str| toml::from_str::<MemorySettings>(text).unwrap().is_auto();
+        assert!(auto("") && auto("host_mib = 1024") && auto("preset = \"auto\""));
+        let said = toml::from_str::<MemorySettings>("preset = \"auto\"\ndevice_mib = 512").unwrap();
+        assert!(said.is_auto() && said.device_mib == Some(512), "what was said is known from what was not");
+        for given in ["device_mib = 512", "max_gaussians = 1000", "image_scale = 0.5", "preset = \"short\""] {
+            assert!(!auto(given), "{given}");
+        }
+        assert_eq!(MemorySettings::default().device_mib(), 512);
     }
 
     #[test]

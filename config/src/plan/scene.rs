@@ -9,8 +9,9 @@ pub const BLOCK_GAUSSIANS: usize = 64;
 const LEAST_GAUSSIANS_PER_CELL: usize = 4 * BLOCK_GAUSSIANS;
 /// Even a small scene is worth so many cells: some 10 MiB of the file.
 const LEAST_CELLS: usize = 256;
-/// Bytes on the host per cell: key, bounds, blocks, and the lists of a window.
-const CELL_BYTES: u64 = 128;
+/// Bytes on the host per cell: key, bounds, blocks, and the lists of a window (96), and a tree of as many cells while the scene is divided
+/// (160: entries of 76 in nodes that are half full).
+const CELL_BYTES: u64 = 256;
 /// Bytes on the host per Gaussian on the device: its cell, and the order in which it is written.
 const TAG_BYTES: u64 = 8;
 

@@ -44,7 +44,7 @@ mod opening;
 mod partial;
 
 pub use celled::{pieces, write_cells};
-pub use chunks::{Chunks, write_chunks, write_columns};
+pub use chunks::{Chunks, Pieces, open_checkpoint, piece_bytes, write_checkpoint_pieces, write_chunks, write_columns};
 pub use partial::{Partial, read_what_is_there};
 
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";

@@ -29,8 +29,8 @@ pub const FARTHER: [f64; 3] = [1.0, 2.0, 4.0];
 const DOWN_DEG: [f64; 3] = [90.0, 60.0, 40.0];
 /// A scene of more is compared from the first of them alone: drawing it takes long.
 const MOST_FROM_AFAR: usize = 2_000_000;
-/// Metres between neighbours of the made-up ground.
-const SPACING_M: f64 = 0.25;
+/// Metres between neighbours of the made-up ground, which begins at the origin and is a square.
+pub const SPACING_M: f64 = 0.25;
 
 /// One level.
 #[derive(Clone, Debug, Serialize)]
@@ -58,14 +58,16 @@ pub struct Levels {
     pub device: String,
 }
 
-/// Writes a made-up scene of `gaussians`: hilly ground with fields, seen by nobody yet; the same number, the same scene.
+/// Writes a made-up scene of `gaussians`: hilly ground with fields, seen by nobody yet; the same number, the same scene, but for how much its
+/// colours change with the direction.
 ///
 /// # Errors
 /// The operating system's.
-pub fn write_scene(path: &Path, gaussians: usize) -> Result<(), FormatError> {
+pub fn write_scene(path: &Path, gaussians: usize, sh_degree: u8) -> Result<(), FormatError> {
     let side = (gaussians as f64).sqrt().ceil() as usize;
     let rows = |range: Range<usize>| {
-        let mut cloud = GaussianCloud::with_capacity(0, range.len());
+        let mut cloud = GaussianCloud::with_capacity(sh_degree, range.len());
+        let mut sh = vec![0.0; cloud.sh_stride()];
         for i in range {
             let (x, y) = (SPACING_M * (i % side) as f64, SPACING_M * (i / side) as f64);
             let hills = 6.0 * ((x / 90.0).sin() + (y / 70.0).cos());
@@ -73,17 +75,24 @@ pub fn write_scene(path: &Path, gaussians: usize) -> Result<(), FormatError> {
             let furrow = 0.06 * (x * 1.7 + y * 0.6).sin();
             let rgb =
                 [0.30 + 0.08 * field, 0.42 + 0.05 * (4.0 - field), 0.25].map(|v| (v + furrow - 0.5) / f64::from(SH_C0));
+            for (k, v) in sh.iter_mut().enumerate() {
+                *v = match rgb.get(k) {
+                    Some(v) => *v as f32,
+                    // Anything small that is another number for each.
+                    None => ((i * 40_503 + k * 9_973) % 4_099) as f32 * 1e-5 - 0.02,
+                };
+            }
             cloud.push(
                 [x, y, hills].map(|v| v as f32),
                 [0.55 * SPACING_M, 0.55 * SPACING_M, 0.02].map(|v| v.ln() as f32),
                 [1.0, 0.0, 0.0, 0.0],
                 3.0,
-                &rgb.map(|v| v as f32),
+                &sh,
             );
         }
         cloud
     };
-    write_chunks(path, &ModelHeader { mission: "levels".into(), ..Default::default() }, gaussians, 0, &rows)
+    write_chunks(path, &ModelHeader { mission: "levels".into(), ..Default::default() }, gaussians, sh_degree, &rows)
 }
 
 /// Writes the levels of `model` into `folder` and compares each, as it is before it is packed, with the whole scene. Neither the scene

@@ -1,11 +1,9 @@
 //! Milliseconds per stage from the device's own timestamps, beside the work counted for that stage and the least time the
 //! device could do it in.
 
-use std::ops::ControlFlow;
 use std::path::Path;
 
 use config::plan::{Plan, sh_columns};
-use config::training::{Strategy, TrainSettings};
 use models::camera::PosedImage;
 use models::cloud::GaussianCloud;
 use models::dataset::Dataset;
@@ -15,11 +13,12 @@ use vulkan::gpu::Gpu;
 use vulkan::shape::KernelShape;
 use vulkan::stages::work::{Load, work};
 use vulkan::stages::{STAGE_NAMES, STAGES};
-use vulkan::trainer::{Counters, RunBudget, Trainer};
 
 use super::figures::short;
-use super::slopes::{DRIVERS, Driver, Line, fit};
-use super::synthetic;
+use crate::cost::measure::{Stopwatch, settings};
+use crate::cost::model::{SH_DEGREE, Sample};
+use crate::cost::slopes::{DRIVERS, Driver, Line, fit};
+use crate::cost::synthetic;
 use crate::engine::device::DeviceRequest;
 use crate::error::JobError;
 use crate::report::Table;
@@ -134,10 +133,6 @@ pub fn measure(
     let Some((width, height)) = largest else {
         return Err(JobError::Request(format!("{}: no training pictures", scene.name)));
     };
-    let mut settings = TrainSettings { steps: WARM_UP + steps, ..TrainSettings::default() };
-    settings.density.strategy = Strategy::None;
-    (settings.resolution.quarter_until, settings.resolution.half_until) = (0.0, 0.0);
-    settings.stop.enabled = false;
     let request = DeviceRequest {
         device: None,
         device_mib: MOST_MIB,
@@ -149,37 +144,29 @@ pub fn measure(
         max_gaussians: Some(scene.cloud.len()),
         scene_gaussians: None,
     };
-    let plan = Plan::new(&request.plan_request(&settings.sh, gpu.info().lanes()))?;
-    let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
-    trainer.time_every_step();
-    trainer.load(&scene.cloud)?;
-    for p in &scene.pictures {
-        trainer.add_view(p, None)?;
+    let plan = Plan::new(&request.plan_request(&settings().sh, gpu.info().lanes()))?;
+    let mut watch = Stopwatch::new(gpu, shape, &plan, &scene.pictures)?;
+    watch.load(&scene.cloud)?;
+    for _ in 0..WARM_UP {
+        watch.step()?;
     }
-    let budget = RunBudget { steps: Some(settings.steps), seconds: None };
-    let warm = trainer.run(&budget, &mut |r| match r.step < WARM_UP {
-        true => ControlFlow::Continue(()),
-        false => ControlFlow::Break(()),
-    })?;
-    let before = trainer.stage_ms();
-    let summary = trainer.run(&budget, &mut |_| ControlFlow::Continue(()))?;
-    let n = u64::from(summary.steps.max(1));
-    let c = per_step(&summary.counters, &warm.counters, n);
-    let gaussians = trainer.gaussians() as u64;
+    let timed = (0..steps).map(|_| watch.step()).collect::<Result<Vec<_>, _>>()?;
+    let n = timed.len().max(1) as f64;
+    let mean = |of: &dyn Fn(&Sample) -> f64| timed.iter().map(|t| of(&t.sample)).sum::<f64>() / n;
+    let amount = |driver: Driver| mean(&|s| driver.amount(&s.load) as f64) as u64;
     let load = Load {
-        gaussians,
-        visible: gaussians.saturating_sub(c.culled),
-        instances: c.instances,
-        evaluations: c.evaluations,
+        gaussians: amount(Driver::Gaussians),
+        visible: amount(Driver::Visible),
+        instances: amount(Driver::Instances),
+        evaluations: amount(Driver::Evaluations),
         pixels: u64::from(width) * u64::from(height),
-        sh_columns: sh_columns(3),
+        sh_columns: sh_columns(SH_DEGREE),
     };
-    let after = trainer.stage_ms();
     let stages = STAGES.iter().enumerate().map(|(i, stage)| {
         let w = work(*stage, &load);
         StageFigures {
             stage: STAGE_NAMES[i],
-            ms: (after[i].1 - before[i].1) / n as f64,
+            ms: mean(&|s| s.stage_ms[i]),
             bytes: w.bytes,
             operations: w.operations,
             least_ms: 1e3 * ceiling.least_seconds(w.bytes, w.operations),
@@ -189,26 +176,16 @@ pub fn measure(
         scene: scene.name.clone(),
         width,
         height,
-        gaussians,
+        gaussians: load.gaussians,
         visible: load.visible,
         instances: load.instances,
         evaluations: load.evaluations,
-        steps: summary.steps,
-        banded: (summary.counters.banded_steps - warm.counters.banded_steps) as f64 / n as f64,
-        step_ms: 1e3 * summary.seconds / n as f64,
+        steps,
+        banded: timed.iter().filter(|t| t.bands > 1).count() as f64 / n,
+        step_ms: mean(&|s| s.step_ms),
         stages: stages.collect(),
         load,
     })
-}
-
-/// The counters that grow with every step, less what the warm-up had counted.
-fn per_step(all: &Counters, warm: &Counters, steps: u64) -> Counters {
-    Counters {
-        culled: (all.culled - warm.culled) / steps,
-        instances: (all.instances - warm.instances) / steps,
-        evaluations: (all.evaluations - warm.evaluations) / steps,
-        ..Counters::default()
-    }
 }
 
 /// A line per stage through all sizes.

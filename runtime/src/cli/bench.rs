@@ -2,11 +2,13 @@
 
 mod detail;
 mod device;
+mod forecast;
 mod ground;
 mod levels;
 mod map;
 mod memory;
 mod methods;
+mod scene;
 mod skips;
 mod stages;
 mod stress;
@@ -33,6 +35,8 @@ enum Command {
     Detail(detail::Args),
     /// All that a board or a card can tell in ten minutes, as a report to send in.
     Device(device::Args),
+    /// What preset auto forecasts of a step against what it takes, at three sizes.
+    Forecast(forecast::Args),
     /// A ground station of many simulated aircraft: seconds for each, memory, how well they meet.
     Ground(ground::Args),
     /// Levels of detail: how many Gaussians each has, and what it shows from its own distance against the whole scene.
@@ -41,6 +45,8 @@ enum Command {
     Memory(memory::Args),
     /// The field's methods beside ours, on the same pictures, poses, steps, Gaussians, memory and seed.
     Methods(methods::Args),
+    /// A scene larger than device and host: trained out of a file and into one, drawn, and compared with an unpaged rendering.
+    Scene(scene::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
     Skips(skips::Args),
     /// Numbers that broke other renderers: the promise, the outcome, what was counted.
@@ -73,10 +79,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Command::Map(args) => map::run(args),
         Command::Detail(args) => detail::run(args),
         Command::Device(args) => device::run(args),
+        Command::Forecast(args) => forecast::run(args),
         Command::Ground(args) => ground::run(args),
         Command::Levels(args) => levels::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Methods(args) => methods::run(args),
+        Command::Scene(args) => scene::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),
         Command::TimeError(args) => time_error::run(args),

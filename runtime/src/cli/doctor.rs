@@ -14,9 +14,9 @@ use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::devices;
+use crate::cost::loads::{Footprint, Sight};
 use crate::kernels::{self, Source};
-use crate::resources;
+use crate::{cost, devices, resources};
 
 mod trust;
 
@@ -97,6 +97,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
                     format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
                 tell("vulkan", Finding::Ok(text));
                 tell("kernels", kernel_shape(&d, args.calibrate));
+                tell("a step", step_cost(&d, args.calibrate));
                 tell("device", computes(&d));
                 tell("memory plan", takes_a_plan(&d));
             }
@@ -235,6 +236,27 @@ fn kernel_shape(info: &GpuInfo, calibrate: bool) -> Finding {
     let (share, tile) = (lanes(shape.share_lanes), lanes(shape.tile_lanes));
     let staged = if shape.fetched > 1 { ", which fetch for each other" } else { "" };
     Finding::Ok(format!("shape {shape}: {share} per share of the Gaussians, {tile} per tile{staged} ({why})"))
+}
+
+/// What `auto` forecasts with.
+fn step_cost(info: &GpuInfo, calibrate: bool) -> Finding {
+    let shape = kernels::known(info).0;
+    let cost = match calibrate {
+        true => Gpu::open(Some(&info.name)).ok().and_then(|gpu| cost::anew(&gpu, shape)),
+        false => cost::known(info, shape),
+    };
+    let Some(cost) = cost else {
+        let how = "the first job with preset auto, or dgtr doctor --calibrate, measures it in seconds";
+        return Finding::note("what it costs is not measured yet", how);
+    };
+    // The point of the presets of whole pictures.
+    let sight = Sight { gaussians: 100_000, share: 0.29, pixels: 640 * 480 };
+    let threads = match cost::threads(info) {
+        0 => String::new(),
+        n => format!(" with {n} threads"),
+    };
+    let ms = cost.step_ms(&sight.load(Footprint::TRAINED));
+    Finding::Ok(format!("{ms:.1} ms forecast{threads} for 100,000 Gaussians and pictures of 640x480"))
 }
 
 /// Ports an autopilot may hang on, and whether this user may open them.

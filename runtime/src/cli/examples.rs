@@ -55,6 +55,7 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
             "dgtr bench methods --simulated 6 --methods dgtr,vastgaussian",
         ],
     ),
+    ("bench scene", &["dgtr bench scene --gaussians 5000000 --device-mib 512 --limit-mib 1024 --out scene"]),
     ("bench skips", &["dgtr bench skips pictures"]),
     ("bench stress", &["dgtr bench stress"]),
     ("bench time-error", &["dgtr bench time-error pictures --out time-error"]),

@@ -13,6 +13,7 @@ use crate::engine::device::training_lens;
 use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
 use crate::interrupt::Interrupt;
 use crate::ortho::keep_scratch_in;
+use crate::preset;
 use crate::report::{REPORT, ReportData, Timing, count, seconds};
 use crate::resources::return_freed_memory;
 use crate::run_json::RunReport;
@@ -58,7 +59,7 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), CliError> {
     return_freed_memory();
     let started = Instant::now();
-    let mission = Mission::read(&args.mission)?;
+    let mut mission = Mission::read(&args.mission)?;
     let mut aircraft = mission.aircraft(args.aircraft.as_deref())?.clone();
     if let Some(link) = args.link {
         aircraft.link = link;
@@ -72,6 +73,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let end =
         EndOfFlight { silence: seconds(silence, "silence")?, patience: (!patience.is_zero()).then_some(patience) };
     let interrupt = Interrupt::install()?;
+    let chosen = preset::of_flight(&mut mission, &aircraft, &args.out);
     let watch = Watch::of(&mission, &[&aircraft.id], "opening the device and the networks", &args.out);
     watch.update(|page| page.title = format!("Aircraft {}, mission {}", aircraft.id, mission.name));
     let _server = args.http.serve(&mission.http, &watch)?;
@@ -84,6 +86,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
         picture: [lens.width, lens.height],
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    if let Some(chosen) = &chosen {
+        chosen.keep(&args.out)?;
+    }
     keep_scratch_in(&args.out);
     let recording = args.record.as_deref().map(|path| Recording::create(path, mission.origin)).transpose()?;
     let (recording, recorder) = recording.unzip();
@@ -99,6 +104,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     drop((options, recording));
     let outcome = outcome?;
     let mut report = report(&outcome);
+    if let Some(chosen) = chosen {
+        chosen.note(&mut report);
+    }
     report.wall_s = started.elapsed().as_secs_f64();
     let path = report.write(&args.out)?;
     if let Err(e) = page(watch.freeze(), &report, &outcome, &path).write(&args.out.join(REPORT)) {

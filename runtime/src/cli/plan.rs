@@ -18,6 +18,7 @@ use crate::devices;
 use crate::engine::device::DeviceRequest;
 use crate::engine::scratch_bytes;
 use crate::fly::delivered_bytes;
+use crate::preset;
 use crate::service::limits::{DeviceMemory, ServiceLimits};
 
 /// Arguments of `dgtr plan`.
@@ -82,12 +83,21 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
+    // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
+    let gpu = devices::open_known(args.device.as_deref());
     let job = match &args.mission {
-        Some(path) => Job::of_flight(Mission::read(path)?),
+        Some(path) => {
+            let mut mission = Mission::read(path)?;
+            // What a service may take must hold for whatever a flight chooses.
+            let measured = gpu.as_ref().ok().filter(|_| !args.systemd);
+            if let Some(choice) = measured.and_then(|gpu| preset::foresee(&mut mission, gpu)) {
+                tracing::info!("{choice}");
+            }
+            Job::of_flight(mission)
+        }
         None => Job::of_arguments(&args)?,
     };
-    // As a job here would be planned. A device that was named has to be there; where none is, a processor's plan.
-    let (lanes, lies) = match (devices::open_known(args.device.as_deref()), &args.device) {
+    let (lanes, lies) = match (gpu, &args.device) {
         (Ok(gpu), _) => (gpu.info().lanes(), device_memory(gpu.info())),
         // A bound that is too large ends no flight.
         (Err(_), None) => (Lanes::SOFTWARE, DeviceMemory::Shared),

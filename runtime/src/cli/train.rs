@@ -82,6 +82,10 @@ pub struct Args {
     /// Where the first Gaussians come from.
     #[arg(long, value_enum, default_value = "feed-forward")]
     init: Init,
+    /// The first Gaussians are those of this model, in the frame of the data set, however many: those that find no room on the device wait
+    /// in a file in --out, and none are ever all in memory. The schedule begins anew.
+    #[arg(long, value_name = "MODEL", conflicts_with = "init")]
+    from: Option<PathBuf>,
     /// Where camera poses come from.
     #[arg(long, value_enum, default_value = "dataset")]
     poses: Poses,
@@ -156,8 +160,11 @@ struct Settings {
 
 /// The presets as clap shows them, each with its budgets.
 pub(super) fn presets() -> impl TypedValueParser<Value = Preset> {
-    let described =
-        |(name, preset): &(&'static str, Preset)| PossibleValue::new(*name).help(preset.values().to_string());
+    let described = |(name, preset): &(&'static str, Preset)| {
+        let chosen =
+            || "chosen by what a step costs on the device, measured once (kept in the cache folder)".to_owned();
+        PossibleValue::new(*name).help(preset.values().map_or_else(chosen, |v| v.to_string()))
+    };
     PossibleValuesParser::new(Preset::ALL.iter().map(described).collect::<Vec<_>>())
         .try_map(|name| Preset::named(&name).ok_or("no such preset"))
 }
@@ -192,7 +199,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if let Some(seed) = args.seed {
         settings.training.seed = seed;
     }
-    let preset = args.preset.map(Preset::values);
+    let preset = args.preset.and_then(Preset::values);
     // A schedule in steps or in a settings file is not cut short by a preset.
     let seconds = match args.steps.is_some() || settings.training.seconds.is_some() {
         true => args.seconds,
@@ -212,10 +219,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
         keyframes: args.keyframes.then_some(settings.keyframes),
         failsafe: args.failsafe.then_some(settings.failsafe),
         init: match args.init {
+            _ if args.from.is_some() => InitKind::Model,
             Init::FeedForward => InitKind::FeedForward,
             Init::Sfm => InitKind::SparsePoints,
             Init::Random => InitKind::Random,
         },
+        from: args.from,
         poses: match args.poses {
             Poses::Dataset => PoseSource::Dataset,
             Poses::Telemetry => PoseSource::Telemetry,
@@ -224,7 +233,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         for_delivery: args.for_delivery,
         steps: args.steps,
         seconds,
-        budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)).unwrap_or(512),
+        auto: args.preset == Some(Preset::Auto),
+        budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)),
         max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
         scene_gaussians: args.scene_gaussians,
         view_slots: args.view_slots,

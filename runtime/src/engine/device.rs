@@ -83,7 +83,7 @@ impl DeviceRequest {
         let (memory, lens) = (&mission.memory, training_lens(mission));
         Self {
             device: None,
-            device_mib: memory.device_mib,
+            device_mib: memory.device_mib(),
             size: (lens.width, lens.height),
             views: mission.keyframes.max as usize,
             crops: crops_of_flight(mission) as usize,

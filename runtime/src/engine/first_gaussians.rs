@@ -26,6 +26,8 @@ pub enum InitKind {
     SparsePoints,
     /// Points at random in what the cameras see.
     Random,
+    /// Those of a model ([`Reconstruction::begin_with`]).
+    Model,
 }
 
 /// A triangulated point: ENU metres, 8-bit sRGB.
@@ -54,6 +56,7 @@ impl Reconstruction {
         let views: Vec<View> = self.views.iter().map(|v| v.1).collect();
         match self.settings.start {
             _ if self.is_continued() => Ok(GaussianCloud::default()),
+            InitKind::Model => Ok(GaussianCloud::default()),
             InitKind::Random => {
                 at_random(&views, &self.points, self.settings.init.depth_m, capacity, self.settings.training.seed)
             }

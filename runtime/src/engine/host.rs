@@ -1,7 +1,7 @@
 //! Host memory of a job, planned like the device's: what it will hold at most, by a formula, before the first picture.
 //!
 //! ```text
-//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·R (+ 40·N + 8·R + cells) + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
+//! B + initialiser(V, N) + matching(V, features, observations) + 2·4·N·(11 + 3D) + 20·R (+ 8·R + cells) + A·3·(P [+ C]) + 2·3·C (+ device) (+ delivery·N)
 //! ```
 //!
 //! V views, N Gaussians of the scene, R on the device (where N > R), D = (SH degree + 1)², P pixels of a training picture, C of the camera's, A pictures decoded ahead.
@@ -9,6 +9,7 @@
 use config::plan::Plan;
 use config::refine::RefineSettings;
 use models::formats::delivery::ENCODING_BYTES;
+use models::formats::model::piece_bytes;
 
 use crate::error::JobError;
 
@@ -19,9 +20,6 @@ const PROGRAM_BYTES: u64 = 96 << 20;
 const FEATURES_BYTES: u64 = 2 * (32 << 20);
 /// The trainer's own lists per Gaussian: density control and SH degrees.
 const LISTS_BYTES: u64 = 20;
-/// Per Gaussian of a scene in cells while it is divided into them: its index (8), and its cell (16) by the size of cells at hand and
-/// by the next.
-const DIVIDED_BYTES: u64 = 40;
 
 /// What a job will hold.
 #[derive(Clone, Copy, Debug)]
@@ -45,6 +43,9 @@ pub struct HostRequest<'a> {
     pub ahead_in_memory: bool,
     /// Models are rounded for delivery, beside all else.
     pub delivers: bool,
+    /// The first Gaussians come out of a model's file and go into the next one piece by piece: two pieces take the place of the cloud and
+    /// its checkpoint.
+    pub from_file: bool,
     /// Bytes that drawing the map takes, when nothing is rounded.
     pub map: u64,
 }
@@ -81,9 +82,12 @@ impl HostPlan {
             ("program", PROGRAM_BYTES),
             ("initialisation", r.initialiser),
             ("matching", matching),
-            ("cloud and checkpoint", 2 * 4 * n * (11 + 3 * coefficients)),
+            (
+                "cloud and checkpoint",
+                2 * if r.from_file { piece_bytes(r.plan.sh_degree) } else { 4 * n * (11 + 3 * coefficients) },
+            ),
             ("density control", LISTS_BYTES * r.plan.gaussians as u64),
-            ("cells", r.plan.scene_lists_bytes() + if r.plan.is_paged() { DIVIDED_BYTES * n } else { 0 }),
+            ("cells", r.plan.scene_lists_bytes()),
             ("pictures ahead", r.ahead * 3 * (p + if r.ahead_in_memory { r.camera_pixels } else { 0 })),
             ("picture at hand", 2 * 3 * r.camera_pixels),
             (
@@ -138,6 +142,7 @@ mod tests {
             ahead: 4,
             ahead_in_memory: false,
             delivers: false,
+            from_file: false,
             map: 0,
         };
         of(&mut request);
@@ -159,6 +164,13 @@ mod tests {
         let delivery = plan.gaussians as u64 * (ENCODING_BYTES as u64 + 4 * (11 + 48));
         assert_eq!(total(&plan, |r| r.delivers = true) - before, delivery);
         assert_eq!(total(&plan, |r| r.map = 1 << 20) - before, 1 << 20);
+        let paged = Plan::new(&PlanRequest { scene_gaussians: Some(5_000_000), ..PlanRequest::default() }).unwrap();
+        let from_file = total(&paged, |r| (r.from_file, r.refine, r.initialiser) = (true, None, 0));
+        assert!(from_file < 128 << 20, "{from_file} bytes of the host for five million Gaussians");
+        assert_eq!(
+            total(&paged, |_| {}) - total(&paged, |r| r.from_file = true),
+            2 * 5_000_000 * 236 - 2 * piece_bytes(3)
+        );
         let kept = plan.views as u64 * refine_kept();
         assert_eq!(before - total(&plan, |r| r.refine_in_file = true), kept);
         assert!(total(&plan, |r| r.refine = None) < before && total(&plan, |r| r.initialiser = 0) < before);
@@ -183,7 +195,7 @@ mod tests {
     fn the_defaults_of_a_mission_fit_into_its_default_host_memory() {
         let memory = config::mission::MemorySettings::default();
         let views = config::mission::KeyframeSettings::default().max;
-        let request = PlanRequest { device_mib: memory.device_mib, views, ..PlanRequest::default() };
+        let request = PlanRequest { device_mib: memory.device_mib(), views, ..PlanRequest::default() };
         let plan = Plan::new(&request).unwrap();
         // On a software device, with a camera of 12 megapixels; the initialiser's plan as `dgtr fly` names it, and as many
         // pictures decoded ahead as it asks for, rounded up.

@@ -26,7 +26,7 @@ impl Reconstruction {
         }
         let made = fresh.report.as_ref().filter(|_| self.settings.incremental);
         Ok(match made {
-            _ if self.is_continued() => 0,
+            _ if self.is_continued() || self.first.is_some() => 0,
             Some(made) => {
                 if self.builds > 0 && self.is_hardly_trained() {
                     self.cloud.clone_from(&fresh.cloud);

@@ -192,7 +192,7 @@ impl Reconstruct for Reconstruction {
         self.report.stage("init", from);
         self.even_light(fresh.light.take(), 0)?;
         let new = self.take_over(&fresh)?;
-        let loaded = self.trainer.load(&self.cloud)?;
+        let loaded = self.load_first()?;
         self.unround()?;
         self.fly_on();
         self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
@@ -329,6 +329,7 @@ impl Reconstruct for Reconstruction {
         self.trainer.continue_from(steps, seconds);
         self.fly_on();
         tracing::warn!("gave up {removed} Gaussians, {} remain", self.cloud.len());
+        self.let_go();
         Ok(())
     }
 
@@ -339,7 +340,8 @@ impl Reconstruct for Reconstruction {
     fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), JobError> {
         let _span = tracing::info_span!("checkpoint").entered();
         let from = Instant::now();
-        if self.has_model() {
+        let in_pieces = self.in_pieces && self.has_model();
+        if self.has_model() && !in_pieces {
             self.trainer.snapshot(&mut self.cloud)?;
         }
         self.header.finished = finished;
@@ -347,12 +349,18 @@ impl Reconstruct for Reconstruction {
         self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), self.trainer.view_pose(i)?))).collect();
         self.header.lights = self.lights(self.header.views.len());
         let path = model_path(out);
-        model::write_checkpoint(&self.settings.disk, &path, &self.header, &self.cloud)?;
+        let gaussians = match in_pieces {
+            true => self.write_pieces(&path)?,
+            false => {
+                model::write_checkpoint(&self.settings.disk, &path, &self.header, &self.cloud)?;
+                self.cloud.len()
+            }
+        };
         self.report.stage("checkpoint", from);
         if let Some(map) = self.settings.map.filter(|_| self.has_model() && (finished || self.mapped < self.builds)) {
             self.draw_map(map, &out.join("map"));
         }
-        Ok((path, self.cloud.len()))
+        Ok((path, gaussians))
     }
 }
 

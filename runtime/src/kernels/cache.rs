@@ -1,6 +1,6 @@
 //! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the shape that was
-//! measured, and the small step that devices are compared by. It is only a cache: it may be deleted, be damaged or be
-//! somebody's handiwork at any time.
+//! measured, the small step that devices are compared by, and what steps cost by how many threads. It is only a cache: it may be
+//! deleted, be damaged or be somebody's handiwork at any time.
 
 use std::path::{Path, PathBuf};
 
@@ -9,8 +9,10 @@ use serde::{Deserialize, Serialize};
 use vulkan::gpu::GpuInfo;
 use vulkan::shape::{KernelShape, kernels_fingerprint};
 
-/// Bound on the file; an entry takes some 200 bytes.
-const LIMIT: u64 = 64 << 10;
+use crate::cost::model::CostModel;
+
+/// Bound on the file; an entry takes some 400 bytes at the most.
+const LIMIT: u64 = 128 << 10;
 /// Devices that are remembered.
 const MOST_DEVICES: usize = 64;
 
@@ -23,6 +25,9 @@ struct Kept {
     /// The same.
     #[serde(default)]
     step: Vec<Step>,
+    /// The same.
+    #[serde(default)]
+    cost: Vec<Cost>,
 }
 
 /// Which device, with which driver, ran which kernels.
@@ -61,6 +66,17 @@ struct Step {
     ms: f64,
 }
 
+/// What steps cost on a device with so many threads and kernels of this shape.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+struct Cost {
+    #[serde(flatten)]
+    id: Id,
+    threads: u32,
+    shape: String,
+    #[serde(flatten)]
+    model: CostModel,
+}
+
 /// A device's shape.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 struct Entry {
@@ -86,9 +102,9 @@ impl Entry {
     }
 }
 
-/// Puts `new` last, in place of what was kept of its device; the one measured longest ago makes room.
-fn remember<T>(kept: &mut Vec<T>, new: T, id: fn(&T) -> &Id) {
-    kept.retain(|old| !id(old).is_device(id(&new)));
+/// Puts `new` last, in place of what was kept of the same; the one measured longest ago makes room.
+fn remember<T>(kept: &mut Vec<T>, new: T, is_same: fn(&T, &T) -> bool) {
+    kept.retain(|old| !is_same(old, &new));
     kept.push(new);
     let over = kept.len().saturating_sub(MOST_DEVICES);
     kept.drain(..over);
@@ -125,7 +141,7 @@ pub fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatEr
 /// A file or folder that cannot be written.
 pub fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
-    remember(&mut kept.device, Entry::of(info, shape), |e| &e.id);
+    remember(&mut kept.device, Entry::of(info, shape), |a, b| a.id.is_device(&b.id));
     save(path, &kept)
 }
 
@@ -145,14 +161,49 @@ pub fn read_step(path: &Path, info: &GpuInfo) -> Result<Option<f64>, FormatError
 /// A file or folder that cannot be written.
 pub fn write_step(path: &Path, info: &GpuInfo, ms: f64) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
-    remember(&mut kept.step, Step { id: Id::of(info), ms }, |s| &s.id);
+    remember(&mut kept.step, Step { id: Id::of(info), ms }, |a, b| a.id.is_device(&b.id));
+    save(path, &kept)
+}
+
+/// What steps cost on this very device, with this driver, so many threads and kernels of this shape; `None` when it was not measured.
+///
+/// # Errors
+/// A file that is there and cannot be used.
+pub fn read_cost(
+    path: &Path,
+    info: &GpuInfo,
+    threads: u32,
+    shape: KernelShape,
+) -> Result<Option<CostModel>, FormatError> {
+    let (kept, id, shape) = (load(path)?, Id::of(info), shape.to_string());
+    let found = kept.cost.iter().rev().find(|c| c.id == id && c.threads == threads && c.shape == shape);
+    Ok(found.map(|c| c.model).filter(CostModel::is_sound))
+}
+
+/// Remembers it, in place of what was remembered of the device with so many threads. A damaged file is begun anew.
+///
+/// # Errors
+/// A file or folder that cannot be written.
+pub fn write_cost(
+    path: &Path,
+    info: &GpuInfo,
+    threads: u32,
+    shape: KernelShape,
+    model: CostModel,
+) -> Result<(), FormatError> {
+    let mut kept = load(path).unwrap_or_default();
+    let new = Cost { id: Id::of(info), threads, shape: shape.to_string(), model };
+    remember(&mut kept.cost, new, |a, b| a.id.is_device(&b.id) && a.threads == b.threads);
     save(path, &kept)
 }
 
 fn save(path: &Path, kept: &Kept) -> Result<(), FormatError> {
     let text = toml::to_string(kept).map_err(|e| FormatError::Invalid { path: path.into(), what: e.to_string() })?;
     write_atomic(path, |out| {
-        writeln!(out, "# Shapes of kernels and steps measured by dgtr (`dgtr doctor --calibrate`); may be deleted.")?;
+        writeln!(
+            out,
+            "# Shapes of kernels, steps and their costs, measured by dgtr (`dgtr doctor --calibrate`); may be deleted."
+        )?;
         out.write_all(text.as_bytes())
     })
 }
@@ -224,6 +275,31 @@ pub(crate) mod tests {
         }
         let endless = (0..2 * MOST_DEVICES).map(|i| device(&format!("device {i}")));
         endless.for_each(|info| write_step(&path, &info, 1.0).unwrap());
+        assert!(std::fs::metadata(&path).unwrap().len() < LIMIT);
+    }
+
+    #[test]
+    fn what_steps_cost_is_kept_by_driver_threads_and_shape() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("kernels.toml");
+        let (info, of) = (device("llvmpipe"), |pixel_ns: f64| CostModel { pixel_ns, ..CostModel::default() });
+        write(&path, &info, SHAPE).unwrap();
+        write_cost(&path, &info, 1, SHAPE, of(3.0)).unwrap();
+        write_cost(&path, &info, 2, SHAPE, of(2.0)).unwrap();
+        let read = |info: &GpuInfo, threads, shape| read_cost(&path, info, threads, shape).unwrap();
+        assert_eq!([1, 2, 4].map(|n| read(&info, n, SHAPE)), [Some(of(3.0)), Some(of(2.0)), None]);
+        assert_eq!(read(&info, 2, OTHER), None, "other kernels take other times");
+        assert_eq!(read(&GpuInfo { driver_version: 8, ..info.clone() }, 2, SHAPE), None);
+        write_cost(&path, &info, 2, OTHER, of(1.0)).unwrap();
+        assert_eq!((read(&info, 2, SHAPE), read(&info, 2, OTHER)), (None, Some(of(1.0))));
+        assert_eq!(super::read(&path, &info).unwrap(), Some(SHAPE));
+        // What nobody could have measured is not believed.
+        for ns in [f64::NAN, -1.0, f64::INFINITY, 0.0] {
+            write_cost(&path, &info, 1, SHAPE, of(ns)).unwrap();
+            assert_eq!(read_cost(&path, &info, 1, SHAPE).unwrap_or(None), None, "{ns}");
+        }
+        (0..2 * MOST_DEVICES as u32).for_each(|n| write_cost(&path, &info, n, SHAPE, of(1.0)).unwrap());
+        (0..2 * MOST_DEVICES).for_each(|i| write(&path, &device(&format!("device {i}")), SHAPE).unwrap());
         assert!(std::fs::metadata(&path).unwrap().len() < LIMIT);
     }
 

@@ -29,7 +29,7 @@ impl ServiceLimits {
     /// What a flight with `memory` may take of a computer with so many processors: one of them stays free for the system and
     /// the autopilot's bridge, wherever there are two.
     pub fn of_flight(memory: &MemorySettings, device: DeviceMemory, processors: usize) -> Self {
-        let device_mib = if device == DeviceMemory::Shared { memory.device_mib.into() } else { 0 };
+        let device_mib = if device == DeviceMemory::Shared { memory.device_mib().into() } else { 0 };
         Self {
             host_mib: memory.host_mib.into(),
             device_mib,
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn the_bound_on_memory_is_the_missions_and_a_devices_share_is_counted_once() {
-        let memory = MemorySettings { host_mib: 3000, device_mib: 700, ..MemorySettings::default() };
+        let memory = MemorySettings { host_mib: 3000, device_mib: Some(700), ..MemorySettings::default() };
         let bound = |device| ServiceLimits::of_flight(&memory, device, 4).to_string();
         assert!(bound(DeviceMemory::Shared).contains("\nMemoryMax=3700M\n"));
         assert!(bound(DeviceMemory::Planned).contains("\nMemoryMax=3000M\n"));

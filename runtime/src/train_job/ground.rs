@@ -4,7 +4,6 @@
 use config::coverage::CoverageSettings;
 use glam::{DVec2, Vec3};
 use models::camera::View;
-use models::cloud::GaussianCloud;
 use models::coverage::{CoverageMap, Heights, Region, hull};
 use models::formats::model::ModelHeader;
 
@@ -15,7 +14,7 @@ const DOWN: f64 = 0.25;
 
 /// What the views of `header` cover of its region, or where it has none of the ground below the cameras; `None` where most of
 /// them do not look down, or there is no ground to speak of.
-pub(super) fn coverage(header: &ModelHeader, cloud: &GaussianCloud, rules: CoverageSettings) -> Option<Coverage> {
+pub(super) fn coverage(header: &ModelHeader, means: &[[f32; 3]], rules: CoverageSettings) -> Option<Coverage> {
     let views: Vec<&View> = header.views.iter().map(|(_, view)| view).filter(|v| v.is_usable()).collect();
     let down = views.iter().filter(|v| v.pose.forward().z < -DOWN).count();
     if 2 * down < views.len() {
@@ -28,7 +27,7 @@ pub(super) fn coverage(header: &ModelHeader, cloud: &GaussianCloud, rules: Cover
     let region = Region::new(corners).ok()?;
     let mut map = CoverageMap::new(&region, rules.ground_m.unwrap_or(0.0).into(), rules).ok()?;
     if rules.ground_m.is_none() {
-        let points: Vec<Vec3> = cloud.means.iter().map(|m| Vec3::from(*m)).collect();
+        let points: Vec<Vec3> = means.iter().map(|m| Vec3::from(*m)).collect();
         let heights = Heights::of(&points, map.grid())?;
         let (low, high) = region.bounds();
         map = CoverageMap::new(&region, heights.at(0.5 * (low + high)), rules).ok()?.over(|p| heights.at(p));
@@ -57,28 +56,29 @@ mod tests {
     }
 
     /// Points on the ground, and a tenth of them on roofs.
-    fn cloud() -> GaussianCloud {
-        let means = (0..4000).map(|i| {
-            let roof = if i % 10 == 0 { 6.0 } else { 0.0 };
-            [(i % 80) as f32 - 20.0, (i / 80) as f32 - 5.0, 700.0 + roof]
-        });
-        GaussianCloud { means: means.collect(), ..GaussianCloud::default() }
+    fn means() -> Vec<[f32; 3]> {
+        (0..4000)
+            .map(|i| {
+                let roof = if i % 10 == 0 { 6.0 } else { 0.0 };
+                [(i % 80) as f32 - 20.0, (i / 80) as f32 - 5.0, 700.0 + roof]
+            })
+            .collect()
     }
 
     #[test]
     fn a_folder_is_judged_over_the_ground_that_was_reconstructed() {
         let rules = CoverageSettings::default();
-        let whole = coverage(&header(-90.0, &[]), &cloud(), rules).expect("a map");
+        let whole = coverage(&header(-90.0, &[]), &means(), rules).expect("a map");
         assert_eq!((whole.percent(), whole.gaps.len()), (100, 0));
         assert!((whole.map.base_m() - 700.0).abs() < 0.5, "{}", whole.map.base_m());
         let middle: Vec<usize> = (0..36).filter(|i| i / 6 < 5).collect();
-        let rest = coverage(&header(-90.0, &middle), &cloud(), rules);
+        let rest = coverage(&header(-90.0, &middle), &means(), rules);
         assert!(rest.is_none(), "cameras on one line have no ground between them");
     }
 
     #[test]
     fn pictures_of_a_thing_have_no_coverage() {
-        assert!(coverage(&header(-5.0, &[]), &cloud(), CoverageSettings::default()).is_none());
-        assert!(coverage(&header(-90.0, &[]), &GaussianCloud::default(), CoverageSettings::default()).is_none());
+        assert!(coverage(&header(-5.0, &[]), &means(), CoverageSettings::default()).is_none());
+        assert!(coverage(&header(-90.0, &[]), &[], CoverageSettings::default()).is_none());
     }
 }

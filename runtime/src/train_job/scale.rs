@@ -33,7 +33,7 @@ impl TrainJob {
         for scale in SCALES {
             let all_on_device = DeviceRequest {
                 device: None,
-                device_mib: self.budget_mib,
+                device_mib: self.budget_mib(),
                 size: largest(set, &frames, scale)?,
                 views: frames.len(),
                 crops: 0,
@@ -50,7 +50,7 @@ impl TrainJob {
             let (w, h) = all_on_device.size;
             if holds(&all_on_device) || (w.max(h) <= WORKING_SIDE && holds(&some_in_file)) {
                 if is_card || scale < 1.0 {
-                    tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {} MiB hold", self.budget_mib);
+                    tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {} MiB hold", self.budget_mib());
                 }
                 return Ok(scale);
             }

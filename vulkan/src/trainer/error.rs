@@ -40,6 +40,9 @@ pub enum TrainError {
     /// The file of the cells that are not on the device.
     #[error("the file of the cells that are not on the device: {0}")]
     SceneFile(String),
+    /// A scene that is read more than once was not the same every time.
+    #[error("the scene changed while it was read; nothing else may write to its file meanwhile")]
+    SceneChanged,
     /// No picture shows anything of the scene.
     #[error("no Gaussian is in view of any picture; check the poses and the initialisation")]
     NothingInView,

@@ -1,7 +1,8 @@
 //! A scene that grows while it is trained: Gaussians of new ground come to those there are, and others move or go, while all that
 //! nobody touches keeps its place, its moments and its part of the schedule.
 
-use super::parameters::{Geometry, LoadReport, record_of};
+use super::load::LoadReport;
+use super::parameters::{Geometry, record_of};
 use super::{TrainError, Trainer, state};
 use config::training::Strategy;
 use models::cloud::{GaussianCloud, sh_coefficients};

@@ -1,7 +1,7 @@
 //! Gaussians in and out of the arena: the only place that knows how their parameters lie in memory.
 
 use super::moments::{HEAVY, ShMoments};
-use super::{TrainError, Trainer, state};
+use super::{Trainer, state};
 use crate::arena::{Arena, Section};
 use config::plan::Plan;
 use models::cloud::{GaussianCloud, sh_coefficients};
@@ -43,17 +43,6 @@ pub(crate) enum Held<'a> {
     OnDevice(usize),
     /// Its record.
     InFile(&'a [u8]),
-}
-
-/// What became of a cloud's Gaussians.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct LoadReport {
-    /// Gaussians now trained.
-    pub loaded: usize,
-    /// Those with numbers that are not finite or a quaternion that cannot be normalised.
-    pub dropped_non_finite: usize,
-    /// Those beyond the plan's capacity; the least important (opacity × area) made way.
-    pub dropped_over_capacity: usize,
 }
 
 /// Where the parameters lie.
@@ -172,48 +161,6 @@ pub(super) fn clear(cloud: &mut GaussianCloud, degree: u8) {
 }
 
 impl Trainer {
-    /// Replaces the Gaussians and starts the schedule anew. Those that are not finite are left out, and so are the least
-    /// important ones beyond the plan's capacity.
-    ///
-    /// # Errors
-    /// [`TrainError::Empty`] when nothing remains; [`TrainError::SceneFile`] where they are more than the device holds.
-    pub fn load(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
-        let mut keep: Vec<usize> = (0..cloud.len()).filter(|i| cloud.is_valid(*i)).collect();
-        let mut report = LoadReport { dropped_non_finite: cloud.len() - keep.len(), ..LoadReport::default() };
-        let capacity = self.plan.scene;
-        if keep.len() > capacity {
-            report.dropped_over_capacity = keep.len() - capacity;
-            let weight = |i: &usize| {
-                let s = cloud.log_scales[*i];
-                let area = s.iter().sum::<f32>() - s.iter().copied().fold(f32::INFINITY, f32::min);
-                area - (1.0 + (-cloud.opacity_logits[*i]).exp()).ln()
-            };
-            keep.select_nth_unstable_by(capacity, |a, b| weight(b).total_cmp(&weight(a)).then(a.cmp(b)));
-            keep.truncate(capacity);
-            keep.sort_unstable();
-        }
-        report.loaded = keep.len();
-        if keep.is_empty() {
-            return Err(TrainError::Empty { non_finite: report.dropped_non_finite });
-        }
-        let coefficients = sh_coefficients(self.plan.sh_degree.min(cloud.sh_degree)) * 3;
-        let fill = |from: usize, record: &mut [u8]| record_of(cloud, from, coefficients, record);
-        if keep.len() > self.plan.gaussians {
-            self.scene.fill(&self.plan, &self.settings, cloud, &keep, fill)?;
-            self.gaussians = 0;
-        } else {
-            self.scene.close();
-            let mut record = vec![0; self.plan.record_bytes()];
-            for (to, &from) in keep.iter().enumerate() {
-                fill(from, &mut record);
-                self.parameters.write_record(&mut self.arena, to, &record);
-            }
-            self.gaussians = keep.len();
-        }
-        self.restart();
-        Ok(report)
-    }
-
     /// Holds the Gaussians just loaded for which `is_held(row of the cloud)` says so: they are drawn and blended, and the others are
     /// trained as if they could not move. Adam does it, by second moments that no gradient comes near: what is held moves by
     /// less than rounding shows, but for numbers that are nearly zero. Until the next [`Trainer::load`]; only for a scene that is
@@ -222,28 +169,6 @@ impl Trainer {
         for index in (0..self.gaussians).filter(|i| is_held(*i)) {
             self.parameters.hold(&mut self.arena, index);
         }
-    }
-
-    /// Writes the present parameters to `cloud`, reusing its memory.
-    ///
-    /// # Errors
-    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
-    pub fn snapshot(&mut self, cloud: &mut GaussianCloud) -> Result<(), TrainError> {
-        self.flush()?;
-        clear(cloud, self.plan.sh_degree);
-        cloud.reserve_exact(self.gaussians());
-        let (parameters, arena, plan) = (self.parameters, &self.arena, &self.plan);
-        let mut record = std::mem::take(&mut self.record);
-        let done = self.scene.each_record(self.gaussians, |from| match from {
-            Held::OnDevice(index) => {
-                parameters.read_record(arena, index, &mut record);
-                push_record(cloud, plan, &record);
-            }
-            Held::InFile(record) => push_record(cloud, plan, record),
-        });
-        self.record = record;
-        done?;
-        Ok(self.arena.failure()?)
     }
 }
 
@@ -267,7 +192,7 @@ pub(super) fn record_of(cloud: &GaussianCloud, from: usize, coefficients: usize,
 }
 
 /// Adds what a record holds to a cloud of the plan's degree.
-fn push_record(cloud: &mut GaussianCloud, plan: &Plan, record: &[u8]) {
+pub(super) fn push_record(cloud: &mut GaussianCloud, plan: &Plan, record: &[u8]) {
     let (geometry, rest) = record.split_at(size_of::<Geometry>());
     let g: Geometry = bytemuck::pod_read_unaligned(geometry);
     cloud.means.push(g.mean);

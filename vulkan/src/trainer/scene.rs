@@ -20,9 +20,11 @@ use config::plan::Plan;
 use config::training::TrainSettings;
 use models::cloud::GaussianCloud;
 use models::ground_cell::{CellKey, Grid};
+use std::collections::BTreeMap;
 use store::{Chain, Store};
 use window::Window;
 
+use super::load::Kept;
 use super::parameters::Geometry;
 use super::{TrainError, Trainer};
 
@@ -32,6 +34,9 @@ const SAMPLED_MEANS: usize = 4096;
 const STRAY_SHARE: f32 = 0.02;
 /// Cells are made smaller by 2^16 at most: Gaussians in one place would be in one cell whatever its size.
 const MOST_HALVINGS: u32 = 16;
+
+/// Shows every Gaussian of a scene, in the same order each time.
+type Visit<'a, E> = &'a dyn Fn(&mut dyn FnMut(&Geometry)) -> Result<(), E>;
 
 /// One cell.
 struct Cell {
@@ -107,78 +112,133 @@ impl Scene {
         self.window.close();
     }
 
-    /// Puts the Gaussians `keep` of a cloud into cells, all of them away; `fill(i, record)` writes Gaussian i.
-    pub fn fill(
-        &mut self,
-        plan: &Plan,
-        settings: &TrainSettings,
-        cloud: &GaussianCloud,
-        keep: &[usize],
-        fill: impl Fn(usize, &mut [u8]),
-    ) -> Result<(), TrainError> {
-        self.close();
-        let geometry = |i: usize| Geometry {
-            mean: cloud.means[i],
-            log_scale: cloud.log_scales[i],
-            ..bytemuck::Zeroable::zeroed()
-        };
-        let keyed = self.divide(plan, settings, keep.len(), &|i| geometry(keep[i]));
-        for run in keyed.chunk_by(|a, b| a.0 == b.0) {
-            let mut cell = Cell { count: run.len(), ..Cell::empty(run[0].0) };
-            run.iter().for_each(|(_, i)| cell.bounds.add(&geometry(keep[*i as usize])));
-            self.store.append(&mut cell.chain, run.len(), |i, record| fill(keep[run[i].1 as usize], record))?;
-            self.cells.push(cell);
-        }
-        self.away = keep.len();
-        Ok(())
-    }
-
-    /// Chooses the size of cells for `n` Gaussians; returns the cell of each, by cell.
-    fn divide(
+    /// Puts the `n` Gaussians that are kept into cells, all of them away; `fill(piece, row, record)` writes one. The scene is read a few
+    /// times: for the size of cells and what is in them, then to bring each Gaussian to its cell.
+    pub fn fill<E: From<TrainError>>(
         &mut self,
         plan: &Plan,
         settings: &TrainSettings,
         n: usize,
-        geometry: &dyn Fn(usize) -> Geometry,
-    ) -> Vec<(CellKey, u32)> {
-        self.means.clear();
-        let stride = n.div_ceil(SAMPLED_MEANS).max(1);
-        self.means.extend((0..n).step_by(stride).map(|i| geometry(i).mean));
-        let wide = |axis: usize| {
-            let mut along: Vec<f32> = self.means.iter().map(|m| m[axis]).collect();
-            along.sort_unstable_by(f32::total_cmp);
-            let strays = (along.len() as f32 * STRAY_SHARE) as usize;
-            along[along.len() - 1 - strays] - along[strays]
-        };
-        let per_cell = plan.gaussians as f32 / settings.cells.per_window as f32;
-        let wanted = ((n as f32 / per_cell) as usize).clamp(1, plan.cells());
-        let side = (wide(0) * wide(1) / wanted as f32).sqrt();
-        self.grid.side = if side.is_finite() && side > 0.0 { side } else { 1.0 };
-        let mut keyed = self.keyed(n, geometry);
-        // Ground is not all covered alike: where much of it is empty, cells are smaller.
-        for _ in 0..MOST_HALVINGS {
-            if distinct(&keyed) >= wanted {
-                break;
-            }
-            self.grid.side *= 0.5;
-            keyed = self.keyed(n, geometry);
+        kept: &Kept<'_, E>,
+        fill: impl Fn(&GaussianCloud, usize, &mut [u8]),
+    ) -> Result<(), E> {
+        self.close();
+        let done = self.divide(plan, settings, n, &|see| {
+            kept.each(&mut |cloud, rows| {
+                rows.iter().for_each(|row| see(&geometry_of(cloud, *row as usize)));
+                Ok(())
+            })
+        });
+        if let Err(e) = done.and_then(|()| self.bring(n, kept, fill)) {
+            self.close();
+            return Err(e);
         }
-        while distinct(&keyed) > plan.cells() && (self.grid.side * 2.0).is_finite() {
-            self.grid.side *= 2.0;
-            keyed = self.keyed(n, geometry);
-        }
-        keyed
+        self.away = n;
+        Ok(())
     }
 
-    /// Gaussians by cell, and in their order within it.
-    fn keyed(&self, n: usize, geometry: &dyn Fn(usize) -> Geometry) -> Vec<(CellKey, u32)> {
-        let key = |i: usize| {
-            let g = geometry(i);
-            (self.grid.key(g.mean, cell::reach_of(&g)), i as u32)
-        };
-        let mut keyed: Vec<(CellKey, u32)> = (0..n).map(key).collect();
-        keyed.sort_unstable();
-        keyed
+    /// Brings each Gaussian to its cell, in order.
+    fn bring<E: From<TrainError>>(
+        &mut self,
+        n: usize,
+        kept: &Kept<'_, E>,
+        fill: impl Fn(&GaussianCloud, usize, &mut [u8]),
+    ) -> Result<(), E> {
+        for cell in &mut self.cells {
+            self.store.set_aside(&mut cell.chain, cell.count)?;
+        }
+        let mut order: Vec<(u32, u32)> = Vec::new();
+        kept.each(&mut |cloud, rows| {
+            order.clear();
+            for row in rows {
+                let cell = self.cell_of(&geometry_of(cloud, *row as usize)).ok_or(TrainError::SceneChanged)?;
+                order.push((cell as u32, *row));
+            }
+            order.sort_unstable();
+            for run in order.chunk_by(|a, b| a.0 == b.0) {
+                let chain = &mut self.cells[run[0].0 as usize].chain;
+                self.store.append(chain, run.len(), |i, record| fill(cloud, run[i].1 as usize, record))?;
+            }
+            Ok(())
+        })?;
+        let all: usize = self.cells.iter().map(|cell| cell.chain.count as usize).sum();
+        let as_counted = self.cells.iter().all(|cell| cell.chain.count as usize == cell.count);
+        if as_counted && all == n { Ok(()) } else { Err(TrainError::SceneChanged.into()) }
+    }
+
+    /// Chooses the size of cells for the `n` Gaussians that `visit` shows, and counts and bounds the cells that have any.
+    fn divide<E: From<TrainError>>(
+        &mut self,
+        plan: &Plan,
+        settings: &TrainSettings,
+        n: usize,
+        visit: Visit<'_, E>,
+    ) -> Result<(), E> {
+        self.sample(n, visit)?;
+        let per_cell = plan.gaussians as f32 / settings.cells.per_window as f32;
+        let wanted = ((n as f32 / per_cell) as usize).clamp(1, plan.cells());
+        let side = (self.wide(0) * self.wide(1) / wanted as f32).sqrt();
+        self.grid.side = if side.is_finite() && side > 0.0 { side } else { 1.0 };
+        let mut cells = self.counted(plan.cells(), visit)?;
+        // Ground is not all covered alike: where much of it is empty, cells are smaller.
+        for _ in 0..MOST_HALVINGS {
+            if cells.len() >= wanted {
+                break;
+            }
+            drop(cells);
+            self.grid.side *= 0.5;
+            cells = self.counted(plan.cells(), visit)?;
+        }
+        while cells.len() > plan.cells() && (self.grid.side * 2.0).is_finite() {
+            drop(cells);
+            self.grid.side *= 2.0;
+            cells = self.counted(plan.cells(), visit)?;
+        }
+        self.cells.extend(cells.into_values());
+        Ok(())
+    }
+
+    /// Takes means at equal steps through all Gaussians.
+    fn sample<E: From<TrainError>>(&mut self, n: usize, visit: Visit<'_, E>) -> Result<(), E> {
+        self.means.clear();
+        let (stride, mut at) = (n.div_ceil(SAMPLED_MEANS).max(1), 0);
+        visit(&mut |g| {
+            if at % stride == 0 && self.means.len() < SAMPLED_MEANS {
+                self.means.push(g.mean);
+            }
+            at += 1;
+        })?;
+        if at == n && n > 0 { Ok(()) } else { Err(TrainError::SceneChanged.into()) }
+    }
+
+    /// How wide the ground is along an axis, strays left out, metres.
+    fn wide(&self, axis: usize) -> f32 {
+        let mut along: Vec<f32> = self.means.iter().map(|m| m[axis]).collect();
+        along.sort_unstable_by(f32::total_cmp);
+        let strays = (along.len() as f32 * STRAY_SHARE) as usize;
+        along[along.len() - 1 - strays] - along[strays]
+    }
+
+    /// Cells of the present size that have Gaussians, counted and bounded. Of more than `most` one more than that, which are no use.
+    fn counted<E>(&self, most: usize, visit: Visit<'_, E>) -> Result<BTreeMap<CellKey, Cell>, E> {
+        let mut cells = BTreeMap::new();
+        visit(&mut |g| {
+            let key = self.grid.key(g.mean, cell::reach_of(g));
+            if cells.len() <= most {
+                cells.entry(key).or_insert_with(|| Cell::empty(key));
+            }
+            if let Some(cell) = cells.get_mut(&key) {
+                cell.count += 1;
+                cell.bounds.add(g);
+            }
+        })?;
+        Ok(cells)
+    }
+
+    /// The cell of a Gaussian; `None` when no cell was counted there.
+    fn cell_of(&self, g: &Geometry) -> Option<usize> {
+        let key = self.grid.key(g.mean, cell::reach_of(g));
+        self.cells.binary_search_by_key(&key, |cell| cell.key).ok()
     }
 
     /// Gaussian `from` takes place `to` on the device, or is copied there.
@@ -198,8 +258,9 @@ impl Scene {
     }
 }
 
-fn distinct(keyed: &[(CellKey, u32)]) -> usize {
-    keyed.chunk_by(|a, b| a.0 == b.0).count()
+/// What cells are made by.
+fn geometry_of(cloud: &GaussianCloud, row: usize) -> Geometry {
+    Geometry { mean: cloud.means[row], log_scale: cloud.log_scales[row], ..bytemuck::Zeroable::zeroed() }
 }
 
 impl Trainer {

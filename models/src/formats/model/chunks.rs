@@ -5,19 +5,25 @@ use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use config::disk::Disk;
+
 use super::celled::Cells;
 use super::columns::{self, read_words, triples, write_floats};
 use super::hashing::Hashing;
 use super::opening::{Body, Opened, open, read_header_of};
 use super::{
-    EXACT, FIXED, FormatError, HASH, ModelHeader, begin, decode_header, encode_header, finish, read, write_atomic,
+    EXACT, FIXED, FormatError, HASH, ModelHeader, begin, decode_header, encode_header, exact_bytes, finish, read,
+    write_atomic,
 };
 use crate::cloud::{GaussianCloud, sh_coefficients};
 
 /// Gaussians of a piece of exact columns.
 const ROWS: usize = 16 << 10;
+/// Buffers of readers and writers of columns: 64 KiB for each of five, and as much for numbers on their way.
+const COLUMNS_BUFFERED: u64 = 10 << 16;
 
 /// A verified model, whose Gaussians are read as often as they are wanted.
+#[derive(Debug)]
 pub struct Chunks {
     path: PathBuf,
     /// What the file says about itself.
@@ -26,6 +32,11 @@ pub struct Chunks {
     pub count: usize,
     /// Their SH degree.
     pub sh_degree: u8,
+}
+
+/// Bytes that reading or writing piece by piece takes of the host for Gaussians of this SH degree: a piece, and buffers of its columns.
+pub fn piece_bytes(sh_degree: u8) -> u64 {
+    ROWS as u64 * exact_bytes(sh_degree) + COLUMNS_BUFFERED
 }
 
 /// What is done with a piece.
@@ -154,18 +165,62 @@ pub fn write_columns(
     let head = encode_header(path, header)?;
     let mut hash = [0; HASH as usize];
     write_atomic(path, |file: &mut dyn Write| {
-        let mut out = begin(file, EXACT, &head, count, sh_degree)?;
-        for (column, floats) in columns::floats(sh_degree).into_iter().enumerate() {
-            let mut counting = Counting { inner: &mut out, bytes: 0 };
-            fill(column, &mut counting)?;
-            if counting.bytes != 4 * (floats * count) as u64 {
-                return Err(std::io::Error::other("a column of another length than its Gaussians have"));
-            }
-        }
-        hash = *out.hasher.finalize().as_bytes();
-        finish(out).map(drop)
+        hash = columns_into(file, &head, count, sh_degree, fill)?;
+        Ok(())
     })?;
     Ok(hash)
+}
+
+fn columns_into(
+    file: &mut dyn Write,
+    head: &[u8],
+    count: usize,
+    sh_degree: u8,
+    fill: &mut dyn FnMut(usize, &mut dyn Write) -> std::io::Result<()>,
+) -> std::io::Result<[u8; HASH as usize]> {
+    let mut out = begin(file, EXACT, head, count, sh_degree)?;
+    for (column, floats) in columns::floats(sh_degree).into_iter().enumerate() {
+        let mut counting = Counting { inner: &mut out, bytes: 0 };
+        fill(column, &mut counting)?;
+        if counting.bytes != 4 * (floats * count) as u64 {
+            return Err(std::io::Error::other("a column of another length than its Gaussians have"));
+        }
+    }
+    let hash = *out.hasher.finalize().as_bytes();
+    finish(out)?;
+    Ok(hash)
+}
+
+/// Reads a scene from its beginning to its end into what it is given, piece by piece.
+pub type Pieces<'a> = &'a mut dyn FnMut(&mut dyn FnMut(&GaussianCloud) -> std::io::Result<()>) -> std::io::Result<()>;
+
+/// As [`super::write_checkpoint`], of Gaussians that are never all in memory: `pieces` reads them once for each column of the file.
+///
+/// # Errors
+/// As [`super::write()`]; those of `pieces`; it gave another number or degree than it should.
+pub fn write_checkpoint_pieces(
+    disk: &Disk,
+    path: &Path,
+    header: &ModelHeader,
+    (count, sh_degree): (usize, u8),
+    pieces: Pieces<'_>,
+) -> Result<(), FormatError> {
+    let head = encode_header(path, header)?;
+    let fill = &mut |column: usize, mut out: &mut dyn Write| {
+        pieces(&mut |cloud| write_floats(&mut out, columns::of(cloud)[column]))
+    };
+    disk.replace_keeping(path, |file| columns_into(file, &head, count, sh_degree, fill).map(drop))
+        .map_err(|e| FormatError::disk(path, e))
+}
+
+/// As [`super::read_checkpoint`], to be read piece by piece.
+///
+/// # Errors
+/// Those of [`super::read_checkpoint`].
+pub fn open_checkpoint(disk: &Disk, path: &Path) -> Result<Option<Chunks>, FormatError> {
+    let newest = disk.newest(path, Chunks::open).map_err(|e| FormatError::io(path, "setting aside", e))?;
+    newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));
+    Ok(newest.found)
 }
 
 /// Counts what passes through.

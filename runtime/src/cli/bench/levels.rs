@@ -38,7 +38,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         None => {
             std::fs::create_dir_all(&args.out).map_err(JobError::io(&args.out))?;
             let scene = args.out.join("scene.dgtr");
-            write_scene(&scene, args.gaussians as usize)?;
+            write_scene(&scene, args.gaussians as usize, 0)?;
             scene
         }
     };

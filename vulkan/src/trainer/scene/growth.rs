@@ -1,6 +1,5 @@
 //! A scene that outgrows the device while it is densified goes into cells then.
 
-use super::{Cell, Scene};
 use crate::trainer::{TrainError, Trainer};
 
 impl Trainer {
@@ -8,14 +7,16 @@ impl Trainer {
     pub(in crate::trainer) fn enter_cells(&mut self) -> Result<(), TrainError> {
         self.flush()?;
         self.scene.close();
-        let geometry = self.parameters.geometry(&self.arena);
-        let keyed = self.scene.divide(&self.plan, &self.settings, self.gaussians, &|i| geometry[i]);
-        let Scene { cells, tags, .. } = &mut self.scene;
-        tags.resize(self.gaussians, 0);
-        for run in keyed.chunk_by(|a, b| a.0 == b.0) {
-            run.iter().for_each(|(_, i)| tags[*i as usize] = cells.len() as u32);
-            cells.push(Cell { on_device: true, ..Cell::empty(run[0].0) });
+        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
+        self.scene.divide::<TrainError>(&self.plan, &self.settings, self.gaussians, &|see| {
+            geometry.iter().for_each(see);
+            Ok(())
+        })?;
+        for g in geometry {
+            let cell = self.scene.cell_of(g).ok_or(TrainError::SceneChanged)?;
+            self.scene.tags.push(cell as u32);
         }
+        self.scene.cells.iter_mut().for_each(|cell| cell.on_device = true);
         self.page_out(false)
     }
 

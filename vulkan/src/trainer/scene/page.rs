@@ -8,10 +8,13 @@ use crate::trainer::{TrainError, Trainer, state};
 
 impl Scene {
     /// Every Gaussian, cell by cell; `on_device` of them are there.
-    pub fn each_record(&mut self, on_device: usize, mut take: impl FnMut(Held<'_>)) -> Result<(), TrainError> {
+    pub fn each_record<E: From<TrainError>>(
+        &mut self,
+        on_device: usize,
+        mut take: impl FnMut(Held<'_>) -> Result<(), E>,
+    ) -> Result<(), E> {
         if !self.is_paged() {
-            (0..on_device).for_each(|i| take(Held::OnDevice(i)));
-            return Ok(());
+            return (0..on_device).try_for_each(|i| take(Held::OnDevice(i)));
         }
         self.check_whole()?;
         self.sort_by_cell(on_device);
@@ -19,7 +22,7 @@ impl Scene {
         for (index, cell) in self.cells.iter().enumerate() {
             if cell.on_device {
                 let run = run_of(&self.order[from..], &self.tags, index as u32);
-                run.iter().for_each(|i| take(Held::OnDevice(*i as usize)));
+                run.iter().try_for_each(|i| take(Held::OnDevice(*i as usize)))?;
                 from += run.len();
             } else {
                 self.store.read(&cell.chain, |_, record| take(Held::InFile(record)))?;
@@ -123,7 +126,10 @@ impl Scene {
         let mut n = 0;
         for &index in wanted {
             let cell = &mut self.cells[index as usize];
-            self.store.read(&cell.chain, |i, record| parameters.write_record(arena, n + i, record))?;
+            self.store.read(&cell.chain, |i, record| {
+                parameters.write_record(arena, n + i, record);
+                Ok::<(), TrainError>(())
+            })?;
             cell.on_device = true;
             n += cell.chain.count as usize;
             self.tags.resize(n, index);

@@ -83,7 +83,7 @@ impl Store {
         let mut done = 0;
         while done < count {
             let within = chain.count as usize % BLOCK_GAUSSIANS;
-            if within == 0 {
+            if within == 0 && !self.steps_on(chain) {
                 self.add_block(chain)?;
             }
             let records = (BLOCK_GAUSSIANS - within).min(count - done);
@@ -98,6 +98,28 @@ impl Store {
             done += records;
         }
         Ok(())
+    }
+
+    /// Sets blocks for so many records of an empty cell aside, one behind the other: what is appended by turns with other cells is read
+    /// as one piece. They are the cell's for good once they are full; the file is cleared where they are not to be filled.
+    ///
+    /// # Errors
+    /// [`TrainError::SceneFile`]: not enough blocks are left.
+    pub fn set_aside(&mut self, chain: &mut Chain, records: usize) -> Result<(), TrainError> {
+        for _ in 0..records.div_ceil(BLOCK_GAUSSIANS) {
+            self.add_block(chain)?;
+        }
+        chain.last = NONE;
+        Ok(())
+    }
+
+    /// Goes on to the next block that was set aside for the cell; false when there is none.
+    fn steps_on(&self, chain: &mut Chain) -> bool {
+        let next = if chain.last == NONE { chain.first } else { self.next[chain.last as usize] };
+        if next != NONE {
+            chain.last = next;
+        }
+        next != NONE
     }
 
     fn add_block(&mut self, chain: &mut Chain) -> Result<(), TrainError> {
@@ -117,8 +139,12 @@ impl Store {
     /// The cell's records in order.
     ///
     /// # Errors
-    /// [`TrainError::SceneFile`].
-    pub fn read(&mut self, chain: &Chain, mut take: impl FnMut(usize, &[u8])) -> Result<(), TrainError> {
+    /// [`TrainError::SceneFile`], and those of `take`.
+    pub fn read<E: From<TrainError>>(
+        &mut self,
+        chain: &Chain,
+        mut take: impl FnMut(usize, &[u8]) -> Result<(), E>,
+    ) -> Result<(), E> {
         let (mut block, mut done, count) = (chain.first, 0, chain.count as usize);
         while done < count && block != NONE {
             let records = BLOCK_GAUSSIANS.min(count - done);
@@ -127,7 +153,7 @@ impl Store {
             let file = self.file.as_ref().ok_or_else(no_file)?;
             file.read_exact_at(bytes, at).map_err(|e| failed("reading", &e))?;
             self.moved += bytes.len() as u64;
-            bytes.chunks_exact(self.record).enumerate().for_each(|(i, record)| take(done + i, record));
+            bytes.chunks_exact(self.record).enumerate().try_for_each(|(i, record)| take(done + i, record))?;
             done += records;
             block = self.next[block as usize];
         }
@@ -162,7 +188,11 @@ mod tests {
 
     fn read(store: &mut Store, chain: &Chain) -> Vec<u8> {
         let mut all = Vec::new();
-        store.read(chain, |_, record| all.push(record[0])).unwrap();
+        let mut take = |_: usize, record: &[u8]| {
+            all.push(record[0]);
+            Ok::<(), TrainError>(())
+        };
+        store.read(chain, &mut take).unwrap();
         all
     }
 
@@ -180,6 +210,26 @@ mod tests {
         assert_eq!((a.count, read(&mut store, &a)), (0, vec![]));
         store.append(&mut a, 100, |i, r| r.fill(i as u8)).unwrap();
         assert_eq!((read(&mut store, &a), read(&mut store, &b)), ((0..100).collect(), vec![200, 201, 202]));
+    }
+
+    #[test]
+    fn cells_that_grow_by_turns_lie_one_behind_the_other_where_room_was_set_aside() {
+        let mut store = store();
+        let mut cells = [Chain::EMPTY; 2];
+        for (cell, records) in cells.iter_mut().zip([150, 65]) {
+            store.set_aside(cell, records).unwrap();
+        }
+        for round in 0..15u8 {
+            store.append(&mut cells[0], 10, |i, r| r.fill(10 * round + i as u8)).unwrap();
+            store.append(&mut cells[1], if round < 13 { 5 } else { 0 }, |i, r| r.fill(5 * round + i as u8)).unwrap();
+        }
+        let [a, b] = cells;
+        assert_eq!([a.first, a.last, b.first, b.last], [0, 2, 3, 4]);
+        assert_eq!((read(&mut store, &a), read(&mut store, &b)), ((0..150).collect(), (0..65).collect()));
+        // One more than was asked for comes to a block of its own, and all come back.
+        cells.iter_mut().for_each(|c| store.append(c, 64, |_, r| r.fill(1)).unwrap());
+        cells.iter_mut().for_each(|c| store.forget(c));
+        assert!(store.append(&mut { Chain::EMPTY }, 64 * store.next.len(), |_, _| {}).is_ok());
     }
 
     #[test]

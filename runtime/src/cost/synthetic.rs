@@ -12,6 +12,8 @@ const HEIGHT_M: f64 = 40.0;
 const RELIEF_M: f32 = 3.0;
 /// The ground is larger than the picture by this on every side, so that some Gaussians are out of view.
 const MARGIN: f32 = 1.15;
+/// Share of the Gaussians that [`view`] sees, but for those at its edges.
+pub const IN_VIEW: f64 = 1.0 / (MARGIN as f64 * MARGIN as f64);
 /// Standard deviation of a Gaussian in distances to its neighbour.
 const OVERLAP: f32 = 0.6;
 

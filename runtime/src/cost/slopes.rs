@@ -1,4 +1,5 @@
-//! How a stage's time grows: a straight line through time against the one quantity the stage loops over.
+//! How a stage's time grows: a straight line through time against the one quantity the stage loops over, and how much of it each
+//! quantity takes where only whole times are known.
 
 use serde::Serialize;
 use vulkan::stages::Stage;
@@ -99,9 +100,41 @@ pub fn fit(points: &[(f64, f64)]) -> Option<Line> {
     Some(Line { fixed: my - per_unit * mx, per_unit, r_squared })
 }
 
+/// Sweeps of [`nonnegative`]: columns that grow together converge slowly, and what they say together does not change any more.
+const SWEEPS: usize = 2000;
+
+/// What each amount costs, never less than nothing, so that amounts times costs come nearest to every row's time: the squares of what is
+/// missed as a share of the time, so that small times count as much as large ones. Rows without a time say nothing.
+pub fn nonnegative<const N: usize>(rows: &[([f64; N], f64)]) -> [f64; N] {
+    let rows: Vec<[f64; N]> = rows.iter().filter(|r| r.1 > 0.0).map(|(amounts, y)| amounts.map(|x| x / y)).collect();
+    let squares: [f64; N] = std::array::from_fn(|k| rows.iter().map(|r| r[k] * r[k]).sum());
+    let mut costs = [0.0; N];
+    for _ in 0..SWEEPS {
+        for k in 0..N {
+            let missed = |row: &[f64; N]| 1.0 - (0..N).filter(|o| *o != k).map(|o| costs[o] * row[o]).sum::<f64>();
+            let along: f64 = rows.iter().map(|row| row[k] * missed(row)).sum();
+            costs[k] = if squares[k] > 0.0 { (along / squares[k]).max(0.0) } else { 0.0 };
+        }
+    }
+    costs
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn costs_are_found_from_whole_times_and_none_is_below_zero() {
+        let rows = [[1.0, 10.0, 3.0], [1.0, 2.0, 50.0], [1.0, 30.0, 7.0], [1.0, 1.0, 1.0]];
+        let timed = rows.map(|r| (r, 0.5 * r[0] + 2.0 * r[1] + 0.1 * r[2]));
+        let found = nonnegative(&timed);
+        assert!(found.iter().zip([0.5, 2.0, 0.1]).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}");
+        // A time that falls as the amount grows costs nothing more, and not less than nothing.
+        let falling = nonnegative(&[([1.0, 1.0], 10.0), ([1.0, 2.0], 9.0)]);
+        assert!(falling[1] == 0.0 && (9.0..10.0).contains(&falling[0]), "{falling:?}");
+        assert_eq!(nonnegative::<2>(&[]), [0.0; 2]);
+        assert_eq!(nonnegative(&[([1.0, 0.0], 0.0), ([1.0, 0.0], 4.0)]), [4.0, 0.0]);
+    }
 
     #[test]
     fn points_on_a_line_give_that_line() {

@@ -1,0 +1,43 @@
+//! `dgtr bench forecast`.
+
+use std::path::PathBuf;
+
+use vulkan::gpu::Gpu;
+
+use crate::bench::device::SIZES;
+use crate::bench::figures::{markdown, write_json};
+use crate::bench::forecast::{measured, table};
+use crate::cli::CliError;
+use crate::cli::output::outln;
+use crate::kernels;
+
+/// Arguments of `dgtr bench forecast`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// How many of the three sizes are measured, the smallest first.
+    #[arg(long, default_value_t = SIZES.len(), value_name = "N")]
+    pub sizes: usize,
+    /// Steps that are measured at each size.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
+    pub steps: u32,
+    /// Vulkan device whose name contains this.
+    #[arg(long)]
+    pub device: Option<String>,
+    /// Write everything as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// Runs `dgtr bench forecast`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let gpu = Gpu::open(args.device.as_deref())?;
+    let (model, all) = measured(&gpu, kernels::shape_of(&gpu), args.sizes, args.steps)?;
+    outln!("{}", markdown(&table(&gpu, &model, &all)));
+    if let Some(path) = &args.json {
+        write_json(path, &serde_json::json!({ "device": gpu.info().name, "cost": model, "sizes": all }))?;
+    }
+    Ok(())
+}

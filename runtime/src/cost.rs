@@ -1,0 +1,104 @@
+//! What a training step costs on this device: measured once in a few seconds, kept beside the kernels' shapes, and asked by whoever must
+//! know beforehand how long a training will take.
+
+use std::path::PathBuf;
+
+use config::kernels::KernelChoice;
+use vulkan::gpu::{Gpu, GpuInfo};
+use vulkan::shape::KernelShape;
+
+use crate::kernels::{cache, choice};
+use model::CostModel;
+
+pub mod loads;
+pub mod measure;
+pub mod model;
+pub mod slopes;
+pub mod synthetic;
+
+/// Mesa's number of threads of its drivers for the processor.
+const LAVAPIPE_THREADS: &str = "LP_NUM_THREADS";
+
+/// Threads by which a device that is a processor computes; 0 for others, which the processor's cores do not make faster.
+pub fn threads(info: &GpuInfo) -> u32 {
+    if !info.is_cpu {
+        return 0;
+    }
+    let cores = || std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+    std::env::var(LAVAPIPE_THREADS).ok().and_then(|n| n.trim().parse().ok()).unwrap_or_else(cores)
+}
+
+/// What steps cost on this device with kernels of `shape`, as far as it was measured.
+pub fn known(info: &GpuInfo, shape: KernelShape) -> Option<CostModel> {
+    kept(cache::path()?, info, shape)
+}
+
+/// The same, measured now and kept where it was not; `None` (and a warning) where it cannot be measured, and where
+/// [`config::kernels::VARIABLE`] says that nothing is. Call it before anything that must not wait: it takes seconds.
+pub fn of(gpu: &Gpu, shape: KernelShape) -> Option<CostModel> {
+    if choice() == KernelChoice::Standard {
+        return None;
+    }
+    measured(gpu, shape, cache::path())
+}
+
+fn kept(path: PathBuf, info: &GpuInfo, shape: KernelShape) -> Option<CostModel> {
+    cache::read_cost(&path, info, threads(info), shape).unwrap_or_else(|e| {
+        tracing::warn!("what steps cost is measured anew: {e}");
+        None
+    })
+}
+
+/// Measures it, whatever is kept, and keeps the result; `None` (and a warning) when it cannot be measured.
+pub fn anew(gpu: &Gpu, shape: KernelShape) -> Option<CostModel> {
+    now(gpu, shape, cache::path())
+}
+
+fn measured(gpu: &Gpu, shape: KernelShape, path: Option<PathBuf>) -> Option<CostModel> {
+    let before = path.clone().and_then(|path| kept(path, gpu.info(), shape));
+    before.or_else(|| now(gpu, shape, path))
+}
+
+fn now(gpu: &Gpu, shape: KernelShape, path: Option<PathBuf>) -> Option<CostModel> {
+    let info = gpu.info();
+    tracing::info!("{}: measuring what a step costs (once)", info.name);
+    let model = match measure::measure(gpu, shape) {
+        Ok(model) if model.is_sound() => model,
+        Ok(_) => {
+            tracing::warn!("{}: its clock says nothing; what steps cost is not known", info.name);
+            return None;
+        }
+        Err(e) => {
+            tracing::warn!("{}: what steps cost could not be measured: {e}", info.name);
+            return None;
+        }
+    };
+    let keep = |path: PathBuf| cache::write_cost(&path, info, threads(info), shape, model);
+    if let Some(Err(e)) = path.map(keep) {
+        tracing::warn!("{e}; what steps cost is measured anew next time");
+    }
+    Some(model)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_measured_is_kept_for_this_number_of_threads_and_found_again() {
+        let Ok(gpu) = Gpu::open(None) else {
+            println!("skipped: no Vulkan device");
+            return;
+        };
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("kernels.toml");
+        let shape = KernelShape::standard(gpu.info());
+        assert_eq!(kept(path.clone(), gpu.info(), shape), None);
+        let model = measured(&gpu, shape, Some(path.clone())).unwrap();
+        assert_eq!(kept(path.clone(), gpu.info(), shape), Some(model));
+        assert_eq!(measured(&gpu, shape, Some(path)), Some(model), "nothing is measured twice");
+        // A folder that cannot be: the model is used, and nothing fails.
+        std::fs::write(dir.path().join("file"), b"").unwrap();
+        assert!(measured(&gpu, shape, Some(dir.path().join("file/kernels.toml"))).unwrap().is_sound());
+    }
+}

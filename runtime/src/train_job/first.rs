@@ -1,0 +1,42 @@
+//! A model that training begins with.
+
+use std::path::Path;
+
+use models::dataset::Dataset;
+use models::formats::model::Chunks;
+
+use crate::engine::model_path;
+use crate::error::JobError;
+
+/// Opens the model `from`. It is read once more, piece by piece, when it is trained, and must still be there then.
+///
+/// # Errors
+/// It cannot be read, holds no Gaussians, or is the one that a `fresh` job in `out` replaces.
+pub(super) fn open(from: &Path, out: &Path, fresh: bool) -> Result<Chunks, JobError> {
+    let model = Chunks::open(from)?;
+    let said = |what: &str| Err(JobError::Request(format!("{}: {what}", from.display())));
+    if model.count == 0 {
+        return said("holds no Gaussians to begin with; train it first (dgtr train continues it)");
+    }
+    let resolved = |path: &Path| path.canonicalize().ok();
+    if fresh && resolved(from).is_some_and(|from| resolved(&model_path(out)) == Some(from)) {
+        return said("is the model that --fresh replaces; give another --out");
+    }
+    Ok(model)
+}
+
+/// Whether the model lies where the data set does.
+///
+/// # Errors
+/// Their frames have different origins.
+pub(super) fn check(model: &Chunks, set: &Dataset) -> Result<(), JobError> {
+    match (model.header.origin, set.origin) {
+        (Some(from), Some(set)) if from != set => {
+            let [from, set] = [from, set].map(|o| format!("{}, {}, {} m", o.lat_deg, o.lon_deg, o.alt_m));
+            Err(JobError::Request(format!(
+                "--from: the model's frame begins at {from}, that of the pictures at {set}; give a model of the same frame"
+            )))
+        }
+        _ => Ok(()),
+    }
+}
