@@ -39,7 +39,8 @@ impl Forecast {
     }
 }
 
-/// The model as it is measured now, and each size by it.
+/// The model as it is measured at the end, and each size by what is measured before and after it: a machine that is faster now than a minute
+/// ago (others use it, its clock rises and falls) says nothing about the forecast.
 ///
 /// # Errors
 /// The device, or its memory.
@@ -49,7 +50,7 @@ pub fn measured(
     sizes: usize,
     steps: u32,
 ) -> Result<(CostModel, Vec<Forecast>), JobError> {
-    let model = measure::measure(gpu, shape)?;
+    let mut model = measure::measure(gpu, shape)?;
     // Nothing is held against what the device could do.
     let none = Ceiling { kernel_bytes_per_s: 1.0, command_bytes_per_s: 1.0, operations_per_s: 1.0 };
     let mut all = Vec::new();
@@ -58,11 +59,14 @@ pub fn measured(
         let before = Sight { gaussians: gaussians as u64, share: IN_VIEW, pixels }.load(Footprint::SYNTHETIC);
         let taken = measure_stages(gpu, shape, &none, &Scene::synthetic(gaussians, size.0, size.1, 1), steps)?;
         let counted = load(taken.gaussians, taken.visible, taken.instances, taken.evaluations, pixels);
+        let after = measure::measure(gpu, shape)?;
+        let meanwhile = model.between(&after);
+        model = after;
         all.push(Forecast {
             gaussians,
             size,
-            forecast_ms: model.step_ms(&before),
-            by_work_ms: model.step_ms(&counted),
+            forecast_ms: meanwhile.step_ms(&before),
+            by_work_ms: meanwhile.step_ms(&counted),
             measured_ms: taken.step_ms,
             instances: [before.instances, taken.instances],
         });

@@ -63,6 +63,15 @@ impl CostModel {
         found
     }
 
+    /// What lies in the middle between two, coefficient by coefficient.
+    pub fn between(&self, other: &Self) -> Self {
+        let mut both = Self { fixed_ms: 0.5 * (self.fixed_ms + other.fixed_ms), ..Self::default() };
+        for driver in DRIVERS {
+            *both.of_mut(driver) = 0.5 * (self.of(driver) + other.of(driver));
+        }
+        both
+    }
+
     /// Adds a fixed time and one per driver, in milliseconds.
     fn add(&mut self, ms: [f64; 1 + DRIVERS.len()]) {
         self.fixed_ms += ms[0];
