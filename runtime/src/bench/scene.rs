@@ -17,7 +17,7 @@ use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::frustum::{Frustum, mean, reach};
 use super::levels::{SPACING_M, write_scene};
-use super::synthetic::picture;
+use crate::cost::synthetic::picture;
 use crate::engine::device::DeviceRequest;
 use crate::engine::host::{HostPlan, HostRequest};
 use crate::engine::{model_path, pieces};
