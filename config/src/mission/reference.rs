@@ -68,11 +68,11 @@ pub(super) fn explain(s: &Setting) -> String {
 
 /// `text` as comment lines.
 pub(super) fn comment(out: &mut String, text: &str) {
-    let mut column = COLUMNS;
+    let mut column = 0;
     for word in text.split_whitespace() {
         let length = word.chars().count() + 1;
-        if column + length > COLUMNS {
-            *out += if column == COLUMNS { "#" } else { "\n#" };
+        if column == 0 || column + length > COLUMNS {
+            *out += if column == 0 { "#" } else { "\n#" };
             column = 1;
         }
         *out += " ";
@@ -140,6 +140,14 @@ mod tests {
 
     fn described<T: Value>() -> Vec<&'static str> {
         T::settings().iter().map(|s| s.name).chain(T::choices().iter().map(|c| c.0)).collect()
+    }
+
+    #[test]
+    fn a_line_that_is_just_full_ends_like_any_other() {
+        let mut out = String::new();
+        comment(&mut out, &format!("{} next", "x".repeat(COLUMNS - 2)));
+        let lines: Vec<&str> = out.lines().collect();
+        assert_eq!((lines.len(), lines[1]), (2, "# next"), "{out}");
     }
 
     #[test]

@@ -42,6 +42,7 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
     ("bench map", &["dgtr bench map --out map"]),
     ("bench detail", &["dgtr bench detail --out detail"]),
     ("bench device", &["dgtr bench device --out board.md"]),
+    ("bench forecast", &["dgtr bench forecast --json forecast.json"]),
     ("bench ground", &["dgtr bench ground --out field --aircraft 24 --side-m 700"]),
     (
         "bench levels",
