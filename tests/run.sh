@@ -24,7 +24,7 @@ flying=$!
 failed=0
 # What flies comes first.
 # shellcheck disable=SC2086
-nice -n 10 cargo test $all --exclude tests || failed=$?
+nice -n 10 cargo test $all --no-fail-fast --exclude tests || failed=$?
 wait "$flying" || failed=$?
 flying=
 cat "$log"

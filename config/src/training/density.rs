@@ -66,7 +66,7 @@ mod tests {
     fn short_schedules_densify_more_often_than_every_300_steps() {
         let d = DensitySettings::default();
         assert_eq!(d.interval(10_000), 300);
-        assert_eq!(d.interval(1_000), 116);
+        assert_eq!(d.interval(1_000), 70);
         assert_eq!(d.interval(1), 1);
     }
 
