@@ -24,10 +24,9 @@ choice! {
     }
 }
 
-/// Visits to each picture that a point needs: of sheffield_cross (43 pictures, scored at full size) pictures of half the size gain more
-/// of the same time up to then. 2 visits to whole pictures against 6 to halves, both 100,000 Gaussians: 22.94 and 23.74 dB, 5 against 15:
-/// 24.03 and 24.37; 10 to whole ones: 24.50, 15 (`short`): 24.7 (`dgtr train sheffield_cross --max-gaussians 100000 --scale 1 --steps N`,
-/// and `--scale 0.5` with three times the steps, `dgtr eval … --split test`).
+/// Visits to each picture that a point needs before a larger one is preferred. On sheffield_cross, scored at full size, pictures of half
+/// the size have 0.55 dB more than whole ones of the same time after 2 visits to whole ones, 0.14 after 5, 0.13 after 15, where whole ones
+/// have 0.010 more SSIM (tests/BENCHMARKS.md, "What a step is forecast to cost").
 pub const VISITS: u32 = 15;
 /// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000
 /// Gaussians, of which a picture of 640×480 sees 29 %), and half as many, which at half the size cost 0.15 dB.

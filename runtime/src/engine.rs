@@ -41,6 +41,8 @@ mod rebuild;
 mod reconstruct;
 mod rounding;
 pub mod source;
+#[cfg(test)]
+mod testing;
 mod waiting;
 
 use device::DeviceRequest;

@@ -24,8 +24,8 @@ mod memory;
 pub use flight::{foresee, of_flight};
 pub use memory::Room;
 
-/// Fractions of a picture's size, smallest first: those that `dgtr train` tries, too.
-const SCALES: [f64; 10] = [0.03125, 0.0625, 0.09375, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.75, 1.0];
+/// Fractions of a picture's size that are tried, smallest first: halves, at which JPEG files are decoded for less, and between.
+pub const SCALES: [f64; 10] = [0.03125, 0.0625, 0.09375, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.75, 1.0];
 /// Pictures are not made smaller than this on the longer side: `tiny` has twice as much.
 const LEAST_SIDE: u32 = 160;
 /// Fewer Gaussians than this are no scene.
@@ -284,13 +284,6 @@ impl Choice {
     }
 }
 
-/// `100,000`.
-fn grouped(n: u32) -> String {
-    let digits = n.to_string();
-    let groups: Vec<_> = digits.as_bytes().rchunks(3).rev().map(String::from_utf8_lossy).collect();
-    groups.join(",")
-}
-
 impl fmt::Display for Choice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (width, height) = self.picture;
@@ -304,11 +297,11 @@ impl fmt::Display for Choice {
             f,
             "auto: {} Gaussians at {:.3} of {width}×{height} in {} MiB: {:.1} ms a step forecast, {} steps in {seconds:.0} s, \
              {:.0} visits a picture; limited by {limit}",
-            grouped(self.max_gaussians),
+            self.max_gaussians,
             self.image_scale,
             self.device_mib,
             self.step_ms,
-            grouped(self.steps),
+            self.steps,
             f64::from(self.steps) / self.views.max(1) as f64,
         )
     }

@@ -6,9 +6,8 @@ use models::dataset::{Dataset, scaled};
 use super::TrainJob;
 use crate::engine::device::DeviceRequest;
 use crate::error::JobError;
+use crate::preset::SCALES;
 
-/// Scales that are tried where none is asked for: halves, at which JPEG files are decoded for less, and between.
-const SCALES: [f64; 9] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125];
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;
 /// Lanes that share the work at most; fewer need less memory.
@@ -30,7 +29,7 @@ impl TrainJob {
         }
         let frames = set.select(&self.split, self.region.as_deref())?;
         let wanted = if is_card { self.max_gaussians.unwrap_or(usize::MAX).min(GAUSSIANS_OF_A_CARD) } else { 0 };
-        for scale in SCALES {
+        for scale in SCALES.into_iter().rev() {
             let all_on_device = DeviceRequest {
                 device: None,
                 device_mib: self.budget_mib(),

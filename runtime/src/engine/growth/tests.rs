@@ -2,7 +2,6 @@
 
 use std::ops::ControlFlow;
 
-use config::mission::NetworkSettings;
 use config::refine::RefineSettings;
 use glam::{DQuat, DVec3};
 use hal::sim::world::{PinholeView, World, WorldSettings};
@@ -14,6 +13,7 @@ use vulkan::trainer::{RunBudget, StepReport};
 
 use super::*;
 use crate::engine::device::DeviceRequest;
+use crate::engine::testing::settings;
 use crate::engine::{EngineSettings, InitKind, Reconstruct};
 
 const LENS: Intrinsics = Intrinsics { width: 240, height: 180, fx: 195.0, fy: 195.0, cx: 120.0, cy: 90.0 };
@@ -64,33 +64,16 @@ fn engine_in(host_mib: Option<u32>) -> Option<Result<Reconstruction, JobError>> 
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers), or no ONNX Runtime");
         return None;
     }
-    let settings = EngineSettings {
-        disk: Default::default(),
-        device: DeviceRequest {
-            device: None,
-            device_mib: 96,
-            size: (LENS.width, LENS.height),
-            views: LINE * LINES,
-            crops: 0,
-            view_slots: None,
-            folder: None,
-            max_gaussians: Some(30_000),
-            scene_gaussians: None,
-        },
+    let mut settings = EngineSettings {
         host_mib,
         camera_pixels: LENS.pixels() as u64,
-        ahead: 0,
-        ahead_in_memory: false,
-        delivers: false,
-        map: None,
-        scale: 1.0,
-        network: NetworkSettings::default(),
-        training: Default::default(),
-        init: Default::default(),
         refine: Some(RefineSettings::default()),
         start: InitKind::FeedForward,
         incremental: true,
+        ..settings()
     };
+    let (size, views, max_gaussians) = ((LENS.width, LENS.height), LINE * LINES, Some(30_000));
+    settings.device = DeviceRequest { device_mib: 96, size, views, max_gaussians, ..settings.device };
     let region = vec![[-78.0, -27.0], [78.0, -27.0], [78.0, 27.0], [-78.0, 27.0]];
     Some(Reconstruction::open(settings, ModelHeader { region, ..ModelHeader::default() }, "fly"))
 }

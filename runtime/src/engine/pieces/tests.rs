@@ -1,61 +1,23 @@
 use std::ops::ControlFlow;
 
-use config::mission::NetworkSettings;
-use glam::{DQuat, DVec3};
-use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use models::formats::model::ModelHeader;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::RunBudget;
 
 use super::*;
-use crate::engine::device::DeviceRequest;
+use crate::engine::testing::{picture, settings};
 use crate::engine::{InitKind, Reconstruct};
 
 /// Of 300 Gaussians so many are on the device at once.
 fn engine(on_device: usize, start: InitKind) -> Reconstruction {
-    let settings = EngineSettings {
-        disk: Default::default(),
-        device: DeviceRequest {
-            device: None,
-            device_mib: 64,
-            size: (32, 24),
-            views: 3,
-            crops: 0,
-            view_slots: None,
-            folder: None,
-            max_gaussians: Some(on_device),
-            scene_gaussians: Some(300),
-        },
-        host_mib: None,
-        camera_pixels: 32 * 24,
-        ahead: 0,
-        ahead_in_memory: false,
-        delivers: false,
-        map: None,
-        scale: 1.0,
-        network: NetworkSettings::default(),
-        training: Default::default(),
-        init: Default::default(),
-        refine: None,
-        start,
-        incremental: false,
-    };
+    let mut settings = EngineSettings { start, ..settings() };
+    (settings.device.max_gaussians, settings.device.scene_gaussians) = (Some(on_device), Some(300));
     Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens")
 }
 
 fn take(engine: &mut Reconstruction) {
     for i in 0..3 {
-        let intrinsics = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 16.0, cy: 12.0 };
-        let pose = Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center: DVec3::new(f64::from(i), 0.0, 20.0) };
-        let picture = PosedImage {
-            name: format!("{i}.png"),
-            time_ns: 0,
-            image: image::RgbImage::from_fn(32, 24, |x, y| image::Rgb([(8 * x) as u8, (10 * y) as u8, 90])),
-            view: View { intrinsics, pose },
-            mask: None,
-            sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
-        };
-        engine.add(picture, i < 2).expect("taken");
+        engine.add(picture(i), i < 2).expect("taken");
     }
     assert!(engine.build(&|| true).expect("built"));
 }

@@ -1,61 +1,13 @@
 //! Promises of the engine.
 
-use config::mission::NetworkSettings;
-use glam::{DQuat, DVec3};
-use models::camera::{Intrinsics, PoseSigma, View};
 use models::cloud::GaussianCloud;
 use models::formats::delivery::{self, Rounding};
 use models::formats::model::ModelHeader;
 use vulkan::gpu::Gpu;
 
 use super::*;
-use crate::engine::device::DeviceRequest;
-use crate::engine::{EngineSettings, InitKind};
-
-fn picture(i: u32) -> PosedImage {
-    let intrinsics = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 16.0, cy: 12.0 };
-    // Straight down, side by side.
-    let center = DVec3::new(f64::from(i), 0.0, 20.0);
-    let pose = Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center };
-    PosedImage {
-        name: format!("{i}.png"),
-        time_ns: 0,
-        image: image::RgbImage::from_fn(32, 24, |x, y| image::Rgb([(8 * x) as u8, (10 * y) as u8, 90])),
-        view: View { intrinsics, pose },
-        mask: None,
-        sigma: PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] },
-    }
-}
-
-fn settings(delivers: bool) -> EngineSettings {
-    EngineSettings {
-        disk: Default::default(),
-        device: DeviceRequest {
-            device: None,
-            device_mib: 64,
-            size: (32, 24),
-            views: 3,
-            crops: 0,
-            view_slots: None,
-            folder: None,
-            max_gaussians: Some(300),
-            scene_gaussians: None,
-        },
-        host_mib: None,
-        camera_pixels: 32 * 24,
-        ahead: 0,
-        ahead_in_memory: false,
-        delivers,
-        map: None,
-        scale: 1.0,
-        network: NetworkSettings::default(),
-        training: Default::default(),
-        init: Default::default(),
-        refine: None,
-        start: InitKind::Random,
-        incremental: false,
-    }
-}
+use crate::engine::EngineSettings;
+use crate::engine::testing::{picture, settings};
 
 #[test]
 fn giving_up_gaussians_does_not_start_the_schedule_anew() {
@@ -63,7 +15,7 @@ fn giving_up_gaussians_does_not_start_the_schedule_anew() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
         return;
     }
-    let mut engine = Reconstruction::open(settings(false), ModelHeader::default(), "train").expect("opens");
+    let mut engine = Reconstruction::open(settings(), ModelHeader::default(), "train").expect("opens");
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
     assert!(engine.build(&|| true).expect("built"));
     let budget = RunBudget { steps: Some(6), seconds: None };
@@ -91,7 +43,9 @@ fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colou
         return;
     }
     let trained = |delivers: bool| {
-        let mut engine = Reconstruction::open(settings(delivers), ModelHeader::default(), "train").expect("opens");
+        let mut engine =
+            Reconstruction::open(EngineSettings { delivers, ..settings() }, ModelHeader::default(), "train")
+                .expect("opens");
         (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
         assert!(engine.build(&|| true).expect("built"));
         let mut steps = 0;
