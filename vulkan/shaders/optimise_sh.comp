@@ -1,8 +1,8 @@
 #version 450
-// From the gradient of a Gaussian's colour to its SH, and Adam in the same breath: no gradient of a parameter is ever stored. What the
-// colour changes by with the Gaussian's place takes the colour gradient's place, for `optimise`: the two are one stage, in two kernels
-// because a board's lane has no registers for both. Mode 1 writes the gradient to where the first moment is and changes nothing else
-// (gradient checks).
+// From the gradient of a Gaussian's colour to its SH, and Adam in the same breath: no gradient of a coefficient is ever stored. What the
+// Gaussian's place gains from it, through the direction that it is seen from, is left where the colour's gradient was, for `project_backward`.
+// With that and `optimise` it is one stage, in three kernels because a board's lane has no registers for all of it at once. Mode 1 writes
+// the gradient to where the first moment is and changes nothing else (gradient checks).
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "harmonics.glsl"
