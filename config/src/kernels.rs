@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxRUNSxFETCHED` such as `64x8x1x8x1x1`.
+/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART` such as `64x8x1x8x1x1x8`.
 pub const VARIABLE: &str = "DGTR_KERNELS";
 
 /// Who decides.
@@ -15,7 +15,7 @@ pub enum KernelChoice {
     Calibrated,
     /// `default`: the built-in sizes; nothing is measured, nothing is read or written.
     Standard,
-    /// `WIDExNARROWxSHARExTILESxRUNSxFETCHED`: these.
+    /// `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART`: these.
     Fixed {
         /// Lanes of a workgroup of the plain loops over Gaussians or pixels.
         wide: u32,
@@ -29,12 +29,16 @@ pub enum KernelChoice {
         tile_lanes: u32,
         /// Gaussians that the lanes of a tile fetch at once: 1, or `tile_lanes`.
         fetched: u32,
+        /// Pixels of a strip whose SSIM sums a lane holds at once: 8, or 2.
+        part: u32,
     },
 }
 
 /// A value that is none of the three.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxRUNSxFETCHED (such as 64x8x1x8x1x1)")]
+#[error(
+    "{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART (such as 64x8x1x8x1x1x8)"
+)]
 pub struct KernelChoiceError(String);
 
 impl FromStr for KernelChoice {
@@ -51,7 +55,7 @@ impl FromStr for KernelChoice {
 
 fn fixed(text: &str) -> Option<KernelChoice> {
     let mut numbers = text.split('x').map(|n| n.parse().ok());
-    let [wide, narrow, share_lanes, tiles, tile_lanes, fetched] = [(); 6].map(|()| numbers.next().flatten());
+    let [wide, narrow, share_lanes, tiles, tile_lanes, fetched, part] = [(); 7].map(|()| numbers.next().flatten());
     let none_left = numbers.next().is_none();
     none_left.then_some(KernelChoice::Fixed {
         wide: wide?,
@@ -60,6 +64,7 @@ fn fixed(text: &str) -> Option<KernelChoice> {
         tiles: tiles?,
         tile_lanes: tile_lanes?,
         fetched: fetched?,
+        part: part?,
     })
 }
 
@@ -82,9 +87,17 @@ mod tests {
         assert_eq!("".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("auto".parse(), Ok(KernelChoice::Calibrated));
         assert_eq!("default".parse(), Ok(KernelChoice::Standard));
-        let fixed = KernelChoice::Fixed { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 1 };
-        assert_eq!("128x16x16x8x8x1".parse(), Ok(fixed));
-        let bad = "off 64 64x8 64x8x1x8x1 64x8x1x8x1x x8x1x8x1x1 64x-8x1x8x1x1 99999999999x8x1x8x1x1 64x8x1x8x1x1x1";
+        let fixed = KernelChoice::Fixed {
+            wide: 128,
+            narrow: 16,
+            share_lanes: 16,
+            tiles: 8,
+            tile_lanes: 8,
+            fetched: 1,
+            part: 2,
+        };
+        assert_eq!("128x16x16x8x8x1x2".parse(), Ok(fixed));
+        let bad = "off 64 64x8 64x8x1x8x1x1 64x8x1x8x1x1x x8x1x8x1x1x8 64x-8x1x8x1x1x8 99999999999x8x1x8x1x1x8 64x8x1x8x1x1x8x1";
         for bad in bad.split(' ') {
             let refused = bad.parse::<KernelChoice>().unwrap_err().to_string();
             assert!(refused.contains(VARIABLE) && refused.contains(bad), "{refused}");

@@ -75,7 +75,7 @@ struct Cli {
 fn notes() -> String {
     let codes: Vec<String> = EXIT_CODES.iter().map(|(_, code, meaning)| format!("{code} {meaning}")).collect();
     format!(
-        "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxRUNSxFETCHED: shape of the kernels; auto \
+        "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART: shape of the kernels; auto \
          measures it once per hardware device and driver (dgtr doctor shows it), default measures nothing. Models do not \
          depend on it.",
         codes.join(", ")

@@ -22,50 +22,53 @@ void main() {
     int height = int(frame.size.y);
     if (i >= width * uint((height + STRIP - 1) / STRIP)) return;
     uint column = i % width, pixels = width * uint(height);
-    int y0 = int(i / width) * STRIP;
-    vec3 by_mean[STRIP], by_square[STRIP], by_product[STRIP];
-    [[unroll]] for (int o = 0; o < STRIP; o++) {
-        by_mean[o] = vec3(0.0);
-        by_square[o] = vec3(0.0);
-        by_product[o] = vec3(0.0);
-    }
-    [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
-        int y = y0 + j;
-        [[unroll]] for (int c = 0; c < 3; c++) {
-            vec3 v = FETCH(blurred, c * int(pixels) + clamp(y, 0, height - 1) * int(width) + int(column)).xyz;
-            v = y >= 0 && y < height ? v : vec3(0.0);
-            [[unroll]] for (int o = 0; o < STRIP; o++) {
-                if (abs(j - o) <= RADIUS) {
-                    by_mean[o][c] = fma(tap(j - o), v.x, by_mean[o][c]);
-                    by_square[o][c] = fma(tap(j - o), v.y, by_square[o][c]);
-                    by_product[o][c] = fma(tap(j - o), v.z, by_product[o][c]);
+    int strip = int(i / width) * STRIP;
+    vec3 gain_gradient = vec3(0.0), offset_gradient = vec3(0.0);
+    float l1 = 0.0;
+    PARTS(first) {
+        int y0 = strip + first;
+        vec3 by_mean[PART], by_square[PART], by_product[PART];
+        [[unroll]] for (int o = 0; o < PART; o++) {
+            by_mean[o] = vec3(0.0);
+            by_square[o] = vec3(0.0);
+            by_product[o] = vec3(0.0);
+        }
+        [[unroll]] for (int j = -RADIUS; j < PART + RADIUS; j++) {
+            int y = y0 + j;
+            [[unroll]] for (int c = 0; c < 3; c++) {
+                vec3 v = FETCH(blurred, c * int(pixels) + clamp(y, 0, height - 1) * int(width) + int(column)).xyz;
+                v = y >= 0 && y < height ? v : vec3(0.0);
+                [[unroll]] for (int o = 0; o < PART; o++) {
+                    if (abs(j - o) <= RADIUS) {
+                        by_mean[o][c] = fma(tap(j - o), v.x, by_mean[o][c]);
+                        by_square[o][c] = fma(tap(j - o), v.y, by_square[o][c]);
+                        by_product[o][c] = fma(tap(j - o), v.z, by_product[o][c]);
+                    }
                 }
             }
         }
-    }
-    vec3 gain_gradient = vec3(0.0), offset_gradient = vec3(0.0);
-    float l1 = 0.0;
-    [[unroll]] for (int o = 0; o < STRIP; o++) {
-        if (y0 + o < height) {
-            uint at = uint(y0 + o) * width + column;
-            vec4 raw = FETCH(image, int(at));
-            uvec2 wanted = FETCH(target, int(at)).xy;
-            vec4 y = unpackUnorm4x8(wanted.x);
-            vec3 x = raw.xyz * gain + offset;
-            bool compared = !left_out(wanted.x);
-            vec3 d = compared ? x - y.xyz : vec3(0.0);
-            l1 += abs(d.x) + abs(d.y) + abs(d.z);
-            vec3 g = l1_weight * sign(d)
-                - ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
-            g = compared ? g : vec3(0.0);
-            offset_gradient += g;
-            g *= gain;
-            gain_gradient += g * raw.xyz; // by the logarithm of the gain
-            float depth = 0.0;
-            if (compared && y.w > 0.0 && y.w >= min_confidence) {
-                depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
+        [[unroll]] for (int o = 0; o < PART; o++) {
+            if (y0 + o < height) {
+                uint at = uint(y0 + o) * width + column;
+                vec4 raw = FETCH(image, int(at));
+                uvec2 wanted = FETCH(target, int(at)).xy;
+                vec4 y = unpackUnorm4x8(wanted.x);
+                vec3 x = raw.xyz * gain + offset;
+                bool compared = !left_out(wanted.x);
+                vec3 d = compared ? x - y.xyz : vec3(0.0);
+                l1 += abs(d.x) + abs(d.y) + abs(d.z);
+                vec3 g = l1_weight * sign(d)
+                    - ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
+                g = compared ? g : vec3(0.0);
+                offset_gradient += g;
+                g *= gain;
+                gain_gradient += g * raw.xyz; // by the logarithm of the gain
+                float depth = 0.0;
+                if (compared && y.w > 0.0 && y.w >= min_confidence) {
+                    depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
+                }
+                image_gradient[at] = vec4(g, depth);
             }
-            image_gradient[at] = vec4(g, depth);
         }
     }
     strip_sums[i].gain = gain_gradient;

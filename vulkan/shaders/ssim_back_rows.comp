@@ -11,21 +11,24 @@ void main() {
     uvec2 size = frame.size;
     uint strips = (size.x + uint(STRIP) - 1u) / uint(STRIP), i = gl_GlobalInvocationID.x;
     if (i >= strips * size.y) return;
-    int width = int(size.x), row = int(i / strips), x0 = int(i % strips) * STRIP;
+    int width = int(size.x), row = int(i / strips), strip = int(i % strips) * STRIP;
     uint pixels = size.x * size.y;
-    [[unroll]] for (uint c = 0u; c < 3u; c++) {
-        vec3 sum[STRIP];
-        [[unroll]] for (int o = 0; o < STRIP; o++) sum[o] = vec3(0.0);
-        [[unroll]] for (int j = -RADIUS; j < STRIP + RADIUS; j++) {
-            int x = x0 + j;
-            vec3 v = FETCH(adjoint, int(c * pixels) + row * width + clamp(x, 0, width - 1)).xyz;
-            v = x >= 0 && x < width ? v : vec3(0.0);
-            [[unroll]] for (int o = 0; o < STRIP; o++) {
-                if (abs(j - o) <= RADIUS) sum[o] = fma(vec3(tap(j - o)), v, sum[o]);
+    PARTS(first) {
+        int x0 = strip + first;
+        [[unroll]] for (uint c = 0u; c < 3u; c++) {
+            vec3 sum[PART];
+            [[unroll]] for (int o = 0; o < PART; o++) sum[o] = vec3(0.0);
+            [[unroll]] for (int j = -RADIUS; j < PART + RADIUS; j++) {
+                int x = x0 + j;
+                vec3 v = FETCH(adjoint, int(c * pixels) + row * width + clamp(x, 0, width - 1)).xyz;
+                v = x >= 0 && x < width ? v : vec3(0.0);
+                [[unroll]] for (int o = 0; o < PART; o++) {
+                    if (abs(j - o) <= RADIUS) sum[o] = fma(vec3(tap(j - o)), v, sum[o]);
+                }
             }
-        }
-        [[unroll]] for (int o = 0; o < STRIP; o++) {
-            if (x0 + o < width) blurred[c * pixels + uint(row * width + x0 + o)].value = sum[o];
+            [[unroll]] for (int o = 0; o < PART; o++) {
+                if (x0 + o < width) blurred[c * pixels + uint(row * width + x0 + o)].value = sum[o];
+            }
         }
     }
 }

@@ -107,7 +107,7 @@ pub fn step_ms(gpu: &Gpu) -> Result<f64, TrainError> {
 
 /// What to try, by kind of kernel.
 struct Candidates {
-    wide: Vec<u32>,
+    wide: Vec<(u32, u32)>,
     narrow: Vec<(u32, u32)>,
     tiles: Vec<Sizes>,
 }
@@ -115,18 +115,21 @@ struct Candidates {
 impl Candidates {
     fn of(info: &GpuInfo) -> Self {
         Self {
-            wide: KernelShape::wide_candidates(info),
+            wide: KernelShape::part_candidates(info)
+                .into_iter()
+                .flat_map(|part| KernelShape::wide_candidates(info).into_iter().map(move |n| (n, part)))
+                .collect(),
             narrow: KernelShape::narrow_candidates(info),
             tiles: KernelShape::tile_candidates(info),
         }
     }
 }
 
-/// What a shape says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched at once.
+/// What a shape says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched or pixels held at once.
 type Sizes = (u32, u32, u32);
 
 fn wide(shape: KernelShape) -> Sizes {
-    (shape.wide, 1, 1)
+    (shape.wide, 1, shape.part)
 }
 
 fn narrow(shape: KernelShape) -> Sizes {
@@ -141,15 +144,15 @@ const KINDS: [fn(KernelShape) -> Sizes; 3] = [wide, narrow, tiles];
 
 /// The shape with these sizes, by kind.
 fn with_sizes([of_wide, of_narrow, of_tiles]: [Sizes; 3]) -> KernelShape {
-    let ((wide, ..), (narrow, share_lanes, _), (tiles, tile_lanes, fetched)) = (of_wide, of_narrow, of_tiles);
-    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }
+    let ((wide, _, part), (narrow, share_lanes, _), (tiles, tile_lanes, fetched)) = (of_wide, of_narrow, of_tiles);
+    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }
 }
 
 /// The shapes to try, the standard one first.
 fn shapes(all: &Candidates, standard: KernelShape, timed: bool) -> Vec<KernelShape> {
     let own = KINDS.map(|kind| kind(standard));
     let listed = [
-        all.wide.iter().map(|n| (*n, 1, 1)).collect::<Vec<_>>(),
+        all.wide.iter().map(|(n, part)| (*n, 1, *part)).collect::<Vec<_>>(),
         all.narrow.iter().map(|(n, lanes)| (*n, *lanes, 1)).collect(),
         all.tiles.clone(),
     ];
@@ -222,7 +225,7 @@ fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 3], TrainError> {
     }
     let after = trainer.group_ms();
     let of = |group: Group| after[group as usize] - before[group as usize];
-    Ok([of(Group::Wide), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)])
+    Ok([of(Group::Wide) + of(Group::Strips), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)])
 }
 
 #[cfg(test)]
@@ -230,23 +233,23 @@ mod tests {
     use super::*;
 
     const STANDARD: KernelShape =
-        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
+        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, part: 8 };
 
     fn trial(wide: u32, narrow: (u32, u32), tiles: Sizes, ms: [f64; 3]) -> Trial {
-        Trial { shape: with_sizes([(wide, 1, 1), (narrow.0, narrow.1, 1), tiles]), ms }
+        Trial { shape: with_sizes([(wide, 1, 8), (narrow.0, narrow.1, 1), tiles]), ms }
     }
 
     #[test]
     fn every_size_is_tried_and_with_timestamps_one_of_each_kind_at_once() {
         let all = Candidates {
-            wide: vec![32, 64, 128, 256],
+            wide: vec![(32, 8), (64, 8), (128, 8), (64, 2)],
             narrow: vec![(16, 1), (32, 1), (16, 16), (32, 32)],
             tiles: vec![(16, 1, 1), (32, 1, 1), (8, 4, 1), (8, 4, 4), (16, 4, 1), (16, 4, 4)],
         };
         for (timed, count) in [(true, 6), (false, 12)] {
             let tried = shapes(&all, STANDARD, timed);
             assert_eq!((tried.len(), tried[0]), (count, STANDARD));
-            assert!(all.wide.iter().all(|w| tried.iter().any(|s| s.wide == *w)));
+            assert!(all.wide.iter().all(|w| tried.iter().any(|s| (s.wide, s.part) == *w)));
             assert!(all.narrow.iter().all(|n| tried.iter().any(|s| (s.narrow, s.share_lanes) == *n)));
             assert!(all.tiles.iter().all(|t| tried.iter().any(|s| tiles(*s) == *t)));
             assert_eq!(tried[1].tile_lanes, 4);
@@ -260,7 +263,7 @@ mod tests {
             trial(64, (32, 1), (32, 1, 1), [5.0, 5.0, 5.0]),
             trial(128, (32, 32), (16, 4, 1), [2.0, 7.0, 3.0]),
         ];
-        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4x1");
+        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4x1x8");
         // Whole steps: (128, …, (8, 4, 1)) says nothing about narrow sizes, nor about tiles.
         let whole = [
             trial(64, (32, 1), (32, 1, 1), [5.0; 3]),
@@ -268,13 +271,13 @@ mod tests {
             trial(64, (16, 16), (32, 1, 1), [4.0; 3]),
             trial(64, (32, 1), (8, 4, 1), [3.0; 3]),
         ];
-        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4x1");
+        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4x1x8");
     }
 
     #[test]
     fn a_gain_within_the_noise_changes_nothing() {
         let close = [trial(64, (32, 1), (32, 1, 1), [10.0; 3]), trial(128, (32, 32), (8, 4, 1), [9.8, 9.6, 9.8])];
-        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1x1");
+        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1x1x8");
         assert_eq!(fastest(&[], STANDARD, true), STANDARD);
     }
 }

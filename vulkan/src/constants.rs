@@ -28,6 +28,11 @@ pub const SSIM_RADIUS: usize = 5;
 /// The window of standard deviation 1.5, from the centre outwards, summing to one over all 11 taps.
 pub const SSIM_WINDOW: [f32; 6] =
     [0.266_011_72, 0.213_005_53, 0.109_360_69, 0.036_000_773, 0.007_598_758, 0.001_028_380_1];
+/// Pixels of a strip: what a lane of the loss kernels works on.
+pub const STRIP: u32 = 8;
+/// Pixels of a strip whose sums a lane holds at once where registers are few. Two: Mali spills none then, and 376/539 with all
+/// eight (tests/data/boards.md).
+pub const SHORT_PART: u32 = 2;
 /// Variance added to both Pearson variances, in units of the prior's variance: constant depth gives no gradient.
 pub const PEARSON_EPSILON: f32 = 1.0e-6;
 /// Adam's β₁ (Kingma & Ba 2015; 3DGS).

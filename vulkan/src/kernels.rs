@@ -8,6 +8,8 @@ use crate::stages::Stage;
 pub(crate) enum Group {
     /// Plain loops over Gaussians or pixels.
     Wide,
+    /// SSIM's windows over strips of pixels, as many lanes: a lane holds the sums of a strip at once, or of a part of it.
+    Strips,
     /// Sorting kernels, dispatched over shares of the Gaussians: one lane per share, or [`SCAN_LANES`].
     Sort,
     /// Kernels that walk the tiles of Gaussians, dispatched over the same shares: one lane per share, or a workgroup.
@@ -16,6 +18,19 @@ pub(crate) enum Group {
     Tiles,
     /// Exactly [`SCAN_LANES`], one per digit or share of the tiles.
     Scan,
+}
+
+impl Group {
+    /// What the names of its variant's files end with; none where there is none.
+    #[cfg_attr(not(test), allow(dead_code, reason = "for the list of what the boards' drivers compile"))]
+    pub fn suffix(self) -> Option<&'static str> {
+        match self {
+            Self::Tiles => Some("_runs"),
+            Self::Strips => Some("_short"),
+            Self::Sort | Self::Walk => Some("_group"),
+            Self::Wide | Self::Scan => None,
+        }
+    }
 }
 
 /// How many kinds there are.
@@ -44,12 +59,12 @@ impl Spirv {
 
 pub(crate) struct KernelInfo {
     pub name: &'static str,
-    /// Name of its source and of its SPIR-V, without more lanes.
+    /// Name of its source and of its SPIR-V, without its variant's suffix.
     #[cfg_attr(not(test), allow(dead_code, reason = "for the list of what the boards' drivers compile"))]
     pub file: &'static str,
     pub spirv: Spirv,
-    /// The variant with more lanes per tile or share.
-    pub more_lanes: Option<Spirv>,
+    /// Its group's other variant ([`Group::suffix`]).
+    pub variant: Option<Spirv>,
     pub bindings: &'static [&'static str],
     /// Sections read through texel fetches, from binding [`FIRST_TEXELS`] on.
     pub texels: &'static [&'static str],
@@ -67,16 +82,19 @@ macro_rules! spirv {
             storage: Some(include_bytes!(concat!("../shaders/spirv/", $file, $variant, ".storage.spv"))),
         }
     };
-    (more_lanes Tiles $file:literal $texels:tt) => {
+    (variant Tiles $file:literal $texels:tt) => {
         Some(spirv!($file "_runs" $texels))
     };
-    (more_lanes Sort $file:literal $texels:tt) => {
+    (variant Strips $file:literal $texels:tt) => {
+        Some(spirv!($file "_short" $texels))
+    };
+    (variant Sort $file:literal $texels:tt) => {
         Some(spirv!($file "_group" $texels))
     };
-    (more_lanes Walk $file:literal $texels:tt) => {
+    (variant Walk $file:literal $texels:tt) => {
         Some(spirv!($file "_group" $texels))
     };
-    (more_lanes $other:ident $file:literal $texels:tt) => {
+    (variant $other:ident $file:literal $texels:tt) => {
         None
     };
 }
@@ -94,7 +112,7 @@ macro_rules! kernels {
             name: stringify!($id),
             file: $file,
             spirv: spirv!($file "" [$($texels)*]),
-            more_lanes: spirv!(more_lanes $group $file [$($texels)*]),
+            variant: spirv!(variant $group $file [$($texels)*]),
             bindings: &[$($binding),*],
             texels: &[$($texels),*],
             group: Group::$group,
@@ -121,10 +139,10 @@ kernels! {
     RasteriseMedian "rasterise_median" Rasterise Tiles ["tile_starts" "image" "transmittance"] ["shaded" "instances"];
     DepthSums "depth_sums" Loss Wide ["image" "target" "lane_sums"] [];
     DepthFinish "depth_finish" Loss Wide ["lane_sums" "status"] [];
-    SsimRows "ssim_rows" Loss Wide ["moments"] ["image" "target"];
-    SsimColumns "ssim_columns" Loss Wide ["adjoint" "strip_sums"] ["moments"];
-    SsimBackRows "ssim_back_rows" Loss Wide ["moments"] ["adjoint"];
-    LossGradient "loss_gradient" Loss Wide ["image_gradient" "strip_sums" "status"] ["moments" "image" "target"];
+    SsimRows "ssim_rows" Loss Strips ["moments"] ["image" "target"];
+    SsimColumns "ssim_columns" Loss Strips ["adjoint" "strip_sums"] ["moments"];
+    SsimBackRows "ssim_back_rows" Loss Strips ["moments"] ["adjoint"];
+    LossGradient "loss_gradient" Loss Strips ["image_gradient" "strip_sums" "status"] ["moments" "image" "target"];
     RasteriseBackward "rasterise_backward" RasteriseBackward Tiles ["tile_starts" "slots"]
         ["shaded" "instances" "image" "image_gradient"];
     RasteriseBackwardDepth "rasterise_backward_depth" RasteriseBackward Tiles ["tile_starts" "slots"]
@@ -139,7 +157,7 @@ kernels! {
 /// A number that changes whenever any kernel does (FNV-1a over names and SPIR-V): what was measured with other kernels
 /// says nothing about these.
 pub(crate) fn fingerprint() -> u64 {
-    let variants = |k: &KernelInfo| [Some(k.spirv), k.more_lanes].into_iter().flatten().flat_map(|s| s.texels);
+    let variants = |k: &KernelInfo| [Some(k.spirv), k.variant].into_iter().flatten().flat_map(|s| s.texels);
     let bytes = KERNELS.iter().flat_map(|k| k.name.bytes().chain(variants(k).copied()));
     bytes.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3))
 }

@@ -4,6 +4,7 @@
 mod listed;
 
 use crate::arena::{Arena, Section};
+use crate::constants::STRIP;
 use crate::gpu::{DeviceLimits, Gpu, GpuError};
 use crate::kernels::{
     DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
@@ -69,10 +70,11 @@ fn bound(arena: &Arena, plan: &Plan, name: &str) -> Section {
     part_of_slots(name, arena.section("slots"), plan.pixels).unwrap_or_else(|| arena.section(name))
 }
 
-/// Whether kernels of this kind have more than one lane per tile or share.
-fn takes_more_lanes(group: Group, shape: KernelShape) -> bool {
+/// Whether kernels of this kind run as their variant: more than one lane per tile or share, strips in parts.
+fn takes_variant(group: Group, shape: KernelShape) -> bool {
     match group {
         Group::Sort | Group::Walk => shape.share_lanes > 1,
+        Group::Strips => shape.part < STRIP,
         _ => shape.tile_lanes > 1,
     }
 }
@@ -81,7 +83,7 @@ fn takes_more_lanes(group: Group, shape: KernelShape) -> bool {
 fn local_size(group: Group, shape: KernelShape) -> u32 {
     let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, .. } = shape;
     match group {
-        Group::Wide => wide,
+        Group::Wide | Group::Strips => wide,
         Group::Sort if share_lanes > 1 => SCAN_LANES,
         Group::Sort | Group::Walk => narrow,
         Group::Tiles => tiles * tile_lanes,
@@ -286,12 +288,12 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
-        let more_lanes = kernel.more_lanes.filter(|_| takes_more_lanes(kernel.group, self.shape));
+        let variant = kernel.variant.filter(|_| takes_variant(kernel.group, self.shape));
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
         unsafe {
             self.gpu.compute_pipeline(
                 kernel.name,
-                more_lanes.unwrap_or(kernel.spirv).reading(self.storage_reads),
+                variant.unwrap_or(kernel.spirv).reading(self.storage_reads),
                 self.layout,
                 &special,
             )

@@ -2,7 +2,7 @@
 //! the same bits with each (`tests/shapes.rs`); only the time differs, and [`calibration`](crate::calibration) measures
 //! which is the fastest.
 
-use crate::constants::RUNS;
+use crate::constants::{RUNS, SHORT_PART, STRIP};
 use crate::gpu::GpuInfo;
 use std::fmt;
 
@@ -22,6 +22,8 @@ pub struct KernelShape {
     pub tile_lanes: u32,
     /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
     pub fetched: u32,
+    /// Pixels of a strip whose SSIM sums a lane holds at once: all of it, or [`SHORT_PART`].
+    pub part: u32,
 }
 
 /// Sizes worth trying. All divide the lanes that the looping kernels are written for ([`config::plan::Lanes`]), so that no lane runs beyond them.
@@ -40,12 +42,19 @@ impl KernelShape {
         let (tiles, tile_lanes) = if runs { (8, RUNS) } else { (few, 1) };
         // A card has lanes enough for every share's histogram (an H100: sorting, counting and emitting 0.3 ms instead of 1.4).
         let card = !info.is_cpu && !info.is_integrated && few >= info.subgroup_size;
-        Self { wide: 64, narrow: few, share_lanes: if card { few } else { 1 }, tiles, tile_lanes, fetched: 1 }
+        // The sums of a whole strip are more than a small GPU's lane has registers for, too.
+        let part = if info.is_cpu || !info.is_integrated { STRIP } else { SHORT_PART };
+        Self { wide: 64, narrow: few, share_lanes: if card { few } else { 1 }, tiles, tile_lanes, fetched: 1, part }
     }
 
     /// Sizes of wide workgroups that this device can run and that fill its subgroups, the standard one among them.
     pub fn wide_candidates(info: &GpuInfo) -> Vec<u32> {
         candidates(&WIDE, Self::standard(info).wide, 1, info)
+    }
+
+    /// Pixels of a strip that a lane may hold at once. In software all: llvmpipe's loss takes half as long again otherwise.
+    pub fn part_candidates(info: &GpuInfo) -> Vec<u32> {
+        if info.is_cpu { vec![STRIP] } else { vec![STRIP, SHORT_PART] }
     }
 
     /// Narrow workgroups and lanes of a share, under the same conditions; those with one lane per share first.
@@ -75,7 +84,8 @@ impl KernelShape {
         let runs = self.tile_lanes == 1 || (self.tile_lanes == RUNS && info.shuffles);
         let fetched = self.fetched == 1 || self.fetched == self.tile_lanes;
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
-        sizes && runs && fetched && shares && self.largest_workgroup() <= info.limits.workgroup_lanes
+        let part = self.part == STRIP || self.part == SHORT_PART;
+        sizes && runs && fetched && shares && part && self.largest_workgroup() <= info.limits.workgroup_lanes
     }
 
     /// Lanes of its largest workgroup.
@@ -87,8 +97,8 @@ impl KernelShape {
 /// As `config::kernels::VARIABLE` takes it.
 impl fmt::Display for KernelShape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched } = self;
-        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}x{fetched}")
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part } = self;
+        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}x{fetched}x{part}")
     }
 }
 
@@ -144,13 +154,14 @@ mod tests {
         let staged = [(8, 8, 1), (8, 8, 8), (16, 8, 1), (16, 8, 8), (32, 8, 1), (32, 8, 8)];
         assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1), (32, 1, 1)], &staged[..]].concat());
         assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[..]].concat());
-        let runs = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 8, fetched: 8 };
+        let runs = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 8, fetched: 8, part: 2 };
         assert!(runs.fits(&pi5) && !runs.fits(&device(false, 8, 256)));
         assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
         assert!(!KernelShape { share_lanes: 16, ..runs }.fits(&pi5));
-        assert_eq!(runs.to_string(), "64x32x32x8x8x8");
+        assert!(!KernelShape { part: 4, ..runs }.fits(&pi5));
+        assert_eq!(runs.to_string(), "64x32x32x8x8x8x2");
     }
 
     #[test]
@@ -174,7 +185,9 @@ mod tests {
             let tiles = KernelShape::tile_candidates(&info);
             for (wide, (narrow, share_lanes)) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
                 assert!(tiles.iter().copied().all(|(tiles, tile_lanes, fetched)| {
-                    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }.fits(&info)
+                    [2, STRIP].into_iter().all(|part| {
+                        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }.fits(&info)
+                    })
                 }));
                 for Lanes { sort, loops } in [Lanes::SOFTWARE, Lanes::BOARD, Lanes::CARD] {
                     assert_eq!((loops % wide, sort % narrow), (0, 0));
@@ -185,7 +198,7 @@ mod tests {
         for (wide, narrow, tiles) in
             [(256, 32, 8), (64, 0, 8), (48, 32, 8), (64, 64, 8), (0, 8, 8), (64, 8, 9), (64, 8, 0), (64, 8, u32::MAX)]
         {
-            let shape = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1 };
+            let shape = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1, part: 8 };
             assert!(!shape.fits(&info), "{shape}");
         }
     }

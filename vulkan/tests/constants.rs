@@ -28,6 +28,8 @@ fn shaders_and_twins_share_every_constant() {
         ("SSIM_C1", c::SSIM_C1),
         ("SSIM_C2", c::SSIM_C2),
         ("PEARSON_EPSILON", c::PEARSON_EPSILON),
+        ("STRIP", c::STRIP as f32),
+        ("SHORT_PART", c::SHORT_PART as f32),
         ("TILE_WIDTH", c::TILE_WIDTH as f32),
         ("TILE_HEIGHT", c::TILE_HEIGHT as f32),
         ("RUN", c::RUN as f32),

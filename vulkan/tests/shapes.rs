@@ -10,6 +10,7 @@ use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::time::Duration;
 use vulkan::calibration::calibrate;
+use vulkan::constants::{SHORT_PART, STRIP};
 use vulkan::gpu::Gpu;
 use vulkan::shape::KernelShape;
 use vulkan::trainer::{Rendering, Trainer};
@@ -72,7 +73,8 @@ fn bits(model: &GaussianCloud) -> Vec<u32> {
 }
 
 /// Together with the standard shape: the smallest and the largest of each size, with one lane per tile and share and with
-/// several, fetching for themselves and for each other, where the device can (each shape costs a compilation).
+/// several, fetching for themselves and for each other, where the device can, with strips in parts and at once (each shape costs a
+/// compilation).
 fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
     let info = gpu.info();
     let wide = KernelShape::wide_candidates(info);
@@ -87,6 +89,7 @@ fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
         tiles,
         tile_lanes,
         fetched,
+        part: if wide == 64 { STRIP } else { SHORT_PART },
     };
     let direct = tiles.iter().rev().find(|t| t.1 > 1 && t.2 == 1);
     // A workgroup per share is never chosen in software, but does the same there, too.

@@ -10,6 +10,7 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::process::Command;
+use vulkan::constants::SHORT_PART;
 use vulkan::gpu::Gpu;
 use vulkan::shape::KernelShape;
 use vulkan::trainer::{Rendering, Trainer};
@@ -58,7 +59,7 @@ fn work() {
     // Every kernel with several lanes that the device can run.
     let tiles = KernelShape::tile_candidates(gpu.info());
     let (tiles, tile_lanes, fetched) = tiles[tiles.len() - 1];
-    let several = KernelShape { narrow: 32, share_lanes: 32, tiles, tile_lanes, fetched, ..standard };
+    let several = KernelShape { narrow: 32, share_lanes: 32, tiles, tile_lanes, fetched, part: SHORT_PART, ..standard };
     for (instances, shape) in [(1 << 16, standard), (400, standard), (1 << 16, several), (400, several)] {
         let plan = Plan::with_capacities(&request, 300, instances);
         let mut settings = plain();

@@ -88,17 +88,18 @@ struct Entry {
     tiles: u32,
     tile_lanes: u32,
     fetched: u32,
+    part: u32,
 }
 
 impl Entry {
     fn of(info: &GpuInfo, shape: KernelShape) -> Self {
-        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched } = shape;
-        Self { id: Id::of(info), wide, narrow, share_lanes, tiles, tile_lanes, fetched }
+        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part } = shape;
+        Self { id: Id::of(info), wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }
     }
 
     fn shape(&self) -> KernelShape {
-        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, .. } = *self;
-        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched }
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part, .. } = *self;
+        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }
     }
 }
 
@@ -224,9 +225,9 @@ pub(crate) mod tests {
     use vulkan::gpu::DeviceLimits;
 
     const SHAPE: KernelShape =
-        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 8 };
+        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 8, part: 2 };
     const OTHER: KernelShape =
-        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
+        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, part: 8 };
 
     /// A board's GPU.
     pub(crate) fn device(name: &str) -> GpuInfo {

@@ -2,6 +2,7 @@
 //! made from the list of kernels. `DGTR_BLESS=1` remakes it.
 
 use super::*;
+use crate::constants::SHORT_PART;
 use config::plan::Lanes;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -9,19 +10,15 @@ use std::path::Path;
 /// A line per kernel and shape: a name for the table, the SPIR-V, the specialisation constants in order.
 fn lines() -> BTreeSet<String> {
     // What a GPU gets where nothing was measured, and what calibration may choose instead (`KernelShape`).
-    let one = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1 };
-    let more = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, ..one };
+    let one = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, part: STRIP };
+    let other = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, part: SHORT_PART, ..one };
     let mut lines = BTreeSet::new();
     for kernel in KERNELS {
-        for shape in [one, more, KernelShape { fetched: 8, ..more }] {
-            if shape != one && kernel.more_lanes.is_none() || shape.fetched > 1 && kernel.group != Group::Tiles {
+        for shape in [one, other, KernelShape { fetched: 8, ..other }] {
+            if shape != one && kernel.variant.is_none() || shape.fetched > 1 && kernel.group != Group::Tiles {
                 continue;
             }
-            let suffix = match (takes_more_lanes(kernel.group, shape), kernel.group) {
-                (false, _) => "",
-                (true, Group::Tiles) => "_runs",
-                (true, _) => "_group",
-            };
+            let suffix = kernel.group.suffix().filter(|_| takes_variant(kernel.group, shape)).unwrap_or_default();
             let (lanes, staged) = (local_size(kernel.group, shape), u32::from(shape.fetched > 1));
             let halves = kernel.bindings.contains(&"sh_first_moment");
             for half in 0..=u32::from(halves) {
@@ -31,7 +28,8 @@ fn lines() -> BTreeSet<String> {
                 let board = Lanes::BOARD;
                 let constants = format!("{lanes} {} 3 {} {} 0 {half} {staged}", sh_columns(3), board.sort, board.loops);
                 lines.insert(format!("{name}:{lanes}{label} {name}.spv {constants}"));
-                if kernel.spirv.storage.is_some() && shape == one && half == 0 {
+                let strips = shape == other && kernel.group == Group::Strips;
+                if kernel.spirv.storage.is_some() && half == 0 && (shape == one || strips) {
                     lines.insert(format!("{name}:{lanes}+storage {name}.storage.spv {constants}"));
                 }
             }

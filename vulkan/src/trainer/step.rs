@@ -5,14 +5,14 @@ use super::frame::flags_of;
 use super::scene::Blocks;
 use super::slots::Picture;
 use super::{StepReport, TrainError, Trainer};
-use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
+use crate::constants::{self, TILE_HEIGHT, TILE_WIDTH};
 use crate::kernels::{DEPTH_LANES, Kernel};
 use crate::layout::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, LossSums, PoseSums, Push};
 use rand::Rng;
 use std::time::Instant;
 
-/// Rows of a strip in the loss kernels (`shaders/window.glsl`).
-const STRIP: usize = 8;
+/// Rows of a strip in the loss kernels.
+const STRIP: usize = constants::STRIP as usize;
 
 impl Trainer {
     /// One gradient step on the next view.
