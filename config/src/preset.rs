@@ -24,10 +24,10 @@ choice! {
     }
 }
 
-/// Visits to each picture that a point needs before a larger one is preferred. On sheffield_cross, scored at full size, pictures of half
-/// the size have 0.55 dB more than whole ones of the same time after 2 visits to whole ones, 0.14 after 5, 0.13 after 15, where whole ones
-/// have 0.010 more SSIM (tests/BENCHMARKS.md, "What a step is forecast to cost").
-pub const VISITS: u32 = 15;
+/// Visits to each picture, half of the schedule at half its size, that a point needs before a larger one is preferred. On sheffield_cross,
+/// scored at full size, pictures of half the size have 0.07 dB more than whole ones of the same time after one visit to whole ones, and
+/// 0.27 and 0.23 less after 2.4 and 5.6 (tests/BENCHMARKS.md, "What a step is forecast to cost").
+pub const VISITS: u32 = 3;
 /// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000
 /// Gaussians, of which a picture of 640×480 sees 29 %), and half as many, which at half the size cost 0.15 dB.
 pub const DENSITIES: [f64; 2] = [0.05, 0.1];

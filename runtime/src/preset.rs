@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use config::plan::{Lanes, Plan, WORKING_SIDE};
 use config::preset::{DENSITIES, SECONDS, SHOWN_BY, VISITS};
-use config::training::ShSettings;
+use config::training::{ResolutionSettings, ShSettings};
 use models::formats::{FormatError, read_bounded, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -52,6 +52,8 @@ pub struct Wanted {
     pub device: DeviceRequest,
     /// `training.sh`.
     pub sh: ShSettings,
+    /// `training.resolution`.
+    pub resolution: ResolutionSettings,
     /// Steps of the schedule where nobody says how many.
     pub schedule: u32,
     /// Steps that were said.
@@ -202,10 +204,25 @@ impl Wanted {
         if is_cut && self.max_gaussians.is_none() && f64::from(held) < LEAST_HELD * of(DENSITIES[0]) {
             return None;
         }
-        let load = Sight { gaussians: held.into(), share, pixels }.load(Footprint::TRAINED);
+        let step_ms = self.mean_ms((width, height), |divisor| {
+            let pixels = pixels / u64::from(divisor * divisor);
+            cost.step_ms(&Sight { gaussians: held.into(), share, pixels }.load(Footprint::TRAINED))
+        });
         // A number that was said stays, whatever the memory holds of it: the plan says so.
         let gaussians = self.max_gaussians.unwrap_or(held);
-        Some(Point { scale, gaussians, plan, step_ms: cost.step_ms(&load).max(1e-3), is_cut })
+        Some(Point { scale, gaussians, plan, step_ms: step_ms.max(1e-3), is_cut })
+    }
+
+    /// Milliseconds of a step on the mean over a schedule in which pictures are small at first, from what one takes at each divisor of
+    /// their size.
+    fn mean_ms(&self, size: (u32, u32), at: impl Fn(u32) -> f64) -> f64 {
+        let phases = self.resolution.phases(size.0, size.1).map(|(share, divisor)| (f64::from(share), at(divisor)));
+        // The schedule goes by time, or by steps.
+        if self.seconds.is_some() {
+            phases.iter().map(|(share, ms)| share / ms).sum::<f64>().recip()
+        } else {
+            phases.iter().map(|(share, ms)| share * ms).sum()
+        }
     }
 
     /// What the point needs, so that as many pictures stay on the device as with all there is.

@@ -56,7 +56,7 @@ pub const SKIPS: &[Skip] = &[
         "training.sh.raise_at": vec![0.033, 0.067, 0.1] => vec![0.0, 0.0, 0.0]
     ),
     skip!("SH degree by residual", false, "training.sh.raise_share": 0.25 => 1.0),
-    skip!("half resolution at first", false, "training.resolution.half_until": 0.1 => 0.0),
+    skip!("half resolution at first", false, "training.resolution.half_until": 0.5 => 0.0),
     skip!("views by residual", false, "training.views.residual_share": 0.5 => 0.0),
     skip!("stop when the loss stops falling", false, "training.stop.enabled": true => false),
     skip!("no depth loss where confidence is low", true, "training.loss.depth_confidence": 0.1 => 0.0),

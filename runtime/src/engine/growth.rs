@@ -17,6 +17,9 @@ use crate::error::JobError;
 /// All poses are solved at once whenever the key frames have grown by this share: their errors, which pictures and GPS bound, are
 /// spread evenly again, for a cost that all solves together keep in proportion to the key frames.
 const WHOLE_GROWTH: f64 = 0.34;
+/// Where the schedule goes on from after a growth. What is there has been trained and would be shaken by the rates of its beginning each
+/// time; pictures are still looked at in half their size. 0.4 to 0.7 dB on a flight of 150 pictures (tests/BENCHMARKS.md, "A long flight").
+const RENEWED_AT: f32 = 0.3;
 /// Share of the plan that is freed at once where new ground finds no room.
 const FREED: usize = 50;
 /// Key frames within so many pictures' widths of one that moved may move a Gaussian with it.
@@ -134,7 +137,7 @@ impl Reconstruction {
         for i in moved {
             self.trainer.renew_view(i, self.views[i].1)?;
         }
-        self.trainer.renew_schedule();
+        self.trainer.renew_schedule(RENEWED_AT);
         self.unround()?;
         self.growing.totals.growths += 1;
         self.growing.totals.pictures += (self.views.len() - first) as u64;

@@ -84,6 +84,7 @@ pub(super) fn choose(mission: &Mission, region: &[[f64; 2]], info: &GpuInfo, cos
         share: shown(pictures),
         device,
         sh: training.sh,
+        resolution: training.resolution,
         schedule: training.steps,
         steps: None,
         seconds: training.seconds,

@@ -30,6 +30,7 @@ fn survey(views: usize, picture: (u32, u32), seconds: Option<f64>) -> Wanted {
         share: shown(views),
         device,
         sh: ShSettings::default(),
+        resolution: ResolutionSettings::default(),
         schedule: 100 * views as u32,
         steps: None,
         seconds,
@@ -64,14 +65,14 @@ fn more_time_and_a_faster_device_choose_larger_points_and_never_smaller_ones() {
             last = size;
         }
     }
-    let by = |cost| side(&chosen(&survey(43, (640, 480), Some(40.0)), cost, 2048));
+    let by = |cost| side(&chosen(&survey(43, (640, 480), Some(10.0)), cost, 2048));
     assert!(by(&slow) < by(&PROCESSOR) && by(&PROCESSOR) < by(&CARD), "{} {} {}", by(&slow), by(&PROCESSOR), by(&CARD));
 }
 
 #[test]
 fn a_slow_board_gets_enough_visits_by_smaller_pictures() {
     let board = CostModel { evaluation_ns: 60.0, visible_ns: 6000.0, pixel_ns: 1600.0, ..PROCESSOR };
-    let choice = chosen(&survey(43, (1280, 960), Some(120.0)), &board, 512);
+    let choice = chosen(&survey(43, (1280, 960), Some(60.0)), &board, 512);
     assert!(choice.limited_by == Limit::Time && choice.steps >= 43 * VISITS, "{choice}");
     assert!(side(&choice) < 640, "{choice}");
 }
@@ -135,6 +136,21 @@ fn what_was_said_stays_and_the_rest_is_chosen_beside_it() {
 }
 
 #[test]
+fn a_schedule_that_begins_with_small_pictures_is_forecast_to_have_more_steps_in_the_same_time() {
+    let whole = ResolutionSettings { quarter_until: 0.0, half_until: 0.0, ..Default::default() };
+    let of = |resolution, steps, seconds| {
+        let wanted = Wanted { resolution, steps, image_scale: Some(1.0), ..survey(43, (640, 480), seconds) };
+        chosen(&wanted, &PROCESSOR, 2048)
+    };
+    let half = ResolutionSettings { half_until: 0.5, ..whole };
+    let (long, short) = (of(whole, None, Some(40.0)), of(half, None, Some(40.0)));
+    assert!(f64::from(short.steps) > 1.2 * f64::from(long.steps), "{short}\n{long}");
+    // Half of the steps at half the size, not half of the time.
+    let by_steps = of(half, Some(100), None);
+    assert!(by_steps.step_ms > short.step_ms && by_steps.step_ms < long.step_ms, "{by_steps}");
+}
+
+#[test]
 fn a_schedule_that_nobody_would_wait_for_gets_seconds() {
     let slow = CostModel { fixed_ms: 1000.0, ..PROCESSOR };
     let choice = chosen(&survey(100, (640, 480), None), &slow, 512);
@@ -167,7 +183,7 @@ fn a_choice_is_kept_and_a_damaged_one_is_none() {
 
 #[test]
 fn forecast_and_truth_stand_side_by_side_in_the_figures() {
-    let choice = chosen(&survey(43, (640, 480), Some(40.0)), &PROCESSOR, 2048);
+    let choice = chosen(&survey(43, (640, 480), Some(10.0)), &PROCESSOR, 2048);
     let mut report = RunReport::new("train");
     choice.note(&mut report);
     assert!(report.more["forecast"].get("measured_ms").is_none(), "nothing was trained");

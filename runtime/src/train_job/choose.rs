@@ -67,6 +67,7 @@ impl TrainJob {
             share: share(set, frames)?,
             device,
             sh: self.training.sh,
+            resolution: self.training.resolution,
             schedule: self.training.steps_for(frames.len()),
             steps: self.steps,
             seconds,

@@ -69,9 +69,11 @@ impl Trainer {
         self.strategy = Strategy::None;
     }
 
-    /// Begins the schedule anew for what is there; moments stay.
-    pub fn renew_schedule(&mut self) {
-        self.before = (0, 0.0);
+    /// Puts the schedule to `progress`, 0…1, for what is there; moments stay.
+    pub fn renew_schedule(&mut self, progress: f32) {
+        let share = f64::from(progress.clamp(0.0, 1.0));
+        let steps = (share * f64::from(self.settings.steps)) as u32;
+        self.before = (steps, share * self.settings.seconds.unwrap_or(0.0));
         self.since = (self.steps, self.elapsed_s);
     }
 
@@ -271,7 +273,9 @@ mod tests {
         (0..5).for_each(|_| _ = t.step().unwrap());
         assert_eq!(t.spent().0, 5);
         let before = snapshot(&mut t);
-        t.renew_schedule();
+        t.renew_schedule(0.5);
+        assert_eq!((t.progress(), t.steps()), (0.5, 5));
+        t.renew_schedule(0.0);
         assert_eq!((t.spent().0, t.steps(), t.progress()), (0, 5, 0.0));
         assert_eq!(snapshot(&mut t), before);
         t.step().unwrap();
@@ -289,7 +293,7 @@ mod tests {
             for k in 0..4 {
                 (0..5).for_each(|_| _ = t.step().unwrap());
                 t.extend(&cloud(10 + k, 20, 0)).unwrap();
-                t.renew_schedule();
+                t.renew_schedule(0.3);
             }
             (0..5).for_each(|_| _ = t.step().unwrap());
             Some(snapshot(&mut t))
