@@ -238,7 +238,7 @@ impl Trainer {
                 reason = StopReason::Caller;
                 break;
             }
-            if patience.is_over(&self.settings.stop, &report, self.views.len()) {
+            if patience.is_over(&self.settings, &report, self.views.len()) {
                 reason = StopReason::Converged;
                 break;
             }

@@ -1,6 +1,6 @@
 //! A run of steps: how long it may take, what it says about itself, and when it ends early.
 
-use config::training::StopSettings;
+use config::training::TrainSettings;
 
 /// How long [`run`](super::Trainer::run) may take; whichever comes first. Neither given: the settings' schedule.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -106,7 +106,8 @@ pub struct TrainSummary {
     pub counters: Counters,
 }
 
-/// Early stop: epochs in a row without a useful fall of the mean loss.
+/// Early stop: epochs in a row without a useful fall of the mean loss. Losses of small pictures say nothing about those of larger ones,
+/// so that epochs count from where pictures have their full size.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Patience {
     sum: f64,
@@ -116,8 +117,9 @@ pub(crate) struct Patience {
 }
 
 impl Patience {
-    pub fn is_over(&mut self, settings: &StopSettings, report: &StepReport, views: usize) -> bool {
-        if !settings.enabled {
+    pub fn is_over(&mut self, settings: &TrainSettings, report: &StepReport, views: usize) -> bool {
+        let (resolution, settings) = (&settings.resolution, &settings.stop);
+        if !settings.enabled || report.progress < resolution.half_until.max(resolution.quarter_until) {
             return false;
         }
         self.sum += f64::from(report.loss);
@@ -131,5 +133,25 @@ impl Patience {
         self.best = Some(self.best.map_or(mean, |b| b.min(mean)));
         (self.sum, self.count) = (0.0, 0);
         self.idle >= settings.patience.max(1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn epochs_without_a_fall_end_a_run_but_not_before_pictures_have_their_full_size() {
+        let mut settings = TrainSettings::default();
+        settings.stop.enabled = true;
+        settings.resolution.half_until = 0.5;
+        let mut patience = Patience::default();
+        // Two views, ten epochs: small pictures have small losses that fall no more.
+        let at = |progress, loss| StepReport { progress, loss, ..StepReport::default() };
+        assert!((0..20).all(|_| !patience.is_over(&settings, &at(0.4, 0.1), 2)));
+        // At full size it falls from above theirs, and then no longer.
+        assert!((0..10).all(|i| !patience.is_over(&settings, &at(0.6, 0.3 - 0.01 * i as f32), 2)));
+        let idle = (0..20).position(|_| patience.is_over(&settings, &at(0.8, 0.3), 2));
+        assert_eq!(idle, Some(2 * settings.stop.patience as usize - 1));
     }
 }
