@@ -31,8 +31,8 @@ pub const VISITS: u32 = 3;
 /// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000
 /// Gaussians, of which a picture of 640×480 sees 29 %), and half as many, which at half the size cost 0.15 dB.
 pub const DENSITIES: [f64; 2] = [0.05, 0.1];
-/// Seconds for which a size is chosen where nobody says how long: those of [`Preset::Longest`]. Twice as many brought 0.03 dB more
-/// (25.00 and 25.03 after 300 and 600 s, tests/BENCHMARKS.md, "Run time against error").
+/// Seconds for which a size is chosen where nobody says how long: those of [`Preset::Longest`]. Half as many had 0.06 dB less
+/// (25.02 and 25.08 after 160 and 300 s, tests/BENCHMARKS.md, "Run time against error").
 pub const SECONDS: f64 = 300.0;
 /// Pictures of a survey that show each place; one of so many shows that share of the scene, where nothing else says how much it does. Of
 /// sheffield_cross's 43 pictures each shows 20 to 30 %.
@@ -58,7 +58,8 @@ impl Preset {
     }
 
     /// Its budgets. Each row names the point of `dgtr bench time-error sheffield_cross --init feed-forward` that it is (43 key
-    /// frames, an idle lavapipe on two cores, PSNR at the row's scale; all lie on the front). `None`: they are the device's to say.
+    /// frames, an idle lavapipe on two cores, PSNR at the row's scale; all lie on the front, `long` by its SSIM). `None`: they are the
+    /// device's to say.
     pub fn values(self) -> Option<PresetValues> {
         let row = |device_mib, max_gaussians, image_scale, seconds| PresetValues {
             device_mib,
@@ -67,15 +68,15 @@ impl Preset {
             seconds,
         };
         Some(match self {
-            // --scale 0.5 --budgets-mib 96 --max-gaussians 12000 --seconds 10: 23.88 dB, 12.3 s.
+            // --scale 0.5 --budgets-mib 96 --max-gaussians 12000 --seconds 10: 23.88 dB, 12.3 s (an earlier recipe).
             Self::Tiny => row(96, 12_000, 0.5, 10.0),
-            // --budgets-mib 512 --max-gaussians 100000 --seconds 40: 24.09 dB, 44.7 s.
+            // --budgets-mib 512 --max-gaussians 100000 --seconds 40: 24.67 dB, 44.9 s.
             Self::Short => row(512, 100_000, 1.0, 40.0),
-            // The same with --seconds 80: 24.56 dB, 85.0 s in all.
+            // The same with --seconds 80: 25.04 dB, 85.3 s in all.
             Self::Medium => row(512, 100_000, 1.0, 80.0),
-            // The same with --seconds 160: 24.81 dB, 166 s.
+            // The same with --seconds 160: 25.02 dB, 0.006 more SSIM, 166 s.
             Self::Long => row(512, 100_000, 1.0, 160.0),
-            // The same with --seconds 300: 25.00 dB, 306 s.
+            // The same with --seconds 300: 25.08 dB, 307 s.
             Self::Longest => row(512, 100_000, 1.0, SECONDS),
             Self::Auto => return None,
         })
