@@ -25,8 +25,8 @@ choice! {
 }
 
 /// Visits to each picture, half of the schedule at half its size, that a point needs before a larger one is preferred. On sheffield_cross,
-/// scored at full size, pictures of half the size have 0.07 dB more than whole ones of the same time after one visit to whole ones, and
-/// 0.27 and 0.23 less after 2.4 and 5.6 (tests/BENCHMARKS.md, "What a step is forecast to cost").
+/// scored at full size, pictures of half the size have 0.08 dB more than whole ones of the same time after 0.9 visits to whole ones, and
+/// 0.27 and 0.23 less after 2.2 and 5.0 (tests/BENCHMARKS.md, "What a step is forecast to cost").
 pub const VISITS: u32 = 3;
 /// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000
 /// Gaussians, of which a picture of 640×480 sees 29 %), and half as many, which at half the size cost 0.15 dB.

@@ -20,19 +20,6 @@ pub(crate) enum Group {
     Scan,
 }
 
-impl Group {
-    /// What the names of its variant's files end with; none where there is none.
-    #[cfg_attr(not(test), allow(dead_code, reason = "for the list of what the boards' drivers compile"))]
-    pub fn suffix(self) -> Option<&'static str> {
-        match self {
-            Self::Tiles => Some("_runs"),
-            Self::Strips => Some("_short"),
-            Self::Sort | Self::Walk => Some("_group"),
-            Self::Wide | Self::Scan => None,
-        }
-    }
-}
-
 /// How many kinds there are.
 pub(crate) const GROUPS: usize = Group::Scan as usize + 1;
 
@@ -63,7 +50,7 @@ pub(crate) struct KernelInfo {
     #[cfg_attr(not(test), allow(dead_code, reason = "for the list of what the boards' drivers compile"))]
     pub file: &'static str,
     pub spirv: Spirv,
-    /// Its group's other variant ([`Group::suffix`]).
+    /// Its group's other variant: `_runs`, `_short` or `_group`.
     pub variant: Option<Spirv>,
     pub bindings: &'static [&'static str],
     /// Sections read through texel fetches, from binding [`FIRST_TEXELS`] on.

@@ -18,7 +18,12 @@ fn lines() -> BTreeSet<String> {
             if shape != one && kernel.variant.is_none() || shape.fetched > 1 && kernel.group != Group::Tiles {
                 continue;
             }
-            let suffix = kernel.group.suffix().filter(|_| takes_variant(kernel.group, shape)).unwrap_or_default();
+            let suffix = match (takes_variant(kernel.group, shape), kernel.group) {
+                (false, _) => "",
+                (true, Group::Tiles) => "_runs",
+                (true, Group::Strips) => "_short",
+                (true, _) => "_group",
+            };
             let (lanes, staged) = (local_size(kernel.group, shape), u32::from(shape.fetched > 1));
             let halves = kernel.bindings.contains(&"sh_first_moment");
             for half in 0..=u32::from(halves) {
