@@ -20,13 +20,16 @@ pub use skips::SkipSettings;
 
 use crate::settings::{Limits, table};
 
+/// More than anybody takes: the steps of a schedule that time alone ends.
+pub const MOST_STEPS: u32 = 1_000_000_000;
+
 table! {
     /// The training recipe. Its defaults are what the measured tables of `tests/BENCHMARKS.md` were measured with.
     pub struct TrainSettings {
         /// Seeds view order, noise, relocation and DropGaussian; same seed, same bytes.
         pub seed: u64 = 1;
         /// Length of the schedule.
-        pub steps: u32 = 10_000, in Limits::within(1.0, 1e9), unit "steps", from "the paper, 4.1: 10,000 steps per device";
+        pub steps: u32 = 10_000, in Limits::within(1.0, MOST_STEPS as f64), unit "steps", from "the paper, 4.1: 10,000 steps per device";
         /// Length of the schedule by wall clock; when given, progress is the larger of the two fractions, so that training
         /// ends at whichever comes first.
         pub seconds: Option<f64> = None, in Limits::within(1e-3, 1e9);
@@ -54,6 +57,11 @@ table! {
         pub regularise: RegulariseSettings = RegulariseSettings::default();
         /// Work that is left out because it changes nothing.
         pub skips: SkipSettings = SkipSettings::default();
+        /// Share of the Gaussians that leave a model which is delivered rounded: those that its loss hangs on least. The others learn to do
+        /// without them.
+        pub thinned_share: f32 = 0.4, in Limits::within(0.0, 0.9);
+        /// Progress at which they do.
+        pub thinned_at: f32 = 0.5, in Limits::within(0.0, 1.0);
         /// Last share of the schedule in which places, sizes, rotations and opacities are rounded as the delivery encoding rounds
         /// them, and colours alone are trained: where the model is delivered rounded (`[upload] encoding`, `dgtr train
         /// --for-delivery`).

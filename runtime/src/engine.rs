@@ -29,6 +29,7 @@ use crate::run_json::RunReport;
 mod budget;
 mod carry;
 mod crops;
+mod delivery;
 pub mod device;
 mod first_gaussians;
 mod follow;
@@ -39,7 +40,6 @@ mod map;
 pub mod pieces;
 mod rebuild;
 mod reconstruct;
-mod rounding;
 pub mod source;
 #[cfg(test)]
 mod testing;
@@ -138,8 +138,8 @@ pub struct Reconstruction {
     builds: u32,
     /// The build that the last map shows.
     mapped: u32,
-    /// The model has been rounded for delivery.
-    rounded: bool,
+    /// What has been done to the model for its delivery.
+    delivery: delivery::Delivery,
     /// Seconds of training over all continuations.
     train_s: f64,
     /// What was done and what it took.
@@ -218,7 +218,7 @@ impl Reconstruction {
             refined: None,
             builds: 0,
             mapped: 0,
-            rounded: false,
+            delivery: delivery::Delivery::default(),
             train_s: 0.0,
             header,
             settings,

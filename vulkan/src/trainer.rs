@@ -48,7 +48,7 @@ use crate::stages::STAGE_NAMES;
 use bytemuck::Zeroable;
 use config::plan::Plan;
 use config::settings::SettingError;
-use config::training::{Strategy, TrainSettings, scene_extent};
+use config::training::{MOST_STEPS, Strategy, TrainSettings, scene_extent};
 use std::ops::ControlFlow;
 use std::time::Instant;
 
@@ -221,9 +221,9 @@ impl Trainer {
         each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
     ) -> Result<TrainSummary, TrainError> {
         if let Some(steps) = budget.steps {
-            self.settings.steps = steps.max(1);
+            self.settings.steps = steps.clamp(1, MOST_STEPS);
         } else if budget.seconds.is_some() {
-            self.settings.steps = u32::MAX;
+            self.settings.steps = MOST_STEPS;
         }
         self.settings.seconds = budget.seconds.or(self.settings.seconds);
         let start = (Instant::now(), self.steps, self.elapsed_s);

@@ -81,6 +81,7 @@ impl Claims {
 
 fn trained(cloud: &GaussianCloud, i: usize) -> Trained {
     Trained {
+        sensitivity: 0.0,
         mean: cloud.means[i],
         log_scale: cloud.log_scales[i],
         rotation: cloud.rotations[i],

@@ -138,7 +138,6 @@ impl Reconstruction {
             self.trainer.renew_view(i, self.views[i].1)?;
         }
         self.trainer.renew_schedule(RENEWED_AT);
-        self.unround()?;
         self.growing.totals.growths += 1;
         self.growing.totals.pictures += (self.views.len() - first) as u64;
         self.report.views = self.views.len() as u64;

@@ -20,6 +20,8 @@ const PLACED_AT_ONCE: usize = 4;
 /// A model is rebuilt when the key frames have grown by this share since the last build: often enough that new ground
 /// is trained on soon, seldom enough that building does not eat the time of training.
 const REBUILD_GROWTH: f64 = 0.34;
+/// Share of the Gaussians that is given up where memory or time is short.
+const GIVEN_UP: f32 = 1.0 / 3.0;
 
 /// What makes a model out of key frames: the seam at which a rehearsal stands in for networks, device and disk.
 pub trait Reconstruct {
@@ -77,7 +79,8 @@ pub trait Reconstruct {
     ) -> Result<StopReason, JobError>;
     /// Trains at half the size, or as scheduled again.
     fn halve_resolution(&mut self, on: bool);
-    /// Gives up the least opaque third of the Gaussians: less memory moved, less to blend.
+    /// Gives up the third of the Gaussians that the loss hangs on least, or that is least opaque where not all are on the device: less memory
+    /// moved, less to blend.
     ///
     /// # Errors
     /// The device fails.
@@ -193,7 +196,7 @@ impl Reconstruct for Reconstruction {
         self.even_light(fresh.light.take(), 0)?;
         let new = self.take_over(&fresh)?;
         let loaded = self.load_first()?;
-        self.unround()?;
+        self.begin_delivery()?;
         self.fly_on();
         self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
         self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
@@ -230,6 +233,7 @@ impl Reconstruct for Reconstruction {
         if self.is_continued() && !self.settings.incremental {
             let steps = u32::try_from(self.header.steps).unwrap_or(u32::MAX);
             self.trainer.continue_from(steps, self.train_s);
+            self.continue_delivery();
         }
         self.builds += 1;
         self.report.views = self.views.len() as u64;
@@ -268,20 +272,18 @@ impl Reconstruct for Reconstruction {
         let _span = tracing::info_span!("train").entered();
         let from = Instant::now();
         let summary = loop {
-            let (part, before, mut is_due) = (self.rounded_from(), self.trainer.elapsed_s(), false);
+            let (due, before, mut next) = (self.delivery_due(), self.trainer.elapsed_s(), None);
             let mut asked_to_stop = false;
             let summary = self.trainer.run(budget, &mut |step| {
-                is_due = part.is_some_and(|from| (from..1.0).contains(&step.progress));
+                next = due.after(step);
                 asked_to_stop = each(step).is_break();
-                if is_due || asked_to_stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+                if next.is_some() || asked_to_stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             })?;
             self.header.steps += u64::from(summary.steps);
             self.report.steps += u64::from(summary.steps);
             self.train_s += self.trainer.elapsed_s() - before;
-            if is_due {
-                self.round()?;
-            }
-            if !is_due || asked_to_stop {
+            next.map_or(Ok(()), |next| self.prepare_delivery(next))?;
+            if next.is_none() || asked_to_stop {
                 break summary;
             }
         };
@@ -318,6 +320,11 @@ impl Reconstruct for Reconstruction {
     }
 
     fn shrink(&mut self) -> Result<(), JobError> {
+        if self.trainer.grows_in_place() {
+            let gone = self.thin(GIVEN_UP)?;
+            tracing::warn!("gave up {gone} Gaussians, {} remain", self.trainer.gaussians());
+            return Ok(());
+        }
         self.trainer.snapshot(&mut self.cloud)?;
         let mut by_opacity = self.cloud.opacity_logits.clone();
         by_opacity.sort_by(f32::total_cmp);

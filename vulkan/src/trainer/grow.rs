@@ -2,7 +2,7 @@
 //! nobody touches keeps its place, its moments and its part of the schedule.
 
 use super::load::LoadReport;
-use super::parameters::{Geometry, record_of};
+use super::parameters::{Geometry, LEAST_LEFT, record_of};
 use super::{TrainError, Trainer, state};
 use config::training::Strategy;
 use models::cloud::{GaussianCloud, sh_coefficients};
@@ -21,21 +21,26 @@ pub struct Trained {
     pub rotation: [f32; 4],
     /// Opacity before the sigmoid.
     pub opacity_logit: f32,
+    /// What the loss may lose with it: root mean square, over the steps since the last [`Trainer::load`] (the last thousand above all), of
+    /// the loss's derivative by the logarithm of the opacity. 0 before the first step; infinite where the Gaussian is too opaque for
+    /// a derivative to be left.
+    pub sensitivity: f32,
 }
 
 impl Trained {
+    /// `unbias`: what the second moments are multiplied by.
+    fn of(g: &Geometry, unbias: f32) -> Self {
+        let Geometry { mean, log_scale, rotation, opacity_logit, .. } = *g;
+        let is_opaque = opacity_logit > -LEAST_LEFT.ln();
+        let sensitivity = if is_opaque { f32::INFINITY } else { g.sensitivity(unbias) };
+        Self { mean, log_scale, rotation, opacity_logit, sensitivity }
+    }
+
     /// Opacity-weighted area of the disc spanned by its two longest axes, m²: how much of the ground it covers.
     pub fn covers_m2(&self) -> f32 {
         let [a, b, c] = self.log_scale;
         let area = a + b + c - a.min(b).min(c);
         std::f32::consts::PI * area.exp() / (1.0 + (-self.opacity_logit).exp())
-    }
-}
-
-impl From<&Geometry> for Trained {
-    fn from(g: &Geometry) -> Self {
-        let Geometry { mean, log_scale, rotation, opacity_logit, .. } = *g;
-        Self { mean, log_scale, rotation, opacity_logit }
     }
 }
 
@@ -69,6 +74,11 @@ impl Trainer {
         self.strategy = Strategy::None;
     }
 
+    /// From here on, until the next [`Trainer::load`], nothing is densified: the number of Gaussians is the caller's.
+    pub fn keep_number(&mut self) {
+        self.strategy = Strategy::None;
+    }
+
     /// Puts the schedule to `progress`, 0…1, for what is there; moments stay.
     pub fn renew_schedule(&mut self, progress: f32) {
         let share = f64::from(progress.clamp(0.0, 1.0));
@@ -83,9 +93,15 @@ impl Trainer {
     /// [`TrainError::Gpu`].
     pub fn each(&mut self, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
         self.flush()?;
+        let unbias = self.second_unbias();
         let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        geometry.iter().for_each(|g| see(&g.into()));
+        geometry.iter().for_each(|g| see(&Trained::of(g, unbias)));
         Ok(())
+    }
+
+    /// What Adam multiplies second moments by, which begin at zero.
+    fn second_unbias(&self) -> f32 {
+        (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(self.steps.max(1) as i32))) as f32
     }
 
     /// Moves Gaussians and takes others out, as `fate` says of each by its number; never the last one. Returns how many went. Only
@@ -95,9 +111,9 @@ impl Trainer {
     /// [`TrainError::Gpu`].
     pub fn revise(&mut self, mut fate: impl FnMut(usize, &Trained) -> Fate) -> Result<usize, TrainError> {
         self.flush()?;
-        let mut gone: Vec<u32> = Vec::new();
+        let (mut gone, unbias): (Vec<u32>, _) = (Vec::new(), self.second_unbias());
         for (i, g) in self.parameters.geometry_mut(&mut self.arena)[..self.gaussians].iter_mut().enumerate() {
-            match fate(i, &(&*g).into()) {
+            match fate(i, &Trained::of(g, unbias)) {
                 Fate::Stays => {}
                 Fate::Moves { mean, rotation } => (g.mean, g.rotation) = (mean, rotation),
                 Fate::Goes => gone.push(i as u32),
@@ -264,6 +280,31 @@ mod tests {
         assert!(t.step().unwrap().loss.is_finite());
         assert_eq!(t.revise(|_, _| Fate::Goes).unwrap(), 48);
         assert_eq!(t.gaussians(), 1, "never the last one");
+    }
+
+    #[test]
+    fn sensitivity_says_by_how_much_the_loss_moves_with_an_opacity() {
+        let Some(mut t) = trainer(1) else { return };
+        let first = cloud(1, 80, 0);
+        t.load(&first).unwrap();
+        t.step().unwrap();
+        let mut sensitive = Vec::new();
+        t.each(|g| sensitive.push(g.sensitivity)).unwrap();
+        let mut order: Vec<usize> = (0..80).collect();
+        order.sort_by(|a, b| sensitive[*b].total_cmp(&sensitive[*a]));
+        let mut loss_with = |i: usize, factor: f32| {
+            let mut other = first.clone();
+            let o = factor / (1.0 + (-first.opacity_logits[i]).exp());
+            other.opacity_logits[i] = (o / (1.0 - o)).ln();
+            t.load(&other).unwrap();
+            t.step().unwrap().loss
+        };
+        for i in order[..5].iter().copied() {
+            let moved = (loss_with(i, 1.01) - loss_with(i, 0.99)).abs() / 0.02;
+            // Pixels at the cut-off come and go; the derivative knows nothing of them.
+            assert!((moved / sensitive[i] - 1.0).abs() < 0.2, "{i}: {moved} {}", sensitive[i]);
+        }
+        assert!(sensitive[order[79]] < 0.2 * sensitive[order[0]]);
     }
 
     #[test]

@@ -6,6 +6,9 @@ use crate::arena::{Arena, Section};
 use config::plan::Plan;
 use models::cloud::{GaussianCloud, sh_coefficients};
 
+/// Nearer to an opacity of 1 than this the derivative is lost in rounding.
+pub(crate) const LEAST_LEFT: f32 = 1e-4;
+
 /// Everything but SH of one Gaussian, with Adam's moments: nine vec4 of section `geometry`.
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -29,6 +32,15 @@ impl Geometry {
 
     fn hold(&mut self) {
         self.second = [[HEAVY; 4]; 3];
+    }
+
+    /// Root mean square over the steps of the loss's derivative by the logarithm of the opacity: what the loss may lose with this
+    /// Gaussian, as Optimal Brain Damage (LeCun et al. 1990) reckons for a network's weights. `unbias` is what Adam multiplies second
+    /// moments by.
+    pub fn sensitivity(&self, unbias: f32) -> f32 {
+        // The moment is of the derivative by the logit, which is that by the logarithm times 1 - opacity.
+        let left = 1.0 / (1.0 + self.opacity_logit.exp());
+        (self.second[0][3] * unbias).sqrt() / left.max(LEAST_LEFT)
     }
 
     pub fn is_finite(&self) -> bool {

@@ -1,0 +1,133 @@
+//! Promises of what a model goes through before it is delivered.
+
+use std::ops::ControlFlow;
+
+use models::cloud::GaussianCloud;
+use models::formats::delivery::{self, Rounding};
+use models::formats::model::ModelHeader;
+use vulkan::gpu::Gpu;
+use vulkan::trainer::{RunBudget, StepReport, StopReason};
+
+use super::*;
+use crate::engine::testing::{picture, settings};
+use crate::engine::{EngineSettings, Reconstruct};
+
+/// An engine that has built its model from three pictures.
+fn built(delivers: bool) -> Option<Reconstruction> {
+    if Gpu::list().is_err() {
+        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        return None;
+    }
+    let settings = EngineSettings { delivers, ..settings() };
+    let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
+    (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
+    assert!(engine.build(&|| true).expect("built"));
+    Some(engine)
+}
+
+/// Trains for so many steps of a schedule of 20; why it ended.
+fn train(engine: &mut Reconstruction, steps: u32) -> StopReason {
+    let mut left = steps;
+    let each = &mut |_: &StepReport| {
+        left -= 1;
+        if left == 0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    };
+    engine.train(&RunBudget { steps: Some(20), seconds: None }, each).expect("trains")
+}
+
+fn sensitivities(engine: &mut Reconstruction) -> Vec<u32> {
+    let mut all = Vec::new();
+    engine.trainer.each(|g| all.push(g.sensitivity)).expect("the device works");
+    all.sort_by(f32::total_cmp);
+    all.into_iter().map(f32::to_bits).collect()
+}
+
+#[test]
+fn those_leave_that_the_loss_hangs_on_least_and_the_others_stay_as_they_are() {
+    let Some(mut engine) = built(false) else { return };
+    train(&mut engine, 9);
+    let (before, steps) = (sensitivities(&mut engine), engine.trainer.steps());
+    assert!(f32::from_bits(before[before.len() / 2]) > 0.0 && before[0] < before[before.len() - 1]);
+    let gone = engine.thin(0.25).expect("the device works");
+    assert_eq!(gone, before.len() / 4);
+    assert!(sensitivities(&mut engine) == before[gone..] && engine.trainer.steps() == steps);
+}
+
+#[test]
+fn before_every_picture_was_looked_at_the_least_opaque_ones_leave() {
+    let Some(mut engine) = built(false) else { return };
+    let opacities = |engine: &mut Reconstruction| {
+        let mut all = Vec::new();
+        engine.trainer.each(|g| all.push(g.opacity_logit)).expect("the device works");
+        all.sort_by(f32::total_cmp);
+        all
+    };
+    train(&mut engine, 1);
+    let before = opacities(&mut engine);
+    let gone = engine.thin(0.5).expect("the device works");
+    assert!(gone > 0 && opacities(&mut engine) == before[gone..]);
+}
+
+#[test]
+fn a_model_for_delivery_is_thinned_once_and_one_that_is_not_never() {
+    for (delivers, share) in [(true, 0.3), (false, 0.0)] {
+        let Some(mut engine) = built(delivers) else { return };
+        engine.settings.training.thinned_share = 0.3;
+        let whole = engine.gaussians();
+        train(&mut engine, 9);
+        assert_eq!(engine.gaussians(), whole, "not before its time");
+        assert_eq!(train(&mut engine, u32::MAX), StopReason::Schedule);
+        assert_eq!(engine.gaussians(), whole - (share * whole as f64) as usize);
+    }
+}
+
+#[test]
+fn a_model_that_was_left_after_it_had_been_thinned_is_not_thinned_again() {
+    let Some(mut engine) = built(true) else { return };
+    for (spent, thinned) in [(8, false), (11, true)] {
+        engine.trainer.continue_from(spent, 0.0);
+        engine
+            .trainer
+            .run(&RunBudget { steps: Some(20), seconds: None }, &mut |_| ControlFlow::Break(()))
+            .expect("trains");
+        engine.continue_delivery();
+        assert_eq!(engine.delivery.thinned, thinned, "{spent}");
+    }
+}
+
+#[test]
+fn a_schedule_that_the_clock_ends_is_thinned_and_rounded_too() {
+    let Some(mut engine) = built(true) else { return };
+    let whole = engine.gaussians();
+    let budget = RunBudget { steps: None, seconds: Some(1.0) };
+    let mut go_on = |_: &StepReport| ControlFlow::Continue(());
+    assert_eq!(engine.train(&budget, &mut go_on).expect("trains"), StopReason::Schedule);
+    assert!(engine.delivery.rounded && engine.delivery.thinned && engine.gaussians() < whole);
+}
+
+#[test]
+fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colours() {
+    let trained = |delivers: bool| {
+        let mut engine = built(delivers)?;
+        let mut steps = 0;
+        let budget = RunBudget { steps: Some(20), seconds: None };
+        let mut each = |_: &StepReport| {
+            steps += 1;
+            ControlFlow::Continue(())
+        };
+        assert_eq!(engine.train(&budget, &mut each).expect("trains"), StopReason::Schedule);
+        engine.trainer.snapshot(&mut engine.cloud).expect("read");
+        Some((steps, engine.header.steps, engine.cloud))
+    };
+    let Some(((steps, counted, rounded), (_, _, exact))) = trained(true).zip(trained(false)) else { return };
+    assert_eq!((steps, counted), (20, 20), "the schedule goes on where it was");
+    let again = delivery::round_shapes(&rounded, &Rounding::default()).expect("rounds");
+    let places = |cloud: &GaussianCloud| {
+        let mut places: Vec<_> = cloud.means.iter().map(|m| m.map(f32::to_bits)).collect();
+        places.sort_unstable();
+        places
+    };
+    assert!(places(&again) == places(&rounded));
+    let of_exact = delivery::round_shapes(&exact, &Rounding::default()).expect("rounds");
+    assert!(places(&of_exact) != places(&exact));
+}
