@@ -92,8 +92,8 @@ pub struct Args {
     /// Take telemetry poses as they are.
     #[arg(long)]
     no_refine: bool,
-    /// Train the last share of the schedule with values as the delivery encoding rounds them ([training] rounded_share): for
-    /// models that go out by `dgtr export --to delivery`.
+    /// Give up the Gaussians that the loss hangs on least ([training] thinned_share) and train the last share of the schedule with values
+    /// as the delivery encoding rounds them (rounded_share): for models that go out by `dgtr export --to delivery`.
     #[arg(long)]
     for_delivery: bool,
     /// Optimiser steps; with neither --steps nor --seconds the recipe's own number ([training] steps, or
