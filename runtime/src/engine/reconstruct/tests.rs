@@ -1,5 +1,6 @@
 //! Promises of the engine.
 
+use config::training::Strategy;
 use models::formats::model::ModelHeader;
 use vulkan::gpu::Gpu;
 
@@ -12,10 +13,12 @@ fn giving_up_gaussians_does_not_start_the_schedule_anew() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
         return;
     }
-    let mut engine = Reconstruction::open(settings(), ModelHeader::default(), "train").expect("opens");
+    let mut settings = settings();
+    settings.training.density.strategy = Strategy::Relocate;
+    let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
     assert!(engine.build(&|| true).expect("built"));
-    let budget = RunBudget { steps: Some(6), seconds: None };
+    let budget = RunBudget { steps: Some(20), seconds: None };
     let mut steps = 0;
     let mut until = |engine: &mut Reconstruction, last: u32| {
         let each = &mut |_: &StepReport| {
@@ -27,8 +30,10 @@ fn giving_up_gaussians_does_not_start_the_schedule_anew() {
     assert_eq!(until(&mut engine, 4), StopReason::Caller);
     let before = engine.gaussians();
     engine.shrink().expect("the device works");
-    assert!(engine.gaussians() < before && !engine.is_done(&budget));
+    let after = engine.gaussians();
+    assert!(after < before && !engine.is_done(&budget));
     assert_eq!(until(&mut engine, u32::MAX), StopReason::Schedule);
-    assert_eq!(steps, 6);
+    assert_eq!(steps, 20);
     assert!(engine.is_done(&budget));
+    assert_eq!(engine.gaussians(), after, "what was given up is not grown again");
 }
