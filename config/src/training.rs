@@ -57,9 +57,12 @@ table! {
         pub regularise: RegulariseSettings = RegulariseSettings::default();
         /// Work that is left out because it changes nothing.
         pub skips: SkipSettings = SkipSettings::default();
-        /// Share of the Gaussians that leave a model which is delivered rounded: those that its loss hangs on least. The others learn to do
-        /// without them.
+        /// Share of the Gaussians that leave a model which is delivered rounded at most: those that its loss hangs on least. The others learn
+        /// to do without them.
         pub thinned_share: f32 = 0.4, in Limits::within(0.0, 0.9);
+        /// They are fewer where their absence could raise the loss by more than this share of it, reckoned by its derivatives: where few
+        /// Gaussians are superfluous.
+        pub thinned_loss: f32 = 0.3, in Limits::at_least(0.0);
         /// Progress at which they do.
         pub thinned_at: f32 = 0.5, in Limits::within(0.0, 1.0);
         /// Last share of the schedule in which places, sizes, rotations and opacities are rounded as the delivery encoding rounds

@@ -73,7 +73,8 @@ impl Reconstruction {
         match next {
             Next::Thin => {
                 self.delivery.thinned = true;
-                let gone = self.thin(self.settings.training.thinned_share)?;
+                let t = &self.settings.training;
+                let gone = self.thin(t.thinned_share, t.thinned_loss * self.trainer.mean_loss())?;
                 self.trainer.keep_number();
                 self.report.skip("gaussians_thinned", gone as u64);
                 tracing::info!("thinned for delivery by {gone} Gaussians, {} remain", self.trainer.gaussians());
@@ -83,22 +84,28 @@ impl Reconstruction {
         }
     }
 
-    /// Takes `share` of the Gaussians out, those of the least [sensitivity](Trained::sensitivity), and leaves all else as it is; how many
-    /// those were. The least opaque ones where too few steps were taken to tell. Only where
-    /// [`Trainer::grows_in_place`](vulkan::trainer::Trainer::grows_in_place).
-    pub(super) fn thin(&mut self, share: f32) -> Result<usize, JobError> {
+    /// Takes Gaussians out, those of the least [sensitivity](Trained::sensitivity), and leaves all else as it is: `share` of them, or as
+    /// many as have sensitivities of no more than `most_loss` together. How many those were. The least opaque ones where too few steps
+    /// were taken to tell. Only where [`Trainer::grows_in_place`](vulkan::trainer::Trainer::grows_in_place).
+    pub(super) fn thin(&mut self, share: f32, most_loss: f32) -> Result<usize, JobError> {
         let told = self.trainer.steps() >= self.least_steps();
         let worth = |g: &Trained| if told { g.sensitivity } else { g.opacity_logit };
         let mut all = Vec::with_capacity(self.trainer.gaussians());
         self.trainer.each(|g| all.push(worth(g)))?;
-        let leave = (f64::from(share) * all.len() as f64) as usize;
-        if leave == 0 {
-            return Ok(0);
+        all.sort_unstable_by(f32::total_cmp);
+        let mut leave = (f64::from(share) * all.len() as f64) as usize;
+        if told {
+            let mut lost = 0.0f64;
+            let cheap = all.iter().take_while(|v| {
+                lost += f64::from(**v);
+                lost <= f64::from(most_loss)
+            });
+            leave = leave.min(cheap.count());
         }
-        let (below, most, _) = all.select_nth_unstable_by(leave - 1, f32::total_cmp);
+        let Some(most) = leave.checked_sub(1).map(|last| all[last]) else { return Ok(0) };
         // Of those that are worth the same the first ones.
-        let most = *most;
-        let mut ties = leave - below.iter().filter(|v| v.total_cmp(&most).is_lt()).count();
+        let below = all.partition_point(|v| v.total_cmp(&most).is_lt());
+        let mut ties = leave - below;
         Ok(self.trainer.revise(|_, g| {
             let goes = match worth(g).total_cmp(&most) {
                 Ordering::Less => true,

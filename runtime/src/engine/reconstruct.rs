@@ -321,7 +321,7 @@ impl Reconstruct for Reconstruction {
 
     fn shrink(&mut self) -> Result<(), JobError> {
         if self.trainer.grows_in_place() {
-            let gone = self.thin(GIVEN_UP)?;
+            let gone = self.thin(GIVEN_UP, f32::INFINITY)?;
             self.trainer.keep_number();
             tracing::warn!("gave up {gone} Gaussians, {} remain", self.trainer.gaussians());
             return Ok(());

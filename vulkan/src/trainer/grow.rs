@@ -99,6 +99,12 @@ impl Trainer {
         Ok(())
     }
 
+    /// Mean over the views of the loss when each was last looked at; 0 before any was.
+    pub fn mean_loss(&self) -> f32 {
+        let seen = || self.views.iter().map(|v| f64::from(v.last_loss)).filter(|loss| loss.is_finite());
+        (seen().sum::<f64>() / seen().count().max(1) as f64) as f32
+    }
+
     /// What Adam multiplies second moments by, which begin at zero.
     fn second_unbias(&self) -> f32 {
         (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(self.steps.max(1) as i32))) as f32

@@ -48,9 +48,22 @@ fn those_leave_that_the_loss_hangs_on_least_and_the_others_stay_as_they_are() {
     train(&mut engine, 9);
     let (before, steps) = (sensitivities(&mut engine), engine.trainer.steps());
     assert!(f32::from_bits(before[before.len() / 2]) > 0.0 && before[0] < before[before.len() - 1]);
-    let gone = engine.thin(0.25).expect("the device works");
+    let gone = engine.thin(0.25, f32::INFINITY).expect("the device works");
     assert_eq!(gone, before.len() / 4);
     assert!(sensitivities(&mut engine) == before[gone..] && engine.trainer.steps() == steps);
+}
+
+#[test]
+fn no_more_leave_than_what_they_may_cost_together() {
+    let Some(mut engine) = built(false) else { return };
+    train(&mut engine, 9);
+    let before = sensitivities(&mut engine);
+    let cost = |n: usize| before[..n].iter().map(|v| f64::from(f32::from_bits(*v))).sum::<f64>() as f32;
+    let (few, loss) = (before.len() / 10, engine.trainer.mean_loss());
+    assert!(loss > 0.0 && loss < 1.0 && cost(before.len() / 2) > cost(few + 1), "{loss}");
+    let between = 0.5 * (cost(few) + cost(few + 1));
+    assert_eq!(engine.thin(0.5, between).expect("the device works"), few);
+    assert_eq!(engine.thin(0.5, 0.0).expect("the device works"), 0, "those that are left are all of use");
 }
 
 #[test]
@@ -64,7 +77,7 @@ fn before_every_picture_was_looked_at_the_least_opaque_ones_leave() {
     };
     train(&mut engine, 1);
     let before = opacities(&mut engine);
-    let gone = engine.thin(0.5).expect("the device works");
+    let gone = engine.thin(0.5, 0.0).expect("the device works");
     assert!(gone > 0 && opacities(&mut engine) == before[gone..]);
 }
 
@@ -72,7 +85,7 @@ fn before_every_picture_was_looked_at_the_least_opaque_ones_leave() {
 fn a_model_for_delivery_is_thinned_once_and_one_that_is_not_never() {
     for (delivers, share) in [(true, 0.3), (false, 0.0)] {
         let Some(mut engine) = built(delivers) else { return };
-        engine.settings.training.thinned_share = 0.3;
+        (engine.settings.training.thinned_share, engine.settings.training.thinned_loss) = (0.3, 1e6);
         let whole = engine.gaussians();
         train(&mut engine, 9);
         assert_eq!(engine.gaussians(), whole, "not before its time");
@@ -98,6 +111,7 @@ fn a_model_that_was_left_after_it_had_been_thinned_is_not_thinned_again() {
 #[test]
 fn a_schedule_that_the_clock_ends_is_thinned_and_rounded_too() {
     let Some(mut engine) = built(true) else { return };
+    engine.settings.training.thinned_loss = 1e6;
     let whole = engine.gaussians();
     let budget = RunBudget { steps: None, seconds: Some(1.0) };
     let mut go_on = |_: &StepReport| ControlFlow::Continue(());
