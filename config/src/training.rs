@@ -62,7 +62,7 @@ table! {
         pub thinned_share: f32 = 0.4, in Limits::within(0.0, 0.9);
         /// They are fewer where their absence could raise the loss by more than this share of it, reckoned by its derivatives: where few
         /// Gaussians are superfluous.
-        pub thinned_loss: f32 = 0.3, in Limits::at_least(0.0);
+        pub thinned_loss: f32 = 0.45, in Limits::at_least(0.0);
         /// Progress at which they do.
         pub thinned_at: f32 = 0.5, in Limits::within(0.0, 1.0);
         /// Last share of the schedule in which places, sizes, rotations and opacities are rounded as the delivery encoding rounds
