@@ -1,6 +1,8 @@
 //! Promises of the model file and the 3DGS PLY: what was written comes back bit by bit, and no damage goes unseen.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
 
+use std::path::Path;
+
 use config::geodesy::Geodetic;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
@@ -24,6 +26,7 @@ fn header(views: usize) -> ModelHeader {
         seed: 7,
         finished: true,
         lights: vec![PictureLight { gain: [0.2, -0.1, 0.0], falloff: [-0.3, 0.1, 0.0], reach: 0.9 }; views],
+        thinned: true,
     }
 }
 
@@ -120,22 +123,31 @@ fn a_model_with_any_bit_flipped_or_any_byte_missing_is_refused() {
     assert!(matches!(model::read(&path), Err(FormatError::Truncated { .. })));
 }
 
-#[test]
-fn a_model_of_before_pictures_had_a_light_is_read_as_one_of_even_light() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = dir.path().join("m.dgtr");
-    let even = ModelHeader { lights: Vec::new(), ..header(2) };
-    model::write(&path, &even, &sample()).unwrap();
-    let mut bytes = std::fs::read(&path).unwrap();
+/// Takes the header's last `fields` bytes, which are 0, out of a model file.
+fn without_the_last(fields: usize, path: &Path) {
+    let mut bytes = std::fs::read(path).unwrap();
     let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap());
-    bytes[12..16].copy_from_slice(&(length - 1).to_le_bytes());
-    assert_eq!(bytes.remove(28 + length as usize - 1), 0);
+    let end = 28 + length as usize;
+    bytes[12..16].copy_from_slice(&(length - fields as u32).to_le_bytes());
+    assert!(bytes.drain(end - fields..end).all(|b| b == 0));
     let hashed = bytes.len() - 32;
     let hash = blake3::hash(&bytes[..hashed]);
     bytes[hashed..].copy_from_slice(hash.as_bytes());
-    std::fs::write(&path, &bytes).unwrap();
-    let (head, cloud) = model::read(&path).unwrap();
-    assert!(head == even && cloud == sample());
+    std::fs::write(path, &bytes).unwrap();
+}
+
+#[test]
+fn a_model_of_before_pictures_had_a_light_or_models_were_thinned_is_read_as_even_and_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.dgtr");
+    let whole = ModelHeader { thinned: false, ..header(2) };
+    let even = ModelHeader { lights: Vec::new(), ..whole.clone() };
+    for (fields, expected) in [(1, whole), (2, even)] {
+        model::write(&path, &expected, &sample()).unwrap();
+        without_the_last(fields, &path);
+        let (head, cloud) = model::read(&path).unwrap();
+        assert!(head == expected && cloud == sample(), "{fields} fields ago");
+    }
 }
 
 #[test]

@@ -243,7 +243,7 @@ impl Reconstruction {
         // Models of earlier versions say it themselves.
         let told = RunReport::read(out).ok().and_then(|run| run.more.get("train_seconds")?.as_f64());
         self.train_s = told.unwrap_or(header.train_seconds);
-        self.header.steps = header.steps;
+        (self.header.steps, self.header.thinned) = (header.steps, header.thinned);
         match earlier {
             pieces::Earlier::Whole(_, cloud) => self.cloud.clone_from(&cloud),
             pieces::Earlier::Pieces(model) => self.first = Some(model),

@@ -2,7 +2,7 @@
 
     features      luminance, normalised by its local mean and deviation, at 1/4 and 1/2 of the size
     cost volume   1/4: `planes` inverse depths over the whole range; 1/2: `fine` planes around the first result
-    aggregation   Gaussian windows of two sizes, as products with band matrices (dense products are what a CPU does best)
+    aggregation   Gaussian windows of two sizes over means of small blocks, as products with matrices (what a CPU does best)
     depth         soft-argmax of the normalised correlation over inverse depth
     confidence    correlation at the peak, damped where the picture has no texture or no second view
 
@@ -27,6 +27,7 @@ SETTINGS = dict(
     norm4=1.5, norm2=2.5, eps=4e-4,   # window of the local normalisation; variance of sensor noise (range -1..1)
     small=2.0, large=5.0, large_share=0.6, fine_window=2.0,   # aggregation
     beta4=60.0, beta2=60.0,           # sharpness of the soft-argmax
+    pooled=lambda sigma: 2 if sigma >= 2 else 1,   # cells whose mean a window sees
     best=0.3,                         # share of the better source against the mean of both
 )
 
@@ -45,24 +46,33 @@ def build(p=None):
     def vec(*parts):
         return g.concat(*[g.reshape(x, [1]) if isinstance(x, str) else g.const(np.array([x], np.int64)) for x in parts])
 
-    def band(n, sigma):
-        """Row-normalised Gaussian band matrix [n, n]."""
+    def window(n, cells, sigma, pooled):
+        """Row-normalised Gaussian windows of n cells over `cells` blocks of `pooled` of them: [n, cells]. A block's cells weigh the same,
+        which adds its own spread to the Gaussian's."""
         i = g.arange(n)
-        d = g.sub(g.unsqueeze(i, 1), g.unsqueeze(i, 0))
+        j = g.add(g.mul(g.arange(cells), np.float32(pooled)), np.float32((pooled - 1) / 2))
+        d = g.sub(g.unsqueeze(i, 1), g.unsqueeze(j, 0))
         # Cut at four deviations: products with the denormal numbers of a full tail cost a hundred times a plain one.
         near = g.cast(g.op("Less", g.op("Abs", d), np.float32(4 * sigma)), TensorProto.FLOAT)
-        e = g.mul(near, g.op("Exp", g.mul(g.mul(d, d), np.float32(-0.5 / sigma**2))))
+        spread = sigma**2 - (pooled**2 - 1) / 12
+        e = g.mul(near, g.op("Exp", g.mul(g.mul(d, d), np.float32(-0.5 / spread))))
         return g.div(e, g.total(e, 1))
 
-    bands = {}
+    windows = {}
     def blur(x, level, sigma, weight=1.0):
-        """x [N, h, w]; `weight` multiplies the result, at the price of nothing."""
+        """x [N, h, w]; `weight` multiplies the result, at the price of nothing. Windows this smooth need not see single cells: means of
+        blocks of about a deviation give the same to a few percent, for a fraction of the products."""
+        pooled = P["pooled"](sigma)
         key = (level, sigma, weight)
-        if key not in bands:
+        if key not in windows:
             h, w = {4: (H4, W4), 2: (H2, W2)}[level]
-            by = band(h, sigma)
-            bands[key] = (by if weight == 1.0 else g.mul(by, np.float32(weight)), g.op("Transpose", band(w, sigma), perm=[1, 0]))
-        by, bx = bands[key]
+            ph, pw = (g.op("Div", g.op("Add", n, np.int64(pooled - 1)), np.int64(pooled)) for n in (h, w))
+            by = window(h, ph, sigma, pooled)
+            windows[key] = (by if weight == 1.0 else g.mul(by, np.float32(weight)), g.op("Transpose", window(w, pw, sigma, pooled), perm=[1, 0]))
+        by, bx = windows[key]
+        if pooled > 1:
+            blocks = g.op("AveragePool", g.unsqueeze(x, 1), kernel_shape=[pooled, pooled], strides=[pooled, pooled], ceil_mode=1)
+            x = g.op("Squeeze", blocks, np.array([1], np.int64))
         return g.matmul(by, g.matmul(x, bx))
 
     # Luminance pyramid, [V, h, w].
@@ -88,7 +98,9 @@ def build(p=None):
         src = g.op("Slice", f, np.array([1], np.int64), np.array([VIEWS], np.int64), np.array([0], np.int64))
         up = g.op("Resize", g.reshape(src, vec(S, 1, h, w)), "", np.array([1, 1, 2, 2], np.float32), mode="linear",
                   coordinate_transformation_mode="half_pixel")
-        return g.reshape(up, vec(S, -1))
+        # Nothing marks what lies outside; within, where there is no texture, a feature is next to nothing.
+        rimmed = g.op("Pad", g.add(up, np.float32(1e-9)), np.array([0, 0, 1, 1, 0, 0, 1, 1], np.int64))
+        return g.reshape(rimmed, vec(S, -1))
 
     def pixels(h, w, div):
         """Full-size pixel coordinates (centres at integers) of a level's cells: x [1, w], y [h, 1]."""
@@ -97,15 +109,16 @@ def build(p=None):
         y = g.add(g.mul(g.arange(h), np.float32(div)), np.float32(off))
         return g.unsqueeze(x, 0), g.unsqueeze(y, 1)
 
-    def sweep(level, s, ref, source, inverse):
-        """Product of reference and warped source feature and its validity, for inverse depths [D,h,w] or [D,1,1]."""
+    def sweep(level, s, ref, source, center, offsets):
+        """Product of reference and warped source feature and its validity, for inverse depths center + offsets, [h,w] or nothing and
+        [D,1,1]."""
         h, w = {4: (H4, W4), 2: (H2, W2)}[level]
         fh, fw = {4: (H2, W2), 2: (H, W)}[level]
         scale = level // 2
         x, y = pixels(h, w, level)
-        # Finer map: centre of index k at full-size coordinate scale*k + (scale-1)/2; rounding = floor(. + 1/2). Both are
-        # affine in the projection's rows, where they cost one small matrix product and not two passes over the volume.
-        gain, offset = (0.5, 0.25) if scale == 2 else (1.0, 0.5)
+        # Finer map: centre of index k at full-size coordinate scale*k + (scale-1)/2; rounding = floor(. + 1/2), and one more for the rim.
+        # Both are affine in the projection's rows, where they cost one small matrix product and not two passes over the volume.
+        gain, offset = (0.5, 1.25) if scale == 2 else (1.0, 1.5)
         to_index = np.array([[gain, 0, offset, 0], [0, gain, offset, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)
         projection = g.matmul(to_index, g.pick("rel_proj", s))
         def entry(r, c):
@@ -113,17 +126,20 @@ def build(p=None):
         rows = []
         for r in range(3):
             base = g.add(g.add(g.mul(x, entry(r, 0)), g.mul(y, entry(r, 1))), entry(r, 2))
-            rows.append(g.add(base, g.mul(inverse, entry(r, 3))))
+            if center is not None:
+                base = g.add(base, g.mul(center, entry(r, 3)))
+            rows.append(g.add(base, g.mul(offsets, entry(r, 3))))
         z = g.op("Reciprocal", g.op("Max", rows[2], np.float32(1e-6)))
         fwf, fhf = g.cast(fw, TensorProto.FLOAT), g.cast(fh, TensorProto.FLOAT)
-        ix, iy = (g.op("Floor", g.mul(row, z)) for row in rows[:2])
-        cx = g.op("Clip", ix, np.float32(0), g.sub(fwf, np.float32(1)))
-        cy = g.op("Clip", iy, np.float32(0), g.sub(fhf, np.float32(1)))
-        inside = g.cast(g.op("And", g.op("Equal", cx, ix), g.op("Equal", cy, iy)), TensorProto.FLOAT)
-        at = g.cast(g.add(g.mul(cy, fwf), cx), TensorProto.INT32)
+        # The rim is outside. What is cut off of the column beyond it is cut off of the index.
+        column = g.op("Clip", g.mul(rows[0], z), np.float32(0), g.add(fwf, np.float32(1.25)))
+        line = g.op("Floor", g.op("Clip", g.mul(rows[1], z), np.float32(0), g.add(fhf, np.float32(1.25))))
+        at = g.cast(g.add(g.mul(line, g.add(fwf, np.float32(2))), column), TensorProto.INT32)
         # GatherElements on flat arrays: a typed loop, where Gather copies every float by itself (three times slower).
         warped = g.op("GatherElements", g.pick(source, s), g.reshape(at, [-1]), axis=0)
-        return g.mul(g.mul(ref, g.reshape(warped, vec(-1, h, w))), inside), inside
+        inside = g.cast(g.cast(warped, TensorProto.BOOL), TensorProto.FLOAT)
+        volume = vec(-1, h, w)
+        return g.mul(ref, g.reshape(warped, volume)), g.reshape(inside, volume)
 
     near, far = g.pick("depth_range", 0), g.pick("depth_range", 1)
     wmax, wmin = g.op("Reciprocal", near), g.op("Reciprocal", far)
@@ -132,32 +148,36 @@ def build(p=None):
     dw = g.div(g.sub(wmax, wmin), np.float32(D - 1))
     planes = g.reshape(g.add(wmin, g.mul(g.sub(wmax, wmin), t)), [D, 1, 1])
 
-    def correlate(level, inverse, small, large, large_share):
+    def correlate(level, center, offsets, small, large, large_share, beta):
+        """`beta` times the correlation, plus `beta` where a source looks: where none does is worse than any match."""
         f = {4: f4, 2: f2}[level]
         src = finer(f, level)
         ref = g.unsqueeze(g.pick(f, 0), 0)
+        best = beta * P["best"]
         scores = []
         for s in range(S):
-            c, v = sweep(level, s, ref, src, inverse)
-            a = blur(c, level, small, 1 - large_share)
+            c, v = sweep(level, s, ref, src, center, offsets)
+            a = blur(c, level, small, best * (1 - large_share))
             if large_share > 0:
-                a = g.add(a, blur(c, level, large, large_share))
+                a = g.add(a, blur(c, level, large, best * large_share))
             # Where a source does not look, it has no opinion.
             scores.append((a, v))
         (a, va), (b, vb) = scores
-        # Partly mean, partly best: a source that is occluded there must not veto. Unseen by both is worse than any match.
-        mean = g.div(g.add(g.mul(a, va), g.mul(b, vb)), g.op("Max", g.add(va, vb), np.float32(1)))
-        mixed = g.add(g.mul(mean, np.float32(1 - P["best"])), g.mul(g.op("Max", a, b), np.float32(P["best"])))
-        return g.sub(mixed, g.sub(np.float32(1), g.op("Max", va, vb)))
+        # Partly mean, partly best: a source that is occluded there must not veto.
+        look = g.add(va, vb)
+        share = g.op("Div", np.float32(1 / P["best"] - 1), g.op("Max", look, np.float32(1)))
+        mean = g.mul(g.add(g.mul(a, va), g.mul(b, vb)), share)
+        return g.add(g.add(mean, g.op("Max", a, b)), g.op("Clip", g.mul(look, np.float32(beta)), np.float32(0), np.float32(beta)))
 
     def soft_argmax(score, values, beta):
+        """The values' mean by exp(score), and the greatest correlation."""
         top = g.maximum(score, 0)
-        e = g.op("Exp", g.mul(g.sub(score, top), np.float32(beta)))
+        e = g.op("Exp", g.sub(score, top))
         mass = g.total(e, 0)
         value = g.div(g.total(g.mul(e, values), 0), mass)
-        return value, top
+        return value, g.sub(g.mul(top, np.float32(1 / beta)), np.float32(1))
 
-    score4 = correlate(4, planes, P["small"], P["large"], P["large_share"])
+    score4 = correlate(4, None, planes, P["small"], P["large"], P["large_share"], P["beta4"])
     w4, top4 = soft_argmax(score4, planes, P["beta4"])            # [1,h4,w4]
 
     def doubled(x):
@@ -167,9 +187,12 @@ def build(p=None):
     w2 = g.op("Squeeze", doubled(w4), np.array([0], np.int64))       # [1,h2,w2]
     F = P["fine"]
     offs = ((np.arange(F) - F // 2) * P["step"]).astype(np.float32).reshape(F, 1, 1)
-    around = g.op("Max", g.add(w2, g.mul(offs, dw)), g.mul(wmin, np.float32(0.5)))
-    score2 = correlate(2, around, P["fine_window"], None, 0)
-    wf, top2 = soft_argmax(score2, around, P["beta2"])
+    # Nowhere beyond twice the farthest depth.
+    nearest = g.add(g.mul(wmin, np.float32(0.5)), g.mul(dw, np.float32(-offs.min())))
+    center, around = g.op("Max", w2, nearest), g.mul(offs, dw)
+    score2 = correlate(2, center, around, P["fine_window"], None, 0, P["beta2"])
+    beyond, top2 = soft_argmax(score2, around, P["beta2"])
+    wf = g.add(center, beyond)
 
     conf4 = g.op("Squeeze", doubled(top4), np.array([0], np.int64))
     # Correlation at both levels: below 0.1 is chance, above 0.8 certain.

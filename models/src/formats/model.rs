@@ -87,6 +87,8 @@ pub struct ModelHeader {
     pub finished: bool,
     /// The light of each training view's picture, in their order, which is not in the Gaussians; empty: it was even.
     pub lights: Vec<PictureLight>,
+    /// Whether Gaussians have been taken out of it for delivery; such a model is not thinned a second time when it is continued.
+    pub thinned: bool,
 }
 
 /// Writes a model whole or not at all.
@@ -281,10 +283,10 @@ fn exact_bytes(sh_degree: u8) -> u64 {
 /// # Errors
 /// [`FormatError::Invalid`]: it cannot be decoded, or a later stage could not work with it.
 pub fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
-    // Files of earlier versions end before the lights: an empty list of them is one byte.
-    let earlier = || postcard::from_bytes(&[bytes, &[0]].concat());
+    // Files of earlier versions end before the last field, or the one before it, too: an empty list and "no" are one byte each.
+    let earlier = |missing: &[u8]| postcard::from_bytes(&[bytes, missing].concat());
     let header: ModelHeader = postcard::from_bytes(bytes)
-        .or_else(|e| earlier().map_err(|_| e))
+        .or_else(|e| earlier(&[0]).or_else(|_| earlier(&[0, 0])).map_err(|_| e))
         .map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))?;
     check_header(path, &header)?;
     Ok(header)

@@ -2,9 +2,10 @@
 //! Those that agree are averaged (one surface instead of a stack of layers) and gain confidence; those that float in
 //! front of what another view sees through lose it.
 
+use glam::{DMat3, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
-use crate::camera::{Projector, Unprojector};
+use crate::camera::{Intrinsics, View};
 
 use super::depth_frame::{DepthFrame, DepthGrid};
 
@@ -17,11 +18,53 @@ const FILLED: f32 = 0.03;
 /// Confidence at which another picture counts as knowing a place.
 const KNOWS: f32 = 0.1;
 
-/// A view that has depths.
+/// Another view that has depths, as the one that is checked sees it. In f64 until the two are one: what is left is small.
 struct Witness<'a> {
     grid: &'a DepthGrid,
-    project: Projector,
-    unproject: Unprojector,
+    /// A pixel (x, y) with a depth d lies at `turn`·(x, y, 1)·d + `shift` there: its pixel times its depth, and its depth.
+    turn: Mat3,
+    shift: Vec3,
+    /// The depth of what lies at a pixel there, seen from here.
+    back: Vec3,
+    back_shift: f32,
+}
+
+impl<'a> Witness<'a> {
+    fn new(own: &View, other: &View, grid: &'a DepthGrid) -> Self {
+        let axes = |v: &View| DMat3::from_quat(v.pose.rotation.normalize());
+        let (here, there) = (axes(own), axes(other));
+        let to_there = matrix(&other.intrinsics) * there.transpose();
+        let back = here.transpose() * there * matrix(&other.intrinsics).inverse();
+        let apart: DVec3 = own.pose.center - other.pose.center;
+        Self {
+            grid,
+            turn: (to_there * here * matrix(&own.intrinsics).inverse()).as_mat3(),
+            shift: (to_there * apart).as_vec3(),
+            back: back.row(2).as_vec3(),
+            back_shift: -(here.transpose() * apart).z as f32,
+        }
+    }
+
+    /// Pixel there and depth of a pixel here at a depth; `None` behind the camera.
+    fn project(&self, pixel: Vec3, depth: f32) -> Option<(f32, f32, f32)> {
+        let p = self.turn * pixel * depth + self.shift;
+        (p.z > 1e-6).then(|| (p.x / p.z, p.y / p.z, p.z))
+    }
+
+    /// Depth here of what lies at a pixel there; `None` behind the camera.
+    fn depth_here(&self, (x, y): (f32, f32), depth: f32) -> Option<f32> {
+        let z = self.back.dot(Vec3::new(x, y, 1.0)) * depth + self.back_shift;
+        (z > 1e-6).then_some(z)
+    }
+}
+
+/// K.
+fn matrix(k: &Intrinsics) -> DMat3 {
+    DMat3::from_cols(
+        DVec3::new(f64::from(k.fx), 0.0, 0.0),
+        DVec3::new(0.0, f64::from(k.fy), 0.0),
+        DVec3::new(f64::from(k.cx), f64::from(k.cy), 1.0),
+    )
 }
 
 /// What the check found, in samples.
@@ -56,12 +99,8 @@ pub fn resolve(
     for &n in others {
         grids.extend(frames[n].depth()?.map(|grid| (n, grid)));
     }
-    let witness = |n: usize, grid| {
-        let view = &frames[n].view;
-        Witness { grid, project: Projector::new(view), unproject: Unprojector::new(view) }
-    };
-    let others: Vec<Witness<'_>> = grids.iter().map(|(n, grid)| witness(*n, grid.as_ref())).collect();
-    let me = witness(r, own);
+    let others: Vec<Witness<'_>> =
+        grids.iter().map(|(n, grid)| Witness::new(&frames[r].view, &frames[*n].view, grid.as_ref())).collect();
     let rows: Vec<(Vec<(f32, f32)>, ConsistencyCount)> = (0..own.height)
         .into_par_iter()
         .map(|j| {
@@ -70,14 +109,14 @@ pub fn resolve(
                 .map(|i| {
                     let at = j * own.width + i;
                     let judged = if own.confidence[at] > 0.0 {
-                        judge(&me, (i, j), &others, tolerance, &mut count)
+                        judge(own, (i, j), &others, tolerance, &mut count)
                     } else {
                         (0.0, 0.0)
                     };
                     match fill {
                         Some(fill) if judged.1 < FILLED && fill[at] > 0.0 => {
                             let (x, y) = own.pixel(i, j);
-                            if known_elsewhere(me.unproject.at(x, y, fill[at]), &others) {
+                            if known_elsewhere(Vec3::new(x, y, 1.0), fill[at], &others) {
                                 return judged;
                             }
                             count.filled += 1;
@@ -110,31 +149,29 @@ pub fn resolve(
 }
 
 /// Whether another picture that sees a place has a depth for it.
-fn known_elsewhere(point: glam::Vec3, others: &[Witness<'_>]) -> bool {
+fn known_elsewhere(pixel: Vec3, depth: f32, others: &[Witness<'_>]) -> bool {
     others.iter().any(|o| {
-        o.project
-            .project(point)
+        o.project(pixel, depth)
             .and_then(|(u, v, _)| o.grid.index_at(u, v))
             .is_some_and(|k| o.grid.confidence[k] > KNOWS)
     })
 }
 
 fn judge(
-    me: &Witness<'_>,
+    own: &DepthGrid,
     (i, j): (usize, usize),
     others: &[Witness<'_>],
     tolerance: f32,
     count: &mut ConsistencyCount,
 ) -> (f32, f32) {
-    let own = me.grid;
     let at = j * own.width + i;
     let (depth, confidence) = (own.depth[at], own.confidence[at]);
     let (x, y) = own.pixel(i, j);
-    let point = me.unproject.at(x, y, depth);
+    let pixel = Vec3::new(x, y, 1.0);
     let (mut sum, mut weight) = (depth * confidence, confidence);
     let (mut support, mut against) = (0.0f32, 0.0f32);
     for other in others {
-        let Some((u, v, z)) = other.project.project(point) else { continue };
+        let Some((u, v, z)) = other.project(pixel, depth) else { continue };
         let Some(k) = other.grid.index_at(u, v) else { continue };
         let (d, c) = (other.grid.depth[k], other.grid.confidence[k]);
         if c <= 0.0 {
@@ -143,7 +180,7 @@ fn judge(
         let difference = (z - d) / d;
         if difference.abs() < tolerance {
             // Their surface at that pixel, seen from here.
-            if let Some((_, _, mine)) = me.project.project(other.unproject.at(u, v, d)) {
+            if let Some(mine) = other.depth_here((u, v), d) {
                 sum += mine * c;
                 weight += c;
                 support += c;

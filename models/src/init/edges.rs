@@ -23,6 +23,8 @@ const OFFERED: [f32; 3] = [0.2, 0.5, 0.8];
 /// Half the side of the small window and its side, pixels.
 const HALF: usize = 2;
 const SIDE: usize = 2 * HALF + 1;
+/// Depths on all rings.
+const AROUND: usize = 8 * RINGS_PX.len();
 
 /// Pictures of a run of the network, as it was given them.
 pub struct Pictures<'a> {
@@ -109,12 +111,15 @@ impl<'a> Pictures<'a> {
 /// surface that reaches too far (offered nearer depths, too, sheffield_cross lost 0.4 dB).
 pub fn follow_the_pictures(grid: &mut DepthGrid, pictures: &Pictures<'_>) -> usize {
     let near_step = dilated(&steps(grid), grid, (REACH_PX / grid.stride).max(1));
-    let mut around = Vec::with_capacity(RINGS_PX.len() * 8);
+    let known: Vec<f32> =
+        grid.depth.iter().zip(&grid.confidence).map(|(d, c)| if *c > 0.0 { *d } else { 0.0 }).collect();
+    let rings = Rings::new(grid);
+    let mut room = [0.0; AROUND + 1];
     let mut moved = Vec::new();
     for at in (0..grid.depth.len()).filter(|at| near_step[*at] && grid.confidence[*at] > 0.0) {
         let (i, j) = (at % grid.width, at / grid.width);
         let pixel = [i, j].map(|k| k * grid.stride + grid.stride / 2);
-        farther_around(grid, [i, j], &mut around);
+        let around = rings.behind(&known, [i, j], &mut room);
         if around.is_empty() {
             continue;
         }
@@ -138,22 +143,58 @@ pub fn follow_the_pictures(grid: &mut DepthGrid, pictures: &Pictures<'_>) -> usi
     moved.len()
 }
 
-/// Depths of surfaces behind a sample's own on rings around it, the nearest first.
-fn farther_around(grid: &DepthGrid, [i, j]: [usize; 2], into: &mut Vec<f32>) {
-    let behind = grid.depth[j * grid.width + i] * (1.0 + SAME);
-    into.clear();
-    for ring in RINGS_PX.map(|px| (px / grid.stride).max(1)) {
-        let [left, up] = [i.wrapping_sub(ring), j.wrapping_sub(ring)];
-        for y in [up, j, j + ring].into_iter().filter(|y| *y < grid.height) {
-            for x in [left, i, i + ring].into_iter().filter(|x| *x < grid.width) {
-                let at = y * grid.width + x;
-                if grid.depth[at] > behind && grid.confidence[at] > 0.0 {
-                    into.push(grid.depth[at]);
+/// Where other depths are looked for.
+struct Rings {
+    width: usize,
+    height: usize,
+    /// Steps from a sample, across and down, and the place of what is there beside its own.
+    steps: [([isize; 2], isize); AROUND],
+    /// No step is longer.
+    reach: usize,
+}
+
+impl Rings {
+    fn new(grid: &DepthGrid) -> Self {
+        const WAYS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
+        let width = grid.width as isize;
+        let steps = std::array::from_fn(|k| {
+            let ring = (RINGS_PX[k / WAYS.len()] / grid.stride).max(1) as isize;
+            let [x, y] = WAYS[k % WAYS.len()].map(|way| way * ring);
+            ([x, y], y * width + x)
+        });
+        Self { width: grid.width, height: grid.height, steps, reach: (REACH_PX / grid.stride).max(1) }
+    }
+
+    /// Depths of surfaces behind a sample's own around it, the nearest first, or one that stands for all; of `known` ones, 0 where
+    /// none is.
+    fn behind<'a>(&self, known: &[f32], [i, j]: [usize; 2], room: &'a mut [f32; AROUND + 1]) -> &'a [f32] {
+        let at = j * self.width + i;
+        let behind = known[at] * (1.0 + SAME);
+        let mut found = 0;
+        let mut take = |depth: f32| {
+            // Written over where it does not count: faster than to ask.
+            room[found] = depth;
+            found += usize::from(depth > behind);
+        };
+        let within = |at: usize, side: usize| at >= self.reach && at + self.reach < side;
+        if within(i, self.width) && within(j, self.height) {
+            self.steps.iter().for_each(|(_, step)| take(known[at.wrapping_add_signed(*step)]));
+        } else {
+            for ([x, y], step) in &self.steps {
+                if i.wrapping_add_signed(*x) < self.width && j.wrapping_add_signed(*y) < self.height {
+                    take(known[at.wrapping_add_signed(*step)]);
                 }
             }
         }
+        let (nearest, farthest) =
+            room[..found].iter().fold((f32::INFINITY, 0.0f32), |(n, f), d| (n.min(*d), f.max(*d)));
+        if farthest < nearest * (1.0 + SAME) {
+            // One surface, or none.
+            return &room[..found.min(1)];
+        }
+        room[..found].sort_unstable_by(f32::total_cmp);
+        &room[..found]
     }
-    into.sort_unstable_by(f32::total_cmp);
 }
 
 /// Where inverse depth, which is linear on a plane, bends.

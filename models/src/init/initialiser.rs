@@ -41,7 +41,7 @@ pub use memory::most_frame_bytes;
 /// Features per picture for the depth range.
 const RANGE_FEATURES: usize = 600;
 /// Longer side of the picture they are found in, pixels: to bound depths, a half of a pixel more does not matter.
-const RANGE_SIDE: u32 = 320;
+const RANGE_SIDE: u32 = 256;
 /// Features keep this far from what a mask leaves out, pixels: half a cell of the network's descriptors.
 const MARGIN: f64 = 4.0;
 /// Every how many pictures the depth range is measured again.
@@ -259,20 +259,24 @@ impl Initialiser {
         prior: &mut dyn FnMut(&str, DepthPrior),
     ) -> Result<Initialisation, InitError> {
         let started = Instant::now();
-        self.report.skipped = SkippedPairs::default();
         if let Some(features) = &mut self.features {
             features.close();
         }
         let views: Vec<View> = self.frames.iter().map(|f| f.view).collect();
         self.ranges = views.par_iter().map(|v| self.settings.depth_m.or_else(|| self.range.of(v))).collect();
-        for i in 0..views.len() {
-            if let Some(depth) = self.typical_depth(i) {
-                partners((i, &views[i]), &views, depth, &self.settings, &mut self.report.skipped);
+        let this = &*self;
+        let skipped = (0..views.len()).into_par_iter().map(|i| {
+            let mut skipped = SkippedPairs::default();
+            if let Some(depth) = this.typical_depth(i) {
+                partners((i, &views[i]), &views, depth, &this.settings, &mut skipped);
             }
-        }
+            skipped
+        });
+        self.report.skipped = skipped.reduce(SkippedPairs::default, SkippedPairs::plus);
         match self.pairs {
             Pairs::Posed(_) => {
-                let stale: Vec<usize> = (0..self.frames.len()).filter(|&i| self.is_stale(i)).collect();
+                let this = &*self;
+                let stale: Vec<usize> = (0..views.len()).into_par_iter().filter(|&i| this.is_stale(i)).collect();
                 self.make_depths(&stale)?;
             }
             Pairs::Unposed(_) => self.align_pairs(&views)?,

@@ -59,6 +59,16 @@ impl SkippedPairs {
         }
     }
 
+    /// These and those.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            no_baseline: self.no_baseline + other.no_baseline,
+            too_wide: self.too_wide + other.too_wide,
+            too_oblique: self.too_oblique + other.too_oblique,
+            no_overlap: self.no_overlap + other.no_overlap,
+        }
+    }
+
     /// All of them.
     pub fn total(&self) -> usize {
         self.no_baseline + self.too_wide + self.too_oblique + self.no_overlap

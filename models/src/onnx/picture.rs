@@ -25,10 +25,10 @@ pub fn push_planes(image: &RgbImage, width: u32, height: u32, settings: &InputSe
     }
     let pixels = image.as_raw();
     if (image.width(), image.height()) == (width, height) {
-        for (i, rgb) in pixels.chunks_exact(3).enumerate() {
-            for c in 0..3 {
-                planes[c * w * h + i] = f32::from(rgb[c]) * gain[c] + offset[c];
-            }
+        let pixels = pixels.as_chunks::<3>().0;
+        for (c, plane) in planes.chunks_exact_mut((w * h).max(1)).enumerate() {
+            let (gain, offset) = (gain[c], offset[c]);
+            plane.iter_mut().zip(pixels).for_each(|(value, rgb)| *value = f32::from(rgb[c]) * gain + offset);
         }
         return;
     }

@@ -67,7 +67,7 @@ impl NetworkSession {
         let fail = |e: String| OnnxError::Runtime { network: name.to_owned(), reason: e };
         let build = || -> ort::Result<Session> {
             let mut b = Session::builder(environment)?
-                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(false).build()])?
+                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(true).build()])?
                 .with_memory_pattern(true)?
                 .with_intra_op_spinning(false)?
                 .with_inter_op_spinning(false)?

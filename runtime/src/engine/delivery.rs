@@ -72,7 +72,7 @@ impl Reconstruction {
     pub(super) fn prepare_delivery(&mut self, next: Next) -> Result<(), JobError> {
         match next {
             Next::Thin => {
-                self.delivery.thinned = true;
+                (self.delivery.thinned, self.header.thinned) = (true, true);
                 let t = &self.settings.training;
                 let gone = self.thin(t.thinned_share, t.thinned_loss * self.trainer.mean_loss())?;
                 self.trainer.keep_number();
@@ -146,18 +146,14 @@ impl Reconstruction {
         Ok(())
     }
 
-    /// A model that is built anew is trained as a whole. One that is continued is what it was when it was left.
+    /// A model that is built anew is trained as a whole. One that is continued is not thinned a second time.
     pub(super) fn begin_delivery(&mut self) -> Result<(), JobError> {
-        let was = std::mem::take(&mut self.delivery);
+        let thinned = self.is_continued() && self.header.thinned;
+        let was = std::mem::replace(&mut self.delivery, Delivery { thinned, rounded: false });
         if was.rounded {
             self.trainer.set_rates(&self.settings.training.rates)?;
         }
         Ok(())
-    }
-
-    /// A model that was left after it had been thinned is not thinned again.
-    pub(super) fn continue_delivery(&mut self) {
-        self.delivery.thinned = self.trainer.progress() >= self.settings.training.thinned_at;
     }
 }
 

@@ -233,7 +233,6 @@ impl Reconstruct for Reconstruction {
         if self.is_continued() && !self.settings.incremental {
             let steps = u32::try_from(self.header.steps).unwrap_or(u32::MAX);
             self.trainer.continue_from(steps, self.train_s);
-            self.continue_delivery();
         }
         self.builds += 1;
         self.report.views = self.views.len() as u64;

@@ -84,21 +84,26 @@ impl Trainer {
         let (colours, depths) = self.arena.slice_mut::<u32>(section).split_at_mut(pixels);
         let range = prior.and_then(depth_range);
         depths.fill(0);
-        for (i, colour) in colours.iter_mut().enumerate().filter(|(_, c)| **c >> 24 != u32::from(LEFT_OUT)) {
-            let mut confidence = 0u8;
-            if let (Some(prior), Some((low, high))) = (prior, range) {
-                let x = ((i as u32 % width) as f32 + 0.5) / width as f32 * prior.width as f32;
-                let y = ((i as u32 / width) as f32 + 0.5) / height as f32 * prior.height as f32;
-                let at = (y as usize).min(prior.height as usize - 1) * prior.width as usize
-                    + (x as usize).min(prior.width as usize - 1);
-                if usable(prior, at) {
-                    confidence = (prior.confidence[at].clamp(0.0, 1.0) * 255.0).round() as u8;
-                    confidence = if confidence == LEFT_OUT { 0 } else { confidence };
-                    let quantum = ((prior.depth[at] - low) / (high - low) * 65535.0).round() as u32;
-                    depths[i / 2] |= quantum << (16 * (i as u32 % 2));
+        // Of each cell of the prior, confidence and depth; of each pixel, row and column there.
+        let cells: Vec<(u32, u32)> = match (prior, range) {
+            (Some(prior), Some(range)) => (0..prior.depth.len()).map(|at| quantised(prior, at, range)).collect(),
+            _ => Vec::new(),
+        };
+        let (across, down) = prior.map_or((0, 0), |p| (p.width, p.height));
+        let nearest = |i: u32, of: u32, cells: u32| {
+            (((i as f32 + 0.5) / of as f32 * cells as f32) as usize).min((cells as usize).saturating_sub(1))
+        };
+        let columns: Vec<usize> = (0..width).map(|x| nearest(x, width, across)).collect();
+        for y in 0..height {
+            let row = nearest(y, height, down) * across as usize;
+            for (x, column) in columns.iter().enumerate() {
+                let i = y as usize * width as usize + x;
+                if colours[i] >> 24 != u32::from(LEFT_OUT) {
+                    let (confidence, depth) = cells.get(row + column).copied().unwrap_or_default();
+                    depths[i / 2] |= depth << (16 * (i % 2));
+                    colours[i] = (colours[i] & 0x00ff_ffff) | confidence << 24;
                 }
             }
-            *colour = (*colour & 0x00ff_ffff) | u32::from(confidence) << 24;
         }
         self.keep(slot, Picture::View(index))?;
         self.views[index].depth_at = if range.is_some() { pixels as u32 } else { 0 };
@@ -243,6 +248,16 @@ fn broken(prior: &DepthPrior) -> Option<&'static str> {
 
 fn usable(prior: &DepthPrior, at: usize) -> bool {
     prior.depth[at].is_finite() && prior.confidence[at] > 0.0
+}
+
+/// Confidence and depth of a prior's cell as a view holds them: in 8 bits, and in 16 over the range; 0 and 0 where it knows none.
+fn quantised(prior: &DepthPrior, at: usize, (low, high): (f32, f32)) -> (u32, u32) {
+    if !usable(prior, at) {
+        return (0, 0);
+    }
+    let confidence = (prior.confidence[at].clamp(0.0, 1.0) * 255.0).round() as u8;
+    let confidence = if confidence == LEFT_OUT { 0 } else { confidence };
+    (confidence.into(), ((prior.depth[at] - low) / (high - low) * 65535.0).round() as u32)
 }
 
 /// Least and greatest usable depth; `None` when they coincide, which correlates with nothing.

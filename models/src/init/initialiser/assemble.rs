@@ -6,7 +6,7 @@ use std::time::Instant;
 use config::init::InitSettings;
 use rayon::prelude::*;
 
-use super::strips::{AtOnce, Strips};
+use super::strips::{Strips, at_once};
 use super::{Initialiser, VOXELS_PER_GAUSSIAN};
 use crate::camera::{DepthPrior, Pinhole};
 use crate::cloud::GaussianCloud;
@@ -51,8 +51,8 @@ impl Initialiser {
         spacing.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (edge, global_scale) = spacing.get(spacing.len() / 2).copied().unwrap_or((1.0, 1.0));
         let voxels = max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN);
-        let held = AtOnce::of(voxels);
-        let mut strips = Strips::over(&looked_at, voxels.div_ceil(held.voxels));
+        let held = at_once(voxels);
+        let mut strips = Strips::over(&looked_at, voxels.div_ceil(held));
         let report = &mut self.report;
         (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
         (report.consistency_ms, report.samples_ms, report.voxels_ms, report.cloud_ms) = (0.0, 0.0, 0.0, 0.0);
@@ -62,29 +62,34 @@ impl Initialiser {
         showing[0] = pictures.iter().copied().filter(|&i| self.frames[i].has_depth()).collect();
         let mut cloud = GaussianCloud::with_capacity(0, if strips.count() > 1 { max_gaussians } else { 0 });
         for strip in 0..strips.count() {
-            let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), held.voxels, held.samples);
+            let mut merge = VoxelMerge::new(edge * VOXEL, center.as_vec3(), held);
             let frames = std::mem::take(&mut showing[strip]);
-            // While one thread sorts the samples of some pictures into voxels, the others check the next pictures.
+            // While this thread sorts the samples of some pictures into voxels, the others check the next pictures.
             let mut waiting: Vec<Checked> = Vec::new();
             for next in frames.chunks(AHEAD).map(Some).chain([None]) {
                 let this = &*self;
+                let mut checked = Ok(Vec::new());
                 let check = || -> Result<Vec<Checked>, InitError> {
                     let checked = next.unwrap_or(&[]).par_iter().map(|&i| this.check(i, global_scale).transpose());
                     checked.flatten_iter().collect()
                 };
-                let sort = || {
+                let voxels_ms = rayon::in_place_scope(|scope| {
+                    scope.spawn(|_| checked = check());
                     let started = Instant::now();
-                    for checked in &waiting {
-                        let found = strips.sort(&checked.samples, strip, |s| merge.push(s));
+                    for done in &mut waiting {
+                        merge.push_all(&done.samples, |s| strips.of(s) == strip);
                         if strip == 0 {
+                            let found = strips.found(&done.samples);
                             strips.count_in(&found);
                             let others = found.iter().enumerate().skip(1).filter(|(_, samples)| **samples > 0);
-                            others.for_each(|(other, _)| showing[other].push(checked.index));
+                            others.for_each(|(other, _)| showing[other].push(done.index));
+                            if let Some(depth) = done.prior.take() {
+                                prior(&this.frames[done.index].name, depth);
+                            }
                         }
                     }
                     started.elapsed().as_secs_f64() * 1e3
-                };
-                let (checked, voxels_ms) = rayon::join(check, sort);
+                });
                 let report = &mut self.report;
                 report.voxels_ms += voxels_ms;
                 for done in std::mem::replace(&mut waiting, checked?) {
@@ -96,7 +101,6 @@ impl Initialiser {
                         report.alone += done.count.alone;
                         report.removed += done.count.removed;
                         report.filled += done.count.filled;
-                        prior(&self.frames[done.index].name, done.prior);
                     }
                 }
             }
@@ -180,7 +184,7 @@ impl Initialiser {
         let samples = samples(&self.frames[i].view, image.as_ref(), &grid, appearance, &self.settings, global_scale);
         let samples_ms = started.elapsed().as_secs_f64() * 1e3 - consistency_ms;
         let (width, height) = (grid.width as u32, grid.height as u32);
-        let prior = DepthPrior { width, height, depth: grid.depth, confidence: grid.confidence };
+        let prior = Some(DepthPrior { width, height, depth: grid.depth, confidence: grid.confidence });
         Ok(Some(Checked { index: i, samples, prior, count, consistency_ms, samples_ms }))
     }
 }
@@ -189,7 +193,8 @@ impl Initialiser {
 struct Checked {
     index: usize,
     samples: Vec<Sample>,
-    prior: DepthPrior,
+    /// Until it is given away.
+    prior: Option<DepthPrior>,
     count: ConsistencyCount,
     consistency_ms: f64,
     samples_ms: f64,

@@ -3,7 +3,7 @@
 use config::init::InitSettings;
 
 use super::assemble::{AHEAD, WITNESSES};
-use super::strips::AtOnce;
+use super::strips::at_once;
 use super::{Initialiser, Pairs, VOXELS_PER_GAUSSIAN};
 use crate::init::merge::VoxelMerge;
 use crate::init::unposed;
@@ -69,7 +69,7 @@ impl Initialiser {
             // Each thread's picture and its sources or witnesses, and the one that comes in.
             Some(_) => self.settings.threads.max(AHEAD) * (1 + WITNESSES.max(self.pairs.sources())) + 1,
         };
-        let merged = AtOnce::of(max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN));
+        let voxels = at_once(max_gaussians.saturating_mul(VOXELS_PER_GAUSSIAN));
         in_memory as u64 * frame_bytes(&self.settings, pixels)
             // Priors on their way out, and the caller's copy of one.
             + (2 * AHEAD as u64 + 1) * 8 * samples
@@ -78,7 +78,7 @@ impl Initialiser {
             + features
             + super::super::range::MAX_POINTS as u64 * RANGE_BYTES
             + 2 * AHEAD as u64 * samples * WORK_BYTES
-            + VoxelMerge::planned_bytes(merged.voxels, merged.samples, max_gaussians)
+            + VoxelMerge::planned_bytes(voxels, max_gaussians)
             + max_gaussians as u64 * CLOUD_BYTES
     }
 }

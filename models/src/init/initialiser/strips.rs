@@ -2,27 +2,14 @@
 
 use glam::DVec3;
 
-use crate::init::merge::{BUFFER, Sample};
+use crate::init::merge::Sample;
 
 /// Voxels up to which the whole ground is merged at once.
 const MOST_VOXELS: usize = 600_000;
 
-/// What is held at once while samples are merged.
-pub(super) struct AtOnce {
-    /// Voxels of a strip.
-    pub voxels: usize,
-    /// Samples that are collected before they are sorted into them.
-    pub samples: usize,
-}
-
-impl AtOnce {
-    /// All of so many voxels, or strips of them in half of the memory and with more work.
-    pub fn of(voxels: usize) -> Self {
-        match voxels <= MOST_VOXELS {
-            true => Self { voxels: voxels.max(1), samples: BUFFER },
-            false => Self { voxels: MOST_VOXELS * 2 / 3, samples: BUFFER / 4 },
-        }
-    }
+/// Voxels that are held at once to merge so many: all of them, or strips of them in two thirds of the memory and with more work.
+pub(super) fn at_once(voxels: usize) -> usize {
+    if voxels <= MOST_VOXELS { voxels.max(1) } else { MOST_VOXELS * 2 / 3 }
 }
 
 /// Strips across the longer axis of what the pictures look at, as many pictures in each.
@@ -56,21 +43,15 @@ impl Strips {
     }
 
     /// The one that a sample lies in; the first for what is not finite.
-    fn of(&self, sample: &Sample) -> usize {
+    pub fn of(&self, sample: &Sample) -> usize {
         let at = sample.position[self.axis];
         self.ends.iter().take_while(|end| at >= **end).count()
     }
 
-    /// Gives those of a picture's samples that lie in `strip` to `own`; how many there are in each.
-    pub fn sort(&self, samples: &[Sample], strip: usize, mut own: impl FnMut(Sample)) -> Vec<usize> {
+    /// How many of a picture's samples lie in each.
+    pub fn found(&self, samples: &[Sample]) -> Vec<usize> {
         let mut found = vec![0; self.count()];
-        for sample in samples {
-            let of = self.of(sample);
-            found[of] += 1;
-            if of == strip {
-                own(*sample);
-            }
-        }
+        samples.iter().for_each(|sample| found[self.of(sample)] += 1);
         found
     }
 

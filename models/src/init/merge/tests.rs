@@ -4,12 +4,16 @@ fn sample(position: Vec3, color: f32) -> Sample {
     Sample { position, color: Vec3::splat(color), covariance: Mat3::IDENTITY * 1e-4, weight: 0.5, opacity: 0.9 }
 }
 
+fn push(merge: &mut VoxelMerge, sample: Sample) {
+    merge.push_all(&[sample], |_| true);
+}
+
 #[test]
 fn a_plane_becomes_flat_gaussians_within_the_budget() {
-    let mut merge = VoxelMerge::new(0.2, Vec3::new(100.0, -50.0, 0.0), 100_000, BUFFER);
+    let mut merge = VoxelMerge::new(0.2, Vec3::new(100.0, -50.0, 0.0), 100_000);
     for i in 0..200 {
         for j in 0..200 {
-            merge.push(sample(Vec3::new(100.0 + i as f32 * 0.1, -50.0 + j as f32 * 0.1, 3.0), 0.5));
+            push(&mut merge, sample(Vec3::new(100.0 + i as f32 * 0.1, -50.0 + j as f32 * 0.1, 3.0), 0.5));
         }
     }
     let out = merge.finish(1500, 1.0);
@@ -22,12 +26,15 @@ fn a_plane_becomes_flat_gaussians_within_the_budget() {
 
 #[test]
 fn the_budget_goes_where_the_colour_varies() {
-    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 100_000, BUFFER);
+    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 100_000);
     for i in 0..200 {
         for j in 0..200 {
             let checker = ((i + j) % 2) as f32;
             let x = i as f32 * 0.1 - 10.0;
-            merge.push(sample(Vec3::new(x + 0.05, j as f32 * 0.1 + 0.05, 0.05), if x < 0.0 { 0.5 } else { checker }));
+            push(
+                &mut merge,
+                sample(Vec3::new(x + 0.05, j as f32 * 0.1 + 0.05, 0.05), if x < 0.0 { 0.5 } else { checker }),
+            );
         }
     }
     let out = merge.finish(21_000, 1.0);
@@ -37,12 +44,12 @@ fn the_budget_goes_where_the_colour_varies() {
 
 #[test]
 fn more_voxels_than_room_are_coarsened_and_nothing_is_lost() {
-    let mut merge = VoxelMerge::new(0.01, Vec3::ZERO, 1000, BUFFER);
+    let mut merge = VoxelMerge::new(0.01, Vec3::ZERO, 1000);
     for i in 0..20_000 {
-        merge.push(sample(Vec3::new(i as f32 * 0.01, 0.0, 0.0), 0.3));
+        push(&mut merge, sample(Vec3::new(i as f32 * 0.01, 0.0, 0.0), 0.3));
     }
-    merge.push(sample(Vec3::NAN, 0.3));
-    merge.push(Sample { weight: 0.0, ..sample(Vec3::ZERO, 0.3) });
+    push(&mut merge, sample(Vec3::NAN, 0.3));
+    push(&mut merge, Sample { weight: 0.0, ..sample(Vec3::ZERO, 0.3) });
     assert!(merge.len() <= 1000 && merge.edge() > 0.1);
     assert_eq!(merge.dropped(), 2);
     let out = merge.finish(5000, 1.0);
@@ -53,11 +60,11 @@ fn more_voxels_than_room_are_coarsened_and_nothing_is_lost() {
 #[test]
 fn merging_is_the_same_bit_for_bit_every_time() {
     let run = || {
-        let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 5000, BUFFER);
+        let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 5000);
         for i in 0..600_000u32 {
             let h = i.wrapping_mul(2_654_435_761);
             let p = Vec3::new((h & 0xff) as f32, (h >> 8 & 0xff) as f32, (h >> 16 & 0xff) as f32) * 0.03;
-            merge.push(sample(p, (h >> 24) as f32 / 255.0));
+            push(&mut merge, sample(p, (h >> 24) as f32 / 255.0));
         }
         merge.finish(2000, 1.0).iter().map(|g| g.position.to_array().map(f32::to_bits)).collect::<Vec<_>>()
     };
@@ -66,8 +73,8 @@ fn merging_is_the_same_bit_for_bit_every_time() {
 
 #[test]
 fn zero_budget_and_no_samples_give_nothing() {
-    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 10, BUFFER);
-    assert!(merge.finish(10, 1.0).is_empty());
-    merge.push(sample(Vec3::ZERO, 0.1));
+    assert!(VoxelMerge::new(0.1, Vec3::ZERO, 10).finish(10, 1.0).is_empty());
+    let mut merge = VoxelMerge::new(0.1, Vec3::ZERO, 10);
+    push(&mut merge, sample(Vec3::ZERO, 0.1));
     assert!(merge.finish(0, 1.0).is_empty());
 }

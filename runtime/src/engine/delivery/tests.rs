@@ -14,12 +14,18 @@ use crate::engine::{EngineSettings, Reconstruct};
 
 /// An engine that has built its model from three pictures.
 fn built(delivers: bool) -> Option<Reconstruction> {
+    built_as(delivers, false)
+}
+
+/// The same; with `incremental`, as a flight does it after its landing.
+fn built_as(delivers: bool, incremental: bool) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
         return None;
     }
-    let settings = EngineSettings { delivers, ..settings() };
+    let settings = EngineSettings { delivers, incremental, ..settings() };
     let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
+    engine.land();
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
     assert!(engine.build(&|| true).expect("built"));
     Some(engine)
@@ -95,16 +101,22 @@ fn a_model_for_delivery_is_thinned_once_and_one_that_is_not_never() {
 }
 
 #[test]
-fn a_model_that_was_left_after_it_had_been_thinned_is_not_thinned_again() {
-    let Some(mut engine) = built(true) else { return };
-    for (spent, thinned) in [(8, false), (11, true)] {
-        engine.trainer.continue_from(spent, 0.0);
-        engine
-            .trainer
-            .run(&RunBudget { steps: Some(20), seconds: None }, &mut |_| ControlFlow::Break(()))
-            .expect("trains");
-        engine.continue_delivery();
-        assert_eq!(engine.delivery.thinned, thinned, "{spent}");
+fn a_model_that_is_continued_after_it_had_been_thinned_is_not_thinned_again() {
+    for incremental in [false, true] {
+        let Some(mut engine) = built_as(true, incremental) else { return };
+        assert!(!engine.delivery.thinned);
+        engine.settings.training.thinned_loss = 1e6;
+        train(&mut engine, u32::MAX);
+        assert!(engine.delivery.thinned);
+        let (dir, left) = (tempfile::tempdir().expect("a folder"), engine.gaussians());
+        engine.checkpoint(dir.path(), true).expect("written");
+        let mut again = Reconstruction::open(engine.settings.clone(), ModelHeader::default(), "train").expect("opens");
+        assert!(again.resume(dir.path()).expect("read").is_some());
+        again.land();
+        (0..3).for_each(|i| again.add(picture(i), i < 2).expect("taken"));
+        assert!(again.build(&|| true).expect("built"));
+        train(&mut again, u32::MAX);
+        assert_eq!((again.delivery.thinned, again.gaussians()), (true, left), "incremental: {incremental}");
     }
 }
 
