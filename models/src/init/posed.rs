@@ -95,8 +95,9 @@ impl PosedNetwork {
     /// Of a network of contract `pair` with `poses = "given"` that takes `views` pictures.
     pub fn new(network: Arc<Network>, views: usize, threads: usize) -> Self {
         let (lanes, threads) = if network.is_embedded() { (threads.max(1), 1) } else { (1, threads) };
+        let session = || LazySession::new(Arc::clone(&network), threads);
         let lane = || Lane {
-            session: LazySession::new(Arc::clone(&network), threads),
+            session: if network.is_embedded() { session().in_series() } else { session() },
             planes: Vec::new(),
             grows_edges: network.is_embedded(),
         };
@@ -126,7 +127,8 @@ impl PosedNetwork {
             loop {
                 let i = next.fetch_add(1, Ordering::Relaxed);
                 let Some(request) = requests.get(i) else { break };
-                let made = lane.run(views, request, stride);
+                let last = next.load(Ordering::Relaxed) >= requests.len();
+                let made = lane.run(views, request, stride, last);
                 let failed = made.is_err();
                 done.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((i, made));
                 if failed {
@@ -166,7 +168,7 @@ impl PosedNetwork {
 
 impl Lane {
     /// When the network wants more sources than there are, the best is given again.
-    fn run(&mut self, views: usize, request: &Request<'_>, stride: usize) -> Result<Made, InitError> {
+    fn run(&mut self, views: usize, request: &Request<'_>, stride: usize, last: bool) -> Result<Made, InitError> {
         let started = Instant::now();
         let opened = self.session.opening_ms();
         let reference = request.reference;
@@ -181,7 +183,8 @@ impl Lane {
             projections.extend(relative_projection(&reference.view, &source.view));
         }
         let k_ref = [k.fx, 0.0, k.cx - 0.5, 0.0, k.fy, k.cy - 0.5, 0.0, 0.0, 1.0];
-        let out = self.session.run((w, h), &[&self.planes, &projections, &request.range, &k_ref])?;
+        let inputs = [self.planes.as_slice(), &projections, &request.range, &k_ref];
+        let out = if last { self.session.run((w, h), &inputs) } else { self.session.run_on((w, h), &inputs) }?;
         let (mut grid, non_finite) = DepthGrid::sampled(w as usize, h as usize, stride, &out[0].data, &out[1].data);
         let moved = if self.grows_edges {
             edges::follow_the_pictures(&mut grid, &edges::Pictures::new((w, h), &self.planes, &projections))

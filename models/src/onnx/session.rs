@@ -1,5 +1,5 @@
-//! One ONNX Runtime session with bounded memory: the arena and spinning threads are off (a companion computer
-//! shares its cores), memory is planned from fixed shapes, and one or two threads work.
+//! One ONNX Runtime session with bounded memory: spinning threads are off (a companion computer shares its cores), and so is the
+//! arena but for series of runs, memory is planned from fixed shapes, and one or two threads work.
 //!
 //! The library is loaded at run time, so that the binary starts on a board without it and says what is missing.
 
@@ -8,8 +8,8 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 
 use ort::environment::Environment;
-use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
+use ort::session::{RunOptions, Session};
 use ort::value::{TensorElementType, TensorRef, ValueType};
 
 use super::OnnxError;
@@ -43,6 +43,8 @@ pub type Input<'a> = (&'a str, &'a [usize], &'a [f32]);
 pub struct NetworkSession {
     name: String,
     session: Session,
+    /// Has an arena.
+    in_series: bool,
     /// Contract's name → the file's, where they differ.
     names: BTreeMap<String, String>,
     inputs: Vec<TensorSpec>,
@@ -52,7 +54,7 @@ pub struct NetworkSession {
 impl NetworkSession {
     /// Opens a network from its bytes. `dimensions` pins symbolic dimensions (`("h", 480)`) so that the runtime can
     /// plan its memory; unknown names are ignored by the runtime. `names` says what the file calls a tensor of the
-    /// contract; everywhere else it goes by the contract's name.
+    /// contract; everywhere else it goes by the contract's name. `in_series`: runs follow each other, and memory is kept between them.
     ///
     /// # Errors
     /// The library is missing or unusable, or the bytes are no network it can run.
@@ -62,12 +64,13 @@ impl NetworkSession {
         threads: usize,
         dimensions: &[(&str, usize)],
         names: &BTreeMap<String, String>,
+        in_series: bool,
     ) -> Result<Self, OnnxError> {
         let environment = environment()?;
         let fail = |e: String| OnnxError::Runtime { network: name.to_owned(), reason: e };
         let build = || -> ort::Result<Session> {
             let mut b = Session::builder(environment)?
-                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(true).build()])?
+                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(in_series).build()])?
                 .with_memory_pattern(true)?
                 .with_intra_op_spinning(false)?
                 .with_inter_op_spinning(false)?
@@ -82,7 +85,7 @@ impl NetworkSession {
         let session = build().map_err(|e| fail(one_line(e)))?;
         let specs = |outlets: &[ort::value::Outlet]| outlets.iter().map(|o| spec(o, names)).collect::<Vec<_>>();
         let (inputs, outputs) = (specs(session.inputs()), specs(session.outputs()));
-        Ok(Self { name: name.to_owned(), session, names: names.clone(), inputs, outputs })
+        Ok(Self { name: name.to_owned(), session, in_series, names: names.clone(), inputs, outputs })
     }
 
     /// What the network was called when it was opened.
@@ -100,11 +103,11 @@ impl NetworkSession {
         &self.outputs
     }
 
-    /// Runs once and copies out the outputs in `wanted`, in that order.
+    /// Runs once and copies out the outputs in `wanted`, in that order. The last one of a series gives the memory back.
     ///
     /// # Errors
     /// ONNX Runtime refused the inputs or failed; an output in `wanted` is missing or not f32.
-    pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str]) -> Result<Vec<Tensor>, OnnxError> {
+    pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str], last: bool) -> Result<Vec<Tensor>, OnnxError> {
         let network = self.name.clone();
         let fail = |reason: String| OnnxError::Runtime { network: network.clone(), reason };
         let mut values = Vec::with_capacity(inputs.len());
@@ -113,7 +116,11 @@ impl NetworkSession {
                 .map_err(|e| fail(format!("input {name}: {}", one_line(e))))?;
             values.push((self.names.get(name).map_or(name, String::as_str), tensor));
         }
-        let results = self.session.run(values).map_err(|e| fail(one_line(e)))?;
+        let mut options = RunOptions::new().map_err(|e| fail(one_line(e)))?;
+        if self.in_series && last {
+            options.set("memory.enable_memory_arena_shrinkage", "cpu:0").map_err(|e| fail(one_line(e)))?;
+        }
+        let results = self.session.run_with_options(values, &options).map_err(|e| fail(one_line(e)))?;
         wanted
             .iter()
             .map(|&name| {
