@@ -73,7 +73,7 @@ pub struct Setting {
 impl Setting {
     /// Unit by the end of the name, or as stated.
     pub fn unit(&self) -> &'static str {
-        const ENDINGS: [(&str, &str); 9] = [
+        const ENDINGS: [(&str, &str); 11] = [
             ("_mib", "MiB"),
             ("_kib", "KiB"),
             ("_pct", "%"),
@@ -83,6 +83,8 @@ impl Setting {
             ("_s", "seconds"),
             ("_m", "metres"),
             ("seconds", "seconds"),
+            ("_wh", "watt-hours"),
+            ("watts", "watts"),
         ];
         let by_name = || ENDINGS.iter().find(|(ending, _)| self.name.ends_with(ending)).map_or("", |e| e.1);
         if self.unit.is_empty() { by_name() } else { self.unit }

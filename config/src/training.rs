@@ -33,6 +33,11 @@ table! {
         /// Length of the schedule by wall clock; when given, progress is the larger of the two fractions, so that training
         /// ends at whichever comes first.
         pub seconds: Option<f64> = None, in Limits::within(1e-3, 1e9);
+        /// Length of the schedule by the energy that the computer takes during it, watt-hours; with steps or seconds, whichever comes
+        /// first.
+        pub energy_wh: Option<f64> = None, in Limits::within(1e-6, 1e6);
+        /// What the computer takes while it trains, watts, where it does not say it (power monitors of hwmon, `vcgencmd`).
+        pub watts: Option<f32> = None, in Limits::within(1e-3, 1e5);
         /// What is minimised.
         pub loss: LossSettings = LossSettings::default();
         /// Step size of every parameter group.

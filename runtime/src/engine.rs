@@ -31,6 +31,7 @@ mod carry;
 mod crops;
 mod delivery;
 pub mod device;
+pub(crate) mod energy;
 mod first_gaussians;
 mod follow;
 mod growth;
@@ -138,6 +139,8 @@ pub struct Reconstruction {
     builds: u32,
     /// The build that the last map shows.
     mapped: u32,
+    /// What the schedule takes, where its energy is bounded.
+    meter: Option<energy::Meter>,
     /// What has been done to the model for its delivery.
     delivery: delivery::Delivery,
     /// Seconds of training over all continuations.
@@ -153,6 +156,7 @@ impl Reconstruction {
     /// Anything missing that the job cannot do without: ONNX Runtime, a Vulkan device, memory.
     pub fn open(settings: EngineSettings, header: ModelHeader, command: &str) -> Result<Self, JobError> {
         let _span = tracing::info_span!("open").entered();
+        let meter = energy::Meter::of(&settings.training)?;
         let (views, mut init) = (settings.device.views, settings.init.clone());
         let depth = settings.network.depth.as_deref().filter(|_| settings.training.loss.depth > 0.0);
         let depth = depth
@@ -218,6 +222,7 @@ impl Reconstruction {
             refined: None,
             builds: 0,
             mapped: 0,
+            meter,
             delivery: delivery::Delivery::default(),
             train_s: 0.0,
             header,

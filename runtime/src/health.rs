@@ -2,6 +2,7 @@
 //! and whether training keeps its time budget.
 
 pub(crate) mod board;
+pub(crate) mod power;
 
 use std::path::{Path, PathBuf};
 

@@ -271,7 +271,8 @@ impl TrainJob {
 
     fn settings(&self, views: usize) -> TrainSettings {
         let seconds = self.seconds.or(self.training.seconds);
-        let unasked = if seconds.is_some() { self.training.steps } else { self.training.steps_for(views) };
+        let is_timed = seconds.is_some() || self.training.energy_wh.is_some();
+        let unasked = if is_timed { self.training.steps } else { self.training.steps_for(views) };
         TrainSettings { steps: self.steps.unwrap_or(unasked), seconds, ..self.training.clone() }
     }
 

@@ -41,7 +41,7 @@ pub use memory::most_frame_bytes;
 /// Features per picture for the depth range.
 const RANGE_FEATURES: usize = 600;
 /// Longer side of the picture they are found in, pixels: to bound depths, a half of a pixel more does not matter.
-const RANGE_SIDE: u32 = 256;
+const RANGE_SIDE: u32 = 320;
 /// Features keep this far from what a mask leaves out, pixels: half a cell of the network's descriptors.
 const MARGIN: f64 = 4.0;
 /// Every how many pictures the depth range is measured again.

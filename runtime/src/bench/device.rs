@@ -16,11 +16,11 @@ use super::stages::{Scene, SizeFigures, measure as measure_stages};
 use super::{child, world};
 use crate::error::JobError;
 use crate::health::board::Board;
+use crate::health::power::pmic_watts;
 
 mod machine;
 
 pub use machine::Machine;
-use machine::pmic_watts;
 
 /// Form of the report.
 const VERSION: u32 = 1;

@@ -103,6 +103,13 @@ pub struct Args {
     /// Seconds of training; with --steps, whichever comes first.
     #[arg(long)]
     seconds: Option<f64>,
+    /// Watt-hours that training may take; with --steps or --seconds, whichever comes first. Power is what the board says (hwmon,
+    /// vcgencmd) or --watts.
+    #[arg(long)]
+    energy_wh: Option<f64>,
+    /// Watts that this computer takes while it trains, where it does not say so itself.
+    #[arg(long, requires = "energy_wh")]
+    watts: Option<f32>,
     /// Budgets of a size of job, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
     #[arg(long, value_parser = presets())]
     preset: Option<Preset>,
@@ -196,12 +203,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if args.network.is_some() {
         settings.network.pair = args.network;
     }
-    if let Some(seed) = args.seed {
-        settings.training.seed = seed;
-    }
+    let training = &mut settings.training;
+    training.seed = args.seed.unwrap_or(training.seed);
+    (training.energy_wh, training.watts) = (args.energy_wh.or(training.energy_wh), args.watts.or(training.watts));
+    training.check()?;
     let preset = args.preset.and_then(Preset::values);
-    // A schedule in steps or in a settings file is not cut short by a preset.
-    let seconds = match args.steps.is_some() || settings.training.seconds.is_some() {
+    // A schedule in steps, in watt-hours or in a settings file is not cut short by a preset.
+    let is_said = settings.training.seconds.is_some() || settings.training.energy_wh.is_some();
+    let seconds = match args.steps.is_some() || is_said {
         true => args.seconds,
         false => args.seconds.or(preset.map(|p| p.seconds)),
     };

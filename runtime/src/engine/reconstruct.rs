@@ -10,6 +10,7 @@ use models::dataset::scaled;
 use models::formats::model;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
+use super::energy::EVERY_S;
 use super::{PictureSource, Reconstruction, model_path};
 use crate::error::JobError;
 
@@ -253,6 +254,7 @@ impl Reconstruct for Reconstruction {
     }
 
     fn set_seconds(&mut self, seconds: Option<f64>) {
+        self.settings.training.seconds = seconds;
         self.trainer.set_seconds(seconds);
     }
 
@@ -270,22 +272,29 @@ impl Reconstruct for Reconstruction {
     ) -> Result<StopReason, JobError> {
         let _span = tracing::info_span!("train").entered();
         let from = Instant::now();
+        let mut last = None;
         let summary = loop {
+            self.read_power();
             let (due, before, mut next) = (self.delivery_due(), self.trainer.elapsed_s(), None);
-            let mut asked_to_stop = false;
+            let read_s = if self.meter.is_some() { before + EVERY_S } else { f64::INFINITY };
+            let (mut asked_to_stop, mut reads) = (false, false);
             let summary = self.trainer.run(budget, &mut |step| {
                 next = due.after(step);
+                reads = step.elapsed_s >= read_s;
                 asked_to_stop = each(step).is_break();
-                if next.is_some() || asked_to_stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+                let goes_on = next.is_none() && !reads && !asked_to_stop;
+                if goes_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             })?;
+            last = summary.last.or(last);
             self.header.steps += u64::from(summary.steps);
             self.report.steps += u64::from(summary.steps);
             self.train_s += self.trainer.elapsed_s() - before;
             next.map_or(Ok(()), |next| self.prepare_delivery(next))?;
-            if next.is_none() || asked_to_stop {
+            if (next.is_none() && !reads) || asked_to_stop {
                 break summary;
             }
         };
+        self.read_power();
         self.report.stage("train", from);
         let c = summary.counters;
         for (name, count) in [
@@ -304,7 +313,7 @@ impl Reconstruct for Reconstruction {
             self.report.more.insert("cells".into(), windows);
         }
         self.report.more.insert("views_read_back".into(), self.trainer.views_read_back().into());
-        if let Some(last) = summary.last.filter(|last| last.loss.is_finite()) {
+        if let Some(last) = last.filter(|last| last.loss.is_finite()) {
             self.report.more.insert("loss".into(), f64::from(last.loss).into());
         }
         for (name, ms) in self.trainer.stage_ms() {

@@ -11,6 +11,7 @@ use vulkan::gpu::{Gpu, GpuInfo};
 use super::{Choice, Room, Wanted, shown};
 use crate::cost::model::CostModel;
 use crate::engine::device::DeviceRequest;
+use crate::engine::energy::{Meter, shorter};
 use crate::engine::model_path;
 use crate::{cost, devices, kernels, session};
 
@@ -87,7 +88,8 @@ pub(super) fn choose(mission: &Mission, region: &[[f64; 2]], info: &GpuInfo, cos
         resolution: training.resolution,
         schedule: training.steps,
         steps: None,
-        seconds: training.seconds,
+        // Whoever opens the engine says what is wrong with its energy.
+        seconds: shorter(training.seconds, Meter::of(training).ok().flatten().map(|meter| meter.seconds())),
         max_gaussians: memory.max_gaussians,
         image_scale: memory.image_scale.map(f64::from),
     };

@@ -7,6 +7,7 @@ use models::dataset::Dataset;
 use super::TrainJob;
 use super::scale::largest;
 use crate::engine::device::DeviceRequest;
+use crate::engine::energy::{Meter, shorter};
 use crate::error::JobError;
 use crate::preset::{Choice, Room, Wanted, most_side, shown};
 use crate::{cost, devices, kernels};
@@ -48,7 +49,8 @@ impl TrainJob {
         }
         let gpu = devices::open(self.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
         let Some(cost) = cost::of(&gpu, kernels::shape_of(&gpu)) else { return Ok(None) };
-        let seconds = self.seconds.or(self.training.seconds);
+        let by_energy = Meter::of(&self.training)?.map(|meter| meter.seconds());
+        let seconds = shorter(self.seconds.or(self.training.seconds), by_energy);
         let device = DeviceRequest {
             device: None,
             device_mib: self.budget_mib(),
