@@ -29,6 +29,7 @@ SETTINGS = dict(
     beta4=60.0, beta2=60.0,           # sharpness of the soft-argmax
     pooled=lambda sigma: 2 if sigma >= 2 else 1,   # cells whose mean a window sees
     best=0.3,                         # share of the better source against the mean of both
+    seen=4,                           # coarse planes of which one says where a source looks; of the fine ones one says it for all
 )
 
 
@@ -109,9 +110,9 @@ def build(p=None):
         y = g.add(g.mul(g.arange(h), np.float32(div)), np.float32(off))
         return g.unsqueeze(x, 0), g.unsqueeze(y, 1)
 
-    def sweep(level, s, ref, source, center, offsets):
-        """Product of reference and warped source feature and its validity, for inverse depths center + offsets, [h,w] or nothing and
-        [D,1,1]."""
+    def sweep(level, s, ref, source, center, offsets, seen):
+        """Product of reference and warped source feature, [D,h,w], for inverse depths center + offsets, [h,w] or nothing and [D,1,1], and
+        for every `seen` planes whether the source looks there at the middle one, [D/seen,1,h,w]."""
         h, w = {4: (H4, W4), 2: (H2, W2)}[level]
         fh, fw = {4: (H2, W2), 2: (H, W)}[level]
         scale = level // 2
@@ -137,9 +138,10 @@ def build(p=None):
         at = g.cast(g.add(g.mul(line, g.add(fwf, np.float32(2))), column), TensorProto.INT32)
         # GatherElements on flat arrays: a typed loop, where Gather copies every float by itself (three times slower).
         warped = g.op("GatherElements", g.pick(source, s), g.reshape(at, [-1]), axis=0)
-        inside = g.cast(g.cast(warped, TensorProto.BOOL), TensorProto.FLOAT)
-        volume = vec(-1, h, w)
-        return g.mul(ref, g.reshape(warped, volume)), g.reshape(inside, volume)
+        warped = g.reshape(warped, vec(-1, h, w))
+        grouped = g.reshape(warped, vec(-1, np.int64(seen), h, w))
+        middle = g.op("Slice", grouped, np.array([seen // 2], np.int64), np.array([seen // 2 + 1], np.int64), np.array([1], np.int64))
+        return g.mul(ref, warped), g.cast(g.cast(middle, TensorProto.BOOL), TensorProto.FLOAT)
 
     near, far = g.pick("depth_range", 0), g.pick("depth_range", 1)
     wmax, wmin = g.op("Reciprocal", near), g.op("Reciprocal", far)
@@ -148,7 +150,7 @@ def build(p=None):
     dw = g.div(g.sub(wmax, wmin), np.float32(D - 1))
     planes = g.reshape(g.add(wmin, g.mul(g.sub(wmax, wmin), t)), [D, 1, 1])
 
-    def correlate(level, center, offsets, small, large, large_share, beta):
+    def correlate(level, center, offsets, seen, small, large, large_share, beta):
         """`beta` times the correlation, plus `beta` where a source looks: where none does is worse than any match."""
         f = {4: f4, 2: f2}[level]
         src = finer(f, level)
@@ -156,18 +158,19 @@ def build(p=None):
         best = beta * P["best"]
         scores = []
         for s in range(S):
-            c, v = sweep(level, s, ref, src, center, offsets)
+            c, v = sweep(level, s, ref, src, center, offsets, seen)
             a = blur(c, level, small, best * (1 - large_share))
             if large_share > 0:
                 a = g.add(a, blur(c, level, large, best * large_share))
             # Where a source does not look, it has no opinion.
-            scores.append((a, v))
+            scores.append((g.reshape(a, vec(-1, np.int64(seen), *sized(level))), v))
         (a, va), (b, vb) = scores
         # Partly mean, partly best: a source that is occluded there must not veto.
         look = g.add(va, vb)
         share = g.op("Div", np.float32(1 / P["best"] - 1), g.op("Max", look, np.float32(1)))
-        mean = g.mul(g.add(g.mul(a, va), g.mul(b, vb)), share)
-        return g.add(g.add(mean, g.op("Max", a, b)), g.op("Clip", g.mul(look, np.float32(beta)), np.float32(0), np.float32(beta)))
+        mean = g.add(g.mul(a, g.mul(va, share)), g.mul(b, g.mul(vb, share)))
+        looked = g.op("Clip", g.mul(look, np.float32(beta)), np.float32(0), np.float32(beta))
+        return g.reshape(g.add(g.add(mean, g.op("Max", a, b)), looked), vec(-1, *sized(level)))
 
     def soft_argmax(score, values, beta):
         """The values' mean by exp(score), and the greatest correlation."""
@@ -177,7 +180,7 @@ def build(p=None):
         value = g.div(g.total(g.mul(e, values), 0), mass)
         return value, g.sub(g.mul(top, np.float32(1 / beta)), np.float32(1))
 
-    score4 = correlate(4, None, planes, P["small"], P["large"], P["large_share"], P["beta4"])
+    score4 = correlate(4, None, planes, P["seen"], P["small"], P["large"], P["large_share"], P["beta4"])
     w4, top4 = soft_argmax(score4, planes, P["beta4"])            # [1,h4,w4]
 
     def doubled(x):
@@ -190,7 +193,7 @@ def build(p=None):
     # Nowhere beyond twice the farthest depth.
     nearest = g.add(g.mul(wmin, np.float32(0.5)), g.mul(dw, np.float32(-offs.min())))
     center, around = g.op("Max", w2, nearest), g.mul(offs, dw)
-    score2 = correlate(2, center, around, P["fine_window"], None, 0, P["beta2"])
+    score2 = correlate(2, center, around, F, P["fine_window"], None, 0, P["beta2"])
     beyond, top2 = soft_argmax(score2, around, P["beta2"])
     wf = g.add(center, beyond)
 
