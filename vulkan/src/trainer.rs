@@ -105,6 +105,8 @@ pub struct Trainer {
     elapsed_s: f64,
     /// Steps and seconds that earlier processes spent on the same schedule.
     before: (u32, f64),
+    /// Progress at which the schedule begins.
+    begun_at: f32,
     /// Steps and seconds at which the schedule began anew.
     since: (u32, f64),
     counters: Counters,
@@ -185,6 +187,7 @@ impl Trainer {
             timed_every: TIMED_EVERY,
             elapsed_s: 0.0,
             before: (0, 0.0),
+            begun_at: 0.0,
             since: (0, 0.0),
             counters: Counters::default(),
             settings: settings.clone(),
@@ -195,7 +198,7 @@ impl Trainer {
     fn restart(&mut self) {
         self.steps = 0;
         self.elapsed_s = 0.0;
-        (self.before, self.since) = ((0, 0.0), (0, 0.0));
+        (self.before, self.since, self.begun_at) = ((0, 0.0), (0, 0.0), 0.0);
         self.flushed = true;
         self.deferred.reset();
         self.sampler.look_at_newest(false);
@@ -265,6 +268,17 @@ impl Trainer {
         self.settings.seconds = seconds;
     }
 
+    /// Until the next [`Trainer::load`] the schedule begins at `progress`, 0…1, and takes as long as it would from its beginning: what is
+    /// trained already needs no large rates and no small pictures.
+    pub fn begin_at(&mut self, progress: f32) {
+        self.begun_at = progress.clamp(0.0, 1.0);
+    }
+
+    /// Progress at which the schedule begins.
+    pub fn begun_at(&self) -> f32 {
+        self.begun_at
+    }
+
     /// Steps and seconds spent on the schedule, earlier processes' included.
     pub fn spent(&self) -> (u32, f64) {
         let (steps, seconds) = (self.steps - self.since.0, self.elapsed_s - self.since.1);
@@ -274,7 +288,7 @@ impl Trainer {
     /// How much of the schedule is over, 0…1.
     pub fn progress(&self) -> f32 {
         let (steps, seconds) = self.spent();
-        self.settings.progress(steps, seconds)
+        self.begun_at + (1.0 - self.begun_at) * self.settings.progress(steps, seconds)
     }
 
     /// Seconds of training since the last [`Trainer::load`].

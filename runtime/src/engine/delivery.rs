@@ -126,9 +126,10 @@ impl Reconstruction {
             .map_err(|e| FormatError::Invalid { path: "the model".into(), what: format!("not rounded: {e}") })?;
         self.cloud.clone_from(&rounded);
         drop(rounded);
-        let (steps, seconds) = self.trainer.spent();
+        let ((steps, seconds), begun_at) = (self.trainer.spent(), self.trainer.begun_at());
         self.trainer.load(&self.cloud)?;
         self.trainer.continue_from(steps, seconds);
+        self.trainer.begin_at(begun_at);
         self.trainer.keep_number();
         let rates = self.settings.training.rates;
         self.trainer.set_rates(&RateSettings {

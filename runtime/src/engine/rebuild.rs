@@ -18,7 +18,18 @@ pub(super) const CONTRADICTED_PX: f64 = 1.5;
 /// schedule went into it: theirs come from depths that all neighbours had a part in.
 const WORTH_KEEPING: f32 = 0.5;
 
+/// Progress at which the schedule after the landing begins where most Gaussians were trained in flight, as each growth leaves it there.
+const LANDED_AT: f32 = 0.3;
+
 impl Reconstruction {
+    /// Where the schedule begins that follows a landing: large rates and small pictures are for what was not trained yet.
+    pub(super) fn begin_after_landing(&mut self, loaded: usize, new: usize) {
+        let landed = self.settings.incremental && !self.flying;
+        if landed && 2 * new < loaded {
+            self.trainer.begin_at(LANDED_AT);
+        }
+    }
+
     /// The cloud to train: what is trained already, and fresh Gaussians where it is not. How many of them are fresh.
     pub(super) fn take_over(&mut self, fresh: &FirstGaussians) -> Result<usize, JobError> {
         if self.builds > 0 {

@@ -52,7 +52,7 @@ pub trait Reconstruct {
     fn land(&mut self) {}
     /// Whether there is a model to train.
     fn has_model(&self) -> bool;
-    /// (Re)builds the model from all key frames and starts its schedule anew; false when `go_on` said no before it was.
+    /// (Re)builds the model from all key frames and starts its schedule; false when `go_on` said no before it was.
     ///
     /// # Errors
     /// The network or the device fails; the pictures give no depth.
@@ -199,6 +199,7 @@ impl Reconstruct for Reconstruction {
         let loaded = self.load_first()?;
         self.begin_delivery()?;
         self.fly_on();
+        self.begin_after_landing(loaded.loaded, new);
         self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
         self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
         let mut with_prior = 0;
@@ -340,9 +341,10 @@ impl Reconstruct for Reconstruction {
         let Some(&least) = by_opacity.get(by_opacity.len() / 3) else { return Ok(()) };
         let logits = self.cloud.opacity_logits.clone();
         let removed = self.cloud.retain(|i| logits[i] >= least);
-        let (steps, seconds) = self.trainer.spent();
+        let ((steps, seconds), begun_at) = (self.trainer.spent(), self.trainer.begun_at());
         self.trainer.load(&self.cloud)?;
         self.trainer.continue_from(steps, seconds);
+        self.trainer.begin_at(begun_at);
         self.fly_on();
         tracing::warn!("gave up {removed} Gaussians, {} remain", self.cloud.len());
         self.let_go();

@@ -195,8 +195,8 @@ fn new_ground_gets_gaussians_and_what_is_far_from_it_stays_to_the_bit() {
 }
 
 /// Flies `pictures`, trains `share` of a schedule as far as is written down, and lands: what there was in flight, how much of it the
-/// landing kept, and what there is then.
-fn landed(pictures: &[PosedImage], share: f64) -> Option<(GaussianCloud, usize, GaussianCloud)> {
+/// landing kept, what there is then, and the progress at which the schedule begins.
+fn landed(pictures: &[PosedImage], share: f64) -> Option<(GaussianCloud, usize, GaussianCloud, f32)> {
     let mut engine = engine()?;
     pictures.iter().for_each(|p| _ = take(&mut engine, p.clone()));
     let in_flight = snapshot(&mut engine);
@@ -206,7 +206,8 @@ fn landed(pictures: &[PosedImage], share: f64) -> Option<(GaussianCloud, usize, 
     assert!(engine.wants_build(true) && engine.build(&|| true).expect("built") && !engine.wants_build(true));
     assert!(!engine.wants_growth());
     let kept = engine.report.more["gaussians_kept"].as_u64().expect("a number") as usize;
-    Some((in_flight, kept, snapshot(&mut engine)))
+    let progress = engine.trainer.progress();
+    Some((in_flight, kept, snapshot(&mut engine), progress))
 }
 
 #[test]
@@ -214,15 +215,17 @@ fn the_same_flight_twice_is_the_same_bytes_and_the_landing_builds_it_once_more()
     let pictures: Vec<PosedImage> = flight().into_iter().take(16).collect();
     let Some(first) = landed(&pictures, 0.0) else { return };
     assert!(landed(&pictures, 0.0).as_ref() == Some(&first));
-    let (in_flight, _, after) = first;
+    let (in_flight, _, after, _) = first;
     assert!(after.len() >= in_flight.len() * 9 / 10, "{} {}", after.len(), in_flight.len());
 }
 
 #[test]
 fn what_was_trained_in_flight_is_where_the_schedule_begins_unless_most_of_it_is_still_ahead() {
     let pictures: Vec<PosedImage> = flight().into_iter().take(16).collect();
-    let Some((in_flight, kept, _)) = landed(&pictures, 0.6) else { return };
+    let Some((in_flight, kept, _, progress)) = landed(&pictures, 0.6) else { return };
     assert!(2 * kept > in_flight.len(), "{kept} of {}", in_flight.len());
-    let Some((_, kept, _)) = landed(&pictures, 0.4) else { return };
+    assert!(progress > 0.0, "what is trained needs neither the largest rates nor the smallest pictures");
+    let Some((_, kept, _, progress)) = landed(&pictures, 0.4) else { return };
     assert_eq!(kept, 0, "depths of all pictures are better than those of the few there were");
+    assert_eq!(progress, 0.0, "and begin their schedule");
 }
