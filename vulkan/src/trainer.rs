@@ -22,6 +22,7 @@ mod render;
 mod run;
 mod sampler;
 mod scene;
+mod schedule;
 mod slots;
 mod snapshot;
 mod state;
@@ -254,41 +255,6 @@ impl Trainer {
             last,
             counters: self.counters,
         })
-    }
-
-    /// Goes on with a schedule on which earlier processes spent `steps` and `seconds`; holds until the next
-    /// [`Trainer::load`].
-    pub fn continue_from(&mut self, steps: u32, seconds: f64) {
-        self.before = (steps, seconds);
-    }
-
-    /// How long the schedule may take from now on, seconds; `None`: its steps alone decide. What is over is over: its share
-    /// changes.
-    pub fn set_seconds(&mut self, seconds: Option<f64>) {
-        self.settings.seconds = seconds;
-    }
-
-    /// Until the next [`Trainer::load`] the schedule begins at `progress`, 0…1, and takes as long as it would from its beginning: what is
-    /// trained already needs no large rates and no small pictures.
-    pub fn begin_at(&mut self, progress: f32) {
-        self.begun_at = progress.clamp(0.0, 1.0);
-    }
-
-    /// Progress at which the schedule begins.
-    pub fn begun_at(&self) -> f32 {
-        self.begun_at
-    }
-
-    /// Steps and seconds spent on the schedule, earlier processes' included.
-    pub fn spent(&self) -> (u32, f64) {
-        let (steps, seconds) = (self.steps - self.since.0, self.elapsed_s - self.since.1);
-        (self.before.0.saturating_add(steps), self.before.1 + seconds)
-    }
-
-    /// How much of the schedule is over, 0…1.
-    pub fn progress(&self) -> f32 {
-        let (steps, seconds) = self.spent();
-        self.begun_at + (1.0 - self.begun_at) * self.settings.progress(steps, seconds)
     }
 
     /// Seconds of training since the last [`Trainer::load`].

@@ -93,8 +93,9 @@ impl Trainer {
         let since_flush = self.steps - self.density.last_flush;
         let d = self.settings.density;
         // With a budget in seconds the number of steps is what the pace so far promises.
-        let expected = if self.settings.seconds.is_some() && progress > 0.01 {
-            (self.steps as f32 / progress) as u32
+        let spent = self.spent_share();
+        let expected = if self.settings.seconds.is_some() && spent > 0.01 {
+            (self.spent().0 as f32 / spent) as u32
         } else {
             self.settings.steps
         };

@@ -79,14 +79,6 @@ impl Trainer {
         self.strategy = Strategy::None;
     }
 
-    /// Puts the schedule to `progress`, 0…1, for what is there; moments stay.
-    pub fn renew_schedule(&mut self, progress: f32) {
-        let share = f64::from(progress.clamp(0.0, 1.0));
-        let steps = (share * f64::from(self.settings.steps)) as u32;
-        self.before = (steps, share * self.settings.seconds.unwrap_or(0.0));
-        self.since = (self.steps, self.elapsed_s);
-    }
-
     /// Shows every Gaussian, in order.
     ///
     /// # Errors
