@@ -25,7 +25,7 @@ const AIRCRAFT: [&str; 5] = ["a1", "a2", "a3", "a4", "a5"];
 /// One way, milliseconds.
 const DELAYS: [u64; 5] = [50, 100, 200, 400, 1000];
 /// After the storm everything must be in within so long.
-const CALM: Duration = Duration::from_secs(400);
+const CALM: Duration = Duration::from_secs(120);
 
 fn checkpoint_of(aircraft: usize) -> Vec<u8> {
     noise(70_000, 100 + aircraft as u8)
