@@ -10,16 +10,13 @@ use vulkan::trainer::{Fate, Trained};
 
 use super::carry::{Claims, Room};
 use super::follow::{Motion, Motions};
-use super::rebuild::{CONTRADICTED_PX, MOVED_PX};
+use super::rebuild::{CONTRADICTED_PX, MOVED_PX, RENEWED_AT};
 use super::{Reconstruction, take_refined};
 use crate::error::JobError;
 
 /// All poses are solved at once whenever the key frames have grown by this share: their errors, which pictures and GPS bound, are
 /// spread evenly again, for a cost that all solves together keep in proportion to the key frames.
 const WHOLE_GROWTH: f64 = 0.34;
-/// Where the schedule goes on from after a growth. What is there has been trained and would be shaken by the rates of its beginning each
-/// time; pictures are still looked at in half their size. 0.2 to 0.7 dB on a flight of 150 pictures (tests/BENCHMARKS.md, "A long flight").
-const RENEWED_AT: f32 = 0.3;
 /// Share of the plan that is freed at once where new ground finds no room.
 const FREED: usize = 50;
 /// Key frames within so many pictures' widths of one that moved may move a Gaussian with it.

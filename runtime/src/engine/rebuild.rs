@@ -18,15 +18,17 @@ pub(super) const CONTRADICTED_PX: f64 = 1.5;
 /// schedule went into it: theirs come from depths that all neighbours had a part in.
 const WORTH_KEEPING: f32 = 0.5;
 
-/// Progress at which the schedule after the landing begins where most Gaussians were trained in flight, as each growth leaves it there.
-const LANDED_AT: f32 = 0.3;
+/// Where the schedule goes on from after a growth, and begins after a landing that keeps most Gaussians. What is there has been trained and
+/// would be shaken by the rates of its beginning each time; pictures are still looked at in half their size. 0.2 to 0.7 dB on a flight of 150
+/// pictures (tests/BENCHMARKS.md, "A long flight").
+pub(super) const RENEWED_AT: f32 = 0.3;
 
 impl Reconstruction {
     /// Where the schedule begins that follows a landing: large rates and small pictures are for what was not trained yet.
     pub(super) fn begin_after_landing(&mut self, loaded: usize, new: usize) {
         let landed = self.settings.incremental && !self.flying;
         if landed && 2 * new < loaded {
-            self.trainer.begin_at(LANDED_AT);
+            self.trainer.begin_at(RENEWED_AT);
         }
     }
 
