@@ -26,11 +26,13 @@ fn encoding_holds_no_more_than_is_planned_for_it_and_its_file_takes_no_more() {
     }
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("m.dgtr");
-    let before = NOW.load(Ordering::Relaxed);
-    MOST.store(before, Ordering::Relaxed);
-    model::write_rounded(&Default::default(), &path, &ModelHeader::default(), &cloud, &Rounding::default()).unwrap();
-    let each = (MOST.load(Ordering::Relaxed) - before) / n;
-    let size = path.metadata().unwrap().len() as usize / n;
-    println!("{each} bytes of memory and {size} of the disk per Gaussian");
-    assert!(each <= ENCODING_BYTES && size <= ENCODED_BYTES, "{each} and {size} bytes per Gaussian");
+    for rounding in [Rounding::default(), Rounding::fine()] {
+        let before = NOW.load(Ordering::Relaxed);
+        MOST.store(before, Ordering::Relaxed);
+        model::write_rounded(&Default::default(), &path, &ModelHeader::default(), &cloud, &rounding).unwrap();
+        let each = (MOST.load(Ordering::Relaxed) - before) / n;
+        let size = path.metadata().unwrap().len() as usize / n;
+        println!("{each} bytes of memory and {size} of the disk per Gaussian");
+        assert!(each <= ENCODING_BYTES && size <= ENCODED_BYTES, "{each} and {size} bytes per Gaussian");
+    }
 }

@@ -16,6 +16,7 @@ use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
+use models::formats::delivery::Rounding;
 use models::formats::model::{Chunks, ModelHeader};
 use models::init::Initialiser;
 use models::light::PictureLight;
@@ -69,8 +70,8 @@ pub struct EngineSettings {
     pub ahead: usize,
     /// Their camera's own pictures wait in memory with them.
     pub ahead_in_memory: bool,
-    /// Models are rounded for delivery while the job goes on.
-    pub delivers: bool,
+    /// To what models are rounded for delivery while the job goes on.
+    pub delivers: Option<Rounding>,
     /// `[map]`: what is drawn after each build; `None` draws nothing.
     pub map: Option<MapSettings>,
     /// Pictures are trained at this fraction of the size they come in; matching sees them whole.
@@ -185,7 +186,7 @@ impl Reconstruction {
                 camera_pixels: settings.camera_pixels,
                 ahead: settings.ahead as u64,
                 ahead_in_memory: settings.ahead_in_memory,
-                delivers: settings.delivers,
+                delivers: settings.delivers.is_some(),
                 from_file: in_pieces && settings.start == InitKind::Model,
                 map: settings.map.map_or(0, |m| m.host_bytes()),
             })

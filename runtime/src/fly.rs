@@ -11,11 +11,10 @@ use config::disk::plan::{DiskPlan, DiskRequest};
 use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
 use config::plan::Lanes;
-use config::upload::Encoding;
 use hal::mavlink_camera::Activity;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;
-use models::formats::delivery::ENCODED_BYTES;
+use models::formats::delivery::{ENCODED_BYTES, Rounding};
 use models::formats::model::ModelHeader;
 use vulkan::trainer::RunBudget;
 
@@ -195,7 +194,7 @@ fn waits(waited_s: &[f64]) -> Option<serde_json::Value> {
 
 /// Most bytes of a Gaussian as it is delivered; 0: models are sent as they are.
 pub fn delivered_bytes(mission: &Mission) -> usize {
-    if mission.upload.encoding == Encoding::Delivery { ENCODED_BYTES } else { 0 }
+    Rounding::of(mission.upload.encoding).map_or(0, |_| ENCODED_BYTES)
 }
 
 /// What a flight may take of the disk.
@@ -284,7 +283,7 @@ fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Dis
         ahead: DECODED_AHEAD + handover::AHEAD,
         // Until they are kept on disk; those that are files already wait there.
         ahead_in_memory: !matches!(aircraft.camera, CameraSource::Folder(_)),
-        delivers: delivered_bytes(mission) > 0,
+        delivers: Rounding::of(mission.upload.encoding),
         map: Some(mission.map).filter(|m| m.pixels > 0),
         // The capture thread has scaled them already.
         scale: 1.0,

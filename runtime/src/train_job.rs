@@ -15,6 +15,7 @@ use config::training::TrainSettings;
 use hal::time::MonotonicClock;
 use models::card::CardOptions;
 use models::dataset::{Dataset, PoseSource};
+use models::formats::delivery::Rounding;
 use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
 use vulkan::trainer::RunBudget;
@@ -92,8 +93,8 @@ pub struct TrainJob {
     pub network: NetworkSettings,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
-    /// Whether the last share of training has values as the delivery encoding rounds them.
-    pub for_delivery: bool,
+    /// As what encoding rounds them the last share of training has values.
+    pub for_delivery: Option<Rounding>,
     /// Whether a model in `out` is ignored.
     pub fresh: bool,
     /// Whether the split `test` is scored at the end.

@@ -10,6 +10,7 @@
 //! All numbers that the decoder steers by are sent along or follow from what it has read, by arithmetic that is the same on
 //! every machine.
 
+use config::upload::Encoding;
 use glam::Vec3;
 
 use crate::camera::View;
@@ -70,7 +71,7 @@ impl Default for Rounding {
             position: 0.28,
             position_power: 0.5,
             shape: ShapeSteps { log_scale: 0.27, rotation_bits: 4, opacity_bits: 4 },
-            color: ColorSteps { luma: 1.0 / 60.0, chroma: 1.6, variation: 0.016, by_importance: 0.5, rounding: 0.45 },
+            color: ColorSteps { luma: 1.0 / 60.0, chroma: 1.6, variation: 0.016, by_importance: 0.3, rounding: 0.45 },
         }
     }
 }
@@ -82,8 +83,17 @@ impl Rounding {
         Self {
             position: 0.17,
             position_power: 0.6,
-            shape: ShapeSteps { log_scale: 0.15, rotation_bits: 5, opacity_bits: 5 },
-            color: ColorSteps { luma: 1.0 / 96.0, chroma: 1.6, variation: 0.011, by_importance: 0.5, rounding: 0.5 },
+            shape: ShapeSteps { log_scale: 0.15, rotation_bits: 5, opacity_bits: 6 },
+            color: ColorSteps { luma: 1.0 / 96.0, chroma: 1.4, variation: 0.009, by_importance: 0.3, rounding: 0.5 },
+        }
+    }
+
+    /// What a model is rounded to that is sent so; `None`: it is sent as it was trained.
+    pub fn of(encoding: Encoding) -> Option<Self> {
+        match encoding {
+            Encoding::Exact => None,
+            Encoding::Delivery => Some(Self::default()),
+            Encoding::Fine => Some(Self::fine()),
         }
     }
 }

@@ -66,7 +66,7 @@ pub struct Args {
     /// With `--to ply|spz|sog|gltf|html|streamed`: leave out colours of a higher degree (0: the same colour from every side).
     #[arg(long, value_name = "0-3", value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: Option<u8>,
-    /// With `--to delivery`: rounded more finely, for scenes seen from near; a third more bytes.
+    /// With `--to delivery`: rounded more finely, for scenes seen from near (trained with `--for-delivery=fine`); a third more bytes.
     #[arg(long)]
     pub fine: bool,
     /// With `--to html`: so many of the cameras as small pictures to jump to, evenly chosen; 0 needs no Vulkan device.

@@ -13,6 +13,7 @@ use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use models::card::CardOptions;
 use models::dataset::PoseSource;
+use models::formats::delivery::Rounding;
 use models::formats::{FormatError, read_bounded};
 use serde::Deserialize;
 
@@ -42,6 +43,24 @@ enum Poses {
     Dataset,
     /// GPS and gimbal angles of gps.csv, refined from the pictures.
     Telemetry,
+}
+
+/// How finely a model for delivery is rounded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Fineness {
+    /// As `dgtr export --to delivery` and `[upload] encoding = "delivery"` do.
+    Coarse,
+    /// As with `--fine` and `"fine"`: for what is seen from near.
+    Fine,
+}
+
+impl Fineness {
+    fn rounding(self) -> Rounding {
+        match self {
+            Self::Coarse => Rounding::default(),
+            Self::Fine => Rounding::fine(),
+        }
+    }
 }
 
 /// Arguments of `dgtr train`.
@@ -94,8 +113,8 @@ pub struct Args {
     no_refine: bool,
     /// Give up the Gaussians that the loss hangs on least ([training] thinned_share) and train the last share of the schedule with values
     /// as the delivery encoding rounds them (rounded_share): for models that go out by `dgtr export --to delivery`.
-    #[arg(long)]
-    for_delivery: bool,
+    #[arg(long, value_enum, num_args = 0..=1, require_equals = true, default_missing_value = "coarse")]
+    for_delivery: Option<Fineness>,
     /// Optimiser steps; with neither --steps nor --seconds the recipe's own number ([training] steps, or
     /// [training.views] visits to each picture where those are fewer).
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
@@ -239,7 +258,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             Poses::Telemetry => PoseSource::Telemetry,
         },
         refine: !args.no_refine,
-        for_delivery: args.for_delivery,
+        for_delivery: args.for_delivery.map(Fineness::rounding),
         steps: args.steps,
         seconds,
         auto: args.preset == Some(Preset::Auto),

@@ -6,7 +6,7 @@ use std::cmp::Ordering;
 
 use config::training::RateSettings;
 use models::formats::FormatError;
-use models::formats::delivery::{self, Rounding};
+use models::formats::delivery;
 use vulkan::trainer::{Fate, StepReport, Trained};
 
 use super::Reconstruction;
@@ -55,7 +55,7 @@ impl Reconstruction {
     /// What is yet to be done to a model that is delivered rounded; nothing while pictures come.
     pub(super) fn delivery_due(&self) -> Due {
         let t = &self.settings.training;
-        let delivers = self.settings.delivers && !self.flying;
+        let delivers = self.settings.delivers.is_some() && !self.flying;
         let thins = delivers && !self.delivery.thinned && t.thinned_share > 0.0 && self.trainer.grows_in_place();
         Due {
             thin: thins.then_some((t.thinned_at, self.least_steps())),
@@ -122,7 +122,7 @@ impl Reconstruction {
     /// Rounds what gives a Gaussian its shape, as its delivery will, and trains colours alone from here on.
     fn round(&mut self) -> Result<(), JobError> {
         self.trainer.snapshot(&mut self.cloud)?;
-        let rounded = delivery::round_shapes(&self.cloud, &Rounding::default())
+        let rounded = delivery::round_shapes(&self.cloud, &self.settings.delivers.unwrap_or_default())
             .map_err(|e| FormatError::Invalid { path: "the model".into(), what: format!("not rounded: {e}") })?;
         self.cloud.clone_from(&rounded);
         drop(rounded);

@@ -38,7 +38,7 @@ impl Earlier {
 /// Whether the Gaussians of such a job are together in the trainer's file only: what a flight builds anew, and what is rounded as a whole, is
 /// in memory.
 pub(super) fn is_in_pieces(settings: &EngineSettings, trainer: &Trainer) -> bool {
-    trainer.plan().is_paged() && !settings.incremental && !settings.delivers
+    trainer.plan().is_paged() && !settings.incremental && settings.delivers.is_none()
 }
 
 /// Why a model is not written.

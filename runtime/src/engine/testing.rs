@@ -26,7 +26,7 @@ pub fn settings() -> EngineSettings {
         camera_pixels: 32 * 24,
         ahead: 0,
         ahead_in_memory: false,
-        delivers: false,
+        delivers: None,
         map: None,
         scale: 1.0,
         network: NetworkSettings::default(),

@@ -14,11 +14,11 @@ use crate::engine::{EngineSettings, Reconstruct};
 
 /// An engine that has built its model from three pictures.
 fn built(delivers: bool) -> Option<Reconstruction> {
-    built_as(delivers, false)
+    built_as(delivers.then(Rounding::default), false)
 }
 
 /// The same; with `incremental`, as a flight does it after its landing.
-fn built_as(delivers: bool, incremental: bool) -> Option<Reconstruction> {
+fn built_as(delivers: Option<Rounding>, incremental: bool) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
         return None;
@@ -103,7 +103,7 @@ fn a_model_for_delivery_is_thinned_once_and_one_that_is_not_never() {
 #[test]
 fn a_model_that_is_continued_after_it_had_been_thinned_is_not_thinned_again() {
     for incremental in [false, true] {
-        let Some(mut engine) = built_as(true, incremental) else { return };
+        let Some(mut engine) = built_as(Some(Rounding::default()), incremental) else { return };
         assert!(!engine.delivery.thinned);
         engine.settings.training.thinned_loss = 1e6;
         train(&mut engine, u32::MAX);
@@ -133,8 +133,8 @@ fn a_schedule_that_the_clock_ends_is_thinned_and_rounded_too() {
 
 #[test]
 fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colours() {
-    let trained = |delivers: bool| {
-        let mut engine = built(delivers)?;
+    let trained = |delivers: Option<Rounding>| {
+        let mut engine = built_as(delivers, false)?;
         let mut steps = 0;
         let budget = RunBudget { steps: Some(20), seconds: None };
         let mut each = |_: &StepReport| {
@@ -145,15 +145,18 @@ fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colou
         engine.trainer.snapshot(&mut engine.cloud).expect("read");
         Some((steps, engine.header.steps, engine.cloud))
     };
-    let Some(((steps, counted, rounded), (_, _, exact))) = trained(true).zip(trained(false)) else { return };
-    assert_eq!((steps, counted), (20, 20), "the schedule goes on where it was");
-    let again = delivery::round_shapes(&rounded, &Rounding::default()).expect("rounds");
     let places = |cloud: &GaussianCloud| {
         let mut places: Vec<_> = cloud.means.iter().map(|m| m.map(f32::to_bits)).collect();
         places.sort_unstable();
         places
     };
-    assert!(places(&again) == places(&rounded));
-    let of_exact = delivery::round_shapes(&exact, &Rounding::default()).expect("rounds");
-    assert!(places(&of_exact) != places(&exact));
+    let Some((_, _, exact)) = trained(None) else { return };
+    for rounding in [Rounding::default(), Rounding::fine()] {
+        let Some((steps, counted, rounded)) = trained(Some(rounding)) else { return };
+        assert_eq!((steps, counted), (20, 20), "the schedule goes on where it was");
+        let again = delivery::round_shapes(&rounded, &rounding).expect("rounds");
+        assert!(places(&again) == places(&rounded));
+        let of_exact = delivery::round_shapes(&exact, &rounding).expect("rounds");
+        assert!(places(&of_exact) != places(&exact));
+    }
 }

@@ -77,23 +77,28 @@ fn where_no_rounded_model_can_be_written_the_exact_one_is_offered() {
 }
 
 #[test]
-fn a_model_is_rounded_for_delivery_and_the_ground_reads_it() {
-    let dir = tempfile::tempdir().expect("temp dir");
-    let (settings, path, header, cloud) = delivery(dir.path());
-    let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
-    o.offer_final(&path);
-    assert!(o.wait_delivered(LIMIT, || true));
-    let sent = o.status().bytes;
-    assert!(10 * sent < std::fs::metadata(&path).expect("metadata").len(), "{sent} bytes");
-    let left = o.status().sent;
-    assert!(left > sent && left < sent + 1000, "{left} bytes left, the model and its offer");
+fn a_model_is_rounded_for_delivery_as_finely_as_is_set_and_the_ground_reads_it() {
+    let sent = [Encoding::Delivery, Encoding::Fine].map(|encoding| {
+        let dir = tempfile::tempdir().expect("temp dir");
+        let (settings, path, header, cloud) = delivery(dir.path());
+        let settings = UploadSettings { encoding, ..settings };
+        let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
+        o.offer_final(&path);
+        assert!(o.wait_delivered(LIMIT, || true));
+        let sent = o.status().bytes;
+        assert!(10 * sent < std::fs::metadata(&path).expect("metadata").len(), "{sent} bytes");
+        let left = o.status().sent;
+        assert!(left > sent && left < sent + 1000, "{left} bytes left, the model and its offer");
 
-    o.shutdown();
-    let mut r = Receiver::open(&settings, anything(&["a1"]), &dir.path().join("g")).expect("receiver");
-    assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
-    let (received, rounded) = model::read(&r.received()[0].path).expect("a model");
-    assert_eq!((received, rounded.len()), (header, 2000));
-    assert_eq!(model::read(&path).expect("still there").1, cloud, "training goes on from the exact one");
+        o.shutdown();
+        let mut r = Receiver::open(&settings, anything(&["a1"]), &dir.path().join("g")).expect("receiver");
+        assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
+        let (received, rounded) = model::read(&r.received()[0].path).expect("a model");
+        assert_eq!((received, rounded.len()), (header, 2000));
+        assert_eq!(model::read(&path).expect("still there").1, cloud, "training goes on from the exact one");
+        sent
+    });
+    assert!(sent[0] < sent[1], "{sent:?} bytes");
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use config::upload::{Encoding, UploadSettings};
+use config::upload::UploadSettings;
 use models::formats::{FormatError, delivery::Rounding, model};
 use models::ground_cell::{CellKey, Grid};
 
@@ -124,13 +124,12 @@ impl Worker {
 
     fn take_up(&mut self, path: &Path, kind: Kind) {
         let order = Order { flight: self.flight.get(), counter: self.counter + 1 };
-        let rounded = match self.settings.encoding {
-            Encoding::Exact => None,
+        let rounded = Rounding::of(self.settings.encoding).and_then(|rounding| {
             // Rather the whole file than none: the disk may be too full for another.
-            Encoding::Delivery => write_delivery(&self.source, path)
+            write_delivery(&self.source, path, &rounding)
                 .inspect_err(|e| tracing::warn!("upload: {e}; the exact model is offered instead"))
-                .ok(),
-        };
+                .ok()
+        });
         match OfferedModel::open(
             rounded.as_deref().unwrap_or(path),
             &self.settings,
@@ -237,13 +236,13 @@ impl Worker {
 }
 
 /// Writes the delivery encoding of a model beside it, without cells that are others' to deliver.
-fn write_delivery(source: &Source, path: &Path) -> Result<PathBuf, FormatError> {
+fn write_delivery(source: &Source, path: &Path, rounding: &Rounding) -> Result<PathBuf, FormatError> {
     let (header, cloud) = model::read(path)?;
     let rounded = path.with_extension("delivery.dgtr");
     let margin = territory::margin(&header, cloud.middle()[2]);
     // A model that does not lie in the mission's frame has no place among regions.
     let territory = source.territory.as_ref().filter(|_| header.origin.is_some());
     let wanted = |grid: Grid, key: CellKey| territory.is_none_or(|t| t.wants(grid, key, margin));
-    model::write_cells(&source.disk, &rounded, &header, &cloud, &Rounding::default(), &wanted)?;
+    model::write_cells(&source.disk, &rounded, &header, &cloud, rounding, &wanted)?;
     Ok(rounded)
 }
