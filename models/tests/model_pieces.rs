@@ -109,3 +109,20 @@ fn memory_does_not_grow_with_the_scene() {
     assert!(![0, 1].into_iter().any(grows), "{most:?}");
     assert!(most[1].iter().all(|bytes| (*bytes as u64) < 2 * piece_bytes(3)), "{most:?}");
 }
+
+#[test]
+fn a_sample_is_evenly_chosen_over_all_pieces_and_holds_constant_colours() {
+    let _alone = ALONE.lock().unwrap_or_else(|e| e.into_inner());
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.dgtr");
+    // Two whole pieces of 16,384 and a part of a third.
+    let (count, most) = (40_000, 700);
+    write(&path, count, 10_000).unwrap();
+    let model = Chunks::open(&path).unwrap();
+    let sample = model.sample(most).unwrap();
+    let every = count.div_ceil(most);
+    let chosen: Vec<f32> = (0..count).step_by(every).map(|i| i as f32).collect();
+    assert_eq!(sample.means.iter().map(|m| m[0]).collect::<Vec<_>>(), chosen);
+    assert_eq!((sample.sh_degree, sample.sh.len()), (0, 3 * chosen.len()));
+    assert_eq!(model.sample(count).unwrap().len(), count);
+}

@@ -6,10 +6,10 @@ use config::disk::Disk;
 use glam::{DVec2, DVec3};
 use models::camera::View;
 use models::cloud::GaussianCloud;
-use models::formats::model::{self, ModelHeader};
+use models::formats::model::{Chunks, ModelHeader};
 use models::ortho::OrthoError;
 use models::ortho::crs::Crs;
-use models::ortho::extent::{Extent, ViewsAround};
+use models::ortho::extent::{Extent, SAMPLE, ViewsAround};
 use models::ortho::files::{MapFiles, NO_HEIGHT, Written};
 use models::ortho::grid::{BLOCK, Block, BlockView, Grid};
 use vulkan::trainer::{Rendering, Trainer};
@@ -62,11 +62,10 @@ pub fn keep_scratch_in(folder: &Path) {
 /// # Errors
 /// The model, the device, or the disk.
 pub fn draw_file(model: &Path, device: Option<&str>, folder: &Path) -> Result<Written, JobError> {
-    let (header, cloud) = model::read(model)?;
-    let map = Map::of(&header, &cloud, &MapRequest::default())?;
-    let mut trainer = map_renderer(device, &cloud)?;
-    drop(cloud);
-    let written = map.write(&mut trainer, &header, (&Disk::default(), folder), |_, _| true)?;
+    let model = Chunks::open(model)?;
+    let map = Map::of_file(&model, &MapRequest::default())?;
+    let mut trainer = map_renderer(device, &model)?;
+    let written = map.write(&mut trainer, &model.header, (&Disk::default(), folder), |_, _| true)?;
     written.ok_or_else(|| JobError::System("a map was not finished".into()))
 }
 
@@ -81,6 +80,14 @@ pub struct DrawnBlock {
 }
 
 impl Map {
+    /// The map of a model's file, of which a piece is in memory at a time.
+    ///
+    /// # Errors
+    /// Those of [`Map::of`]; the file cannot be read any more.
+    pub fn of_file(model: &Chunks, request: &MapRequest) -> Result<Self, JobError> {
+        Self::of(&model.header, &model.sample(SAMPLE)?, request)
+    }
+
     /// The map of a model.
     ///
     /// # Errors

@@ -8,7 +8,7 @@ use std::path::Path;
 use glam::{DMat4, DVec2, DVec3, DVec4};
 use hal::sim::world::{FromAbove, MapKind, World};
 use models::cloud::GaussianCloud;
-use models::formats::model::{self, ModelHeader};
+use models::formats::model::{self, Chunks, ModelHeader};
 use models::ortho::files::NO_HEIGHT;
 use models::ortho::grid::{Block, Grid};
 use serde::Serialize;
@@ -78,14 +78,14 @@ pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> 
         arguments.extend_from_slice(more);
         let folder = out.join(name);
         child::run(&arguments, &folder, None)?.report(name)?;
-        Ok::<_, JobError>(model::read(&folder.join("model.dgtr"))?)
+        Ok::<_, JobError>(folder.join("model.dgtr"))
     };
     // One step moves nothing: these are the Gaussians as the depth maps were fused into them.
-    let (_, first) = train("fused", &["--steps".into(), "1".into()])?;
-    let (header, cloud) = train("trained", training)?;
-    let map = Map::of(&header, &cloud, &MapRequest { min_views, ..MapRequest::default() })?;
-    let compared = draw(&map, &cloud, &world)?;
-    let origin = header.origin.map_or(0.0, |o| o.alt_m);
+    let (_, first) = model::read(&train("fused", &["--steps".into(), "1".into()])?)?;
+    let model = Chunks::open(&train("trained", training)?)?;
+    let map = Map::of_file(&model, &MapRequest { min_views, ..MapRequest::default() })?;
+    let compared = draw(&map, &model, &world)?;
+    let origin = model.header.origin.map_or(0.0, |o| o.alt_m);
     let level: Vec<bool> = (0..compared.truth.len()).map(|i| compared.is_level(i)).collect();
     let fused = fused_heights(&first, &compared, map.grid().gsd());
     let errors_of = |height: &dyn Fn(usize) -> Option<f64>| {
@@ -100,7 +100,7 @@ pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> 
     Ok(MapScores {
         gsd_m: map.grid().gsd(),
         pixels: drawn,
-        covered: drawn as f64 / seen_pixels(&map, &header, &compared) as f64,
+        covered: drawn as f64 / seen_pixels(&map, &model.header, &compared) as f64,
         psnr: compared.psnr(),
         shift_px,
         squares,
@@ -119,8 +119,8 @@ fn seen_pixels(map: &Map, header: &ModelHeader, compared: &Compared) -> usize {
     (0..compared.truth.len()).filter(seen).count().max(1)
 }
 
-fn draw(map: &Map, cloud: &GaussianCloud, world: &World) -> Result<Compared, JobError> {
-    let mut trainer = map_renderer(None, cloud)?;
+fn draw(map: &Map, model: &Chunks, world: &World) -> Result<Compared, JobError> {
+    let mut trainer = map_renderer(None, model)?;
     let grid = map.grid();
     let [columns, rows] = grid.size().map(|n| n as usize);
     let n = columns * rows;

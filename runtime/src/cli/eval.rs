@@ -5,13 +5,13 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use models::dataset::Dataset;
-use models::formats::model::{self, ModelHeader};
+use models::formats::model::{Chunks, ModelHeader};
 use serde::Serialize;
 
 use super::CliError;
 use super::plan::largest;
 use crate::cli::output::outln;
-use crate::engine::device::{map_renderer, renderer};
+use crate::engine::device::{file_renderer, map_renderer};
 use crate::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
 use crate::ortho::{Map, MapRequest};
 use crate::transfer::stem;
@@ -82,10 +82,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if frames.is_empty() {
         return Err(CliError::input(format!("{}: split {:?} holds no pictures", dataset.display(), args.split)));
     }
-    let (header, cloud, _) = model::read_what_is_there(&args.model)?;
     let (width, height) = largest(&set, &frames, args.scale)?;
     let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
-    let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
+    let (header, mut trainer) = file_renderer(args.device.as_deref(), &args.model, (width, height))?;
     let into = IntoModel::of(&set, &header);
     let scores = evaluate(&mut trainer, &set, &frames, args.scale, &into, metric.as_mut(), args.save.as_deref())?;
     let naive = match args.baselines {
@@ -95,7 +94,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if args.json {
         let answer = Answer {
             scores: &scores,
-            gaussians: cloud.len(),
+            gaussians: trainer.gaussians(),
             steps: header.steps,
             split: &args.split,
             region: args.region.as_deref(),
@@ -121,7 +120,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         row("ground-plane warp", &naive.ground_warp);
         row("mean colour", &naive.mean_color);
     }
-    outln!("{} Gaussians after {} steps", cloud.len(), header.steps);
+    outln!("{} Gaussians after {} steps", trainer.gaussians(), header.steps);
     Ok(())
 }
 
@@ -130,10 +129,10 @@ fn figures(psnr: f64, fitted: f64, ssim: f64) -> String {
 }
 
 fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
-    let (header, cloud) = model::read(&args.model)?;
-    let map = Map::of(&header, &cloud, &MapRequest::default())?;
-    let points = heights::reference(reference, &header, &map)?;
-    let mut trainer = map_renderer(args.device.as_deref(), &cloud)?;
+    let model = Chunks::open(&args.model)?;
+    let map = Map::of_file(&model, &MapRequest::default())?;
+    let points = heights::reference(reference, &model.header, &map)?;
+    let mut trainer = map_renderer(args.device.as_deref(), &model)?;
     let scores = heights::compare(&map, &mut trainer, &points)?;
     if args.json {
         outln!("{}", serde_json::to_string(&scores).map_err(CliError::failed)?);

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use config::disk::Disk;
-use models::formats::model;
+use models::formats::model::Chunks;
 
 use super::CliError;
 use crate::engine::device::map_renderer;
@@ -51,7 +51,7 @@ fn four(text: &str) -> Result<[f64; 4], String> {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let (header, cloud) = model::read(&args.model)?;
+    let model = Chunks::open(&args.model)?;
     let request = MapRequest {
         gsd: args.gsd.map(|cm| cm / 100.0),
         epsg: args.epsg,
@@ -59,16 +59,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
         min_views: args.min_views,
         ..MapRequest::default()
     };
-    let map = Map::of(&header, &cloud, &request)?;
-    let mut trainer = map_renderer(args.device.as_deref(), &cloud)?;
-    drop(cloud);
+    let map = Map::of_file(&model, &request)?;
+    let mut trainer = map_renderer(args.device.as_deref(), &model)?;
     let stop = interrupt::Interrupt::install()?;
     let [columns, rows] = map.grid().size();
     let total = map.grid().blocks().count() as u64;
     let mut progress = console::Progress::new("drawing", total);
     std::fs::create_dir_all(&args.out).map_err(JobError::io(&args.out))?;
     keep_scratch_in(&args.out);
-    let written = map.write(&mut trainer, &header, (&Disk::default(), &args.out), |done, _| {
+    let written = map.write(&mut trainer, &model.header, (&Disk::default(), &args.out), |done, _| {
         progress.set(done as u64, || format!("{columns} × {rows} pixels"));
         !stop.requested()
     })?;

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use image::{ImageBuffer, Luma};
 use models::camera::View;
 use models::formats::reconstruction::Shot;
-use models::formats::{FormatError, model, transforms, write_atomic};
+use models::formats::{FormatError, transforms, write_atomic};
 use models::metrics::to_rgb8;
 use vulkan::trainer::Rendering;
 
 use super::CliError;
-use crate::engine::device::renderer;
+use crate::engine::device::file_renderer;
 use crate::evaluate::save_png;
 use crate::transfer::stem;
 use crate::{console, interrupt};
@@ -50,8 +50,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         cameras.shots.iter().map(|s| Ok((stem(&s.path), view(&args.cameras, s)?))).collect::<Result<_, CliError>>()?;
     let width = views.iter().map(|v| v.1.intrinsics.width).max().unwrap_or(1);
     let height = views.iter().map(|v| v.1.intrinsics.height).max().unwrap_or(1);
-    let (_, cloud, _) = model::read_what_is_there(&args.model)?;
-    let mut trainer = renderer(args.device.as_deref(), &cloud, width, height)?;
+    let (_, mut trainer) = file_renderer(args.device.as_deref(), &args.model, (width, height))?;
     let stop = interrupt::Interrupt::install()?;
     let mut progress = console::Progress::new("rendering", views.len() as u64);
     let mut rendering = Rendering::default();

@@ -9,11 +9,14 @@ use config::plan::{Lanes, Plan, PlanError, PlanRequest};
 use config::training::{ShSettings, TrainSettings};
 use models::camera::Intrinsics;
 use models::cloud::GaussianCloud;
+use models::formats::FormatError;
+use models::formats::model::{self, Chunks, ModelHeader};
 use models::ortho::grid::BLOCK;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use vulkan::trainer::{TrainError, Trainer};
 
+use super::pieces;
 use crate::error::JobError;
 use crate::{devices, kernels};
 
@@ -144,30 +147,63 @@ fn allocated(folder: &Path, bytes: u64) -> std::io::Result<File> {
 /// # Errors
 /// No device, or not enough of its memory; an empty cloud.
 pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height: u32) -> Result<Trainer, JobError> {
-    renderer_of(device, cloud, (width, height), INSTANCES_PER_PIXEL)
+    let mut trainer = filled_renderer(device, (cloud.sh_degree, cloud.len()), (width, height), INSTANCES_PER_PIXEL)?;
+    trainer.load(cloud)?;
+    Ok(trainer)
+}
+
+/// The same of a model's file, of which the host never holds more than a piece; what the file says about itself. Of a file that is cut
+/// short: what is there.
+///
+/// # Errors
+/// Those of [`renderer`], and of [`model::read_what_is_there`].
+pub fn file_renderer(
+    device: Option<&str>,
+    path: &Path,
+    (width, height): (u32, u32),
+) -> Result<(ModelHeader, Trainer), JobError> {
+    let model = match Chunks::open(path) {
+        Err(FormatError::Truncated { .. } | FormatError::TooLarge { .. }) => {
+            let (header, cloud, _) = model::read_what_is_there(path)?;
+            return Ok((header, renderer(device, &cloud, width, height)?));
+        }
+        model => model?,
+    };
+    let trainer = renderer_of_pieces(device, &model, (width, height), INSTANCES_PER_PIXEL)?;
+    Ok((model.header, trainer))
 }
 
 /// The same for the blocks of a map, in less memory: where more Gaussians meet, a block is drawn in bands.
 ///
 /// # Errors
-/// Those of [`renderer`].
-pub fn map_renderer(device: Option<&str>, cloud: &GaussianCloud) -> Result<Trainer, JobError> {
-    renderer_of(device, cloud, (BLOCK, BLOCK), INSTANCES_PER_MAP_PIXEL)
+/// Those of [`renderer`]; the model cannot be read any more.
+pub fn map_renderer(device: Option<&str>, model: &Chunks) -> Result<Trainer, JobError> {
+    renderer_of_pieces(device, model, (BLOCK, BLOCK), INSTANCES_PER_MAP_PIXEL)
 }
 
-fn renderer_of(
+fn renderer_of_pieces(
     device: Option<&str>,
-    cloud: &GaussianCloud,
-    (width, height): (u32, u32),
+    model: &Chunks,
+    size: (u32, u32),
     instances_per_pixel: usize,
 ) -> Result<Trainer, JobError> {
-    if cloud.is_empty() {
+    let mut trainer = filled_renderer(device, (model.sh_degree, model.count), size, instances_per_pixel)?;
+    pieces::load(&mut trainer, model)?;
+    Ok(trainer)
+}
+
+/// One for so many Gaussians, of which there must be some.
+fn filled_renderer(
+    device: Option<&str>,
+    (sh_degree, gaussians): (u8, usize),
+    size: (u32, u32),
+    instances_per_pixel: usize,
+) -> Result<Trainer, JobError> {
+    if gaussians == 0 {
         let what = "the model holds no Gaussians; train it first (dgtr train continues it)";
         return Err(JobError::Request(what.into()));
     }
-    let mut trainer = empty_renderer(device, (cloud.sh_degree, cloud.len()), (width, height), instances_per_pixel)?;
-    trainer.load(cloud)?;
-    Ok(trainer)
+    empty_renderer(device, (sh_degree, gaussians), size, instances_per_pixel)
 }
 
 /// One for any clouds of at most `gaussians` of this SH degree, one after another.

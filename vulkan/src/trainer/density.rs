@@ -92,14 +92,7 @@ impl Trainer {
         let _phase = tracing::trace_span!("density control").entered();
         let since_flush = self.steps - self.density.last_flush;
         let d = self.settings.density;
-        // With a budget in seconds the number of steps is what the pace so far promises.
-        let spent = self.spent_share();
-        let expected = if self.settings.seconds.is_some() && spent > 0.01 {
-            (self.spent().0 as f32 / spent) as u32
-        } else {
-            self.settings.steps
-        };
-        let interval = d.interval(expected);
+        let interval = d.interval(self.expected_steps());
         let due = match self.scene.is_paged() {
             true => self.window_ends(),
             false => self.steps - self.density.last >= interval,

@@ -46,8 +46,61 @@ impl Trainer {
     }
 
     /// The share of its steps or seconds that is spent.
-    pub(super) fn spent_share(&self) -> f32 {
+    fn spent_share(&self) -> f32 {
         let (steps, seconds) = self.spent();
         self.settings.progress(steps, seconds)
+    }
+
+    /// How many steps the schedule takes, wherever it begins. With a budget in seconds that is what the pace so far promises.
+    pub(super) fn expected_steps(&self) -> u32 {
+        let share = self.spent_share();
+        match self.settings.seconds {
+            Some(_) if share > 0.01 => (self.spent().0 as f32 / share) as u32,
+            _ => self.settings.steps,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use config::plan::{Plan, PlanRequest};
+
+    use super::*;
+    use crate::gpu::Gpu;
+    use crate::synthetic::plain;
+
+    fn trainer() -> Option<Trainer> {
+        let Ok(gpu) = Gpu::open(None) else {
+            println!("skipped: no Vulkan device");
+            return None;
+        };
+        let request = PlanRequest { width: 48, height: 32, views: 1, max_gaussians: Some(10), ..Default::default() };
+        Some(Trainer::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap())
+    }
+
+    #[test]
+    fn a_schedule_takes_as_many_steps_wherever_it_begins() {
+        let Some(mut t) = trainer() else { return };
+        t.settings.steps = 100_000;
+        // A tenth of the seconds for a thousand steps.
+        t.set_seconds(Some(100.0));
+        t.continue_from(1_000, 10.0);
+        for begun_at in [0.0, 0.5] {
+            t.begin_at(begun_at);
+            assert!((t.progress() - (begun_at + (1.0 - begun_at) * 0.1)).abs() < 1e-6);
+            assert!(t.expected_steps().abs_diff(10_000) <= 1, "{}", t.expected_steps());
+        }
+    }
+
+    #[test]
+    fn before_a_pace_is_known_and_without_seconds_the_schedule_takes_its_steps() {
+        let Some(mut t) = trainer() else { return };
+        t.settings.steps = 7_000;
+        t.set_seconds(Some(100.0));
+        t.continue_from(50, 0.5);
+        assert_eq!(t.expected_steps(), 7_000);
+        t.set_seconds(None);
+        t.continue_from(1_000, 90.0);
+        assert_eq!(t.expected_steps(), 7_000);
     }
 }

@@ -78,6 +78,25 @@ impl Chunks {
         Ok(dropped)
     }
 
+    /// At most `most` of the valid Gaussians, evenly chosen, of SH degree 0.
+    ///
+    /// # Errors
+    /// As [`super::read`].
+    pub fn sample(&self, most: usize) -> Result<GaussianCloud, FormatError> {
+        let every = self.count.div_ceil(most.max(1)).max(1);
+        let (mut sample, mut at) = (GaussianCloud::with_capacity(0, self.count.min(most)), 0usize);
+        self.each::<FormatError>(&mut |piece| {
+            let first = at.next_multiple_of(every) - at;
+            for i in (first..piece.len()).step_by(every) {
+                let constant = &piece.sh[i * piece.sh_stride()..][..3];
+                sample.push(piece.means[i], piece.log_scales[i], piece.rotations[i], piece.opacity_logits[i], constant);
+            }
+            at += piece.len();
+            Ok(())
+        })?;
+        Ok(sample)
+    }
+
     fn columns<E: From<FormatError>>(
         &self,
         header: usize,
