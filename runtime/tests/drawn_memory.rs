@@ -5,9 +5,13 @@
 #[path = "../../tests/peak_allocator.rs"]
 mod peak_allocator;
 
+use std::sync::PoisonError;
+
+use config::disk::Disk;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
+use models::formats::delivery::Rounding;
 use models::formats::model::{self, Chunks, ModelHeader, piece_bytes};
 use models::ortho::extent::SAMPLE;
 use peak_allocator::peak_of;
@@ -15,6 +19,9 @@ use runtime::engine::device::{file_renderer, renderer};
 use runtime::ortho::{Map, MapRequest};
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{Rendering, Trainer};
+
+/// The mark is the process's: one test at a time.
+static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 /// Gaussians along each side of the ground, half a metre apart.
 const ALONG: usize = 400;
@@ -51,6 +58,7 @@ fn drawn(trainer: &mut Trainer) -> Vec<f32> {
 
 #[test]
 fn a_file_is_drawn_and_mapped_as_if_it_were_read_whole_in_the_memory_of_a_piece() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     if Gpu::list().is_err() {
         return println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
     }
@@ -77,4 +85,21 @@ fn a_file_is_drawn_and_mapped_as_if_it_were_read_whole_in_the_memory_of_a_piece(
     assert_eq!(map_of_file, map_of_cloud);
     let most = pieces + SAMPLE * 4 * 20;
     assert!(peak < most, "{peak} bytes of {most}");
+}
+
+#[test]
+fn of_a_file_that_is_cut_short_what_is_there_is_drawn() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    if Gpu::list().is_err() {
+        return println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+    }
+    let dir = tempfile::tempdir().expect("temp dir");
+    let path = dir.path().join("m.dgtr");
+    model::write_rounded(&Disk::default(), &path, &ModelHeader::default(), &ground(), &Rounding::default())
+        .expect("written");
+    let whole = file_renderer(None, &path, (64, 48)).expect("a device").1.gaussians();
+    let bytes = std::fs::read(&path).expect("read");
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).expect("cut");
+    let part = file_renderer(None, &path, (64, 48)).expect("a part").1.gaussians();
+    assert!(whole == COUNT && part > COUNT / 8 && part < COUNT, "{part} of {whole}");
 }

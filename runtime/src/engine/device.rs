@@ -152,8 +152,8 @@ pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height:
     Ok(trainer)
 }
 
-/// The same of a model's file, of which the host never holds more than a piece; what the file says about itself. Of a file that is cut
-/// short: what is there.
+/// The same of a model's file, of which the host never holds more than a piece (a cell of one that is rounded; one of version 2 whole);
+/// what the file says about itself. Of a file that is cut short: what is there.
 ///
 /// # Errors
 /// Those of [`renderer`], and of [`model::read_what_is_there`].
@@ -162,15 +162,18 @@ pub fn file_renderer(
     path: &Path,
     (width, height): (u32, u32),
 ) -> Result<(ModelHeader, Trainer), JobError> {
-    let model = match Chunks::open(path) {
-        Err(FormatError::Truncated { .. } | FormatError::TooLarge { .. }) => {
+    let whole = Chunks::open(path).map_err(JobError::from).and_then(|model| {
+        let trainer = renderer_of_pieces(device, &model, (width, height), INSTANCES_PER_PIXEL)?;
+        Ok((model.header, trainer))
+    });
+    match whole {
+        // Whether cells are there shows when they are read.
+        Err(JobError::File(FormatError::Truncated { .. } | FormatError::TooLarge { .. })) => {
             let (header, cloud, _) = model::read_what_is_there(path)?;
-            return Ok((header, renderer(device, &cloud, width, height)?));
+            Ok((header, renderer(device, &cloud, width, height)?))
         }
-        model => model?,
-    };
-    let trainer = renderer_of_pieces(device, &model, (width, height), INSTANCES_PER_PIXEL)?;
-    Ok((model.header, trainer))
+        whole => whole,
+    }
 }
 
 /// The same for the blocks of a map, in less memory: where more Gaussians meet, a block is drawn in bands.
