@@ -1,13 +1,14 @@
 #!/bin/sh
 # What crops are worth on real pictures: brighton_beach's card reduced to 1,600 x 900 with the data set's poses, whole pictures trained at
-# 640 x 360, `dgtr bench detail`, then crops in all steps from progress 0.2 on. Needs the data: DGTR_DATA, or ../shared beside the repository.
-#   tests/brighton.sh [OUT] [SECONDS]
+# a quarter of that size, 400 x 225, `dgtr bench detail`, then crops in all steps from progress 0.2 on. Needs the data: DGTR_DATA, or ../shared beside the repository.
+#   tests/brighton.sh [OUT] [SECONDS] [SCALE]
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 data="${DGTR_DATA:-$here/../shared}/data"
 [ -d "$data/brighton_beach_card" ] || { echo "brighton.sh: $data is not there; set DGTR_DATA to the folder that holds data/"; exit 0; }
 out="${1:-brighton-out}"
 seconds="${2:-60}"
+scale="${3:-0.25}"
 dgtr="$here/target/release/dgtr"
 [ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
 mkdir -p "$out/data/images"
@@ -28,7 +29,7 @@ description.update(camera_model="OPENCV", fl_x=951.0, fl_y=951.0, cx=800.0, cy=4
 json.dump(description, open(out + "/transforms.json", "w"))
 shutil.copy(data + "/brighton_beach/split.json", out)
 PY
-"$dgtr" --quiet bench detail "$out/data" --out "$out" --scale 0.4 --seconds "$seconds"
+"$dgtr" --quiet bench detail "$out/data" --out "$out" --scale "$scale" --seconds "$seconds"
 printf '[training.crops]\nfrom = 0.2\nshare = 1.0\n' > "$out/early.toml"
-"$dgtr" --quiet train "$out/data" --out "$out/early" --fresh --no-eval --scale 0.4 --max-gaussians 100000 --seconds "$seconds" --settings "$out/early.toml"
+"$dgtr" --quiet train "$out/data" --out "$out/early" --fresh --no-eval --scale "$scale" --max-gaussians 100000 --seconds "$seconds" --settings "$out/early.toml"
 "$dgtr" --quiet eval "$out/early/model.dgtr" "$out/data" --split test --scale 1

@@ -94,8 +94,10 @@ pub struct Trainer {
     /// Those on the device.
     gaussians: usize,
     extent: f32,
-    /// Steps taken since `load`.
-    steps: u32,
+    /// Updates of the Gaussians since `load`: one for each picture looked at, or for each part of one.
+    updates: u32,
+    /// Pictures looked at since `load`, parts of them by their share of its pixels.
+    looked: f64,
     /// Whether the lazy Adam updates of all Gaussians are done.
     flushed: bool,
     /// Gradients are left where the first moments are, and nothing moves (gradient checks).
@@ -108,14 +110,14 @@ pub struct Trainer {
     before: (u32, f64),
     /// Progress at which the schedule begins.
     begun_at: f32,
-    /// Steps and seconds at which the schedule began anew.
-    since: (u32, f64),
+    /// Pictures looked at and seconds spent when the schedule began anew.
+    since: (f64, f64),
     counters: Counters,
 }
 
 impl std::fmt::Debug for Trainer {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Trainer({} Gaussians, {} views, step {})", self.gaussians, self.views.len(), self.steps)
+        write!(f, "Trainer({} Gaussians, {} views, step {})", self.gaussians, self.views.len(), self.updates)
     }
 }
 
@@ -182,14 +184,15 @@ impl Trainer {
             strategy: Strategy::None,
             gaussians: 0,
             extent: 1.0,
-            steps: 0,
+            updates: 0,
+            looked: 0.0,
             flushed: true,
             gradients_only: false,
             timed_every: TIMED_EVERY,
             elapsed_s: 0.0,
             before: (0, 0.0),
             begun_at: 0.0,
-            since: (0, 0.0),
+            since: (0.0, 0.0),
             counters: Counters::default(),
             settings: settings.clone(),
         })
@@ -197,9 +200,9 @@ impl Trainer {
 
     /// Starts the schedule anew for the Gaussians just loaded.
     fn restart(&mut self) {
-        self.steps = 0;
+        (self.updates, self.looked) = (0, 0.0);
         self.elapsed_s = 0.0;
-        (self.before, self.since, self.begun_at) = ((0, 0.0), (0, 0.0), 0.0);
+        (self.before, self.since, self.begun_at) = ((0, 0.0), (0.0, 0.0), 0.0);
         self.flushed = true;
         self.deferred.reset();
         self.sampler.look_at_newest(false);
@@ -208,7 +211,7 @@ impl Trainer {
         self.strategy = self.settings.density.resolve(self.gaussians(), self.plan.scene);
         self.counters = Counters::default();
         self.extent = 0.0;
-        self.density.last = 0;
+        self.density.last = 0.0;
         self.density.last_flush = 0;
         self.degrees.reset();
         self.commands.clear_times();
@@ -230,7 +233,7 @@ impl Trainer {
             self.settings.steps = MOST_STEPS;
         }
         self.settings.seconds = budget.seconds.or(self.settings.seconds);
-        let start = (Instant::now(), self.steps, self.elapsed_s);
+        let start = (Instant::now(), self.steps());
         let mut reason = StopReason::Schedule;
         let mut last = None;
         let mut patience = run::Patience::default();
@@ -248,7 +251,7 @@ impl Trainer {
             }
         }
         Ok(TrainSummary {
-            steps: self.steps - start.1,
+            steps: self.steps() - start.1,
             seconds: start.0.elapsed().as_secs_f64(),
             reason,
             gaussians: self.gaussians(),
@@ -267,9 +270,10 @@ impl Trainer {
         self.gaussians + self.scene.away
     }
 
-    /// Steps taken since the last [`Trainer::load`].
+    /// Steps taken since the last [`Trainer::load`]: pictures looked at. Where a scene is larger than the device a picture is looked at
+    /// in parts, each of which updates the Gaussians, and its step is over when they amount to it.
     pub fn steps(&self) -> u32 {
-        self.steps
+        self.looked as u32
     }
 
     /// The plan everything was allocated by.
@@ -330,7 +334,7 @@ impl Trainer {
             return Ok(());
         }
         self.frame.gaussians = self.gaussians as u32;
-        self.frame.step = self.steps + 1;
+        self.frame.step = self.updates + 1;
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
         let all = Push { mode: 1, ..Push::default() };

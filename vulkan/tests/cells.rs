@@ -7,6 +7,8 @@ mod scenes;
 
 use config::plan::{Plan, PlanRequest};
 use config::training::{Strategy, TrainSettings};
+use std::ops::ControlFlow;
+
 use counting_allocator::allocations;
 use glam::DVec3;
 use models::camera::{OrthographicView, View};
@@ -14,7 +16,7 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{Rendering, TrainError, Trainer};
+use vulkan::trainer::{CropPlace, Rendering, RunBudget, TrainError, Trainer};
 
 /// A trainer of `on_device` Gaussians at once, of a scene of so many, for three views of 64 × 48.
 fn trainer(on_device: usize, scene: Option<usize>, settings: &TrainSettings) -> Option<Trainer> {
@@ -65,10 +67,10 @@ fn model(trainer: &mut Trainer) -> GaussianCloud {
     model
 }
 
-/// `steps` in a window before the next is chosen.
-fn windows_of(steps: u32) -> TrainSettings {
+/// So many updates in a window before the next is chosen.
+fn windows_of(updates: u32) -> TrainSettings {
     let mut settings = plain();
-    settings.cells.steps = steps;
+    settings.cells.updates = updates;
     settings.density.strategy = Strategy::None;
     // The scene is as wide as its places are apart; a step is not.
     (settings.rates.mean_start, settings.rates.mean_end) = (1e-6, 1e-6);
@@ -98,8 +100,8 @@ fn what_a_window_trains_is_what_a_trainer_of_the_whole_scene_would_to_the_bit() 
 
 #[test]
 fn every_place_comes_to_its_turn_and_the_same_seed_gives_the_same_bytes() {
-    let after = |snapshots: bool| {
-        let mut t = trainer(400, Some(900), &windows_of(7))?;
+    let after = |updates: u32, snapshots: bool| {
+        let mut t = trainer(400, Some(900), &windows_of(updates))?;
         t.load(&three_places()).unwrap();
         for place in 0..3 {
             let v = look(place);
@@ -119,9 +121,11 @@ fn every_place_comes_to_its_turn_and_the_same_seed_gives_the_same_bytes() {
         assert_eq!(t.gaussians(), 900);
         Some(model(&mut t))
     };
-    let Some(model) = after(false) else { return };
-    assert!(model == after(false).unwrap());
-    assert!(model == after(true).unwrap(), "a snapshot changed what followed");
+    for updates in [1, 7] {
+        let Some(model) = after(updates, false) else { return };
+        assert!(model == after(updates, false).unwrap());
+        assert!(model == after(updates, true).unwrap(), "a snapshot changed what followed");
+    }
 }
 
 #[test]
@@ -160,11 +164,13 @@ fn a_picture_of_a_scene_in_cells_is_that_of_the_whole_scene_to_the_bit() {
 
 #[test]
 fn drawing_between_two_steps_changes_nothing_of_what_follows() {
-    let after = |draws: bool| {
-        let mut t = trainer(400, Some(900), &windows_of(32))?;
+    let after = |updates: u32, draws: bool| {
+        let mut t = trainer(400, Some(900), &windows_of(updates))?;
         t.load(&three_places()).unwrap();
-        let v = look(0);
-        t.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
+        for place in [0, 1] {
+            let v = look(place);
+            t.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
+        }
         // Drawing ends a window that is over, and with that settles the order of cells: the last step is in the midst of one.
         for _ in 0..70 {
             // Where the lazy Adam updates are done anyway.
@@ -174,8 +180,10 @@ fn drawing_between_two_steps_changes_nothing_of_what_follows() {
         }
         Some(model(&mut t))
     };
-    let Some(undisturbed) = after(false) else { return };
-    assert!(undisturbed == after(true).unwrap());
+    for updates in [1, 32] {
+        let Some(undisturbed) = after(updates, false) else { return };
+        assert!(undisturbed == after(updates, true).unwrap(), "windows of {updates}");
+    }
 }
 
 #[test]
@@ -204,16 +212,89 @@ fn a_scene_that_outgrows_the_device_goes_into_cells_and_grows_on() {
 
 #[test]
 fn windows_allocate_nothing() {
-    let Some(mut t) = trainer(400, Some(900), &windows_of(5)) else { return };
-    t.load(&three_places()).unwrap();
+    for updates in [1, 5] {
+        let Some(mut t) = trainer(400, Some(900), &windows_of(updates)) else { return };
+        t.load(&three_places()).unwrap();
+        for place in 0..3 {
+            let v = look(place);
+            t.add_view(&posed(&v, &photo(place as u64, &v)), None).unwrap();
+        }
+        (0..4).for_each(|_| _ = t.step().unwrap());
+        let before = allocations();
+        (0..40).for_each(|_| _ = t.step().unwrap());
+        assert_eq!(allocations() - before, 0, "windows of {updates}");
+    }
+}
+
+/// Three places of many small Gaussians, seen from afar: of each a device of 150 holds a part.
+fn three_places_afar() -> GaussianCloud {
+    let mut scene = three_places();
+    scene.log_scales.iter_mut().for_each(|s| *s = s.map(|s| s.min(-2.0) - 2.5));
+    scene.means.iter_mut().for_each(|m| m[2] += 30.0);
+    scene
+}
+
+/// A camera at each place that sees it as a whole.
+fn look_from_afar(place: usize) -> View {
+    let mut v = look(place);
+    v.intrinsics.fx *= 7.0;
+    v.intrinsics.fy *= 7.0;
+    v
+}
+
+#[test]
+fn a_step_is_a_picture_looked_at_however_many_parts_it_takes() {
+    let mut settings = windows_of(1);
+    settings.steps = 12;
+    let Some(mut t) = trainer(150, Some(900), &settings) else { return };
+    t.load(&three_places_afar()).unwrap();
     for place in 0..3 {
-        let v = look(place);
+        let v = look_from_afar(place);
         t.add_view(&posed(&v, &photo(place as u64, &v)), None).unwrap();
     }
-    (0..4).for_each(|_| _ = t.step().unwrap());
-    let before = allocations();
-    (0..40).for_each(|_| _ = t.step().unwrap());
-    assert_eq!(allocations() - before, 0);
+    let mut steps = Vec::new();
+    let summary = t.run(&RunBudget::default(), &mut |report| {
+        steps.push(report.step);
+        ControlFlow::Continue(())
+    });
+    let summary = summary.unwrap();
+    assert!(steps.len() >= 18, "{} updates", steps.len());
+    assert!(steps.is_sorted() && steps[0] == 1 && (12..=13).contains(steps.last().unwrap()), "{steps:?}");
+    assert_eq!((summary.steps, t.steps(), t.spent().0, t.progress()), (12, 12, 12, 1.0));
+    assert_eq!(summary.counters.windows as usize, steps.len());
+}
+
+#[test]
+fn crops_of_a_scene_in_cells_are_trained_in_parts_too() {
+    let mut settings = windows_of(1);
+    (settings.crops.from, settings.crops.share) = (0.0, 0.5);
+    let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+    let request = PlanRequest {
+        device_mib: 64,
+        width: 64,
+        height: 48,
+        views: 1,
+        crops: 2,
+        max_gaussians: Some(150),
+        scene_gaussians: Some(900),
+        ..Default::default()
+    };
+    let mut t = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+    t.keep_scene_in(tempfile::tempfile().unwrap());
+    t.keep_views_in(tempfile::tempfile().unwrap());
+    t.load(&three_places_afar()).unwrap();
+    let v = look_from_afar(0);
+    t.add_view(&posed(&v, &photo(0, &v)), None).unwrap();
+    let large = View { intrinsics: v.intrinsics.resized(128, 96), ..v };
+    let picture = posed(&large, &photo(0, &large)).image;
+    for x in [0, 64] {
+        let place = CropPlace { x, y: 24, whole: (128, 96) };
+        t.add_crop(0, &image::imageops::crop_imm(&picture, x, 24, 64, 48).to_image(), None, place).unwrap();
+    }
+    let of_crops = (0..40).filter(|_| t.step().unwrap().crop.is_some()).count();
+    assert!((16..=20).contains(&of_crops), "{of_crops} of 40");
+    let cells = t.cells();
+    assert!(cells.1 > 0 && cells.1 < cells.0, "{cells:?}");
 }
 
 #[test]

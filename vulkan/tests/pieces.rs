@@ -162,7 +162,7 @@ fn a_source_that_fails_or_changes_is_an_error_and_the_next_scene_is_whole() {
         };
         // After so many readings it fails, or gives fewer, more, or others.
         let mut noticed = [0; 4];
-        for (readings, change) in (0..6).flat_map(|readings| (0..4).map(move |change| (readings, change))) {
+        for (readings, change) in (0..20).flat_map(|readings| (0..4).map(move |change| (readings, change))) {
             let read = Cell::new(0);
             let loaded = t.load_pieces::<TrainError>(&|take| {
                 let over = read.replace(read.get() + 1) >= readings;

@@ -2,18 +2,21 @@
 
 use super::{Plan, SECTION_ALIGNMENT, sh_columns};
 
-/// Gaussians of a block of the file; a cell owns whole blocks. Some 30 KiB: large enough that a disk reads them at its pace, small
+/// Gaussians of a block of the file; a cell owns whole blocks. Some 20 KiB: large enough that a disk reads them at its pace, small
 /// beside a cell.
-pub const BLOCK_GAUSSIANS: usize = 64;
+pub const BLOCK_GAUSSIANS: usize = 32;
 /// Gaussians of a cell that its last block may leave empty on average: bounds how many cells there may be.
 const LEAST_GAUSSIANS_PER_CELL: usize = 4 * BLOCK_GAUSSIANS;
 /// Even a small scene is worth so many cells: some 10 MiB of the file.
 const LEAST_CELLS: usize = 256;
-/// Bytes on the host per cell: key, bounds, blocks, and the lists of a window (96), and a tree of as many cells while the scene is divided
-/// (160: entries of 76 in nodes that are half full).
-const CELL_BYTES: u64 = 256;
-/// Bytes on the host per Gaussian on the device: its cell, and the order in which it is written.
-const TAG_BYTES: u64 = 8;
+/// More of them would take longer to choose from than they spare.
+const MOST_CELLS: usize = 16 << 10;
+/// Bytes on the host per cell: key, bounds, blocks, and the lists of a window (112), and a tree of as many keys while the scene is divided
+/// (40: entries of 16 in nodes that are half full).
+const CELL_BYTES: u64 = 152;
+/// Bytes on the host per Gaussian on the device: its cell, the order in which it is written, whether it left a hole, and where it was
+/// before something was drawn.
+const TAG_BYTES: u64 = 16;
 
 impl Plan {
     /// Whether there may be more Gaussians than the device holds at once.
@@ -23,7 +26,7 @@ impl Plan {
 
     /// Cells of ground that the scene is divided into at most.
     pub fn cells(&self) -> usize {
-        if self.is_paged() { (self.scene / LEAST_GAUSSIANS_PER_CELL).max(LEAST_CELLS) } else { 0 }
+        if self.is_paged() { (self.scene / LEAST_GAUSSIANS_PER_CELL).clamp(LEAST_CELLS, MOST_CELLS) } else { 0 }
     }
 
     /// Bytes of one Gaussian with Adam's moments, in the arena and in the file alike.
@@ -68,8 +71,8 @@ mod tests {
         let plan = Plan::new(&request).unwrap();
         assert!(plan.is_paged() && plan.total_bytes <= 512 << 20);
         assert_eq!(plan.record_bytes(), 144 + 192 + 192);
-        let blocks = 5_000_000usize.div_ceil(64) + plan.cells();
-        assert_eq!(plan.scene_file_bytes(), (blocks * 64 * 528) as u64);
+        let blocks = 5_000_000usize.div_ceil(BLOCK_GAUSSIANS) + plan.cells();
+        assert_eq!(plan.scene_file_bytes(), (blocks * BLOCK_GAUSSIANS * 528) as u64);
         assert!(plan.scene_file_bytes() < 5_000_000 * 528 * 5 / 4 + (1 << 20));
     }
 

@@ -88,7 +88,7 @@ impl Trainer {
     /// What the next step looks at.
     pub(super) fn choose(&mut self, progress: f32) -> Picture {
         let (share, views, crops) = (self.settings.views.residual_share, &self.views, &self.crops);
-        if !crops.is_empty() && self.settings.crops.is_due(self.steps, progress) {
+        if !crops.is_empty() && self.settings.crops.is_due(self.updates, progress) {
             Picture::Crop(self.crop_sampler.next(crops.len(), share, |i| crops[i].last_loss))
         } else {
             Picture::View(self.sampler.next(views.len(), share, |i| views[i].last_loss))
@@ -97,7 +97,7 @@ impl Trainer {
 
     /// What [`Self::choose`] will give after the step at work, as far as that is known.
     pub(super) fn next_picture(&self) -> Option<Picture> {
-        if !self.crops.is_empty() && self.settings.crops.is_due(self.steps + 1, self.progress()) {
+        if !self.crops.is_empty() && self.settings.crops.is_due(self.updates + 1, self.progress()) {
             self.crop_sampler.peek().map(Picture::Crop)
         } else {
             self.sampler.peek().map(Picture::View)

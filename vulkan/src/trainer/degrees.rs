@@ -52,7 +52,7 @@ impl Trainer {
         self.degrees.raises = due;
         self.flush()?;
         let limit = self.settings.sh.degree.min(self.plan.sh_degree);
-        let (n, parameters, t) = (self.gaussians, self.parameters, self.steps as i32);
+        let (n, parameters, t) = (self.gaussians, self.parameters, self.updates as i32);
         let unbias = |beta: f32| 1.0 / (1.0 - f64::from(beta).powi(t)) as f32;
         let (first, second) = (unbias(self.settings.adam.beta1), unbias(self.settings.adam.beta2));
         let Degrees { asks, ranked, .. } = &mut self.degrees;

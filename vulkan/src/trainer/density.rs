@@ -25,7 +25,8 @@ pub(crate) struct Scratch {
     /// Gaussians to copy and where to.
     moves: Vec<[u32; 2]>,
     binomials: Vec<[f64; MOST_COPIES]>,
-    pub last: u32,
+    /// Pictures looked at when it was last done.
+    pub last: f64,
     pub last_flush: u32,
 }
 
@@ -43,7 +44,7 @@ impl Scratch {
             copies: vec![0; capacity],
             moves: Vec::with_capacity(capacity),
             binomials,
-            last: 0,
+            last: 0.0,
             last_flush: 0,
         }
     }
@@ -90,35 +91,34 @@ impl Trainer {
     /// Runs density control when its time has come.
     pub(super) fn control_density(&mut self, progress: f32) -> Result<(), TrainError> {
         let _phase = tracing::trace_span!("density control").entered();
-        let since_flush = self.steps - self.density.last_flush;
+        let since_flush = self.updates - self.density.last_flush;
         let d = self.settings.density;
         let interval = d.interval(self.expected_steps());
-        let due = match self.scene.is_paged() {
-            true => self.window_ends(),
-            false => self.steps - self.density.last >= interval,
-        };
+        let since = (self.looked - self.density.last) as f32;
+        let paged = self.scene.is_paged();
+        let share = if paged { self.density_due(since, interval) } else { since / interval.max(1) as f32 };
+        let due = share >= 1.0 && (!paged || self.window_ends());
         if self.strategy == Strategy::None || progress >= d.until || !due {
             if since_flush >= FLUSH_EVERY {
                 self.flush()?;
-                self.density.last_flush = self.steps;
+                self.density.last_flush = self.updates;
             }
             return Ok(());
         }
         self.flush()?;
-        self.density.last_flush = self.steps;
-        self.density.last = self.steps;
-        let share = if self.scene.is_paged() { self.window_share(interval) } else { 1.0 };
-        self.decay_opacities(progress, share);
+        self.density.last_flush = self.updates;
+        self.density.last = self.looked;
+        self.decay_opacities(progress);
         self.drop_non_finite();
         match self.strategy {
             Strategy::Prune => self.prune(),
-            _ => self.relocate_and_grow(share)?,
+            _ => self.relocate_and_grow()?,
         }
         Ok(())
     }
 
-    fn decay_opacities(&mut self, progress: f32, share: f32) {
-        let amount = f64::from(self.settings.regularise.opacity_decay * (1.0 - progress) * share);
+    fn decay_opacities(&mut self, progress: f32) {
+        let amount = f64::from(self.settings.regularise.opacity_decay * (1.0 - progress));
         if amount <= 0.0 {
             return;
         }
@@ -155,10 +155,9 @@ impl Trainer {
         self.scene.truncate(self.gaussians);
     }
 
-    /// Grows by `share` of what a densification may add.
-    fn relocate_and_grow(&mut self, share: f32) -> Result<(), TrainError> {
+    fn relocate_and_grow(&mut self) -> Result<(), TrainError> {
         let n = self.gaussians;
-        let grown = (n as f32 * self.settings.density.growth * share) as usize;
+        let grown = (n as f32 * self.settings.density.growth) as usize;
         if self.plan.is_paged() && !self.scene.is_paged() && n + grown > self.plan.gaussians {
             return self.enter_cells();
         }

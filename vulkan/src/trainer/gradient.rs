@@ -34,7 +34,7 @@ impl Trainer {
         self.measure_extent();
         self.open_degrees();
         self.forget_all();
-        let (_, first_pixel) = self.prepare_frame(Picture::View(index), Blocks::WHOLE, 1.0);
+        let (_, first_pixel, _) = self.prepare_frame(Picture::View(index), Blocks::WHOLE, 1.0);
         (self.frame.background, self.frame.drop_share) = ([0.0; 3], 0.0);
         self.write_frame();
         self.forward_count(Picture::View(index), first_pixel)?;

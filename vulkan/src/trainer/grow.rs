@@ -99,7 +99,7 @@ impl Trainer {
 
     /// What Adam multiplies second moments by, which begin at zero.
     fn second_unbias(&self) -> f32 {
-        (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(self.steps.max(1) as i32))) as f32
+        (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(self.steps().max(1) as i32))) as f32
     }
 
     /// Moves Gaussians and takes others out, as `fate` says of each by its number; never the last one. Returns how many went. Only
@@ -159,7 +159,7 @@ impl Trainer {
             });
             let g = &mut self.parameters.geometry_mut(&mut self.arena)[to];
             // It missed nothing before it was there.
-            g.state = state::up_to(g.state, self.steps);
+            g.state = state::up_to(g.state, self.updates);
             if all_degrees {
                 g.state = state::with_degree(g.state, self.plan.sh_degree);
             }

@@ -148,6 +148,12 @@ impl Parameters {
         }
     }
 
+    /// Sets the state word of a record.
+    pub fn write_state(record: &mut [u8], state: f32) {
+        let at = std::mem::offset_of!(Geometry, state);
+        record[at..at + size_of::<f32>()].copy_from_slice(bytemuck::bytes_of(&state));
+    }
+
     /// Holds Gaussian `index` where it is.
     fn hold(&self, arena: &mut Arena, index: usize) {
         self.geometry_mut(arena)[index].hold();

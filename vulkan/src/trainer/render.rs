@@ -69,7 +69,7 @@ impl Trainer {
         f.plain();
         let degree = self.settings.sh.degree_at(1.0).min(self.plan.sh_degree);
         (f.gaussians, f.sh_degree, f.divisor) = (self.gaussians as u32, degree.into(), 1);
-        f.step = self.steps + 1;
+        f.step = self.updates + 1;
         look(f);
         let whole = Window::whole(width, height);
         let rows = self.rows_per_window(&whole, width)?;

@@ -14,7 +14,7 @@ pub struct RunBudget {
 /// One step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
-    /// Number of this step, from 1.
+    /// Number of this step, from 1: of the pictures looked at, which a scene larger than the device makes of several updates.
     pub step: u32,
     /// The view it looked at.
     pub view: usize,

@@ -5,6 +5,7 @@
 //! Gaussian that is away. A cell that is away stands still; Adam's moments come back as they left. What happens depends on steps,
 //! never on how fast the disk is.
 
+mod begin;
 mod cell;
 mod drawing;
 mod growth;
@@ -32,8 +33,15 @@ use super::{TrainError, Trainer};
 const SAMPLED_MEANS: usize = 4096;
 /// Share of the ground that is left out on each side when the size of cells is chosen: strays.
 const STRAY_SHARE: f32 = 0.02;
-/// Cells are made smaller by 2^16 at most: Gaussians in one place would be in one cell whatever its size.
-const MOST_HALVINGS: u32 = 16;
+/// Cells are made smaller so often at most: Gaussians in one place would be in one cell whatever its size.
+const MOST_CHANGES: u32 = 16;
+/// This share of the cells wanted will do.
+const ENOUGH: f32 = 0.8;
+/// And this share, where smaller cells came to be no more than [`LEAST_GAIN`] times as many.
+const ENOUGH_IN_VAIN: f32 = 0.25;
+const LEAST_GAIN: f32 = 1.02;
+/// Cells are made larger by this factor until there are few enough.
+const WIDER: f32 = 1.2;
 
 /// Shows every Gaussian of a scene, in the same order each time.
 type Visit<'a, E> = &'a dyn Fn(&mut dyn FnMut(&Geometry)) -> Result<(), E>;
@@ -47,11 +55,23 @@ struct Cell {
     /// Where its Gaussians lie in the file, or lay before they came to the device.
     chain: Chain,
     on_device: bool,
+    /// Of the window: on the device but while something is drawn.
+    at_work: bool,
+    /// A copy of it is on the device, to be drawn.
+    copied: bool,
 }
 
 impl Cell {
     fn empty(key: CellKey) -> Self {
-        Self { key, bounds: Bounds::EMPTY, count: 0, chain: Chain::EMPTY, on_device: false }
+        Self {
+            key,
+            bounds: Bounds::EMPTY,
+            count: 0,
+            chain: Chain::EMPTY,
+            on_device: false,
+            at_work: false,
+            copied: false,
+        }
     }
 }
 
@@ -65,6 +85,13 @@ pub(crate) struct Scene {
     tags: Vec<u32>,
     /// Gaussians on the device by cell.
     order: Vec<u32>,
+    /// Where in `order` each cell begins, and in the end where it ends.
+    starts: Vec<u32>,
+    /// Places on the device of those that left, in order.
+    holes: Vec<u32>,
+    /// While something is drawn: the cell of each Gaussian of the window, as `tags` will have it again.
+    places: Vec<u32>,
+    drawing: bool,
     /// Gaussians that are not on the device.
     pub away: usize,
     /// Every Gaussian is where the cells say: false from when the file fails while cells are moved until the next load.
@@ -85,6 +112,10 @@ impl Scene {
             store: Store::new(plan),
             tags: Vec::with_capacity(tags),
             order: Vec::with_capacity(tags),
+            starts: Vec::with_capacity(plan.cells()),
+            holes: Vec::with_capacity(tags),
+            places: Vec::with_capacity(tags),
+            drawing: false,
             away: 0,
             whole: true,
             window: Window::new(plan),
@@ -108,7 +139,7 @@ impl Scene {
         self.cells.clear();
         self.tags.clear();
         self.store.clear();
-        (self.away, self.whole) = (0, true);
+        (self.away, self.whole, self.drawing) = (0, true, false);
         self.window.close();
     }
 
@@ -179,22 +210,24 @@ impl Scene {
         let wanted = ((n as f32 / per_cell) as usize).clamp(1, plan.cells());
         let side = (self.wide(0) * self.wide(1) / wanted as f32).sqrt();
         self.grid.side = if side.is_finite() && side > 0.0 { side } else { 1.0 };
-        let mut cells = self.counted(plan.cells(), visit)?;
+        let mut found = self.count(visit)?;
         // Ground is not all covered alike: where much of it is empty, cells are smaller.
-        for _ in 0..MOST_HALVINGS {
-            if cells.len() >= wanted {
+        let mut gains = true;
+        for _ in 0..MOST_CHANGES {
+            let share = found as f32 / wanted as f32;
+            if share >= if gains { ENOUGH } else { ENOUGH_IN_VAIN } {
                 break;
             }
-            drop(cells);
-            self.grid.side *= 0.5;
-            cells = self.counted(plan.cells(), visit)?;
+            // As many as there are come of a square metre, nearly: Gaussians as large as cells are in coarser ones.
+            self.grid.side *= share.sqrt().clamp(0.5, 0.9);
+            let before = std::mem::replace(&mut found, self.count(visit)?);
+            gains = found as f32 >= LEAST_GAIN * before as f32;
         }
-        while cells.len() > plan.cells() && (self.grid.side * 2.0).is_finite() {
-            drop(cells);
-            self.grid.side *= 2.0;
-            cells = self.counted(plan.cells(), visit)?;
+        while found > self.cells.len() && (self.grid.side * WIDER).is_finite() {
+            self.grid.side *= WIDER;
+            found = self.count(visit)?;
         }
-        self.cells.extend(cells.into_values());
+        self.cells.sort_unstable_by_key(|cell| cell.key);
         Ok(())
     }
 
@@ -219,20 +252,27 @@ impl Scene {
         along[along.len() - 1 - strays] - along[strays]
     }
 
-    /// Cells of the present size that have Gaussians, counted and bounded. Of more than `most` one more than that, which are no use.
-    fn counted<E>(&self, most: usize, visit: Visit<'_, E>) -> Result<BTreeMap<CellKey, Cell>, E> {
-        let mut cells = BTreeMap::new();
+    /// Counts and bounds the cells of the present size that have Gaussians, in no order. How many they are: one more than there is room
+    /// for where they are more, which are no use then.
+    fn count<E>(&mut self, visit: Visit<'_, E>) -> Result<usize, E> {
+        let Self { cells, grid, .. } = self;
+        cells.clear();
+        let (mut index, mut too_many) = (BTreeMap::new(), false);
         visit(&mut |g| {
-            let key = self.grid.key(g.mean, cell::reach_of(g));
-            if cells.len() <= most {
-                cells.entry(key).or_insert_with(|| Cell::empty(key));
+            let key = grid.key(g.mean, cell::reach_of(g));
+            let at = *index.entry(key).or_insert(cells.len() as u32) as usize;
+            if at == cells.len() {
+                if cells.len() == cells.capacity() {
+                    index.remove(&key);
+                    too_many = true;
+                    return;
+                }
+                cells.push(Cell::empty(key));
             }
-            if let Some(cell) = cells.get_mut(&key) {
-                cell.count += 1;
-                cell.bounds.add(g);
-            }
+            cells[at].count += 1;
+            cells[at].bounds.add(g);
         })?;
-        Ok(cells)
+        Ok(cells.len() + usize::from(too_many))
     }
 
     /// The cell of a Gaussian; `None` when no cell was counted there.

@@ -20,7 +20,7 @@ impl Trainer {
         let share = f64::from(progress.clamp(0.0, 1.0));
         let steps = (share * f64::from(self.settings.steps)) as u32;
         self.before = (steps, share * self.settings.seconds.unwrap_or(0.0));
-        self.since = (self.steps, self.elapsed_s);
+        self.since = (self.looked, self.elapsed_s);
     }
 
     /// Until the next [`Trainer::load`] the schedule begins at `progress`, 0…1, and takes as long as it would from its beginning: what is
@@ -36,8 +36,8 @@ impl Trainer {
 
     /// Steps and seconds spent on the schedule, earlier processes' included.
     pub fn spent(&self) -> (u32, f64) {
-        let (steps, seconds) = (self.steps - self.since.0, self.elapsed_s - self.since.1);
-        (self.before.0.saturating_add(steps), self.before.1 + seconds)
+        let (looked, seconds) = (self.looked - self.since.0, self.elapsed_s - self.since.1);
+        (self.before.0.saturating_add(looked as u32), self.before.1 + seconds)
     }
 
     /// Where in the schedule it is, 0…1.

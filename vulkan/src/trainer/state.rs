@@ -26,6 +26,14 @@ pub(super) fn up_to(state: f32, step: u32) -> f32 {
     f32::from_bits(state.to_bits() & !(STATE_STEPS | STATE_STEPS << 13) | step | step << 13)
 }
 
+/// The state word with the steps missed up to `step` instead of those it was last moved in, or the other way round.
+pub(super) fn turned(state: f32, step: u32) -> f32 {
+    let word = state.to_bits();
+    let missed = |last: u32| step.wrapping_sub(last) & STATE_STEPS;
+    let fields = missed(word) | missed(word >> 13) << 13;
+    f32::from_bits(word & !(STATE_STEPS | STATE_STEPS << 13) | fields)
+}
+
 /// Degree of the highest coefficient (r, g, b each) that is not zero.
 pub(super) fn degree_in_use(coefficients: &[f32]) -> u8 {
     let used = coefficients.iter().rposition(|c| *c != 0.0).map_or(0, |i| i / 3 + 1);
@@ -50,6 +58,19 @@ mod tests {
                 assert!(renewed.is_normal());
             }
         }
+    }
+
+    #[test]
+    fn what_is_away_keeps_what_it_missed_and_misses_no_more() {
+        let word = with_degree(up_to(state(0), 0), 2);
+        // Moved in step 8,190 and, its SH, in 8,187; taken off after 8,200, put on after 20,000.
+        let word = f32::from_bits(word.to_bits() | 8190 | 8187 << 13);
+        let away = turned(word, 8200);
+        assert!(away.is_normal());
+        assert_eq!((away.to_bits() & STATE_STEPS, away.to_bits() >> 13 & STATE_STEPS, degree_of(away)), (10, 13, 2));
+        let back = turned(away, 20_000).to_bits();
+        assert_eq!((back & STATE_STEPS, back >> 13 & STATE_STEPS), (19_990 & STATE_STEPS, 19_987 & STATE_STEPS));
+        assert_eq!(turned(turned(word, 777), 777).to_bits(), word.to_bits());
     }
 
     #[test]

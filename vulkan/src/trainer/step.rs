@@ -26,30 +26,32 @@ impl Trainer {
         if self.gaussians() == 0 {
             return Err(TrainError::Empty { non_finite: 0 });
         }
-        let _step = tracing::trace_span!("step", step = self.steps + 1).entered();
+        let _step = tracing::trace_span!("step", step = self.updates + 1).entered();
         let start = Instant::now();
         self.measure_extent();
-        if self.steps == 0 {
+        if self.updates == 0 {
             self.open_degrees();
         }
         let progress = self.progress();
         let (picture, part) = if self.scene.is_paged() {
-            self.hold_window()?;
+            self.hold_window(progress)?;
             self.choose_part(progress)
         } else {
             (self.choose(progress), Blocks::WHOLE)
         };
-        let (divisor, first_pixel) = self.prepare_frame(picture, part, progress);
+        let (divisor, first_pixel, share) = self.prepare_frame(picture, part, progress);
         self.deferred.write(&mut self.frame.deferred);
         self.write_frame();
-        self.commands.weigh(super::timed_weight(self.steps, self.timed_every));
+        self.commands.weigh(super::timed_weight(self.updates, self.timed_every));
         let counted = self.forward_count(picture, first_pixel)?;
         self.read_ahead();
         self.forward_backward()?;
         self.commands.weigh(1.0);
-        self.steps += 1;
+        let adam_step = self.adam_step();
+        self.updates += 1;
+        self.looked += share;
         self.flushed = false;
-        self.deferred.push(self.steps, self.frame.mean_rate, self.settings.rates.decay(progress));
+        self.deferred.push(adam_step, self.frame.mean_rate, self.settings.rates.decay(progress));
         self.elapsed_s += start.elapsed().as_secs_f64();
         let mut report = self.read_loss(picture, counted, divisor, progress);
         self.arena.failure()?;
@@ -63,8 +65,8 @@ impl Trainer {
         Ok(report)
     }
 
-    /// Fills the frame for a part of a picture; returns the resolution divisor and where in the picture it begins.
-    pub(super) fn prepare_frame(&mut self, picture: Picture, part: Blocks, progress: f32) -> (u32, u32) {
+    /// Fills the frame for a part of a picture; returns the resolution divisor, where in the picture it begins, and its share of it.
+    pub(super) fn prepare_frame(&mut self, picture: Picture, part: Blocks, progress: f32) -> (u32, u32, f64) {
         let s = &self.settings;
         let resident = &self.views[self.view_of(picture)];
         let (mut view, depth_at) = match picture {
@@ -80,10 +82,12 @@ impl Trainer {
         (lens.width, lens.height) = (width, height);
         (lens.fx, lens.fy, lens.cx, lens.cy) = (lens.fx / d, lens.fy / d, lens.cx / d, lens.cy / d);
         // A pixel weighs the same whether its picture is looked at whole or in parts: Adam's moments know no difference.
-        let whole = (width * height) as f32;
+        let whole = f64::from(width) * f64::from(height);
         let ((x, width), (y, height)) = (Blocks::pixels(part.x, width), Blocks::pixels(part.y, height));
-        let share = (width * height) as f32 / whole;
+        let pixels_share = f64::from(width) * f64::from(height) / whole;
+        let (share, whole) = (pixels_share as f32, whole as f32);
         (lens.cx, lens.cy, lens.width, lens.height) = (lens.cx - x as f32, lens.cy - y as f32, width, height);
+        let t = self.adam_step();
         let f = &mut *self.frame;
         f.look(&view);
         let has_depth = depth_at != 0 && s.loss.depth > 0.0;
@@ -114,15 +118,20 @@ impl Trainer {
         (f.mean_rate, f.log_scale_rate, f.rotation_rate) = (mean / decay, r.log_scale, r.rotation);
         (f.opacity_rate, f.sh_dc_rate, f.sh_rest_rate) = (r.opacity, r.sh_dc, r.sh_rest);
         (f.noise, f.max_noise) = (s.regularise.noise * mean, self.extent);
-        let t = self.steps + 1;
         (f.beta1, f.beta2, f.epsilon) = (s.adam.beta1, s.adam.beta2, s.adam.epsilon);
         f.moment_scale = self.plan.moment_scale();
         let bias = |beta: f32| (1.0 / (1.0 - f64::from(beta).powi(t as i32))) as f32;
         (f.first_bias, f.second_bias) = (decay * bias(s.adam.beta1), bias(s.adam.beta2));
-        (f.step, f.seed) = (t, (s.seed ^ (s.seed >> 32)) as u32);
+        (f.step, f.seed) = (self.updates + 1, (s.seed ^ (s.seed >> 32)) as u32);
         (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * whole), s.loss.ssim / (3.0 * whole));
         (f.source_width, f.depth_offset) = (source_width, depth_at);
-        (divisor, (y * source_width + x) * divisor)
+        (divisor, (y * source_width + x) * divisor, pixels_share)
+    }
+
+    /// Of the present update, as Adam corrects the bias of its moments by it. Gaussians are updated as often in so many steps whether
+    /// pictures are looked at whole or in parts.
+    fn adam_step(&self) -> u32 {
+        self.steps() + 1
     }
 
     /// First submission: picture, projection, sort, counts.
@@ -219,7 +228,7 @@ impl Trainer {
             view.adjust.move_exposure(sums.exposure, &s.rates, &s.adam);
         }
         StepReport {
-            step: self.steps,
+            step: self.looked.ceil() as u32,
             view: index,
             crop: if let Picture::Crop(crop) = picture { Some(crop) } else { None },
             loss,

@@ -22,14 +22,10 @@ fn take(engine: &mut Reconstruction) {
     assert!(engine.build(&|| true).expect("built"));
 }
 
+/// Looks at so many pictures, in parts.
 fn train(engine: &mut Reconstruction, steps: u32) {
-    let budget = RunBudget { steps: Some(100), seconds: None };
-    let mut left = steps;
-    let mut each = |_: &_| {
-        left -= 1;
-        if left == 0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    };
-    engine.train(&budget, &mut each).expect("trains");
+    let budget = RunBudget { steps: Some(engine.trainer.spent().0 + steps), seconds: None };
+    engine.train(&budget, &mut |_| ControlFlow::Continue(())).expect("trains");
 }
 
 fn trained(engine: &mut Reconstruction) -> GaussianCloud {

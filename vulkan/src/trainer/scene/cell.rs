@@ -130,36 +130,45 @@ impl Sight {
     /// The blocks in which Gaussians of a cell may show; `None` when none of them can.
     pub fn blocks(&self, bounds: &Bounds) -> Option<Blocks> {
         let [x, y] = [0, 1].map(|axis| self.along(axis, bounds));
-        let in_front = bounds.most(self.axes[2]) + self.shift.z >= self.near;
         match (x, y) {
-            (Some(x), Some(y)) if in_front => Some(Blocks { x, y }),
+            (Some(x), Some(y)) if self.is_in_front(bounds) => Some(Blocks { x, y }),
             _ => None,
         }
     }
 
+    /// Whether Gaussians of a cell may show in a part: quicker than [`Self::blocks`].
+    pub fn shows_in(&self, part: Blocks, bounds: &Bounds) -> bool {
+        let along = |axis: usize, [first, end]: [u8; 2]| {
+            self.beyond(axis, bounds, -1.0, usize::from(end)) && self.beyond(axis, bounds, 1.0, usize::from(first))
+        };
+        along(0, part.x) && along(1, part.y) && self.is_in_front(bounds)
+    }
+
+    fn is_in_front(&self, bounds: &Bounds) -> bool {
+        bounds.most(self.axes[2]) + self.shift.z >= self.near
+    }
+
     /// First block and one past the last along an axis.
     fn along(&self, axis: usize, bounds: &Bounds) -> Option<[u8; 2]> {
-        let reach = bounds.reach * self.slant[axis];
-        let edges = &self.edges[axis];
-        // Of the planes through the camera and a boundary, on which sides something of the cell lies.
-        let beyond = |side: f32, edge: f32| {
-            let (per_depth, constant) = if self.perspective {
-                (self.blur[axis] - side * edge, 0.0)
-            } else {
-                (0.0, self.blur[axis] - side * edge)
-            };
-            let direction = side * self.axes[axis] + per_depth * self.axes[2];
-            let shift = side * self.shift[axis] + per_depth * self.shift.z;
-            // Sums of large numbers lose bits: a millionth of them is given away.
-            let lost = 1e-6 * (shift.abs() + bounds.low.abs().max(bounds.high.abs()).max_element() + reach);
-            bounds.most(direction) + shift + constant + reach + lost > 0.0
-        };
-        if !beyond(-1.0, edges[usize::from(SIDE)]) || !beyond(1.0, edges[0]) {
+        let beyond = |side: f32, edge: u8| self.beyond(axis, bounds, side, usize::from(edge));
+        if !beyond(-1.0, SIDE) || !beyond(1.0, 0) {
             return None;
         }
-        let first = (0..SIDE).find(|b| beyond(-1.0, edges[usize::from(*b) + 1]))?;
-        let last = (0..SIDE).rev().find(|b| beyond(1.0, edges[usize::from(*b)]))?;
+        let first = (0..SIDE).find(|b| beyond(-1.0, b + 1))?;
+        let last = (0..SIDE).rev().find(|b| beyond(1.0, *b))?;
         (first <= last).then_some([first, last + 1])
+    }
+
+    /// Whether something of a cell lies on that side, -1 or 1, of the plane through the camera and a boundary between blocks.
+    fn beyond(&self, axis: usize, bounds: &Bounds, side: f32, edge: usize) -> bool {
+        let (reach, edge) = (bounds.reach * self.slant[axis], self.edges[axis][edge]);
+        let (per_depth, constant) =
+            if self.perspective { (self.blur[axis] - side * edge, 0.0) } else { (0.0, self.blur[axis] - side * edge) };
+        let direction = side * self.axes[axis] + per_depth * self.axes[2];
+        let shift = side * self.shift[axis] + per_depth * self.shift.z;
+        // Sums of large numbers lose bits: a millionth of them is given away.
+        let lost = 1e-6 * (shift.abs() + bounds.low.abs().max(bounds.high.abs()).max_element() + reach);
+        bounds.most(direction) + shift + constant + reach + lost > 0.0
     }
 }
 

@@ -16,10 +16,12 @@ impl Trainer {
     /// too many.
     pub(in crate::trainer) fn hold_region(&mut self) -> Result<Option<usize>, TrainError> {
         let sight = Sight::of_region(&self.frame);
-        // A window that is over ends as it would have without the drawing.
-        self.end_window()?;
-        // Training moved what is on the device.
-        self.scene.measure(&self.arena, &self.parameters);
+        if !self.scene.drawing {
+            // A window that is over ends as it would have without the drawing.
+            self.end_window()?;
+            // Training moved what is on the device.
+            self.scene.measure(&self.arena, &self.parameters);
+        }
         let mut cells = std::mem::take(&mut self.scene.drawn);
         cells.clear();
         let (mut needed, mut away) = (0, false);
@@ -27,11 +29,11 @@ impl Trainer {
             if sight.blocks(&cell.bounds).is_some() {
                 cells.push(i as u32);
                 needed += cell.count;
-                away |= !cell.on_device;
+                away |= !(cell.on_device || cell.copied);
             }
         }
         let fits = needed <= self.plan.gaussians;
-        let done = if away && fits { self.page_out(false).and_then(|()| self.page_in(&cells)) } else { Ok(()) };
+        let done = if away && fits { self.draw_instead(&cells) } else { Ok(()) };
         self.scene.drawn = cells;
         done.map(|()| (away && !fits).then_some(needed))
     }

@@ -17,18 +17,18 @@ impl Trainer {
             self.scene.tags.push(cell as u32);
         }
         self.scene.cells.iter_mut().for_each(|cell| cell.on_device = true);
-        self.page_out(false)
+        self.page_out()
     }
 
-    /// What a densification at the end of a window is worth of one in a schedule that holds the whole scene: each cell comes to its
-    /// turn once in as many steps as it takes to go through all of them.
-    pub(in crate::trainer) fn window_share(&self, interval: u32) -> f32 {
+    /// Where in a scene in cells densification stands, `steps` after the last one, as a share of one in a schedule that holds the whole
+    /// scene and densifies every `interval` steps: each cell comes to its turn once in as many steps as it takes to go through all.
+    pub(in crate::trainer) fn density_due(&self, steps: f32, interval: u32) -> f32 {
         let turns = self.gaussians() as f32 / self.gaussians.max(1) as f32;
-        (self.settings.cells.steps as f32 * turns / interval.max(1) as f32).min(1.0)
+        steps * turns / interval.max(1) as f32
     }
 
     /// Whether the step just taken was the last of its window.
     pub(in crate::trainer) fn window_ends(&self) -> bool {
-        self.steps >= self.scene.window.until
+        self.updates >= self.scene.window.until
     }
 }

@@ -1,10 +1,48 @@
 //! Cells onto the device and back, with their moments.
+//!
+//! Where Gaussians lie on the device decides bits of what follows, so it depends on steps alone: those that leave make room, in order,
+//! for those that come, and what a drawing takes off comes back to where it was.
 
 use super::cell::{self, Bounds};
 use super::{Cell, Scene};
 use crate::arena::Arena;
 use crate::trainer::parameters::{Held, Parameters};
 use crate::trainer::{TrainError, Trainer, state};
+
+/// The device's memory while cells come and go.
+struct Device<'a> {
+    arena: &'a mut Arena,
+    parameters: Parameters,
+    /// The last step taken.
+    step: u32,
+    /// The SH degree that all Gaussians have, where they have one.
+    degree: Option<u8>,
+}
+
+impl Device<'_> {
+    /// Copies Gaussian `index` to a record. Its state says there how many steps it missed: while it is away it misses none.
+    fn take_off(&self, index: usize, record: &mut [u8]) {
+        self.parameters.read_record(self.arena, index, record);
+        let missed = state::turned(self.parameters.geometry(self.arena)[index].state, self.step);
+        Parameters::write_state(record, missed);
+    }
+
+    /// Copies a record to place `index`.
+    fn put_on(&mut self, index: usize, record: &[u8]) {
+        self.parameters.write_record(self.arena, index, record);
+        let g = &mut self.parameters.geometry_mut(self.arena)[index];
+        g.state = state::turned(g.state, self.step);
+        if let Some(degree) = self.degree {
+            g.state = state::with_degree(g.state, degree);
+        }
+    }
+
+    /// Gaussian `index` missed nothing.
+    fn up_to_date(&mut self, index: usize) {
+        let g = &mut self.parameters.geometry_mut(self.arena)[index];
+        g.state = state::up_to(g.state, self.step);
+    }
+}
 
 impl Scene {
     /// Every Gaussian, cell by cell; `on_device` of them are there.
@@ -17,16 +55,14 @@ impl Scene {
             return (0..on_device).try_for_each(|i| take(Held::OnDevice(i)));
         }
         self.check_whole()?;
-        self.sort_by_cell(on_device);
+        self.sort_by_cell();
         let mut from = 0;
         for (index, cell) in self.cells.iter().enumerate() {
-            if cell.on_device {
-                let run = run_of(&self.order[from..], &self.tags, index as u32);
-                run.iter().try_for_each(|i| take(Held::OnDevice(*i as usize)))?;
-                from += run.len();
-            } else {
-                self.store.read(&cell.chain, |_, record| take(Held::InFile(record)))?;
-            }
+            // Of a cell that is away some may have come to be on the device, as those that left another one for it.
+            self.store.read(&cell.chain, |_, record| take(Held::InFile(record)))?;
+            let run = run_of(&self.order[from..], &self.tags, index as u32);
+            run.iter().try_for_each(|i| take(Held::OnDevice(*i as usize)))?;
+            from += run.len();
         }
         Ok(())
     }
@@ -41,48 +77,24 @@ impl Scene {
         }
     }
 
-    fn sort_by_cell(&mut self, on_device: usize) {
-        let Self { order, tags, .. } = self;
+    /// Those on the device, but for copies that are drawn.
+    fn sort_by_cell(&mut self) {
+        let Self { order, tags, starts, drawing, .. } = self;
         order.clear();
-        order.extend(0..on_device as u32);
-        order.sort_unstable_by_key(|i| (tags[*i as usize], *i));
-    }
-
-    /// Takes all Gaussians off the device. With `again`, those that left their cell are counted to the one they came to; cells may
-    /// have other indices then.
-    fn page_out(
-        &mut self,
-        arena: &Arena,
-        parameters: &Parameters,
-        on_device: usize,
-        again: bool,
-    ) -> Result<(), TrainError> {
-        self.check_whole()?;
-        if again {
-            self.count_to_cells_again(arena, parameters);
+        if *drawing {
+            return;
         }
-        self.sort_by_cell(on_device);
-        self.measure(arena, parameters);
-        self.whole = false;
-        let Self { cells, store, order, tags, .. } = self;
-        for cell in cells.iter_mut().filter(|cell| cell.on_device) {
-            store.forget(&mut cell.chain);
-            cell.on_device = false;
+        starts.clear();
+        starts.resize(self.cells.len(), 0);
+        tags.iter().for_each(|tag| starts[*tag as usize] += 1);
+        let mut before = 0;
+        starts.iter_mut().for_each(|start| before += std::mem::replace(start, before));
+        order.resize(tags.len(), 0);
+        for (i, tag) in tags.iter().enumerate() {
+            let start = &mut starts[*tag as usize];
+            order[*start as usize] = i as u32;
+            *start += 1;
         }
-        let mut from = 0;
-        while from < order.len() {
-            let index = tags[order[from] as usize];
-            let run = run_of(&order[from..], tags, index);
-            let cell = &mut cells[index as usize];
-            store.append(&mut cell.chain, run.len(), |i, record| {
-                parameters.read_record(arena, run[i] as usize, record);
-            })?;
-            from += run.len();
-        }
-        tags.clear();
-        self.away += on_device;
-        self.whole = true;
-        Ok(())
     }
 
     /// Counts and bounds the cells on the device, and those to which Gaussians came from there.
@@ -119,24 +131,129 @@ impl Scene {
         }
     }
 
-    /// Puts the cells `wanted`, in order, onto the empty device; returns how many Gaussians they have.
-    fn page_in(&mut self, arena: &mut Arena, parameters: &Parameters, wanted: &[u32]) -> Result<usize, TrainError> {
+    /// Writes those to the file whose cell does not stay; their places are holes then.
+    fn leave(&mut self, device: &Device<'_>, stays: impl Fn(&Cell) -> bool) -> Result<(), TrainError> {
+        self.check_whole()?;
+        self.sort_by_cell();
+        self.whole = false;
+        let Self { cells, store, order, tags, holes, .. } = self;
+        holes.clear();
+        let mut from = 0;
+        while from < order.len() {
+            let index = tags[order[from] as usize];
+            let run = run_of(&order[from..], tags, index);
+            let cell = &mut cells[index as usize];
+            if !stays(cell) {
+                store.append(&mut cell.chain, run.len(), |i, record| device.take_off(run[i] as usize, record))?;
+                holes.extend_from_slice(run);
+            }
+            from += run.len();
+        }
+        cells.iter_mut().for_each(|cell| cell.on_device &= stays(cell));
+        holes.sort_unstable();
+        self.away += holes.len();
+        self.whole = true;
+        Ok(())
+    }
+
+    /// Puts the cells at work that are away onto the device: into the holes, then behind the others. Whoever is last comes to the holes
+    /// that are left.
+    fn come(&mut self, device: &mut Device<'_>) -> Result<(), TrainError> {
         self.check_whole()?;
         self.whole = false;
-        let mut n = 0;
-        for &index in wanted {
-            let cell = &mut self.cells[index as usize];
-            self.store.read(&cell.chain, |i, record| {
-                parameters.write_record(arena, n + i, record);
+        let mut filled = 0;
+        let Self { cells, store, tags, holes, .. } = self;
+        for (index, cell) in cells.iter_mut().enumerate().filter(|(_, cell)| cell.at_work && !cell.on_device) {
+            store.read(&cell.chain, |_, record| {
+                let place = holes.get(filled).map_or(tags.len(), |hole| *hole as usize);
+                device.put_on(place, record);
+                match tags.get_mut(place) {
+                    Some(tag) => *tag = index as u32,
+                    None => tags.push(index as u32),
+                }
+                filled += 1;
                 Ok::<(), TrainError>(())
             })?;
+            self.away -= cell.chain.count as usize;
+            store.forget(&mut cell.chain);
             cell.on_device = true;
-            n += cell.chain.count as usize;
-            self.tags.resize(n, index);
         }
-        self.away -= n;
+        let left = filled.min(holes.len());
+        self.close_up(device, left);
         self.whole = true;
-        Ok(n)
+        Ok(())
+    }
+
+    /// The last ones come to the holes, but for the first `filled` of them.
+    fn close_up(&mut self, device: &mut Device<'_>, filled: usize) {
+        for hole in self.holes.drain(filled..).rev() {
+            let hole = hole as usize;
+            let Some(last) = self.tags.pop() else { break };
+            if let Some(tag) = self.tags.get_mut(hole) {
+                *tag = last;
+                device.parameters.shift(device.arena, self.tags.len(), hole);
+            }
+        }
+        self.holes.clear();
+    }
+
+    /// Takes the window off the device, remembers where each of it was, and puts copies of the cells `drawn`, by index and in order,
+    /// there instead.
+    fn draw_instead(&mut self, device: &mut Device<'_>, drawn: &[u32]) -> Result<(), TrainError> {
+        if !self.drawing {
+            self.leave(device, |_| false)?;
+            std::mem::swap(&mut self.tags, &mut self.places);
+            self.drawing = true;
+        }
+        self.forget_copies();
+        let Self { cells, store, tags, .. } = self;
+        for &index in drawn {
+            let (n, cell) = (tags.len(), &mut cells[index as usize]);
+            store.read(&cell.chain, |i, record| {
+                device.put_on(n + i, record);
+                // What it missed it still has to do: here it is drawn as it is.
+                device.up_to_date(n + i);
+                Ok::<(), TrainError>(())
+            })?;
+            tags.resize(n + cell.chain.count as usize, index);
+            cell.copied = true;
+        }
+        self.away -= self.tags.len();
+        Ok(())
+    }
+
+    fn forget_copies(&mut self) {
+        self.away += self.tags.len();
+        self.tags.clear();
+        self.cells.iter_mut().for_each(|cell| cell.copied = false);
+    }
+
+    /// Puts the window back to where each of it was.
+    fn end_drawing(&mut self, device: &mut Device<'_>) -> Result<(), TrainError> {
+        self.check_whole()?;
+        self.forget_copies();
+        self.whole = false;
+        std::mem::swap(&mut self.tags, &mut self.places);
+        self.drawing = false;
+        self.sort_by_cell();
+        let Self { cells, store, order, tags, .. } = self;
+        let mut from = 0;
+        while from < order.len() {
+            let index = tags[order[from] as usize];
+            let run = run_of(&order[from..], tags, index);
+            let cell = &mut cells[index as usize];
+            store.read(&cell.chain, |i, record| {
+                device.put_on(run[i] as usize, record);
+                Ok::<(), TrainError>(())
+            })?;
+            store.forget(&mut cell.chain);
+            from += run.len();
+        }
+        // A cell at work may have lost all it had.
+        cells.iter_mut().for_each(|cell| cell.on_device = cell.at_work);
+        self.away -= tags.len();
+        self.whole = true;
+        Ok(())
     }
 }
 
@@ -147,32 +264,64 @@ fn run_of<'a>(order: &'a [u32], tags: &[u32], index: u32) -> &'a [u32] {
 }
 
 impl Trainer {
-    /// Takes all cells off the device. With `again`, Gaussians that left their cell are counted to the one they came to, and cells may
-    /// have other indices.
-    pub(super) fn page_out(&mut self, again: bool) -> Result<(), TrainError> {
-        let _phase = tracing::trace_span!("page out").entered();
-        self.flush()?;
-        let moved = self.scene.store.moved;
-        self.scene.page_out(&self.arena, &self.parameters, self.gaussians, again)?;
-        self.counters.paged_bytes += self.scene.store.moved - moved;
-        self.gaussians = 0;
-        Ok(())
+    /// The scene and the device, to move cells between them.
+    fn moving(&mut self) -> (&mut Scene, Device<'_>) {
+        let degree = (self.settings.sh.raise_share >= 1.0).then_some(self.plan.sh_degree);
+        let device = Device { arena: &mut self.arena, parameters: self.parameters, step: self.updates, degree };
+        (&mut self.scene, device)
     }
 
-    /// Puts the cells `wanted`, by index and in order, onto the empty device.
-    pub(super) fn page_in(&mut self, wanted: &[u32]) -> Result<(), TrainError> {
-        let _phase = tracing::trace_span!("page in", cells = wanted.len()).entered();
+    /// Moves cells, and counts what was moved.
+    fn page(&mut self, how: impl FnOnce(&mut Scene, Device<'_>) -> Result<(), TrainError>) -> Result<(), TrainError> {
+        let _phase = tracing::trace_span!("page").entered();
         let moved = self.scene.store.moved;
-        self.gaussians = self.scene.page_in(&mut self.arena, &self.parameters, wanted)?;
+        let (scene, device) = self.moving();
+        let done = how(scene, device);
         self.counters.paged_bytes += self.scene.store.moved - moved;
-        // A cell that is away stands still: it missed nothing.
-        let (steps, all_degrees) = (self.steps, self.settings.sh.raise_share >= 1.0);
-        for g in &mut self.parameters.geometry_mut(&mut self.arena)[..self.gaussians] {
-            g.state = state::up_to(g.state, steps);
-            if all_degrees {
-                g.state = state::with_degree(g.state, self.plan.sh_degree);
-            }
+        self.gaussians = self.scene.tags.len();
+        done
+    }
+
+    /// Takes all off the device; no window is at work.
+    pub(super) fn page_out(&mut self) -> Result<(), TrainError> {
+        self.page(|scene, device| {
+            scene.leave(&device, |_| false)?;
+            scene.tags.clear();
+            Ok(())
+        })
+    }
+
+    /// Those that left their cell for one that is away leave the device, too.
+    pub(super) fn settle_in_cells(&mut self) -> Result<(), TrainError> {
+        self.page(|scene, mut device| {
+            scene.count_to_cells_again(device.arena, &device.parameters);
+            scene.measure(device.arena, &device.parameters);
+            scene.leave(&device, |cell| cell.on_device)?;
+            scene.close_up(&mut device, 0);
+            Ok(())
+        })
+    }
+
+    /// Has the cells `wanted`, by index, on the device instead of those that are there.
+    pub(super) fn exchange(&mut self, wanted: &[u32]) -> Result<(), TrainError> {
+        self.page(|scene, mut device| {
+            scene.cells.iter_mut().for_each(|cell| cell.at_work = false);
+            wanted.iter().for_each(|index| scene.cells[*index as usize].at_work = true);
+            scene.leave(&device, |cell| cell.at_work)?;
+            scene.come(&mut device)
+        })
+    }
+
+    /// Has copies of the cells `drawn`, by index and in order, on the device while something is drawn.
+    pub(super) fn draw_instead(&mut self, drawn: &[u32]) -> Result<(), TrainError> {
+        self.page(|scene, mut device| scene.draw_instead(&mut device, drawn))
+    }
+
+    /// Has the window back that was on the device before something was drawn.
+    pub(super) fn end_drawing(&mut self) -> Result<(), TrainError> {
+        if !self.scene.drawing {
+            return Ok(());
         }
-        Ok(())
+        self.page(|scene, mut device| scene.end_drawing(&mut device))
     }
 }

@@ -2,12 +2,43 @@
 
 use super::cell::{Blocks, SIDE};
 
-/// The rectangles that are halved from the whole picture down to the block (x, y), the largest first.
-pub(super) fn parts_around(x: u8, y: u8) -> impl Iterator<Item = Blocks> {
-    let around = |at: u8, side: u8| [at / side * side, at / side * side + side];
-    [(8, 8), (4, 8), (4, 4), (2, 4), (2, 2), (1, 2), (1, 1)]
-        .into_iter()
-        .map(move |(w, h)| Blocks { x: around(x, w), y: around(y, h) })
+/// The part around the block (x, y) in which at most `room` Gaussians show, and how many do, as `seen` counts them. It grows by a side
+/// at a time, the one whose blocks add the fewest Gaussians each.
+///
+/// # Errors
+/// How many show in the block alone, where that is more than there is room for.
+pub(super) fn grown_around(
+    (x, y): (u8, u8),
+    room: usize,
+    seen: impl Fn(Blocks) -> usize,
+) -> Result<(Blocks, usize), usize> {
+    let mut part = Blocks { x: [x, x + 1], y: [y, y + 1] };
+    let mut needed = seen(part);
+    if needed > room {
+        return Err(needed);
+    }
+    loop {
+        let larger = part.larger().map(|p| (p, seen(p))).filter(|(_, needed)| *needed <= room);
+        let each = |p: &(Blocks, usize)| (p.1 - needed) as f32 / (p.0.count() - part.count()) as f32;
+        match larger.min_by(|a, b| each(a).total_cmp(&each(b))) {
+            Some(best) => (part, needed) = best,
+            None => return Ok((part, needed)),
+        }
+    }
+}
+
+impl Blocks {
+    /// This part and one more row or column.
+    fn larger(self) -> impl Iterator<Item = Self> {
+        let Self { x: [left, right], y: [top, bottom] } = self;
+        let sides = [
+            (left > 0).then(|| Self { x: [left - 1, right], ..self }),
+            (right < SIDE).then(|| Self { x: [left, right + 1], ..self }),
+            (top > 0).then(|| Self { y: [top - 1, bottom], ..self }),
+            (bottom < SIDE).then(|| Self { y: [top, bottom + 1], ..self }),
+        ];
+        sides.into_iter().flatten()
+    }
 }
 
 /// The largest rectangle all of whose bits are in `mask`; `None` when it has none.
@@ -59,9 +90,22 @@ mod tests {
     }
 
     #[test]
-    fn parts_halve_from_the_whole_picture_down_to_the_block() {
-        let parts: Vec<Blocks> = parts_around(5, 2).collect();
-        assert_eq!((parts[0], parts[6]), (Blocks::WHOLE, Blocks { x: [5, 6], y: [2, 3] }));
-        assert!(parts.windows(2).all(|p| p[0].count() == 2 * p[1].count() && p[0].mask() & p[1].mask() == p[1].mask()));
+    fn a_part_grows_to_where_little_shows_and_no_further_than_there_is_room() {
+        // One Gaussian a block, in the columns from 4 on ten.
+        let seen = |part: Blocks| {
+            let columns = (part.x[0]..part.x[1]).map(|x| if x < 4 { 1 } else { 10 }).sum::<usize>();
+            columns * usize::from(part.y[1] - part.y[0])
+        };
+        assert_eq!(grown_around((1, 6), 32, seen), Ok((Blocks { x: [0, 4], y: [0, 8] }, 32)));
+        assert_eq!(grown_around((1, 6), 1000, seen), Ok((Blocks::WHOLE, 352)));
+        assert_eq!(grown_around((5, 5), 9, seen), Err(10));
+        let (part, needed) = grown_around((7, 0), 47, seen).unwrap();
+        assert!(part.mask() >> 7 & 1 == 1 && needed <= 47 && needed == seen(part), "{part:?} {needed}");
+        assert!(part.larger().all(|p| seen(p) > 47), "{part:?}");
+    }
+
+    #[test]
+    fn what_shows_nowhere_is_no_hindrance() {
+        assert_eq!(grown_around((3, 3), 0, |_| 0), Ok((Blocks::WHOLE, 0)));
     }
 }

@@ -216,6 +216,7 @@ mod tests {
     fn cells_that_grow_by_turns_lie_one_behind_the_other_where_room_was_set_aside() {
         let mut store = store();
         let mut cells = [Chain::EMPTY; 2];
+        // Blocks of 32: five and three of them.
         for (cell, records) in cells.iter_mut().zip([150, 65]) {
             store.set_aside(cell, records).unwrap();
         }
@@ -224,12 +225,12 @@ mod tests {
             store.append(&mut cells[1], if round < 13 { 5 } else { 0 }, |i, r| r.fill(5 * round + i as u8)).unwrap();
         }
         let [a, b] = cells;
-        assert_eq!([a.first, a.last, b.first, b.last], [0, 2, 3, 4]);
+        assert_eq!([a.first, a.last, b.first, b.last], [0, 4, 5, 7]);
         assert_eq!((read(&mut store, &a), read(&mut store, &b)), ((0..150).collect(), (0..65).collect()));
         // One more than was asked for comes to a block of its own, and all come back.
-        cells.iter_mut().for_each(|c| store.append(c, 64, |_, r| r.fill(1)).unwrap());
+        cells.iter_mut().for_each(|c| store.append(c, BLOCK_GAUSSIANS, |_, r| r.fill(1)).unwrap());
         cells.iter_mut().for_each(|c| store.forget(c));
-        assert!(store.append(&mut { Chain::EMPTY }, 64 * store.next.len(), |_, _| {}).is_ok());
+        assert!(store.append(&mut { Chain::EMPTY }, BLOCK_GAUSSIANS * store.next.len(), |_, _| {}).is_ok());
     }
 
     #[test]
@@ -237,13 +238,13 @@ mod tests {
         let mut store = store();
         for _ in 0..2 {
             let mut chains = vec![Chain::EMPTY; store.next.len()];
-            chains.iter_mut().for_each(|c| store.append(c, 64, |_, r| r.fill(1)).unwrap());
+            chains.iter_mut().for_each(|c| store.append(c, BLOCK_GAUSSIANS, |_, r| r.fill(1)).unwrap());
             let error = store.append(&mut { Chain::EMPTY }, 1, |_, _| {}).unwrap_err();
             assert!(error.to_string().contains("no block left"), "{error}");
             chains.iter_mut().for_each(|c| store.forget(c));
         }
         store.clear();
-        assert!(store.append(&mut { Chain::EMPTY }, 64 * store.next.len(), |_, _| {}).is_ok());
+        assert!(store.append(&mut { Chain::EMPTY }, BLOCK_GAUSSIANS * store.next.len(), |_, _| {}).is_ok());
     }
 
     #[test]

@@ -1,8 +1,9 @@
 //! Which cells are on the device, for how long, and which parts of which pictures are trained meanwhile.
 //!
-//! A window begins with the block of a picture that was looked at least and takes the cells which a part around it sees, and the
-//! nearest for as long as there is room: the same ground, seen from many places. What is trained is that part, and of every
-//! picture the largest rectangle that sees no cell which is away meanwhile.
+//! A window [begins](super::begin) with a part of a picture that was looked at least, and the cells which that part sees. Where it lasts
+//! for one update, cells stay beside those for as long as there is room, as the next window may want them. Where it lasts for several,
+//! the nearest cells come, too: the same ground, seen from many places, and of every picture the largest rectangle is trained that sees
+//! no cell which is away meanwhile.
 
 use config::plan::Plan;
 use config::training::Strategy;
@@ -10,23 +11,24 @@ use glam::Vec2;
 use rand::Rng;
 
 use super::cell::{Blocks, SIDE, Sight};
-use super::parts::{largest_rectangle, parts_around};
+use super::parts::largest_rectangle;
 use super::{Cell, Scene};
 use crate::trainer::slots::Picture;
 use crate::trainer::{TrainError, Trainer};
 
 /// Blocks of a picture.
-const BLOCKS: usize = SIDE as usize * SIDE as usize;
-/// A sixteenth of a picture is worth a step; what the window began with always is.
+pub(super) const BLOCKS: usize = SIDE as usize * SIDE as usize;
+/// A sixteenth of a picture is worth an update; what the window began with always is.
 const LEAST_BLOCKS: u32 = 4;
 /// The chance of a block that was looked at least.
 const LEAST_SEEN: u64 = 1 << 20;
 /// How much the chance of a block shrinks with each look more than that, in powers of two.
 const SEEN_SHIFT: u32 = 3;
-/// The part that a window begins with sees such a share of what the device holds.
+/// Where several updates share a window, the part that it begins with sees such a share of what the device holds: most of the room is left
+/// to the ground around, which other pictures see from elsewhere.
 const FIRST_SHARE: usize = 4;
 /// A block that shows nothing, or more than the device holds.
-const NEVER: u32 = u32::MAX;
+pub(super) const NEVER: u32 = u32::MAX;
 
 /// A part of a picture that sees no Gaussian which is away.
 #[derive(Clone, Copy, Debug)]
@@ -49,12 +51,14 @@ pub(crate) struct Window {
     first: bool,
     /// The fewest looks at any block.
     least_looks: u32,
-    /// The step after which it ends.
+    /// The update after which it ends.
     pub until: u32,
-    /// Steps that looked at each block of each view.
-    visits: Vec<u32>,
+    /// Updates that looked at each block of each view.
+    pub(super) visits: Vec<u32>,
     sights: Vec<Sight>,
     by_distance: Vec<(f32, u32)>,
+    /// Of the picture that a window begins with: the cells that may show in it, and in which blocks.
+    pub(super) shown: Vec<(u32, u64)>,
 }
 
 impl Window {
@@ -71,6 +75,7 @@ impl Window {
             visits: vec![0; views * BLOCKS],
             sights: Vec::with_capacity(views + crops),
             by_distance: Vec::with_capacity(plan.cells()),
+            shown: Vec::with_capacity(plan.cells()),
         }
     }
 
@@ -91,54 +96,61 @@ impl Window {
         u64::from(item.part.count()) * part.map(|(_, visits)| LEAST_SEEN >> shift(*visits)).sum::<u64>()
     }
 
-    /// The block of the first `views` views that was looked at least, one of several by chance; `None` when none can be.
-    fn least_visited(&self, views: usize, rng: &mut impl Rng) -> Option<(usize, u8, u8)> {
+    /// Blocks of the first `views` views, of those that were looked at least, by chance; `None` when none can be.
+    pub(super) fn least_visited<const N: usize>(
+        &self,
+        views: usize,
+        rng: &mut impl Rng,
+    ) -> Option<[(usize, (u8, u8)); N]> {
         let visits = &self.visits[..views * BLOCKS];
         let least = visits.iter().copied().min().filter(|v| *v != NEVER)?;
-        let those = || visits.iter().enumerate().filter(|(_, v)| **v == least);
-        let (at, _) = those().nth(rng.random_range(0..those().count()))?;
-        let (view, block) = (at / BLOCKS, (at % BLOCKS) as u8);
-        Some((view, block % SIDE, block / SIDE))
+        let those = || visits.iter().enumerate().filter(|(_, v)| **v == least).map(|(at, _)| at);
+        let count = those().count();
+        let mut drawn: [(usize, usize); N] = std::array::from_fn(|i| (rng.random_range(0..count), i));
+        drawn.sort_unstable();
+        let (mut found, mut left) = ([(0, (0, 0)); N], drawn.iter().peekable());
+        for (ordinal, at) in those().enumerate() {
+            while let Some((_, i)) = left.next_if(|(drawn, _)| *drawn == ordinal) {
+                let block = (at % BLOCKS) as u8;
+                found[*i] = (at / BLOCKS, (block % SIDE, block / SIDE));
+            }
+            if left.peek().is_none() {
+                break;
+            }
+        }
+        Some(found)
     }
 }
 
 impl Trainer {
     /// Has the cells of a window on the device: the present one's, or those of the next when it is over.
-    pub(in crate::trainer) fn hold_window(&mut self) -> Result<(), TrainError> {
-        let over = self.steps >= self.scene.window.until;
-        let away = |index: &u32| !self.scene.cells[*index as usize].on_device;
-        if !over && !self.scene.window.cells.iter().any(away) {
+    pub(in crate::trainer) fn hold_window(&mut self, progress: f32) -> Result<(), TrainError> {
+        self.end_drawing()?;
+        if !self.window_ends() {
             return Ok(());
         }
         self.end_window()?;
-        self.page_out(false)?;
-        if over {
-            self.choose_cells()?;
-        }
+        self.choose_cells(progress)?;
         let cells = std::mem::take(&mut self.scene.window.cells);
-        let done = self.page_in(&cells);
+        let done = self.exchange(&cells);
         self.scene.window.cells = cells;
         done?;
-        if over {
-            self.scene.window.until = self.steps + self.settings.cells.steps;
-            self.counters.windows += 1;
-        }
+        self.scene.window.until = self.updates + self.settings.cells.updates;
+        self.counters.windows += 1;
         Ok(())
     }
 
-    /// Takes the cells of a window that is over off the device.
+    /// Counts to their cells again what a window that is over moved.
     pub(super) fn end_window(&mut self) -> Result<(), TrainError> {
-        if self.scene.window.cells.is_empty() || !self.window_ends() {
+        if self.gaussians == 0 || !self.window_ends() {
             return Ok(());
         }
-        self.page_out(true)?;
-        self.scene.window.cells.clear();
-        Ok(())
+        self.settle_in_cells()
     }
 
     /// What the next step looks at, and which part of it.
     pub(in crate::trainer) fn choose_part(&mut self, progress: f32) -> (Picture, Blocks) {
-        let crops_due = self.settings.crops.is_due(self.steps, progress);
+        let crops_due = self.settings.crops.is_due(self.updates, progress);
         let (window, rng) = (&mut self.scene.window, self.sampler.rng());
         let is_crop = |item: &Item| matches!(item.picture, Picture::Crop(_));
         let crops = crops_due && !window.first && window.items.iter().any(is_crop);
@@ -163,16 +175,22 @@ impl Trainer {
 
     /// Where each view, and behind them each crop, looks.
     fn look_around(&mut self) {
-        self.frame.flags = 0;
         self.scene.window.sights.clear();
-        for i in 0..self.views.len() + self.crops.len() {
-            let view = match i.checked_sub(self.views.len()) {
-                None => self.views[i].view,
-                Some(crop) => self.crops[crop].seen_from(&self.views[self.crops[crop].view].view),
-            };
-            self.frame.look(&view);
-            self.scene.window.sights.push(Sight::new(&self.frame, [0, 0], self.frame.size));
+        let crops = (0..self.crops.len()).map(Picture::Crop);
+        for picture in (0..self.views.len()).map(Picture::View).chain(crops) {
+            let sight = self.sight_of(picture);
+            self.scene.window.sights.push(sight);
         }
+    }
+
+    pub(super) fn sight_of(&mut self, picture: Picture) -> Sight {
+        let view = match picture {
+            Picture::View(view) => self.views[view].view,
+            Picture::Crop(crop) => self.crops[crop].seen_from(&self.views[self.crops[crop].view].view),
+        };
+        self.frame.flags = 0;
+        self.frame.look(&view);
+        Sight::new(&self.frame, [0, 0], self.frame.size)
     }
 
     /// Gaussians that a window begins with: all that the device holds, but for those that densification adds to them.
@@ -183,41 +201,25 @@ impl Trainer {
         if grows { (most as f32 / (1.0 + d.growth)) as usize } else { most }
     }
 
-    /// The cells of the next window, while none is on the device, and what is trained with them.
-    fn choose_cells(&mut self) -> Result<(), TrainError> {
-        self.look_around();
-        let (capacity, views) = (self.window_capacity(), self.views.len());
-        let Scene { window, cells, .. } = &mut self.scene;
-        let mut fewest = usize::MAX;
-        let (view, part) = loop {
-            let Some((view, x, y)) = window.least_visited(views, self.sampler.rng()) else {
-                let least = TrainError::TooCrowded { needed: fewest, gaussians: capacity };
-                return Err(if fewest == usize::MAX { TrainError::NothingInView } else { least });
-            };
-            let sight = window.sights[view];
-            let seen = |part: Blocks| {
-                let shows = |c: &&Cell| sight.blocks(&c.bounds).is_some_and(|b| b.mask() & part.mask() != 0);
-                cells.iter().filter(shows).map(|c| c.count).sum::<usize>()
-            };
-            let mut needed = 0;
-            // Most of the room is left to the ground around, which other pictures see from elsewhere.
-            let fits = [capacity / FIRST_SHARE, capacity].into_iter().find_map(|room| {
-                parts_around(x, y).find(|part| {
-                    needed = seen(*part);
-                    needed <= room
-                })
-            });
-            match fits {
-                Some(part) if needed > 0 => break (view, part),
-                Some(_) => {}
-                None => fewest = fewest.min(needed),
-            }
-            window.visits[view * BLOCKS + usize::from(y) * usize::from(SIDE) + usize::from(x)] = NEVER;
+    /// The cells of the next window, and what is trained with them.
+    fn choose_cells(&mut self, progress: f32) -> Result<(), TrainError> {
+        let (capacity, views, updates) =
+            (self.window_capacity(), self.views.len(), self.settings.cells.updates as usize);
+        let first = capacity / updates.clamp(1, FIRST_SHARE);
+        let crop = if self.settings.crops.is_due(self.updates, progress) { self.begin_with_crop(first) } else { None };
+        let (picture, part) = match crop {
+            Some(first) => first,
+            None => self.begin_with_view(first, capacity)?,
         };
-        window.begin(cells.len());
-        window.plan_part(cells, (view, part));
-        window.fill_up(cells, capacity);
-        window.choose_items(cells, views);
+        let Scene { window, cells, .. } = &mut self.scene;
+        window.begin(cells, picture, part);
+        window.fill_up(cells, capacity, updates > 1);
+        if updates > 1 {
+            self.look_around();
+            let Scene { window, cells, .. } = &mut self.scene;
+            window.choose_items(cells, views);
+        }
+        let window = &self.scene.window;
         let blocks: u32 = window.items.iter().map(|item| item.part.count()).sum();
         let (cells, parts) = (window.cells.len(), window.items.len());
         tracing::debug!(cells, gaussians = window.held, parts, blocks, "window of cells");
@@ -225,29 +227,20 @@ impl Trainer {
     }
 }
 
-fn shows_in(cell: &Cell, sight: &Sight, part: Blocks) -> bool {
-    cell.count > 0 && sight.blocks(&cell.bounds).is_some_and(|blocks| blocks.mask() & part.mask() != 0)
-}
-
 impl Window {
-    /// Nothing is wanted of so many cells.
-    fn begin(&mut self, cells: usize) {
-        self.wanted.clear();
-        self.wanted.resize(cells, false);
-        self.items.clear();
-        self.held = 0;
-    }
-
-    /// Wants the cells that show in a part of a view, which is then trained in this window.
-    fn plan_part(&mut self, cells: &[Cell], (view, part): (usize, Blocks)) {
-        for (wanted, cell) in self.wanted.iter_mut().zip(cells) {
-            if !*wanted && shows_in(cell, &self.sights[view], part) {
-                *wanted = true;
-                self.held += cell.count;
-            }
+    /// Wants the cells that show in a part of the picture that was [grown around](super::parts::grown_around) last: it is trained first.
+    fn begin(&mut self, cells: &[Cell], picture: Picture, part: Blocks) {
+        let Self { wanted, shown, items, held, .. } = self;
+        wanted.clear();
+        wanted.resize(cells.len(), false);
+        *held = 0;
+        for (i, _) in shown.iter().filter(|(_, shown)| shown & part.mask() != 0) {
+            wanted[*i as usize] = true;
+            *held += cells[*i as usize].count;
         }
-        self.items.push(Item { picture: Picture::View(view), part, weight: part.count() });
-        self.look_at(view, part);
+        items.clear();
+        items.push(Item { picture, part, weight: part.count() });
+        self.first = true;
     }
 
     /// Counts a look at a part of a view.
@@ -258,15 +251,16 @@ impl Window {
     }
 
     /// The nearest cells for as long as there is room, by their nearest edge: a rectangle of a picture needs the large Gaussians, too,
-    /// that reach into it from afar.
-    fn fill_up(&mut self, cells: &[Cell], capacity: usize) {
+    /// that reach into it from afar. Where `more` than the first part is not to be trained, of those that are at work already.
+    fn fill_up(&mut self, cells: &[Cell], capacity: usize, more: bool) {
         let mut centre = Vec2::ZERO;
         for (cell, _) in cells.iter().zip(&self.wanted).filter(|(_, wanted)| **wanted) {
             centre += cell.count as f32 * cell.bounds.centre();
         }
         centre /= self.held.max(1) as f32;
         self.by_distance.clear();
-        for (i, cell) in cells.iter().enumerate().filter(|(i, c)| !self.wanted[*i] && c.count > 0) {
+        let of_use = |(i, c): &(usize, &Cell)| !self.wanted[*i] && c.count > 0 && (more || c.at_work);
+        for (i, cell) in cells.iter().enumerate().filter(of_use) {
             self.by_distance.push((cell.bounds.ground_distance(centre), i as u32));
         }
         self.by_distance.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -305,7 +299,6 @@ impl Window {
                 self.items.push(Item { picture, part, weight });
             }
         }
-        self.first = true;
         self.least_looks = self.visits[..views * BLOCKS].iter().copied().min().unwrap_or(0);
     }
 }
@@ -314,10 +307,28 @@ impl Window {
 mod tests {
     use config::plan::PlanRequest;
     use config::training::ResolutionSettings;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
 
     use super::*;
     use crate::gpu::Gpu;
     use crate::synthetic::{cloud, photo, plain, posed, view};
+
+    #[test]
+    fn a_window_begins_where_pictures_were_looked_at_least() {
+        let request =
+            PlanRequest { views: 2, max_gaussians: Some(256), scene_gaussians: Some(1000), ..Default::default() };
+        let mut window = Window::new(&Plan::new(&request).unwrap());
+        window.visits.fill(3);
+        (window.visits[5], window.visits[BLOCKS + 9], window.visits[20]) = (2, 2, NEVER);
+        let mut rng = Pcg64Mcg::seed_from_u64(1);
+        let found = window.least_visited::<16>(2, &mut rng).unwrap();
+        let those = [(0, (5, 0)), (1, (1, 1))];
+        assert!(found.iter().all(|place| those.contains(place)), "{found:?}");
+        assert!(those.iter().all(|place| found.contains(place)), "{found:?}");
+        window.visits.fill(NEVER);
+        assert_eq!(window.least_visited::<4>(2, &mut rng), None);
+    }
 
     #[test]
     fn a_part_of_a_picture_is_compared_with_that_part_of_it_at_every_resolution() {
@@ -333,7 +344,7 @@ mod tests {
             let mut t = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
             t.load(&cloud(1, 64, 0)).unwrap();
             t.add_view(&picture, None).unwrap();
-            let (chosen, first_pixel) = t.prepare_frame(Picture::View(0), part, 0.0);
+            let (chosen, first_pixel, _) = t.prepare_frame(Picture::View(0), part, 0.0);
             t.write_frame();
             t.forward_count(Picture::View(0), first_pixel).unwrap();
             let ((x, width), (y, height)) =

@@ -1,0 +1,88 @@
+//! Where a window of cells begins: a part of a picture, as large as finds room, where little has to be moved for it.
+
+use rand::Rng;
+
+use super::Scene;
+use super::cell::{Blocks, SIDE};
+use super::parts::grown_around;
+use super::window::{BLOCKS, NEVER};
+use crate::trainer::slots::Picture;
+use crate::trainer::{TrainError, Trainer};
+
+/// Places at which a window may begin: the one is taken of which the most is on the device.
+const PLACES: usize = 32;
+
+impl Trainer {
+    /// The view, of those looked at least, that a window begins with, and which part of it, in which at most `first` Gaussians show, or,
+    /// where a block alone shows more, `capacity`.
+    pub(super) fn begin_with_view(&mut self, first: usize, capacity: usize) -> Result<(Picture, Blocks), TrainError> {
+        let (views, mut fewest) = (self.views.len(), usize::MAX);
+        loop {
+            let mut best: Option<(f32, usize, (u8, u8))> = None;
+            let places = self.scene.window.least_visited::<PLACES>(views, self.sampler.rng());
+            for (view, block) in places.into_iter().flatten() {
+                let here = self.share_at_work(Picture::View(view), block);
+                if best.is_none_or(|(most, ..)| here > most) {
+                    best = Some((here, view, block));
+                }
+            }
+            let Some((_, view, block)) = best else {
+                let least = TrainError::TooCrowded { needed: fewest, gaussians: capacity };
+                return Err(if fewest == usize::MAX { TrainError::NothingInView } else { least });
+            };
+            match self
+                .part_around(Picture::View(view), block, first)
+                .or_else(|_| self.part_around(Picture::View(view), block, capacity))
+            {
+                Ok((part, needed)) if needed > 0 => return Ok((Picture::View(view), part)),
+                Ok(_) => {}
+                Err(needed) => fewest = fewest.min(needed),
+            }
+            let (x, y) = block;
+            self.scene.window.visits[view * BLOCKS + usize::from(y) * usize::from(SIDE) + usize::from(x)] = NEVER;
+        }
+    }
+
+    /// A crop that a window begins with, and which part of it; `None` when there is none, or none that shows what finds room.
+    pub(super) fn begin_with_crop(&mut self, room: usize) -> Option<(Picture, Blocks)> {
+        let mut best: Option<(f32, usize, (u8, u8))> = None;
+        for _ in 0..if self.crops.is_empty() { 0 } else { PLACES } {
+            let rng = self.sampler.rng();
+            let (crop, block) =
+                (rng.random_range(0..self.crops.len()), (rng.random_range(0..SIDE), rng.random_range(0..SIDE)));
+            let here = self.share_at_work(Picture::Crop(crop), block);
+            if best.is_none_or(|(most, ..)| here > most) {
+                best = Some((here, crop, block));
+            }
+        }
+        let (_, crop, block) = best?;
+        let (part, needed) = self.part_around(Picture::Crop(crop), block, room).ok()?;
+        (needed > 0).then_some((Picture::Crop(crop), part))
+    }
+
+    /// How much of what may show in a block of a picture is on the device, 0…1.
+    fn share_at_work(&mut self, picture: Picture, (x, y): (u8, u8)) -> f32 {
+        let (sight, block) = (self.sight_of(picture), Blocks { x: [x, x + 1], y: [y, y + 1] });
+        let (mut all, mut here) = (0, 0);
+        for cell in self.scene.cells.iter().filter(|cell| cell.count > 0 && sight.shows_in(block, &cell.bounds)) {
+            all += cell.count;
+            here += if cell.at_work { cell.count } else { 0 };
+        }
+        here as f32 / all.max(1) as f32
+    }
+
+    /// The part around a block of a picture in which at most `room` Gaussians show, and how many do.
+    fn part_around(&mut self, picture: Picture, block: (u8, u8), room: usize) -> Result<(Blocks, usize), usize> {
+        let sight = self.sight_of(picture);
+        let Scene { window, cells, .. } = &mut self.scene;
+        let shown = &mut window.shown;
+        shown.clear();
+        for (i, cell) in cells.iter().enumerate().filter(|(_, cell)| cell.count > 0) {
+            shown.extend(sight.blocks(&cell.bounds).map(|blocks| (i as u32, blocks.mask())));
+        }
+        grown_around(block, room, |part| {
+            let mask = part.mask();
+            shown.iter().filter(|(_, shown)| shown & mask != 0).map(|(i, _)| cells[*i as usize].count).sum()
+        })
+    }
+}
