@@ -319,6 +319,27 @@ fn a_file_that_fails_is_an_error_and_never_a_smaller_model() {
 }
 
 #[test]
+fn a_drawing_that_fails_counts_no_gaussian_twice() {
+    let mut failed = 0;
+    for eighths in 1..8 {
+        let Some(mut t) = trainer(400, Some(900), &windows_of(4)) else { return };
+        let file = tempfile::tempfile().unwrap();
+        t.keep_scene_in(file.try_clone().unwrap());
+        t.load(&three_places()).unwrap();
+        let v = look(0);
+        t.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
+        (0..2).for_each(|_| _ = t.step().unwrap());
+        // Some cells are there, others are not.
+        file.set_len(file.metadata().unwrap().len() * eighths / 8).unwrap();
+        for _ in 0..2 {
+            failed += u32::from(t.render(&look(2), &mut Rendering::default()).is_err());
+            assert_eq!(t.gaussians(), 900, "{eighths} eighths of the file");
+        }
+    }
+    assert!(failed > 0);
+}
+
+#[test]
 fn what_cannot_be_trained_is_said_in_one_line() {
     let Some(mut t) = trainer(4, Some(900), &plain()) else { return };
     let mut scene = three_places();

@@ -90,7 +90,8 @@ pub(crate) struct Scene {
     /// Places on the device of those that left, in order.
     holes: Vec<u32>,
     /// While something is drawn: the cell of each Gaussian of the window, as `tags` will have it again.
-    places: Vec<u32>,
+    window_tags: Vec<u32>,
+    /// The device holds copies that are drawn.
     drawing: bool,
     /// Gaussians that are not on the device.
     pub away: usize,
@@ -114,7 +115,7 @@ impl Scene {
             order: Vec::with_capacity(tags),
             starts: Vec::with_capacity(plan.cells()),
             holes: Vec::with_capacity(tags),
-            places: Vec::with_capacity(tags),
+            window_tags: Vec::with_capacity(tags),
             drawing: false,
             away: 0,
             whole: true,

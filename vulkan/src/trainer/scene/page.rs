@@ -13,8 +13,8 @@ use crate::trainer::{TrainError, Trainer, state};
 struct Device<'a> {
     arena: &'a mut Arena,
     parameters: Parameters,
-    /// The last step taken.
-    step: u32,
+    /// Updates so far.
+    updates: u32,
     /// The SH degree that all Gaussians have, where they have one.
     degree: Option<u8>,
 }
@@ -23,7 +23,7 @@ impl Device<'_> {
     /// Copies Gaussian `index` to a record. Its state says there how many steps it missed: while it is away it misses none.
     fn take_off(&self, index: usize, record: &mut [u8]) {
         self.parameters.read_record(self.arena, index, record);
-        let missed = state::turned(self.parameters.geometry(self.arena)[index].state, self.step);
+        let missed = state::turned(self.parameters.geometry(self.arena)[index].state, self.updates);
         Parameters::write_state(record, missed);
     }
 
@@ -31,7 +31,7 @@ impl Device<'_> {
     fn put_on(&mut self, index: usize, record: &[u8]) {
         self.parameters.write_record(self.arena, index, record);
         let g = &mut self.parameters.geometry_mut(self.arena)[index];
-        g.state = state::turned(g.state, self.step);
+        g.state = state::turned(g.state, self.updates);
         if let Some(degree) = self.degree {
             g.state = state::with_degree(g.state, degree);
         }
@@ -40,7 +40,7 @@ impl Device<'_> {
     /// Gaussian `index` missed nothing.
     fn up_to_date(&mut self, index: usize) {
         let g = &mut self.parameters.geometry_mut(self.arena)[index];
-        g.state = state::up_to(g.state, self.step);
+        g.state = state::up_to(g.state, self.updates);
     }
 }
 
@@ -202,11 +202,11 @@ impl Scene {
     fn draw_instead(&mut self, device: &mut Device<'_>, drawn: &[u32]) -> Result<(), TrainError> {
         if !self.drawing {
             self.leave(device, |_| false)?;
-            std::mem::swap(&mut self.tags, &mut self.places);
+            std::mem::swap(&mut self.tags, &mut self.window_tags);
             self.drawing = true;
         }
         self.forget_copies();
-        let Self { cells, store, tags, .. } = self;
+        let Self { cells, store, tags, away, .. } = self;
         for &index in drawn {
             let (n, cell) = (tags.len(), &mut cells[index as usize]);
             store.read(&cell.chain, |i, record| {
@@ -216,9 +216,9 @@ impl Scene {
                 Ok::<(), TrainError>(())
             })?;
             tags.resize(n + cell.chain.count as usize, index);
+            *away -= cell.chain.count as usize;
             cell.copied = true;
         }
-        self.away -= self.tags.len();
         Ok(())
     }
 
@@ -233,7 +233,7 @@ impl Scene {
         self.check_whole()?;
         self.forget_copies();
         self.whole = false;
-        std::mem::swap(&mut self.tags, &mut self.places);
+        std::mem::swap(&mut self.tags, &mut self.window_tags);
         self.drawing = false;
         self.sort_by_cell();
         let Self { cells, store, order, tags, .. } = self;
@@ -264,19 +264,14 @@ fn run_of<'a>(order: &'a [u32], tags: &[u32], index: u32) -> &'a [u32] {
 }
 
 impl Trainer {
-    /// The scene and the device, to move cells between them.
-    fn moving(&mut self) -> (&mut Scene, Device<'_>) {
-        let degree = (self.settings.sh.raise_share >= 1.0).then_some(self.plan.sh_degree);
-        let device = Device { arena: &mut self.arena, parameters: self.parameters, step: self.updates, degree };
-        (&mut self.scene, device)
-    }
-
     /// Moves cells, and counts what was moved.
     fn page(&mut self, how: impl FnOnce(&mut Scene, Device<'_>) -> Result<(), TrainError>) -> Result<(), TrainError> {
         let _phase = tracing::trace_span!("page").entered();
         let moved = self.scene.store.moved;
-        let (scene, device) = self.moving();
-        let done = how(scene, device);
+        let degree = (self.settings.sh.raise_share >= 1.0).then_some(self.plan.sh_degree);
+        let arena = &mut self.arena;
+        let device = Device { arena, parameters: self.parameters, updates: self.updates, degree };
+        let done = how(&mut self.scene, device);
         self.counters.paged_bytes += self.scene.store.moved - moved;
         self.gaussians = self.scene.tags.len();
         done

@@ -92,7 +92,7 @@ impl Window {
         let visits = self.visits[view * BLOCKS..(view + 1) * BLOCKS].iter().enumerate();
         let part = visits.filter(|(block, visits)| item.part.mask() >> block & 1 == 1 && **visits != NEVER);
         let shift = |visits: u32| (SEEN_SHIFT * visits.saturating_sub(self.least_looks)).min(LEAST_SEEN.ilog2());
-        // A step on a large part is worth more than one on each of its blocks.
+        // An update on a large part is worth more than one on each of its blocks.
         u64::from(item.part.count()) * part.map(|(_, visits)| LEAST_SEEN >> shift(*visits)).sum::<u64>()
     }
 
@@ -148,7 +148,7 @@ impl Trainer {
         self.settle_in_cells()
     }
 
-    /// What the next step looks at, and which part of it.
+    /// What the next update looks at, and which part of it.
     pub(in crate::trainer) fn choose_part(&mut self, progress: f32) -> (Picture, Blocks) {
         let crops_due = self.settings.crops.is_due(self.updates, progress);
         let (window, rng) = (&mut self.scene.window, self.sampler.rng());
