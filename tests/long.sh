@@ -2,25 +2,27 @@
 # A long flight: `dgtr sim` flies a survey of as many pictures as asked, `dgtr fly` makes the model in a fixed plan, under a bound on
 # its memory. What is asked of it: memory that does not grow with the flight, and a new picture in the model within
 # seconds, however long the flight is already.
-#   tests/long.sh [--pictures N] [--width W] [--speed X] [--seconds S] [--gaussians G] [--degree D] [--out DIR]
+#   tests/long.sh [--pictures N] [--width W] [--speed X] [--seconds S] [--gaussians G] [--on-device H] [--degree D] [--out DIR]
 # N pictures of a region of 600 × 400 m per 1,000; W pixels wide (4:3); X seconds of flight per second; S seconds of training after
-# the landing (0.24 a picture); at most G Gaussians (560 a picture, 2.3 for a square metre) with SH of degree D (1). Prints resident
+# the landing (0.24 a picture); at most G Gaussians (560 a picture, 2.3 for a square metre) with SH of degree D (1), of which the
+# device holds H at once (all) and the others wait in cells on the disk. Prints resident
 # memory and processor time by hundreds of key frames, seconds from picture to model, and the PSNR of held-out views by thirds of the
 # flight (needs python3). Ends with 0 when the flight ended with a model within its bounds.
 set -euo pipefail
 here=$(cd "$(dirname "$0")/.." && pwd)
-pictures=1000 width=1280 speed=1 seconds= gaussians= degree=1 out=long-out
-usage() { echo "usage: tests/long.sh [--pictures N] [--width W] [--speed X] [--seconds S] [--gaussians G] [--degree D] [--out DIR]" >&2; exit 2; }
+pictures=1000 width=1280 speed=1 seconds= gaussians= on_device= degree=1 out=long-out
+usage() { echo "usage: tests/long.sh [--pictures N] [--width W] [--speed X] [--seconds S] [--gaussians G] [--on-device H] [--degree D] [--out DIR]" >&2; exit 2; }
 while [ $# -gt 0 ]; do
     [ $# -ge 2 ] || usage
     case "$1" in
         --pictures) pictures="$2" ;; --width) width="$2" ;; --speed) speed="$2" ;; --seconds) seconds="$2" ;;
-        --gaussians) gaussians="$2" ;; --degree) degree="$2" ;; --out) out="$2" ;;
+        --gaussians) gaussians="$2" ;; --on-device) on_device="$2" ;; --degree) degree="$2" ;; --out) out="$2" ;;
         *) usage ;;
     esac
     shift 2
 done
 seconds="${seconds:-$(awk -v n="$pictures" 'BEGIN { print n * 0.24 }')}" gaussians="${gaussians:-$((pictures * 560))}"
+on_device="${on_device:-$gaussians}"
 dgtr="${DGTR:-$here/target/release/dgtr}"
 [ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
 rm -rf "$out"; mkdir -p "$out/camera"
@@ -29,13 +31,13 @@ cd "$out"
 device_mib=512 host_mib=1536
 
 # 48 × 36 m of ground a picture from 40 m; 12 m to the next on the line and 20 m to the next line.
-awk -v n="$pictures" -v w="$width" -v d="$device_mib" -v h="$host_mib" -v s="$seconds" -v g="$gaussians" -v degree="$degree" 'BEGIN {
+awk -v n="$pictures" -v w="$width" -v d="$device_mib" -v h="$host_mib" -v s="$seconds" -v g="$gaussians" -v held="$on_device" -v degree="$degree" 'BEGIN {
     k = sqrt(n / 1000) / 2
     printf "name = \"long\"\nseed = 7\norigin = { lat_deg = 46.0, lon_deg = 7.0, alt_m = 500.0 }\n"
     f = w / 1.2
     printf "camera = { width = %d, height = %d, fx = %f, fy = %f, cx = %f, cy = %f, exposure_delay_ms = 60.0 }\n", w, w * 3 / 4, f, f, w / 2, w * 3 / 8
     printf "keyframes = { t_min_m = 6.0, max = %d }\n", n * 1.1 + 16
-    printf "memory = { device_mib = %d, host_mib = %d, max_gaussians = %d }\n", d, h, g
+    printf "memory = { device_mib = %d, host_mib = %d, max_gaussians = %d, scene_gaussians = %d }\n", d, h, held, g
     printf "training = { seconds = %f, sh = { degree = %d } }\nupload = { folder = \"upload\" }\n", s, degree
     # The schedule after the landing is short on purpose: nothing is to be given up for it in flight.
     printf "failsafe = { behind_visits = 0.0, far_behind_visits = 0.0 }\n"

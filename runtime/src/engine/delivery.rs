@@ -7,7 +7,7 @@ use std::cmp::Ordering;
 use config::training::RateSettings;
 use models::formats::FormatError;
 use models::formats::delivery;
-use vulkan::trainer::{Fate, StepReport, Trained};
+use vulkan::trainer::{Fate, Region, StepReport, Trained};
 
 use super::Reconstruction;
 use crate::error::JobError;
@@ -56,7 +56,7 @@ impl Reconstruction {
     pub(super) fn delivery_due(&self) -> Due {
         let t = &self.settings.training;
         let delivers = self.settings.delivers.is_some() && !self.flying;
-        let thins = delivers && !self.delivery.thinned && t.thinned_share > 0.0 && self.trainer.grows_in_place();
+        let thins = delivers && !self.delivery.thinned && t.thinned_share > 0.0;
         Due {
             thin: thins.then_some((t.thinned_at, self.least_steps())),
             round: (delivers && !self.delivery.rounded && t.rounded_share > 0.0).then_some(1.0 - t.rounded_share),
@@ -86,12 +86,12 @@ impl Reconstruction {
 
     /// Takes Gaussians out, those of the least [sensitivity](Trained::sensitivity), and leaves all else as it is: `share` of them, or as
     /// many as have sensitivities of no more than `most_loss` together. How many those were. The least opaque ones where too few steps
-    /// were taken to tell. Only where [`Trainer::grows_in_place`](vulkan::trainer::Trainer::grows_in_place).
+    /// were taken to tell.
     pub(super) fn thin(&mut self, share: f32, most_loss: f32) -> Result<usize, JobError> {
         let told = self.trainer.steps() >= self.least_steps();
         let worth = |g: &Trained| if told { g.sensitivity } else { g.opacity_logit };
         let mut all = Vec::with_capacity(self.trainer.gaussians());
-        self.trainer.each(|g| all.push(worth(g)))?;
+        self.trainer.each(&Region::ALL, |g| all.push(worth(g)))?;
         all.sort_unstable_by(f32::total_cmp);
         let mut leave = (f64::from(share) * all.len() as f64) as usize;
         if told {
@@ -106,7 +106,7 @@ impl Reconstruction {
         // Of those that are worth the same the first ones.
         let below = all.partition_point(|v| v.total_cmp(&most).is_lt());
         let mut ties = leave - below;
-        Ok(self.trainer.revise(|_, g| {
+        Ok(self.trainer.revise(&Region::ALL, |g| {
             let goes = match worth(g).total_cmp(&most) {
                 Ordering::Less => true,
                 Ordering::Equal if ties > 0 => {

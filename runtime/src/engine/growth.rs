@@ -1,12 +1,13 @@
 //! In flight: what a new key frame shows stands in the model as soon as it is there. Its pose is settled among its neighbours, its
 //! depth becomes Gaussians where none stand, theirs move along, and all else stays as it is.
 
+use std::cmp::Ordering;
 use std::collections::BTreeSet;
 use std::time::Instant;
 
 use models::camera::DepthPrior;
 use models::cloud::GaussianCloud;
-use vulkan::trainer::{Fate, Trained};
+use vulkan::trainer::{Fate, Region, Trained};
 
 use super::carry::{Claims, Room};
 use super::follow::{Motion, Motions};
@@ -94,7 +95,7 @@ impl Reconstruction {
     /// Whether new key frames can be added to the model as it is.
     pub(super) fn can_grow(&self) -> bool {
         let network = self.initialiser.as_ref().is_some_and(models::init::Initialiser::grows);
-        self.flying && network && self.trainer.grows_in_place()
+        self.flying && network
     }
 
     /// After a load: while pictures come, the newest are trained on first and their Gaussians are the only new ones.
@@ -184,18 +185,19 @@ impl Reconstruction {
             (low, high) = (low.min(looks_at(m) - reach), high.max(looks_at(m) + reach));
         }
         let within = |p: glam::DVec2| p.cmpge(low).all() && p.cmple(high).all();
+        let region = Region {
+            low: [low.x as f32, low.y as f32, f32::NEG_INFINITY],
+            high: [high.x as f32, high.y as f32, f32::INFINITY],
+        };
         // Those around that stand still hold what is theirs.
         let around: Vec<Motion> = (0..self.built.len()).filter_map(motion).filter(|m| within(looks_at(m))).collect();
         let (motions, mut followed) = (Motions::new(around, depth_m), 0);
-        let fate = |_: usize, g: &Trained| {
-            if !within(glam::DVec2::new(g.mean[0].into(), g.mean[1].into())) {
-                return Fate::Stays;
-            }
+        let fate = |g: &Trained| {
             let fate = motions.fate(g.mean, g.rotation, CONTRADICTED_PX);
             followed += usize::from(fate != Fate::Stays);
             fate
         };
-        let dropped = self.trainer.revise(fate)?;
+        let dropped = self.trainer.revise(&region, fate)?;
         self.report.skip("gaussians_contradicted", dropped as u64);
         // Of the others what they moved adds up until it shows.
         going.into_iter().for_each(|i| self.built[i] = self.views[i].1);
@@ -208,19 +210,16 @@ impl Reconstruction {
         for m in &fresh.means {
             (low, high) = (low.min(glam::Vec3::from_array(*m)), high.max(glam::Vec3::from_array(*m)));
         }
-        let (low, high) = (low - 8.0 * edge_m, high + 8.0 * edge_m);
+        let around = Region { low: (low - 8.0 * edge_m).into(), high: (high + 8.0 * edge_m).into() };
         let (mut claims, mut room) = (Claims::new(edge_m), Room::new(self.share().square()));
-        self.trainer.each(|g| {
-            let mean = glam::Vec3::from_array(g.mean);
-            if mean.cmpge(low).all() && mean.cmple(high).all() {
-                claims.claim(g);
-                room.count(g.mean);
-            }
+        self.trainer.each(&around, |g| {
+            claims.claim(g);
+            room.count(g.mean);
         })?;
         // Where nothing stands, and in no square more than its share.
         let mut new = fresh.clone();
         new.retain(|i| !claims.hold(fresh.means[i]) && room.take(fresh.means[i]));
-        let capacity = self.trainer.plan().gaussians;
+        let capacity = self.trainer.plan().scene;
         let over = (self.trainer.gaussians() + new.len()).saturating_sub(capacity);
         if over > 0 {
             self.make_room(over.max(capacity / FREED))?;
@@ -230,15 +229,23 @@ impl Reconstruction {
 
     /// Takes out the Gaussians that cover least.
     fn make_room(&mut self, least: usize) -> Result<(), JobError> {
-        let mut covers: Vec<(f32, u32)> = Vec::with_capacity(self.trainer.gaussians());
-        self.trainer.each(|g| covers.push((g.covers_m2(), covers.len() as u32)))?;
+        let mut covers: Vec<f32> = Vec::with_capacity(self.trainer.gaussians());
+        self.trainer.each(&Region::ALL, |g| covers.push(g.covers_m2()))?;
         let least = least.min(covers.len().saturating_sub(1));
         if least == 0 {
             return Ok(());
         }
-        let (going, _, _) = covers.select_nth_unstable_by(least, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let going: std::collections::HashSet<u32> = going.iter().map(|g| g.1).collect();
-        let gone = self.trainer.revise(|i, _| if going.contains(&(i as u32)) { Fate::Goes } else { Fate::Stays })?;
+        let (below, most, _) = covers.select_nth_unstable_by(least - 1, f32::total_cmp);
+        // Of those that cover the same the first ones.
+        let (most, mut ties) = (*most, 1 + below.iter().filter(|c| c.total_cmp(most).is_eq()).count());
+        let gone = self.trainer.revise(&Region::ALL, |g| match g.covers_m2().total_cmp(&most) {
+            Ordering::Less => Fate::Goes,
+            Ordering::Equal if ties > 0 => {
+                ties -= 1;
+                Fate::Goes
+            }
+            _ => Fate::Stays,
+        })?;
         self.growing.totals.made_room += gone as u64;
         Ok(())
     }

@@ -112,15 +112,11 @@ impl Reconstruction {
             Some(model) => load(&mut self.trainer, &model)?,
             None => self.trainer.load(&self.cloud)?,
         };
-        self.let_go();
-        Ok(loaded)
-    }
-
-    /// The trainer has the Gaussians: a scene in pieces is not kept beside it.
-    pub(super) fn let_go(&mut self) {
+        // The trainer has the Gaussians: a scene in pieces is not kept beside it.
         if self.in_pieces {
             self.cloud = GaussianCloud::default();
         }
+        Ok(loaded)
     }
 
     /// Writes the trained Gaussians as a checkpoint; how many there are.

@@ -329,25 +329,9 @@ impl Reconstruct for Reconstruction {
     }
 
     fn shrink(&mut self) -> Result<(), JobError> {
-        if self.trainer.grows_in_place() {
-            let gone = self.thin(GIVEN_UP, f32::INFINITY)?;
-            self.trainer.keep_number();
-            tracing::warn!("gave up {gone} Gaussians, {} remain", self.trainer.gaussians());
-            return Ok(());
-        }
-        self.trainer.snapshot(&mut self.cloud)?;
-        let mut by_opacity = self.cloud.opacity_logits.clone();
-        by_opacity.sort_by(f32::total_cmp);
-        let Some(&least) = by_opacity.get(by_opacity.len() / 3) else { return Ok(()) };
-        let logits = self.cloud.opacity_logits.clone();
-        let removed = self.cloud.retain(|i| logits[i] >= least);
-        let ((steps, seconds), begun_at) = (self.trainer.spent(), self.trainer.begun_at());
-        self.trainer.load(&self.cloud)?;
-        self.trainer.continue_from(steps, seconds);
-        self.trainer.begin_at(begun_at);
-        self.fly_on();
-        tracing::warn!("gave up {removed} Gaussians, {} remain", self.cloud.len());
-        self.let_go();
+        let gone = self.thin(GIVEN_UP, f32::INFINITY)?;
+        self.trainer.keep_number();
+        tracing::warn!("gave up {gone} Gaussians, {} remain", self.trainer.gaussians());
         Ok(())
     }
 

@@ -8,7 +8,7 @@ use config::training::Strategy;
 use models::cloud::{GaussianCloud, sh_coefficients};
 
 /// Gaussians among which one is sought whose second moments new ones begin with.
-const LOOKED_AT: usize = 1024;
+pub(super) const LOOKED_AT: usize = 1024;
 
 /// A Gaussian as it is trained.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,7 +29,7 @@ pub struct Trained {
 
 impl Trained {
     /// `unbias`: what the second moments are multiplied by.
-    fn of(g: &Geometry, unbias: f32) -> Self {
+    pub(super) fn of(g: &Geometry, unbias: f32) -> Self {
         let Geometry { mean, log_scale, rotation, opacity_logit, .. } = *g;
         let is_opaque = opacity_logit > -LEAST_LEFT.ln();
         let sensitivity = if is_opaque { f32::INFINITY } else { g.sensitivity(unbias) };
@@ -41,6 +41,25 @@ impl Trained {
         let [a, b, c] = self.log_scale;
         let area = a + b + c - a.min(b).min(c);
         std::f32::consts::PI * area.exp() / (1.0 + (-self.opacity_logit).exp())
+    }
+}
+
+/// A box of space whose edges run along the axes, metres: where Gaussians are looked at. Of a scene in cells the others are not read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Region {
+    /// Its corner to the west, the south and below.
+    pub low: [f32; 3],
+    /// The corner across.
+    pub high: [f32; 3],
+}
+
+impl Region {
+    /// Everywhere.
+    pub const ALL: Self = Self { low: [f32::NEG_INFINITY; 3], high: [f32::INFINITY; 3] };
+
+    /// Whether a mean lies in it. One that is not a number is everywhere.
+    pub fn holds(&self, mean: [f32; 3]) -> bool {
+        (0..3).all(|k| !(mean[k] < self.low[k] || mean[k] > self.high[k]))
     }
 }
 
@@ -61,11 +80,6 @@ pub enum Fate {
 }
 
 impl Trainer {
-    /// Whether Gaussians can be added and moved where they are; else [`Trainer::snapshot`] and [`Trainer::load`] do it.
-    pub fn grows_in_place(&self) -> bool {
-        !self.plan.is_paged()
-    }
-
     /// From here on, until the next [`Trainer::load`] that is followed by none of this: views are looked at newest first, with an
     /// exponential tail of older ones, instead of once in an epoch each, and the number of Gaussians is the caller's: nothing is
     /// densified.
@@ -79,15 +93,18 @@ impl Trainer {
         self.strategy = Strategy::None;
     }
 
-    /// Shows every Gaussian, in order.
+    /// Shows every Gaussian of `within`, in order.
     ///
     /// # Errors
-    /// [`TrainError::Gpu`].
-    pub fn each(&mut self, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
+    pub fn each(&mut self, within: &Region, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
         self.flush()?;
         let unbias = self.second_unbias();
+        if self.scene.is_paged() {
+            return self.each_in_cells(within, |g| see(&Trained::of(g, unbias)));
+        }
         let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        geometry.iter().for_each(|g| see(&Trained::of(g, unbias)));
+        geometry.iter().filter(|g| within.holds(g.mean)).for_each(|g| see(&Trained::of(g, unbias)));
         Ok(())
     }
 
@@ -102,16 +119,20 @@ impl Trainer {
         (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(self.steps().max(1) as i32))) as f32
     }
 
-    /// Moves Gaussians and takes others out, as `fate` says of each by its number; never the last one. Returns how many went. Only
-    /// where [`Trainer::grows_in_place`].
+    /// Moves Gaussians of `within` and takes others out, as `fate` says of each in the order of [`Trainer::each`]; never the last one.
+    /// Returns how many went.
     ///
     /// # Errors
-    /// [`TrainError::Gpu`].
-    pub fn revise(&mut self, mut fate: impl FnMut(usize, &Trained) -> Fate) -> Result<usize, TrainError> {
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
+    pub fn revise(&mut self, within: &Region, mut fate: impl FnMut(&Trained) -> Fate) -> Result<usize, TrainError> {
         self.flush()?;
         let (mut gone, unbias): (Vec<u32>, _) = (Vec::new(), self.second_unbias());
-        for (i, g) in self.parameters.geometry_mut(&mut self.arena)[..self.gaussians].iter_mut().enumerate() {
-            match fate(i, &Trained::of(g, unbias)) {
+        if self.scene.is_paged() {
+            return self.revise_cells(within, |g| fate(&Trained::of(g, unbias)));
+        }
+        let geometry = &mut self.parameters.geometry_mut(&mut self.arena)[..self.gaussians];
+        for (i, g) in geometry.iter_mut().enumerate().filter(|(_, g)| within.holds(g.mean)) {
+            match fate(&Trained::of(g, unbias)) {
                 Fate::Stays => {}
                 Fate::Moves { mean, rotation } => (g.mean, g.rotation) = (mean, rotation),
                 Fate::Goes => gone.push(i as u32),
@@ -132,19 +153,26 @@ impl Trainer {
         Ok(before - self.gaussians)
     }
 
-    /// Adds Gaussians, as many as find room; those that are not finite are left out. Only where [`Trainer::grows_in_place`].
+    /// Adds Gaussians, as many as find room; those that are not finite are left out. A scene that outgrows the device goes into cells.
     ///
     /// # Errors
-    /// [`TrainError::Gpu`].
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
     pub fn extend(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
         self.flush()?;
         let valid: Vec<usize> = (0..cloud.len()).filter(|i| cloud.is_valid(*i)).collect();
-        let room = self.plan.gaussians.saturating_sub(self.gaussians);
+        let room = self.plan.scene.saturating_sub(self.gaussians());
         let report = LoadReport {
             loaded: valid.len().min(room),
             dropped_non_finite: cloud.len() - valid.len(),
             dropped_over_capacity: valid.len().saturating_sub(room),
         };
+        if !self.scene.is_paged() && self.gaussians + report.loaded > self.plan.gaussians {
+            self.enter_cells()?;
+        }
+        if self.scene.is_paged() {
+            self.extend_cells(cloud, &valid[..report.loaded])?;
+            return Ok(report);
+        }
         let donor = self.donor();
         let coefficients = sh_coefficients(self.plan.sh_degree.min(cloud.sh_degree)) * 3;
         let all_degrees = self.settings.sh.raise_share >= 1.0;
@@ -171,18 +199,26 @@ impl Trainer {
         Ok(report)
     }
 
-    /// The Gaussian whose second moments new ones begin with: from zero, their first steps would be several times too long, as Adam no
-    /// longer corrects that bias after many steps ([`Parameters::copy`](super::parameters::Parameters::copy)). Its position is pulled
-    /// harder than three quarters of those looked at are, as new ones are; none before the first step.
+    /// The [donor](donor_of) among those on the device.
     fn donor(&self) -> Option<usize> {
         let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        let pull = |g: &Geometry| g.second[0][..3].iter().sum::<f32>();
         let every = self.gaussians.div_ceil(LOOKED_AT).max(1);
-        let looked_at = geometry.iter().enumerate().step_by(every).map(|(i, g)| (pull(g), i));
-        let mut moved: Vec<(f32, usize)> = looked_at.filter(|(pull, _)| *pull > 0.0 && pull.is_finite()).collect();
-        let at = moved.len() * 3 / 4;
-        (at < moved.len()).then(|| moved.select_nth_unstable_by(at, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).1.1)
+        donor_of(geometry.iter().enumerate().step_by(every).map(|(i, g)| (pull_of(g), i)))
     }
+}
+
+/// How hard the position was pulled.
+pub(super) fn pull_of(g: &Geometry) -> f32 {
+    g.second[0][..3].iter().sum()
+}
+
+/// The Gaussian whose second moments new ones begin with: from zero, their first steps would be several times too long, as Adam no
+/// longer corrects that bias after many steps ([`Parameters::copy`](super::parameters::Parameters::copy)). Its position is
+/// [pulled](pull_of) harder than three quarters of those looked at are, as new ones are; none before the first step.
+pub(super) fn donor_of<T: Copy + Ord>(looked_at: impl Iterator<Item = (f32, T)>) -> Option<T> {
+    let mut moved: Vec<(f32, T)> = looked_at.filter(|(pull, _)| *pull > 0.0 && pull.is_finite()).collect();
+    let at = moved.len() * 3 / 4;
+    (at < moved.len()).then(|| moved.select_nth_unstable_by(at, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).1.1)
 }
 
 #[cfg(test)]
@@ -255,8 +291,9 @@ mod tests {
         (0..3).for_each(|_| _ = t.step().unwrap());
         let before = snapshot(&mut t);
         let turned = [0.0, 1.0, 0.0, 0.0];
+        let mut numbers = 0..;
         let gone = t
-            .revise(|i, g| match i {
+            .revise(&Region::ALL, |g| match numbers.next().unwrap_or(0) {
                 0..10 => Fate::Goes,
                 10..20 => Fate::Moves { mean: [g.mean[0] + 1.0, g.mean[1], g.mean[2]], rotation: turned },
                 59 => Fate::Goes,
@@ -276,7 +313,7 @@ mod tests {
         last.sort_by(|a, b| a[0].total_cmp(&b[0]));
         assert_eq!(filled, last, "the last ones take the places that became free");
         assert!(t.step().unwrap().loss.is_finite());
-        assert_eq!(t.revise(|_, _| Fate::Goes).unwrap(), 48);
+        assert_eq!(t.revise(&Region::ALL, |_| Fate::Goes).unwrap(), 48);
         assert_eq!(t.gaussians(), 1, "never the last one");
     }
 
@@ -287,7 +324,7 @@ mod tests {
         t.load(&first).unwrap();
         t.step().unwrap();
         let mut sensitive = Vec::new();
-        t.each(|g| sensitive.push(g.sensitivity)).unwrap();
+        t.each(&Region::ALL, |g| sensitive.push(g.sensitivity)).unwrap();
         let mut order: Vec<usize> = (0..80).collect();
         order.sort_by(|a, b| sensitive[*b].total_cmp(&sensitive[*a]));
         let mut loss_with = |i: usize, factor: f32| {

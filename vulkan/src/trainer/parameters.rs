@@ -154,6 +154,15 @@ impl Parameters {
         record[at..at + size_of::<f32>()].copy_from_slice(bytemuck::bytes_of(&state));
     }
 
+    /// Gives a record the second moments of another one.
+    pub fn begin_with(&self, record: &mut [u8], donor: &[u8]) {
+        let at = std::mem::offset_of!(Geometry, second);
+        let sh = record.len() - self.sh_second.bytes_each();
+        for range in [at..size_of::<Geometry>(), sh..record.len()] {
+            record[range.clone()].copy_from_slice(&donor[range]);
+        }
+    }
+
     /// Holds Gaussian `index` where it is.
     fn hold(&self, arena: &mut Arena, index: usize) {
         self.geometry_mut(arena)[index].hold();
@@ -165,6 +174,18 @@ impl Parameters {
         self.geometry_mut(arena)[index].forget();
         self.sh_first.forget(arena, index);
         self.sh_second.forget(arena, index);
+    }
+}
+
+impl Geometry {
+    /// Of a record.
+    pub fn of_record(record: &[u8]) -> Self {
+        bytemuck::pod_read_unaligned(&record[..size_of::<Self>()])
+    }
+
+    /// Puts it into a record.
+    pub fn into_record(self, record: &mut [u8]) {
+        record[..size_of::<Self>()].copy_from_slice(bytemuck::bytes_of(&self));
     }
 }
 

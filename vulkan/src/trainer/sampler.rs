@@ -83,6 +83,11 @@ impl Sampler {
         self.order.last().map(|v| *v as usize)
     }
 
+    /// The next one while the newest are looked at first.
+    pub fn next_newest(&mut self, views: usize) -> Option<usize> {
+        self.newest.then(|| self.next(views, 0.0, |_| 0.0))
+    }
+
     /// `losses(view)` is the view's last loss; `views` is at least 1.
     pub fn next(&mut self, views: usize, residual_share: f32, losses: impl Fn(usize) -> f32) -> usize {
         if self.order.is_empty() && self.newest {

@@ -5,6 +5,7 @@
 //! Gaussian that is away. A cell that is away stands still; Adam's moments come back as they left. What happens depends on steps,
 //! never on how fast the disk is.
 
+mod amend;
 mod begin;
 mod cell;
 mod drawing;
@@ -207,7 +208,9 @@ impl Scene {
         visit: Visit<'_, E>,
     ) -> Result<(), E> {
         self.sample(n, visit)?;
-        let per_cell = plan.gaussians as f32 / settings.cells.per_window as f32;
+        // A scene that is to grow has cells for all that comes.
+        let (per_window, cells) = (settings.cells.per_window as f32, plan.cells() as f32);
+        let per_cell = (plan.gaussians as f32 / per_window).max(plan.scene as f32 / cells);
         let wanted = ((n as f32 / per_cell) as usize).clamp(1, plan.cells());
         let side = (self.wide(0) * self.wide(1) / wanted as f32).sqrt();
         self.grid.side = if side.is_finite() && side > 0.0 { side } else { 1.0 };

@@ -55,11 +55,11 @@ fn flight() -> Vec<PosedImage> {
 
 /// An engine in flight; `None`, with a word about it, where device or ONNX Runtime are missing.
 fn engine() -> Option<Reconstruction> {
-    engine_in(None).map(|engine| engine.expect("opens"))
+    engine_in(None, None).map(|engine| engine.expect("opens"))
 }
 
-/// The same in so much of the host's memory, MiB.
-fn engine_in(host_mib: Option<u32>) -> Option<Result<Reconstruction, JobError>> {
+/// The same in so much of the host's memory, MiB, on a device that holds so many Gaussians of them all.
+fn engine_in(host_mib: Option<u32>, on_device: Option<usize>) -> Option<Result<Reconstruction, JobError>> {
     if Gpu::list().is_err() || models::onnx::session::find_library().is_err() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers), or no ONNX Runtime");
         return None;
@@ -72,8 +72,9 @@ fn engine_in(host_mib: Option<u32>) -> Option<Result<Reconstruction, JobError>> 
         incremental: true,
         ..settings()
     };
-    let (size, views, max_gaussians) = ((LENS.width, LENS.height), LINE * LINES, Some(30_000));
-    settings.device = DeviceRequest { device_mib: 96, size, views, max_gaussians, ..settings.device };
+    let (size, views, all) = ((LENS.width, LENS.height), LINE * LINES, 30_000);
+    let (max_gaussians, scene_gaussians) = (on_device.or(Some(all)), on_device.map(|_| all));
+    settings.device = DeviceRequest { device_mib: 96, size, views, max_gaussians, scene_gaussians, ..settings.device };
     let region = vec![[-78.0, -27.0], [78.0, -27.0], [78.0, 27.0], [-78.0, 27.0]];
     Some(Reconstruction::open(settings, ModelHeader { region, ..ModelHeader::default() }, "fly"))
 }
@@ -86,11 +87,11 @@ fn what_waits_of_few_pictures_goes_to_a_file_when_the_host_has_no_room_for_it() 
     drop(roomy);
     let mib = |bytes: u64| Some((bytes >> 20) as u32);
     // A little less: one of the two files does. As little as both save: the other, too. Less than that is refused.
-    let little = engine_in(mib(bytes - (1 << 20))).expect("as before").expect("fits");
+    let little = engine_in(mib(bytes - (1 << 20)), None).expect("as before").expect("fits");
     assert!(planned(&little) < bytes - (1 << 20));
-    let least = planned(&engine_in(mib(planned(&little) - (1 << 20))).expect("as before").expect("fits"));
+    let least = planned(&engine_in(mib(planned(&little) - (1 << 20)), None).expect("as before").expect("fits"));
     assert!(least < planned(&little) - (1 << 20));
-    let refused = engine_in(mib(least - (1 << 20))).expect("as before").map(drop);
+    let refused = engine_in(mib(least - (1 << 20)), None).expect("as before").map(drop);
     assert!(matches!(refused, Err(JobError::HostMemory { .. })), "{refused:?}");
 }
 
@@ -162,6 +163,29 @@ fn every_picture_is_in_the_model_at_once_at_a_cost_that_does_not_grow_with_the_f
     let (then, now) = (mean(early, |n| n.2), mean(late, |n| n.2));
     assert!(then > 200.0 && now < 1.4 * then, "observations {then} {now}: {near:?}");
     assert!(mean(late, |n| n.0) < 1.4 * mean(early, |n| n.0), "depths: {near:?}");
+}
+
+#[test]
+fn a_flight_over_more_than_the_device_holds_grows_as_well() {
+    let Some(engine) = engine_in(None, Some(6_000)) else { return };
+    let (pictures, mut engine) = (flight(), engine.expect("opens"));
+    let mut grown = 0;
+    for (i, picture) in pictures.into_iter().take(2 * LINE).enumerate() {
+        grown += usize::from(take(&mut engine, picture).is_some());
+        assert!(i < 2 || engine.built.len() == i + 1, "picture {i} waits for nothing");
+    }
+    assert_eq!((grown, engine.builds), (2 * LINE - 3, 1), "built once, of three");
+    let (cells, on_device) = engine.trainer.cells();
+    assert!(cells > on_device && on_device > 0, "{on_device} of {cells} cells");
+    let model = snapshot(&mut engine);
+    assert!(model.len() > 6_000 && model.len() == engine.gaussians(), "{} {}", model.len(), engine.gaussians());
+    // To make room and to give up is done in cells, too.
+    engine.make_room(1_000).expect("made");
+    assert_eq!(engine.gaussians(), model.len() - 1_000);
+    engine.shrink().expect("shrinks");
+    assert!(engine.gaussians() < model.len() - 2_000);
+    engine.land();
+    assert!(engine.build(&|| true).expect("built"));
 }
 
 #[test]

@@ -13,13 +13,16 @@ use crate::trainer::{TrainError, Trainer};
 const PLACES: usize = 32;
 
 impl Trainer {
-    /// The view, of those looked at least, that a window begins with, and which part of it, in which at most `first` Gaussians show, or,
+    /// The view, of those looked at least, or while views come of the newest, that a window begins with, and which part of it, in which at most `first` Gaussians show, or,
     /// where a block alone shows more, `capacity`.
     pub(super) fn begin_with_view(&mut self, first: usize, capacity: usize) -> Result<(Picture, Blocks), TrainError> {
         let (views, mut fewest) = (self.views.len(), usize::MAX);
         loop {
             let mut best: Option<(f32, usize, (u8, u8))> = None;
-            let places = self.scene.window.least_visited::<PLACES>(views, self.sampler.rng());
+            let newest = self.sampler.next_newest(views).map(|view| view..view + 1);
+            let (window, rng) = (&self.scene.window, self.sampler.rng());
+            let places = newest.and_then(|view| window.least_visited::<PLACES>(view, rng));
+            let places = places.or_else(|| window.least_visited(0..views, self.sampler.rng()));
             for (view, block) in places.into_iter().flatten() {
                 let here = self.share_at_work(Picture::View(view), block);
                 if best.is_none_or(|(most, ..)| here > most) {

@@ -10,7 +10,7 @@ use crate::trainer::parameters::{Held, Parameters};
 use crate::trainer::{TrainError, Trainer, state};
 
 /// The device's memory while cells come and go.
-struct Device<'a> {
+pub(super) struct Device<'a> {
     arena: &'a mut Arena,
     parameters: Parameters,
     /// Updates so far.
@@ -68,7 +68,7 @@ impl Scene {
     }
 
     /// What was lost on the way to the file or from it must not be taken for a smaller scene.
-    fn check_whole(&self) -> Result<(), TrainError> {
+    pub(super) fn check_whole(&self) -> Result<(), TrainError> {
         match self.whole {
             true => Ok(()),
             false => {
@@ -265,7 +265,10 @@ fn run_of<'a>(order: &'a [u32], tags: &[u32], index: u32) -> &'a [u32] {
 
 impl Trainer {
     /// Moves cells, and counts what was moved.
-    fn page(&mut self, how: impl FnOnce(&mut Scene, Device<'_>) -> Result<(), TrainError>) -> Result<(), TrainError> {
+    pub(super) fn page(
+        &mut self,
+        how: impl FnOnce(&mut Scene, Device<'_>) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
         let _phase = tracing::trace_span!("page").entered();
         let moved = self.scene.store.moved;
         let degree = (self.settings.sh.raise_share >= 1.0).then_some(self.plan.sh_degree);

@@ -24,6 +24,17 @@ impl Chain {
     pub const EMPTY: Self = Self { first: NONE, last: NONE, count: 0 };
 }
 
+/// What becomes of a record that is looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Rewritten {
+    /// Nothing.
+    Stays,
+    /// It was changed.
+    Changes,
+    /// It is taken out.
+    Goes,
+}
+
 /// Blocks in a file, and a buffer of one.
 pub(crate) struct Store {
     file: Option<File>,
@@ -160,6 +171,64 @@ impl Store {
         Ok(())
     }
 
+    /// Rewrites the cell's records where they lie, as `look` says of each; those behind one that goes move up, and blocks that become
+    /// empty are free.
+    ///
+    /// # Errors
+    /// [`TrainError::SceneFile`]: what was rewritten so far is, and what was not is not.
+    pub fn rewrite(
+        &mut self,
+        chain: &mut Chain,
+        mut look: impl FnMut(&mut [u8]) -> Rewritten,
+    ) -> Result<(), TrainError> {
+        let (mut from, mut to, mut done, mut kept, count) = (chain.first, chain.first, 0, 0, chain.count as usize);
+        while done < count && from != NONE {
+            let records = BLOCK_GAUSSIANS.min(count - done);
+            let at = self.offset(from, 0);
+            let (bytes, record) = (&mut self.buffer[..records * self.record], self.record);
+            self.file.as_ref().ok_or_else(no_file)?.read_exact_at(bytes, at).map_err(|e| failed("reading", &e))?;
+            self.moved += bytes.len() as u64;
+            let (mut changed, mut stay) = (kept < done, 0);
+            for i in 0..records {
+                let rewritten = look(&mut bytes[i * record..(i + 1) * record]);
+                changed |= rewritten != Rewritten::Stays;
+                if rewritten != Rewritten::Goes {
+                    bytes.copy_within(i * record..(i + 1) * record, stay * record);
+                    stay += 1;
+                }
+            }
+            let mut written = 0;
+            while written < stay {
+                let within = kept % BLOCK_GAUSSIANS;
+                if within == 0 && kept > 0 {
+                    to = self.next[to as usize];
+                }
+                let records = (BLOCK_GAUSSIANS - within).min(stay - written);
+                if changed {
+                    let at = self.offset(to, within);
+                    let bytes = &self.buffer[written * record..(written + records) * record];
+                    let file = self.file.as_ref().ok_or_else(no_file)?;
+                    file.write_all_at(bytes, at).map_err(|e| failed("writing", &e))?;
+                    self.moved += bytes.len() as u64;
+                }
+                (kept, written) = (kept + records, written + records);
+            }
+            done += records;
+            from = self.next[from as usize];
+        }
+        if kept == 0 {
+            self.forget(chain);
+            return Ok(());
+        }
+        let behind = std::mem::replace(&mut self.next[to as usize], NONE);
+        if behind != NONE {
+            self.next[chain.last as usize] = self.free;
+            self.free = behind;
+        }
+        (chain.last, chain.count) = (to, kept as u32);
+        Ok(())
+    }
+
     fn offset(&self, block: u32, record: usize) -> u64 {
         (block as u64 * BLOCK_GAUSSIANS as u64 + record as u64) * self.record as u64
     }
@@ -231,6 +300,49 @@ mod tests {
         cells.iter_mut().for_each(|c| store.append(c, BLOCK_GAUSSIANS, |_, r| r.fill(1)).unwrap());
         cells.iter_mut().for_each(|c| store.forget(c));
         assert!(store.append(&mut { Chain::EMPTY }, BLOCK_GAUSSIANS * store.next.len(), |_, _| {}).is_ok());
+    }
+
+    #[test]
+    fn records_change_and_go_where_they_lie_and_blocks_that_become_empty_are_free() {
+        let mut store = store();
+        let (mut a, mut b) = (Chain::EMPTY, Chain::EMPTY);
+        for round in 0..4u8 {
+            store.append(&mut a, 40, |i, r| r.fill(round * 40 + i as u8)).unwrap();
+            store.append(&mut b, 1, |_, r| r.fill(200 + round)).unwrap();
+        }
+        let free =
+            |store: &Store| std::iter::successors(Some(store.free), |b| store.next.get(*b as usize).copied()).count();
+        let before = free(&store);
+        // What stays as it is is not written.
+        let (read_before, mut looked_at) = (store.moved, 0);
+        store
+            .rewrite(&mut a, |_| {
+                looked_at += 1;
+                Rewritten::Stays
+            })
+            .unwrap();
+        assert_eq!((looked_at, store.moved - read_before), (160, 160 * store.record as u64));
+        store
+            .rewrite(&mut a, |r| match r[0] {
+                0..70 | 150.. => Rewritten::Goes,
+                100 => {
+                    r.fill(250);
+                    Rewritten::Changes
+                }
+                _ => Rewritten::Stays,
+            })
+            .unwrap();
+        let left: Vec<u8> = (70..150).map(|v| if v == 100 { 250 } else { v }).collect();
+        assert_eq!((read(&mut store, &a), a.count), (left.clone(), 80));
+        assert_eq!(
+            (read(&mut store, &b), free(&store)),
+            (vec![200, 201, 202, 203], before + 2),
+            "five blocks, now three"
+        );
+        store.append(&mut a, 40, |i, r| r.fill(i as u8)).unwrap();
+        assert_eq!(read(&mut store, &a), left.into_iter().chain(0..40).collect::<Vec<u8>>());
+        store.rewrite(&mut a, |_| Rewritten::Goes).unwrap();
+        assert_eq!((a.count, free(&store)), (0, before + 5));
     }
 
     #[test]

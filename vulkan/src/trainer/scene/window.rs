@@ -9,6 +9,7 @@ use config::plan::Plan;
 use config::training::Strategy;
 use glam::Vec2;
 use rand::Rng;
+use std::ops::Range;
 
 use super::cell::{Blocks, SIDE, Sight};
 use super::parts::largest_rectangle;
@@ -86,6 +87,12 @@ impl Window {
         self.visits.fill(0);
     }
 
+    /// Ends with the update `updates`. What showed nothing may show something afterwards.
+    pub fn end_at(&mut self, updates: u32) {
+        self.until = updates;
+        self.visits.iter_mut().filter(|visits| **visits == NEVER).for_each(|visits| *visits = 0);
+    }
+
     /// How likely an item is chosen: by its blocks, each the less the oftener it was looked at.
     fn chance(&self, item: &Item) -> u64 {
         let Picture::View(view) = item.picture else { return item.weight.into() };
@@ -96,13 +103,13 @@ impl Window {
         u64::from(item.part.count()) * part.map(|(_, visits)| LEAST_SEEN >> shift(*visits)).sum::<u64>()
     }
 
-    /// Blocks of the first `views` views, of those that were looked at least, by chance; `None` when none can be.
+    /// Blocks of `views`, of those that were looked at least, by chance; `None` when none can be.
     pub(super) fn least_visited<const N: usize>(
         &self,
-        views: usize,
+        views: Range<usize>,
         rng: &mut impl Rng,
     ) -> Option<[(usize, (u8, u8)); N]> {
-        let visits = &self.visits[..views * BLOCKS];
+        let visits = &self.visits[views.start * BLOCKS..views.end * BLOCKS];
         let least = visits.iter().copied().min().filter(|v| *v != NEVER)?;
         let those = || visits.iter().enumerate().filter(|(_, v)| **v == least).map(|(at, _)| at);
         let count = those().count();
@@ -112,7 +119,7 @@ impl Window {
         for (ordinal, at) in those().enumerate() {
             while let Some((_, i)) = left.next_if(|(drawn, _)| *drawn == ordinal) {
                 let block = (at % BLOCKS) as u8;
-                found[*i] = (at / BLOCKS, (block % SIDE, block / SIDE));
+                found[*i] = (views.start + at / BLOCKS, (block % SIDE, block / SIDE));
             }
             if left.peek().is_none() {
                 break;
@@ -322,12 +329,14 @@ mod tests {
         window.visits.fill(3);
         (window.visits[5], window.visits[BLOCKS + 9], window.visits[20]) = (2, 2, NEVER);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
-        let found = window.least_visited::<16>(2, &mut rng).unwrap();
+        let found = window.least_visited::<16>(0..2, &mut rng).unwrap();
         let those = [(0, (5, 0)), (1, (1, 1))];
         assert!(found.iter().all(|place| those.contains(place)), "{found:?}");
         assert!(those.iter().all(|place| found.contains(place)), "{found:?}");
+        let found = window.least_visited::<16>(1..2, &mut rng).unwrap();
+        assert_eq!(found, [(1, (1, 1)); 16]);
         window.visits.fill(NEVER);
-        assert_eq!(window.least_visited::<4>(2, &mut rng), None);
+        assert_eq!(window.least_visited::<4>(0..2, &mut rng), None);
     }
 
     #[test]
