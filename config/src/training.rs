@@ -10,6 +10,7 @@ mod density;
 mod rates;
 mod schedule;
 mod skips;
+mod validation;
 
 pub use cells::CellSettings;
 pub use crops::CropSettings;
@@ -17,6 +18,7 @@ pub use density::{DensitySettings, Strategy};
 pub use rates::{AdamSettings, RateSettings};
 pub use schedule::{ResolutionSettings, ShSettings, StopSettings, ViewSettings};
 pub use skips::SkipSettings;
+pub use validation::ValidationSettings;
 
 use crate::settings::{Limits, table};
 
@@ -60,6 +62,8 @@ table! {
         pub stop: StopSettings = StopSettings::default();
         /// Regularisers that act on the parameters or on the rendering.
         pub regularise: RegulariseSettings = RegulariseSettings::default();
+        /// Views that are kept back for a while.
+        pub validation: ValidationSettings = ValidationSettings::default();
         /// Work that is left out because it changes nothing.
         pub skips: SkipSettings = SkipSettings::default();
         /// Share of the Gaussians that leave a model which is delivered rounded at most: those that its loss hangs on least. The others learn

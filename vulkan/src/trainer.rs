@@ -27,6 +27,7 @@ mod slots;
 mod snapshot;
 mod state;
 mod step;
+mod validation;
 mod views;
 
 pub use check::{PlanFit, TrainingCheck, check_device, check_plan, check_training};
@@ -37,6 +38,7 @@ pub use grow::{Fate, Region, Trained};
 pub use load::{LoadReport, Pieces};
 pub use render::Rendering;
 pub use run::{Counters, RunBudget, StepReport, StopReason, TrainSummary};
+pub use validation::Validated;
 
 use crate::arena::Arena;
 use crate::commands::{Commands, Recording};
@@ -87,6 +89,7 @@ pub struct Trainer {
     crop_sampler: sampler::Sampler,
     density: density::Scratch,
     degrees: degrees::Degrees,
+    validation: validation::Validation,
     bands: Vec<bands::Band>,
     /// Dispatches that counting and emitting are spread over.
     walk_rounds: u32,
@@ -179,6 +182,7 @@ impl Trainer {
             crop_sampler: sampler::Sampler::new(settings.seed, plan.crops),
             density: density::Scratch::new(plan.gaussians),
             degrees: degrees::Degrees::new(plan.gaussians),
+            validation: validation::Validation::new(plan.views),
             bands: Vec::with_capacity(plan.tiles),
             walk_rounds: bands::WALK_ROUNDS,
             strategy: Strategy::None,
@@ -214,6 +218,7 @@ impl Trainer {
         self.density.last = 0.0;
         self.density.last_flush = 0;
         self.degrees.reset();
+        self.validation.reset();
         self.commands.clear_times();
     }
 

@@ -8,7 +8,7 @@ use image::imageops::{FilterType, resize};
 use models::camera::{Pose, PosedImage};
 use models::dataset::scaled;
 use models::formats::model;
-use vulkan::trainer::{RunBudget, StepReport, StopReason};
+use vulkan::trainer::{RunBudget, StepReport, StopReason, Validated};
 
 use super::energy::EVERY_S;
 use super::{PictureSource, Reconstruction, model_path};
@@ -312,6 +312,16 @@ impl Reconstruct for Reconstruction {
         if let (cells @ 1.., _) = self.trainer.cells() {
             let windows = serde_json::json!({ "cells": cells, "windows": c.windows, "paged_bytes": c.paged_bytes });
             self.report.more.insert("cells".into(), windows);
+        }
+        if let Some(Validated { views, holds, drop }) = self.trainer.validated() {
+            let validation = serde_json::json!({ "views": views, "holds": holds, "drop": drop });
+            if self.report.more.insert("validation".into(), validation).is_none() {
+                let (holds, drop) = (100.0 * holds, 100.0 * drop);
+                tracing::info!(
+                    "of what is learnt of the other pictures {holds:.0} % holds for {views} that were kept back: \
+                     {drop:.0} % of the Gaussians are left out of each step by the end"
+                );
+            }
         }
         self.report.more.insert("views_read_back".into(), self.trainer.views_read_back().into());
         if let Some(last) = last.filter(|last| last.loss.is_finite()) {

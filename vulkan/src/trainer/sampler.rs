@@ -22,6 +22,8 @@ pub(crate) struct Sampler {
     visits: Vec<u32>,
     /// While views came some were chosen more often than others: the next epoch begins with those chosen least.
     uneven: bool,
+    /// Views that have no turn.
+    left_out: Vec<bool>,
 }
 
 impl Sampler {
@@ -36,13 +38,25 @@ impl Sampler {
             by_loss: Vec::with_capacity(capacity),
             visits: vec![0; capacity],
             uneven: false,
+            left_out: vec![false; capacity],
         }
     }
 
     /// Back to the first epoch.
     pub fn reset(&mut self) {
         self.rng = Pcg64Mcg::seed_from_u64(self.seed);
+        self.leave_out(|_| false);
+    }
+
+    /// Views of which `is_left_out` says so have no turn from here on; the present epoch ends.
+    pub fn leave_out(&mut self, is_left_out: impl Fn(usize) -> bool) {
+        self.left_out.iter_mut().enumerate().for_each(|(view, left_out)| *left_out = is_left_out(view));
         self.order.clear();
+    }
+
+    /// Whether the newest views are looked at first.
+    pub fn looks_at_newest(&self) -> bool {
+        self.newest
     }
 
     /// The set of views changed: the present epoch ends.
@@ -94,11 +108,14 @@ impl Sampler {
             self.draw_newest(views);
         }
         if self.order.is_empty() {
-            self.order.extend(0..views as u32);
+            let left_out = &self.left_out;
+            let turns = || (0..views as u32).filter(|view| !left_out.get(*view as usize).is_some_and(|out| *out));
+            self.order.extend(turns());
+            let views = self.order.len();
             let extra = (views as f32 * residual_share) as usize;
             if extra > 0 {
                 self.by_loss.clear();
-                self.by_loss.extend(0..views as u32);
+                self.by_loss.extend(turns());
                 self.by_loss
                     .sort_unstable_by(|a, b| losses(*b as usize).total_cmp(&losses(*a as usize)).then(a.cmp(b)));
                 self.order.extend(self.by_loss.iter().take(extra.min(views)));
@@ -179,6 +196,21 @@ mod tests {
         // From then on every epoch is shuffled.
         let next: Vec<i32> = (0..views).map(|_| before[sampler.next(views, 0.0, |_| 0.0)]).collect();
         assert!(!next.is_sorted());
+    }
+
+    #[test]
+    fn views_that_are_left_out_have_no_turn_until_they_are_back() {
+        let (views, mut sampler) = (10, Sampler::new(5, 10));
+        let turns = |sampler: &mut Sampler, n| {
+            let mut turns: Vec<usize> = (0..n).map(|_| sampler.next(views, 0.2, |v| v as f32)).collect();
+            turns.sort_unstable();
+            turns
+        };
+        sampler.next(views, 0.2, |_| 0.0);
+        sampler.leave_out(|view| view % 5 == 4);
+        assert_eq!(turns(&mut sampler, 9), [0, 1, 2, 3, 5, 6, 7, 8, 8], "none of them by its loss either");
+        sampler.leave_out(|_| false);
+        assert_eq!(turns(&mut sampler, 12), [0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 9, 9]);
     }
 
     #[test]

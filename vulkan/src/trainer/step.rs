@@ -5,6 +5,7 @@ use super::frame::flags_of;
 use super::scene::Blocks;
 use super::slots::Picture;
 use super::{StepReport, TrainError, Trainer};
+use crate::commands::Recording;
 use crate::constants::{self, TILE_HEIGHT, TILE_WIDTH};
 use crate::kernels::{DEPTH_LANES, Kernel};
 use crate::layout::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, LossSums, PoseSums, Push};
@@ -33,6 +34,7 @@ impl Trainer {
             self.open_degrees();
         }
         let progress = self.progress();
+        self.validate(progress)?;
         let (picture, part) = if self.scene.is_paged() {
             self.hold_window(progress)?;
             self.choose_part(progress)
@@ -110,7 +112,7 @@ impl Trainer {
             let rng = self.sampler.rng();
             f.background = std::array::from_fn(|_| rng.random_range(0.0..1.0) * s.regularise.background);
         }
-        f.drop_share = s.regularise.drop * progress;
+        f.drop_share = s.regularise.drop.max(self.validation.drop()) * progress;
         let r = &s.rates;
         let mean = r.mean(progress, self.extent);
         // The device multiplies every step by the first bias: what decays for all decays there.
@@ -146,14 +148,9 @@ impl Trainer {
         self.cut_bands()
     }
 
-    /// Second submission (one per band where there are several): blend, loss, gradient, Adam.
-    pub(super) fn forward_backward(&mut self) -> Result<(), TrainError> {
-        let _phase = tracing::trace_span!("blend, loss, gradient, Adam").entered();
-        let depth = self.frame.has(FLAG_DEPTH);
+    /// Begins the second submission: the picture, band by band.
+    pub(super) fn blend(&self) -> Result<Recording<'_>, TrainError> {
         let single = self.bands.len() == 1;
-        let backward = if depth { Kernel::RasteriseBackwardDepth } else { Kernel::RasteriseBackward };
-        let lanes = self.plan.lanes.loops as usize;
-        let visible = self.status().visible as usize;
         let mut r = self.take_recording()?;
         for (i, band) in self.bands.iter().enumerate() {
             if i > 0 {
@@ -163,16 +160,33 @@ impl Trainer {
             self.record_emit(&r, *band, single);
             self.record_blend(&r, *band);
         }
+        Ok(r)
+    }
+
+    /// The loss of the picture, and its gradient at every pixel.
+    pub(super) fn record_loss(&self, r: &Recording<'_>) {
         let (width, height) = (self.frame.size[0] as usize, self.frame.size[1] as usize);
         let (rows, columns) = (width.div_ceil(STRIP) * height, height.div_ceil(STRIP) * width);
-        if depth {
-            r.run(Kernel::DepthSums, DEPTH_LANES as usize, Push::default());
-            r.run(Kernel::DepthFinish, 1, Push::default());
-        }
         r.run(Kernel::SsimRows, rows, Push::default());
         r.run(Kernel::SsimColumns, columns, Push::default());
         r.run(Kernel::SsimBackRows, rows, Push::default());
         r.run(Kernel::LossGradient, columns, Push::default());
+    }
+
+    /// Second submission (one per band where there are several): blend, loss, gradient, Adam.
+    pub(super) fn forward_backward(&mut self) -> Result<(), TrainError> {
+        let _phase = tracing::trace_span!("blend, loss, gradient, Adam").entered();
+        let depth = self.frame.has(FLAG_DEPTH);
+        let single = self.bands.len() == 1;
+        let backward = if depth { Kernel::RasteriseBackwardDepth } else { Kernel::RasteriseBackward };
+        let lanes = self.plan.lanes.loops as usize;
+        let visible = self.status().visible as usize;
+        let mut r = self.blend()?;
+        if depth {
+            r.run(Kernel::DepthSums, DEPTH_LANES as usize, Push::default());
+            r.run(Kernel::DepthFinish, 1, Push::default());
+        }
+        self.record_loss(&r);
         if !single {
             // Emitting moved the histogram on; count once more for the second round.
             self.record_tiles(&r);

@@ -1,0 +1,156 @@
+//! Views that are kept back tell what is learnt by heart.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
+
+#[path = "../../tests/counting_allocator.rs"]
+mod counting_allocator;
+mod scenes;
+
+use std::collections::BTreeSet;
+
+use config::plan::{Plan, PlanRequest};
+use config::training::{Strategy, TrainSettings};
+use counting_allocator::allocations;
+use glam::DVec3;
+use models::camera::View;
+use models::cloud::GaussianCloud;
+use scenes::device::{plain, posed};
+use scenes::{cloud, photo, view};
+use vulkan::gpu::Gpu;
+use vulkan::trainer::{Rendering, Trainer};
+
+const VIEWS: usize = 10;
+const STEPS: u32 = 600;
+/// Those that are kept back of ten.
+const KEPT: [usize; 2] = [2, 7];
+
+fn settings() -> TrainSettings {
+    let mut settings = plain();
+    settings.density.strategy = Strategy::None;
+    settings.steps = STEPS;
+    settings
+}
+
+fn trainer(settings: &TrainSettings) -> Option<Trainer> {
+    let Ok(gpu) = Gpu::open(None) else {
+        println!("skipped: no Vulkan device");
+        return None;
+    };
+    let request = PlanRequest {
+        device_mib: 64,
+        width: 64,
+        height: 48,
+        views: VIEWS as u32,
+        max_gaussians: Some(400),
+        ..Default::default()
+    };
+    Some(Trainer::new(&gpu, &Plan::new(&request).unwrap(), settings).unwrap())
+}
+
+/// A camera so many metres to the east.
+fn look(east_m: f64) -> View {
+    let mut v = view(64, 48);
+    v.pose.center += DVec3::X * east_m;
+    v
+}
+
+/// Ten pictures of one thing, seen from nearly the same place: what is learnt of some holds for all.
+fn of_one_thing(settings: &TrainSettings) -> Option<Trainer> {
+    let mut t = trainer(settings)?;
+    let (thing, mut drawn) = (cloud(3, 200, 1), Rendering::default());
+    t.load(&thing).unwrap();
+    for k in 0..VIEWS {
+        let v = look(0.01 * k as f64);
+        t.render(&v, &mut drawn).unwrap();
+        let mut picture = posed(&v, &photo(0, &v));
+        for (pixel, rgb) in picture.image.pixels_mut().zip(drawn.rgb.chunks_exact(3)) {
+            pixel.0 = std::array::from_fn(|c| (255.0 * rgb[c].clamp(0.0, 1.0)).round() as u8);
+        }
+        t.add_view(&picture, None).unwrap();
+    }
+    let mut first = thing.clone();
+    first.sh.iter_mut().for_each(|c| *c *= 0.3);
+    t.load(&first).unwrap();
+    Some(t)
+}
+
+/// Ten pictures that have nothing in common, from all around: they can only be learnt by heart.
+fn of_nothing(settings: &TrainSettings) -> Option<Trainer> {
+    let mut t = trainer(settings)?;
+    for k in 0..VIEWS {
+        let v = look(0.6 * k as f64 - 2.7);
+        t.add_view(&posed(&v, &photo(k as u64, &v)), None).unwrap();
+    }
+    t.load(&cloud(3, 300, 3)).unwrap();
+    Some(t)
+}
+
+fn model(t: &mut Trainer) -> GaussianCloud {
+    let mut model = GaussianCloud::with_capacity(3, t.gaussians());
+    t.snapshot(&mut model).unwrap();
+    model
+}
+
+/// Views looked at while the schedule goes from one progress to the other.
+fn looked_at(t: &mut Trainer, until: f32) -> BTreeSet<usize> {
+    let mut seen = BTreeSet::new();
+    while t.progress() < until {
+        seen.insert(t.step().unwrap().view);
+    }
+    seen
+}
+
+#[test]
+fn what_holds_for_views_kept_back_is_learnt_on_and_what_does_not_is_left_out_more_and_more() {
+    let Some(mut t) = of_one_thing(&settings()) else { return };
+    looked_at(&mut t, 0.4);
+    let found = t.validated().unwrap();
+    assert!(found.views == 2 && found.holds > 0.6 && found.drop == 0.0, "{found:?}");
+    let mut t = of_nothing(&settings()).unwrap();
+    let before = looked_at(&mut t, 0.101);
+    let between = looked_at(&mut t, 0.349);
+    assert_eq!(t.validated(), None);
+    let after = looked_at(&mut t, 0.5);
+    assert_eq!(before.len(), VIEWS);
+    assert!(between.len() == VIEWS - 2 && KEPT.iter().all(|view| !between.contains(view)), "{between:?}");
+    assert_eq!(after.len(), VIEWS, "they are back");
+    let found = t.validated().unwrap();
+    assert!(found.holds < 0.0 && found.drop > 0.0, "{found:?}");
+}
+
+#[test]
+fn views_kept_back_and_what_is_left_out_follow_the_steps_and_allocate_nothing() {
+    let run = || {
+        let mut t = of_nothing(&settings())?;
+        (0..4).for_each(|_| _ = t.step().unwrap());
+        let before = allocations();
+        while t.progress() < 0.4 {
+            t.step().unwrap();
+        }
+        assert_eq!(allocations() - before, 0);
+        assert!(t.validated().unwrap().drop > 0.0);
+        Some(model(&mut t))
+    };
+    let Some(first) = run() else { return };
+    assert!(run().unwrap() == first, "the same seed, the same bytes");
+    let mut without = settings();
+    without.validation.share = 0.0;
+    let mut t = of_nothing(&without).unwrap();
+    looked_at(&mut t, 0.4);
+    assert!(t.validated().is_none() && model(&mut t) != first);
+}
+
+#[test]
+fn short_schedules_and_those_who_say_what_is_left_out_keep_nothing_back() {
+    let trained = |change: &dyn Fn(&mut TrainSettings)| {
+        let mut settings = settings();
+        change(&mut settings);
+        let mut t = of_nothing(&settings)?;
+        assert_eq!(looked_at(&mut t, 0.4).len(), VIEWS);
+        assert_eq!(t.validated(), None);
+        Some(model(&mut t))
+    };
+    let Some(short) = trained(&|s| s.steps = 490) else { return };
+    assert!(short == trained(&|s| (s.steps, s.validation.share) = (490, 0.0)).unwrap(), "to the bit as without");
+    trained(&|s| s.regularise.drop = 0.1);
+    trained(&|s| s.validation.drop = 0.0);
+}
