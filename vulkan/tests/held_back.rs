@@ -16,7 +16,7 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{Rendering, Trainer};
+use vulkan::trainer::{CropPlace, Rendering, Trainer};
 
 const VIEWS: usize = 10;
 const STEPS: u32 = 600;
@@ -40,6 +40,7 @@ fn trainer(settings: &TrainSettings) -> Option<Trainer> {
         width: 64,
         height: 48,
         views: VIEWS as u32,
+        crops: 1,
         max_gaussians: Some(400),
         ..Default::default()
     };
@@ -153,4 +154,20 @@ fn short_schedules_and_those_who_say_what_is_left_out_keep_nothing_back() {
     assert!(short == trained(&|s| (s.steps, s.validation.share) = (490, 0.0)).unwrap(), "to the bit as without");
     trained(&|s| s.regularise.drop = 0.1);
     trained(&|s| s.validation.drop = 0.0);
+}
+
+#[test]
+fn whoever_looks_at_crops_meanwhile_keeps_nothing_back_as_they_are_no_whole_pictures() {
+    for (from, kept) in [(0.2, false), (0.4, true)] {
+        let mut settings = settings();
+        settings.crops.from = from;
+        let Some(mut t) = of_nothing(&settings) else { return };
+        t.keep_views_in(tempfile::tempfile().unwrap());
+        let v = look(-2.7);
+        let large = View { intrinsics: v.intrinsics.resized(128, 96), ..v };
+        let part = image::imageops::crop_imm(&posed(&large, &photo(0, &large)).image, 32, 24, 64, 48).to_image();
+        t.add_crop(0, &part, None, CropPlace { x: 32, y: 24, whole: (128, 96) }).unwrap();
+        looked_at(&mut t, 0.37);
+        assert_eq!(t.validated().is_some(), kept, "crops from {from}");
+    }
 }

@@ -142,8 +142,10 @@ impl Trainer {
         let looks = u64::from(s.visits) * views as u64;
         let asked = s.share > 0.0 && s.drop > 0.0 && self.settings.regularise.drop == 0.0;
         let early = progress < COMPARED[0];
+        // What crops teach is no whole picture's loss.
+        let crops = !self.crops.is_empty() && self.settings.crops.from < COMPARED[1];
         let worth_it = views >= FEWEST_VIEWS && u64::from(self.expected_steps()) >= looks;
-        if !(asked && early && worth_it) || self.scene.is_paged() || self.sampler.looks_at_newest() {
+        if !(asked && early && worth_it) || crops || self.scene.is_paged() || self.sampler.looks_at_newest() {
             self.validation.phase = Phase::Over;
             return;
         }
@@ -151,8 +153,6 @@ impl Trainer {
         self.validation.phase = Phase::KeptBack;
         let kept = &self.validation.views;
         self.sampler.leave_out(|view| kept.contains(&(view as u32)));
-        let crops = &self.crops;
-        self.crop_sampler.leave_out(|crop| crops.get(crop).is_some_and(|crop| kept.contains(&(crop.view as u32))));
     }
 
     fn compare(&mut self, progress: f32) -> Result<(), TrainError> {
@@ -184,7 +184,6 @@ impl Trainer {
     /// Gives the views back, and draws the conclusion.
     fn end_validation(&mut self) {
         self.sampler.leave_out(|_| false);
-        self.crop_sampler.leave_out(|_| false);
         let v = &mut self.validation;
         v.phase = Phase::Over;
         let validated =
