@@ -156,7 +156,7 @@ impl Scene {
         fill: impl Fn(&GaussianCloud, usize, &mut [u8]),
     ) -> Result<(), E> {
         self.close();
-        let done = self.divide(plan, settings, n, &|see| {
+        let done = self.divide(plan, settings, [n, n], &|see| {
             kept.each(&mut |cloud, rows| {
                 rows.iter().for_each(|row| see(&geometry_of(cloud, *row as usize)));
                 Ok(())
@@ -199,19 +199,19 @@ impl Scene {
         if as_counted && all == n { Ok(()) } else { Err(TrainError::SceneChanged.into()) }
     }
 
-    /// Chooses the size of cells for the `n` Gaussians that `visit` shows, and counts and bounds the cells that have any.
+    /// Chooses the size of cells for the `n` Gaussians that `visit` shows, which are to become `grown`, and counts and bounds the cells
+    /// that have any.
     fn divide<E: From<TrainError>>(
         &mut self,
         plan: &Plan,
         settings: &TrainSettings,
-        n: usize,
+        [n, grown]: [usize; 2],
         visit: Visit<'_, E>,
     ) -> Result<(), E> {
         self.sample(n, visit)?;
-        // A scene that is to grow has cells for all that comes.
-        let (per_window, cells) = (settings.cells.per_window as f32, plan.cells() as f32);
-        let per_cell = (plan.gaussians as f32 / per_window).max(plan.scene as f32 / cells);
-        let wanted = ((n as f32 / per_cell) as usize).clamp(1, plan.cells());
+        let per_cell = plan.gaussians as f32 / settings.cells.per_window as f32;
+        let wanted = ((grown as f32 / per_cell) as usize).clamp(1, plan.cells());
+        let wanted = (wanted as u64 * n as u64 / grown.max(n) as u64).max(1) as usize;
         let side = (self.wide(0) * self.wide(1) / wanted as f32).sqrt();
         self.grid.side = if side.is_finite() && side > 0.0 { side } else { 1.0 };
         let mut found = self.count(visit)?;

@@ -1,4 +1,4 @@
-//! A scene that outgrows the device while it is densified goes into cells then.
+//! A scene that outgrows the device while it is densified, or as new ground comes, goes into cells then.
 
 use crate::trainer::{TrainError, Trainer};
 
@@ -8,7 +8,9 @@ impl Trainer {
         self.flush()?;
         self.scene.close();
         let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        self.scene.divide::<TrainError>(&self.plan, &self.settings, self.gaussians, &|see| {
+        // There are cells for all that the scene may come to hold.
+        let sizes = [self.gaussians, self.plan.scene];
+        self.scene.divide::<TrainError>(&self.plan, &self.settings, sizes, &|see| {
             geometry.iter().for_each(see);
             Ok(())
         })?;
