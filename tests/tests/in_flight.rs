@@ -74,7 +74,12 @@ fn cable(socket: &str, alias: PathBuf, pulled: &AtomicBool, over: &AtomicBool) {
         match socket.read(&mut buffer, wait) {
             // What comes while the cable is out is lost; so is what a full line does not take.
             Ok(got) => drop(near.as_mut().map(|port| port.write(&buffer[..got.bytes]))),
-            Err(_) => return,
+            // The simulator is gone, or never was there: the port was free a moment ago, and whoever starts a process beside us holds its
+            // old listener until that process runs.
+            Err(_) => {
+                (far, near) = (None, None);
+                continue;
+            }
         }
         if let Some(Ok(got)) = near.as_mut().map(|port| port.read(&mut buffer, wait))
             && got.bytes > 0
