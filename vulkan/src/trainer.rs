@@ -34,7 +34,7 @@ pub use check::{PlanFit, TrainingCheck, check_device, check_plan, check_training
 pub use crops::CropPlace;
 pub use error::TrainError;
 pub use gradient::ViewGradients;
-pub use grow::{Fate, Region, Trained};
+pub use grow::{BoundingBox, Fate, Trained};
 pub use load::{LoadReport, Pieces};
 pub use render::Rendering;
 pub use run::{Counters, RunBudget, StepReport, StopReason, TrainSummary};

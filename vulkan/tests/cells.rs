@@ -13,17 +13,14 @@ use counting_allocator::allocations;
 use glam::DVec3;
 use models::camera::{OrthographicView, View};
 use models::cloud::GaussianCloud;
-use scenes::device::{plain, posed};
-use scenes::{cloud, photo, view};
-use vulkan::gpu::Gpu;
+use scenes::device::{model, open, plain, posed};
+use scenes::photo;
+use scenes::places::{look, three_places};
 use vulkan::trainer::{CropPlace, Rendering, RunBudget, TrainError, Trainer};
 
 /// A trainer of `on_device` Gaussians at once, of a scene of so many, for three views of 64 × 48.
 fn trainer(on_device: usize, scene: Option<usize>, settings: &TrainSettings) -> Option<Trainer> {
-    let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device");
-        return None;
-    };
+    let gpu = open()?;
     let request = PlanRequest {
         device_mib: 64,
         width: 64,
@@ -38,33 +35,6 @@ fn trainer(on_device: usize, scene: Option<usize>, settings: &TrainSettings) -> 
         trainer.keep_scene_in(tempfile::tempfile().unwrap());
     }
     Some(trainer)
-}
-
-/// Metres between two places of which no picture shows both.
-const APART: f64 = 1000.0;
-
-/// The scene of the other tests three times, far apart.
-fn three_places() -> GaussianCloud {
-    let mut all = cloud(8, 300, 3);
-    for place in [1, 2] {
-        let mut other = cloud(8 + place, 300, 3);
-        other.means.iter_mut().for_each(|m| m[0] += place as f32 * APART as f32);
-        all.extend(&other);
-    }
-    all
-}
-
-/// A camera at each place.
-fn look(place: usize) -> View {
-    let mut v = view(64, 48);
-    v.pose.center += DVec3::X * (place as f64 * APART);
-    v
-}
-
-fn model(trainer: &mut Trainer) -> GaussianCloud {
-    let mut model = GaussianCloud::with_capacity(3, trainer.gaussians());
-    trainer.snapshot(&mut model).unwrap();
-    model
 }
 
 /// So many updates in a window before the next is chosen.
@@ -268,7 +238,7 @@ fn a_step_is_a_picture_looked_at_however_many_parts_it_takes() {
 fn crops_of_a_scene_in_cells_are_trained_in_parts_too() {
     let mut settings = windows_of(1);
     (settings.crops.from, settings.crops.share) = (0.0, 0.5);
-    let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+    let Some(gpu) = open() else { return };
     let request = PlanRequest {
         device_mib: 64,
         width: 64,

@@ -5,23 +5,15 @@ mod scenes;
 
 use config::plan::{Plan, PlanRequest};
 use config::training::Strategy;
-use glam::DVec3;
-use models::camera::View;
 use models::cloud::GaussianCloud;
-use scenes::device::{plain, posed};
-use scenes::{cloud, photo, view};
-use vulkan::gpu::Gpu;
-use vulkan::trainer::{Fate, Region, TrainError, Trained, Trainer};
-
-/// Metres between two places of which no picture shows both.
-const APART: f32 = 1000.0;
+use scenes::device::{model, open, plain, posed};
+use scenes::photo;
+use scenes::places::{APART, at, look, three_places};
+use vulkan::trainer::{BoundingBox, Fate, TrainError, Trained, Trainer};
 
 /// A trainer that has room for 400 Gaussians, or all, of a scene of 1,300.
 fn trainer(paged: bool) -> Option<Trainer> {
-    let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device");
-        return None;
-    };
+    let gpu = open()?;
     let request = PlanRequest {
         device_mib: 64,
         width: 64,
@@ -40,35 +32,9 @@ fn trainer(paged: bool) -> Option<Trainer> {
     Some(trainer)
 }
 
-/// 300 Gaussians at a place.
-fn at(place: usize) -> GaussianCloud {
-    let mut scene = cloud(8 + place as u64, 300, 3);
-    scene.means.iter_mut().for_each(|m| m[0] += place as f32 * APART);
-    scene
-}
-
-fn three_places() -> GaussianCloud {
-    let mut all = at(0);
-    (1..3).for_each(|place| all.extend(&at(place)));
-    all
-}
-
-/// A camera at each place.
-fn look(place: usize) -> View {
-    let mut v = view(64, 48);
-    v.pose.center += DVec3::X * f64::from(place as f32 * APART);
-    v
-}
-
 fn add_view(t: &mut Trainer, place: usize) {
     let v = look(place);
     t.add_view(&posed(&v, &photo(place as u64, &v)), None).unwrap();
-}
-
-fn model(t: &mut Trainer) -> GaussianCloud {
-    let mut model = GaussianCloud::with_capacity(3, t.gaussians());
-    t.snapshot(&mut model).unwrap();
-    model
 }
 
 /// Means and rotations in an order of their own: cells have another one.
@@ -80,9 +46,12 @@ fn sorted(cloud: &GaussianCloud) -> Vec<[u32; 7]> {
 }
 
 /// Around a place.
-fn around(place: usize) -> Region {
+fn around(place: usize) -> BoundingBox {
     let x = place as f32 * APART;
-    Region { low: [x - 100.0, f32::NEG_INFINITY, f32::NEG_INFINITY], high: [x + 100.0, f32::INFINITY, f32::INFINITY] }
+    BoundingBox {
+        low: [x - 100.0, f32::NEG_INFINITY, f32::NEG_INFINITY],
+        high: [x + 100.0, f32::INFINITY, f32::INFINITY],
+    }
 }
 
 #[test]
@@ -109,7 +78,7 @@ fn what_comes_moves_and_goes_in_cells_is_what_does_where_the_device_holds_everyt
         assert_eq!((report.loaded, report.dropped_non_finite, report.dropped_over_capacity), (499, 1, 0));
         let (mut seen, mut all) = (Vec::new(), 0);
         t.each(&around(2), |g| seen.push(g.mean.map(f32::to_bits))).unwrap();
-        t.each(&Region::ALL, |_| all += 1).unwrap();
+        t.each(&BoundingBox::ALL, |_| all += 1).unwrap();
         seen.sort_unstable();
         Some((gone, seen, all, t.gaussians(), sorted(&model(&mut t))))
     };
@@ -161,7 +130,7 @@ fn a_scene_in_cells_takes_no_more_than_it_has_room_for_and_never_loses_its_last_
     });
     let report = t.extend(&more).unwrap();
     assert_eq!((report.loaded, report.dropped_over_capacity, t.gaussians()), (400, 200, 1300));
-    assert_eq!(t.revise(&Region::ALL, |_| Fate::Goes).unwrap(), 1299);
+    assert_eq!(t.revise(&BoundingBox::ALL, |_| Fate::Goes).unwrap(), 1299);
     assert_eq!((t.gaussians(), model(&mut t).len()), (1, 1));
 }
 
@@ -172,9 +141,11 @@ fn a_file_that_fails_while_gaussians_move_is_an_error_and_never_a_smaller_model(
     add_view(&mut t, 0);
     (0..3).for_each(|_| _ = t.step().unwrap());
     t.keep_scene_in(std::fs::File::options().read(true).write(true).open("/dev/null").unwrap());
-    let error = t.revise(&Region::ALL, |_| Fate::Goes).unwrap_err();
+    let error = t.revise(&BoundingBox::ALL, |_| Fate::Goes).unwrap_err();
     assert!(matches!(error, TrainError::SceneFile(_)), "{error}");
-    for error in [t.extend(&at(1)).map(drop), t.each(&Region::ALL, |_| {}), t.snapshot(&mut GaussianCloud::default())] {
+    for error in
+        [t.extend(&at(1)).map(drop), t.each(&BoundingBox::ALL, |_| {}), t.snapshot(&mut GaussianCloud::default())]
+    {
         let error = error.unwrap_err();
         assert!(error.to_string().contains("last checkpoint"), "{error}");
     }

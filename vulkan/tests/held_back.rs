@@ -12,10 +12,8 @@ use config::training::{Strategy, TrainSettings};
 use counting_allocator::allocations;
 use glam::DVec3;
 use models::camera::View;
-use models::cloud::GaussianCloud;
-use scenes::device::{plain, posed};
+use scenes::device::{model, open, plain, posed};
 use scenes::{cloud, photo, view};
-use vulkan::gpu::Gpu;
 use vulkan::trainer::{CropPlace, Rendering, Trainer};
 
 const VIEWS: usize = 10;
@@ -31,10 +29,7 @@ fn settings() -> TrainSettings {
 }
 
 fn trainer(settings: &TrainSettings) -> Option<Trainer> {
-    let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device");
-        return None;
-    };
+    let gpu = open()?;
     let request = PlanRequest {
         device_mib: 64,
         width: 64,
@@ -85,12 +80,6 @@ fn of_nothing(settings: &TrainSettings) -> Option<Trainer> {
     Some(t)
 }
 
-fn model(t: &mut Trainer) -> GaussianCloud {
-    let mut model = GaussianCloud::with_capacity(3, t.gaussians());
-    t.snapshot(&mut model).unwrap();
-    model
-}
-
 /// Views looked at while the schedule goes from one progress to the other.
 fn looked_at(t: &mut Trainer, until: f32) -> BTreeSet<usize> {
     let mut seen = BTreeSet::new();
@@ -138,6 +127,27 @@ fn views_kept_back_and_what_is_left_out_follow_the_steps_and_allocate_nothing() 
     let mut t = of_nothing(&without).unwrap();
     looked_at(&mut t, 0.4);
     assert!(t.validated().is_none() && model(&mut t) != first);
+}
+
+#[test]
+fn what_was_found_is_gone_with_a_load_and_goes_on_where_the_schedule_does() {
+    let Some(mut t) = of_nothing(&settings()) else { return };
+    looked_at(&mut t, 0.4);
+    let (found, there, spent) = (t.validated(), model(&mut t), t.spent());
+    assert!(found.is_some_and(|found| found.drop > 0.0));
+    let mut after = |continued: bool| {
+        t.load(&there).unwrap();
+        assert_eq!(t.validated(), None);
+        t.continue_from(spent.0, spent.1);
+        if continued {
+            t.continue_validated(found);
+        }
+        (0..5).for_each(|_| _ = t.step().unwrap());
+        (t.validated(), model(&mut t))
+    };
+    let (with, without) = (after(true), after(false));
+    assert_eq!((with.0, without.0), (found, None));
+    assert!(with.1 != without.1, "Gaussians are left out of each step again");
 }
 
 #[test]

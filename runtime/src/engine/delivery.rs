@@ -7,7 +7,7 @@ use std::cmp::Ordering;
 use config::training::RateSettings;
 use models::formats::FormatError;
 use models::formats::delivery;
-use vulkan::trainer::{Fate, Region, StepReport, Trained};
+use vulkan::trainer::{BoundingBox, Fate, StepReport, Trained};
 
 use super::Reconstruction;
 use crate::error::JobError;
@@ -91,7 +91,7 @@ impl Reconstruction {
         let told = self.trainer.steps() >= self.least_steps();
         let worth = |g: &Trained| if told { g.sensitivity } else { g.opacity_logit };
         let mut all = Vec::with_capacity(self.trainer.gaussians());
-        self.trainer.each(&Region::ALL, |g| all.push(worth(g)))?;
+        self.trainer.each(&BoundingBox::ALL, |g| all.push(worth(g)))?;
         all.sort_unstable_by(f32::total_cmp);
         let mut leave = (f64::from(share) * all.len() as f64) as usize;
         if told {
@@ -106,7 +106,7 @@ impl Reconstruction {
         // Of those that are worth the same the first ones.
         let below = all.partition_point(|v| v.total_cmp(&most).is_lt());
         let mut ties = leave - below;
-        Ok(self.trainer.revise(&Region::ALL, |g| {
+        Ok(self.trainer.revise(&BoundingBox::ALL, |g| {
             let goes = match worth(g).total_cmp(&most) {
                 Ordering::Less => true,
                 Ordering::Equal if ties > 0 => {
@@ -127,7 +127,9 @@ impl Reconstruction {
         self.cloud.clone_from(&rounded);
         drop(rounded);
         let ((steps, seconds), begun_at) = (self.trainer.spent(), self.trainer.begun_at());
+        let validated = self.trainer.validated();
         self.trainer.load(&self.cloud)?;
+        self.trainer.continue_validated(validated);
         self.trainer.continue_from(steps, seconds);
         self.trainer.begin_at(begun_at);
         self.trainer.keep_number();

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use models::camera::DepthPrior;
 use models::cloud::GaussianCloud;
-use vulkan::trainer::{Fate, Region, Trained};
+use vulkan::trainer::{BoundingBox, Fate, Trained};
 
 use super::carry::{Claims, Room};
 use super::follow::{Motion, Motions};
@@ -185,7 +185,7 @@ impl Reconstruction {
             (low, high) = (low.min(looks_at(m) - reach), high.max(looks_at(m) + reach));
         }
         let within = |p: glam::DVec2| p.cmpge(low).all() && p.cmple(high).all();
-        let region = Region {
+        let near = BoundingBox {
             low: [low.x as f32, low.y as f32, f32::NEG_INFINITY],
             high: [high.x as f32, high.y as f32, f32::INFINITY],
         };
@@ -197,7 +197,7 @@ impl Reconstruction {
             followed += usize::from(fate != Fate::Stays);
             fate
         };
-        let dropped = self.trainer.revise(&region, fate)?;
+        let dropped = self.trainer.revise(&near, fate)?;
         self.report.skip("gaussians_contradicted", dropped as u64);
         // Of the others what they moved adds up until it shows.
         going.into_iter().for_each(|i| self.built[i] = self.views[i].1);
@@ -210,7 +210,7 @@ impl Reconstruction {
         for m in &fresh.means {
             (low, high) = (low.min(glam::Vec3::from_array(*m)), high.max(glam::Vec3::from_array(*m)));
         }
-        let around = Region { low: (low - 8.0 * edge_m).into(), high: (high + 8.0 * edge_m).into() };
+        let around = BoundingBox { low: (low - 8.0 * edge_m).into(), high: (high + 8.0 * edge_m).into() };
         let (mut claims, mut room) = (Claims::new(edge_m), Room::new(self.share().square()));
         self.trainer.each(&around, |g| {
             claims.claim(g);
@@ -230,7 +230,7 @@ impl Reconstruction {
     /// Takes out the Gaussians that cover least.
     fn make_room(&mut self, least: usize) -> Result<(), JobError> {
         let mut covers: Vec<f32> = Vec::with_capacity(self.trainer.gaussians());
-        self.trainer.each(&Region::ALL, |g| covers.push(g.covers_m2()))?;
+        self.trainer.each(&BoundingBox::ALL, |g| covers.push(g.covers_m2()))?;
         let least = least.min(covers.len().saturating_sub(1));
         if least == 0 {
             return Ok(());
@@ -238,7 +238,7 @@ impl Reconstruction {
         let (below, most, _) = covers.select_nth_unstable_by(least - 1, f32::total_cmp);
         // Of those that cover the same the first ones.
         let (most, mut ties) = (*most, 1 + below.iter().filter(|c| c.total_cmp(most).is_eq()).count());
-        let gone = self.trainer.revise(&Region::ALL, |g| match g.covers_m2().total_cmp(&most) {
+        let gone = self.trainer.revise(&BoundingBox::ALL, |g| match g.covers_m2().total_cmp(&most) {
             Ordering::Less => Fate::Goes,
             Ordering::Equal if ties > 0 => {
                 ties -= 1;

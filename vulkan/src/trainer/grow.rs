@@ -46,14 +46,14 @@ impl Trained {
 
 /// A box of space whose edges run along the axes, metres: where Gaussians are looked at. Of a scene in cells the others are not read.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Region {
+pub struct BoundingBox {
     /// Its corner to the west, the south and below.
     pub low: [f32; 3],
     /// The corner across.
     pub high: [f32; 3],
 }
 
-impl Region {
+impl BoundingBox {
     /// Everywhere.
     pub const ALL: Self = Self { low: [f32::NEG_INFINITY; 3], high: [f32::INFINITY; 3] };
 
@@ -97,7 +97,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
-    pub fn each(&mut self, within: &Region, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
+    pub fn each(&mut self, within: &BoundingBox, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
         self.flush()?;
         let unbias = self.second_unbias();
         if self.scene.is_paged() {
@@ -124,7 +124,11 @@ impl Trainer {
     ///
     /// # Errors
     /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
-    pub fn revise(&mut self, within: &Region, mut fate: impl FnMut(&Trained) -> Fate) -> Result<usize, TrainError> {
+    pub fn revise(
+        &mut self,
+        within: &BoundingBox,
+        mut fate: impl FnMut(&Trained) -> Fate,
+    ) -> Result<usize, TrainError> {
         self.flush()?;
         let (mut gone, unbias): (Vec<u32>, _) = (Vec::new(), self.second_unbias());
         if self.scene.is_paged() {
@@ -293,7 +297,7 @@ mod tests {
         let turned = [0.0, 1.0, 0.0, 0.0];
         let mut numbers = 0..;
         let gone = t
-            .revise(&Region::ALL, |g| match numbers.next().unwrap_or(0) {
+            .revise(&BoundingBox::ALL, |g| match numbers.next().unwrap_or(0) {
                 0..10 => Fate::Goes,
                 10..20 => Fate::Moves { mean: [g.mean[0] + 1.0, g.mean[1], g.mean[2]], rotation: turned },
                 59 => Fate::Goes,
@@ -313,7 +317,7 @@ mod tests {
         last.sort_by(|a, b| a[0].total_cmp(&b[0]));
         assert_eq!(filled, last, "the last ones take the places that became free");
         assert!(t.step().unwrap().loss.is_finite());
-        assert_eq!(t.revise(&Region::ALL, |_| Fate::Goes).unwrap(), 48);
+        assert_eq!(t.revise(&BoundingBox::ALL, |_| Fate::Goes).unwrap(), 48);
         assert_eq!(t.gaussians(), 1, "never the last one");
     }
 
@@ -324,7 +328,7 @@ mod tests {
         t.load(&first).unwrap();
         t.step().unwrap();
         let mut sensitive = Vec::new();
-        t.each(&Region::ALL, |g| sensitive.push(g.sensitivity)).unwrap();
+        t.each(&BoundingBox::ALL, |g| sensitive.push(g.sensitivity)).unwrap();
         let mut order: Vec<usize> = (0..80).collect();
         order.sort_by(|a, b| sensitive[*b].total_cmp(&sensitive[*a]));
         let mut loss_with = |i: usize, factor: f32| {

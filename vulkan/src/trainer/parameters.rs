@@ -43,6 +43,16 @@ impl Geometry {
         (self.second[0][3] * unbias).sqrt() / left.max(LEAST_LEFT)
     }
 
+    /// Of a record.
+    pub fn of_record(record: &[u8]) -> Self {
+        bytemuck::pod_read_unaligned(&record[..size_of::<Self>()])
+    }
+
+    /// Puts it into a record.
+    pub fn into_record(self, record: &mut [u8]) {
+        record[..size_of::<Self>()].copy_from_slice(bytemuck::bytes_of(&self));
+    }
+
     pub fn is_finite(&self) -> bool {
         let numbers = self.mean.iter().chain(&self.log_scale).chain(&self.rotation);
         self.opacity_logit.is_finite() && numbers.into_iter().all(|v| v.is_finite())
@@ -177,18 +187,6 @@ impl Parameters {
     }
 }
 
-impl Geometry {
-    /// Of a record.
-    pub fn of_record(record: &[u8]) -> Self {
-        bytemuck::pod_read_unaligned(&record[..size_of::<Self>()])
-    }
-
-    /// Puts it into a record.
-    pub fn into_record(self, record: &mut [u8]) {
-        record[..size_of::<Self>()].copy_from_slice(bytemuck::bytes_of(&self));
-    }
-}
-
 /// An empty cloud of `degree` that keeps its memory.
 pub(super) fn clear(cloud: &mut GaussianCloud, degree: u8) {
     cloud.sh_degree = degree;
@@ -232,8 +230,7 @@ pub(super) fn record_of(cloud: &GaussianCloud, from: usize, coefficients: usize,
 
 /// Adds what a record holds to a cloud of the plan's degree.
 pub(super) fn push_record(cloud: &mut GaussianCloud, plan: &Plan, record: &[u8]) {
-    let (geometry, rest) = record.split_at(size_of::<Geometry>());
-    let g: Geometry = bytemuck::pod_read_unaligned(geometry);
+    let (g, rest) = (Geometry::of_record(record), &record[size_of::<Geometry>()..]);
     cloud.means.push(g.mean);
     cloud.opacity_logits.push(g.opacity_logit);
     cloud.log_scales.push(g.log_scale);

@@ -285,6 +285,18 @@ impl Scene {
         self.cells.binary_search_by_key(&key, |cell| cell.key).ok()
     }
 
+    /// The cell of a key: a new one while there is room for one more, else where it would be among the others.
+    fn cell_or_new(&mut self, key: CellKey) -> Result<usize, usize> {
+        self.cells.binary_search_by_key(&key, |cell| cell.key).or_else(|new| {
+            if self.cells.len() == self.cells.capacity() {
+                return Err(new);
+            }
+            self.tags.iter_mut().filter(|tag| **tag >= new as u32).for_each(|tag| *tag += 1);
+            self.cells.insert(new, Cell::empty(key));
+            Ok(new)
+        })
+    }
+
     /// Gaussian `from` takes place `to` on the device, or is copied there.
     pub fn place(&mut self, from: usize, to: usize) {
         if self.is_paged() {

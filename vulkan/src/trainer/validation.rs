@@ -127,6 +127,11 @@ impl Trainer {
         self.validation.found
     }
 
+    /// Goes on with what validation found before, where a scene is loaded again in the midst of its schedule.
+    pub fn continue_validated(&mut self, found: Option<Validated>) {
+        (self.validation.phase, self.validation.found) = (Phase::Over, found);
+    }
+
     /// Keeps views back, compares their loss with the others', or gives them back, as the schedule is at `progress`.
     pub(super) fn validate(&mut self, progress: f32) -> Result<(), TrainError> {
         match self.validation.phase {

@@ -19,7 +19,15 @@ pub fn empty_trainer(sh_degree: u8, capacity: usize, view: &View, settings: &Tra
     Some(vulkan::cases::scenes::empty_trainer(&open()?, sh_degree, capacity, view, settings).unwrap())
 }
 
-fn open() -> Option<Gpu> {
+/// The Gaussians as they are.
+pub fn model(trainer: &mut Trainer) -> GaussianCloud {
+    let mut model = GaussianCloud::with_capacity(3, trainer.gaussians());
+    trainer.snapshot(&mut model).unwrap();
+    model
+}
+
+/// The first device.
+pub fn open() -> Option<Gpu> {
     match Gpu::open(None) {
         Ok(gpu) => Some(gpu),
         Err(e) => {

@@ -2,5 +2,6 @@
 #![allow(unused_imports, reason = "each test binary uses its own part")]
 
 pub mod device;
+pub mod places;
 
 pub use vulkan::cases::scenes::{Answer, answer, cloud, grey, photo, view};

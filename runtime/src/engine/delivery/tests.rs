@@ -43,7 +43,7 @@ fn train(engine: &mut Reconstruction, steps: u32) -> StopReason {
 
 fn sensitivities(engine: &mut Reconstruction) -> Vec<u32> {
     let mut all = Vec::new();
-    engine.trainer.each(&Region::ALL, |g| all.push(g.sensitivity)).expect("the device works");
+    engine.trainer.each(&BoundingBox::ALL, |g| all.push(g.sensitivity)).expect("the device works");
     all.sort_by(f32::total_cmp);
     all.into_iter().map(f32::to_bits).collect()
 }
@@ -77,7 +77,7 @@ fn before_every_picture_was_looked_at_the_least_opaque_ones_leave() {
     let Some(mut engine) = built(false) else { return };
     let opacities = |engine: &mut Reconstruction| {
         let mut all = Vec::new();
-        engine.trainer.each(&Region::ALL, |g| all.push(g.opacity_logit)).expect("the device works");
+        engine.trainer.each(&BoundingBox::ALL, |g| all.push(g.opacity_logit)).expect("the device works");
         all.sort_by(f32::total_cmp);
         all
     };

@@ -6,36 +6,29 @@ use models::cloud::{GaussianCloud, sh_coefficients};
 use super::cell::{self, Bounds};
 use super::store::Rewritten;
 use super::{Cell, Scene};
-use crate::trainer::grow::{Fate, LOOKED_AT, Region, donor_of, pull_of};
+use crate::trainer::grow::{BoundingBox, Fate, LOOKED_AT, donor_of, pull_of};
 use crate::trainer::parameters::{Geometry, record_of};
 use crate::trainer::{TrainError, Trainer};
 use config::plan::BLOCK_GAUSSIANS;
 
 impl Bounds {
-    /// Whether a mean of the cell may lie in `region`.
-    fn meets(&self, region: &Region) -> bool {
-        (0..3).all(|k| self.low[k] <= region.high[k] && self.high[k] >= region.low[k])
+    /// Whether a mean of the cell may lie in `within`.
+    fn meets(&self, within: &BoundingBox) -> bool {
+        (0..3).all(|k| self.low[k] <= within.high[k] && self.high[k] >= within.low[k])
     }
 }
 
 impl Scene {
-    /// The cells of some means in `region`. One that is not a number is in no bounds: where all are looked at, so are all cells.
-    fn cells_of(&mut self, region: &Region) -> (&mut super::Store, impl Iterator<Item = &mut Cell>) {
-        let (store, all) = (&mut self.store, *region == Region::ALL);
-        (store, self.cells.iter_mut().filter(move |cell| cell.count > 0 && (all || cell.bounds.meets(region))))
+    /// The cells of some means in `within`. One that is not a number is in no bounds: where all are looked at, so are all cells.
+    fn cells_of(&mut self, within: &BoundingBox) -> (&mut super::Store, impl Iterator<Item = &mut Cell>) {
+        let (store, all) = (&mut self.store, *within == BoundingBox::ALL);
+        (store, self.cells.iter_mut().filter(move |cell| cell.count > 0 && (all || cell.bounds.meets(within))))
     }
 
-    /// The cell that a new Gaussian comes to; one of its own while there is room for one more, else a neighbour, whose bounds grow.
+    /// The cell that a new Gaussian comes to; a neighbour, whose bounds grow, where there is no room for one of its own.
     fn cell_for(&mut self, g: &Geometry) -> usize {
         let key = self.grid.key(g.mean, cell::reach_of(g));
-        match self.cells.binary_search_by_key(&key, |cell| cell.key) {
-            Ok(found) => found,
-            Err(new) if self.cells.len() < self.cells.capacity() => {
-                self.cells.insert(new, Cell::empty(key));
-                new
-            }
-            Err(new) => new.min(self.cells.len() - 1),
-        }
+        self.cell_or_new(key).unwrap_or_else(|near| near.min(self.cells.len() - 1))
     }
 
     /// A record whose second moments new ones begin with ([`donor_of`]), of some cells at equal steps.
@@ -79,7 +72,7 @@ impl Trainer {
     /// Shows every Gaussian of `within`, cell by cell.
     pub(in crate::trainer) fn each_in_cells(
         &mut self,
-        within: &Region,
+        within: &BoundingBox,
         mut see: impl FnMut(&Geometry),
     ) -> Result<(), TrainError> {
         self.leave_for_file()?;
@@ -103,7 +96,7 @@ impl Trainer {
     /// it, whose bounds grow, until the cell was on the device. Returns how many went.
     pub(in crate::trainer) fn revise_cells(
         &mut self,
-        within: &Region,
+        within: &BoundingBox,
         mut fate: impl FnMut(&Geometry) -> Fate,
     ) -> Result<usize, TrainError> {
         self.leave_for_file()?;
@@ -225,7 +218,7 @@ mod tests {
     fn the_first_step_of_new_gaussians_is_of_the_usual_length() {
         let Some(mut t) = grown() else { return };
         let (mut moved, mut new) = (0, Vec::new());
-        t.each_in_cells(&Region::ALL, |g| match g.first == [[0.0; 4]; 3] {
+        t.each_in_cells(&BoundingBox::ALL, |g| match g.first == [[0.0; 4]; 3] {
             true => new.push(g.second[0][0]),
             false => moved += 1,
         })

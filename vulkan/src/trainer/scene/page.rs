@@ -116,18 +116,10 @@ impl Scene {
             if self.grid.holds(home, g.mean, reach) || !g.is_finite() {
                 continue;
             }
-            let key = self.grid.key(g.mean, reach);
-            let found = self.cells.binary_search_by_key(&key, |cell| cell.key);
-            self.tags[i] = match found {
-                Ok(other) => other as u32,
-                Err(new) if self.cells.len() < self.cells.capacity() => {
-                    self.tags.iter_mut().filter(|tag| **tag >= new as u32).for_each(|tag| *tag += 1);
-                    self.cells.insert(new, Cell::empty(key));
-                    new as u32
-                }
-                // It stays, and the bounds of its cell grow.
-                Err(_) => self.tags[i],
-            };
+            // Where there is no room for its cell it stays, and the bounds of the one it is in grow.
+            if let Ok(cell) = self.cell_or_new(self.grid.key(g.mean, reach)) {
+                self.tags[i] = cell as u32;
+            }
         }
     }
 
