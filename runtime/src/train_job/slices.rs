@@ -47,12 +47,13 @@ impl<K: Clock> Slices<K> {
         let mut progress = Progress::new("training", goal);
         let every_ns = u64::try_from(self.checkpoint_every.as_nanos()).unwrap_or(u64::MAX);
         let mut due_ns = self.clock.now_ns().saturating_add(every_ns);
-        let (mut steps, mut words) = (steps_before, String::new());
+        let (mut steps, mut last, mut words) = (steps_before, 0, String::new());
         loop {
             let mut alarmed = false;
             let (clock, failsafe) = (&self.clock, &mut self.failsafe);
             let reason = engine.train(&budget, &mut |step| {
-                steps += 1;
+                // A step of a scene larger than the device takes several updates.
+                steps += u64::from(std::mem::replace(&mut last, step.step) != step.step);
                 let at = (f64::from(step.progress) * goal as f64).round() as u64;
                 progress.set(at, || format!("loss {:.4}, {} Gaussians", step.loss, step.gaussians));
                 words = format!("loss {:.4}", step.loss);
