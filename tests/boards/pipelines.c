@@ -2,7 +2,7 @@
 //
 //   pipelines FOLDER < kernels.txt
 //
-// A line in: name, SPIR-V file in FOLDER, eight specialisation constants. A line out: name, tab, cell of the table. The pipeline
+// A line in: name, SPIR-V file in FOLDER, nine specialisation constants. A line out: name, tab, cell of the table. The pipeline
 // layout is the project's (vulkan/src/pipelines.rs): a uniform buffer at binding 0, storage buffers at 1 to 8, uniform texel
 // buffers at 9 to 13, or storage buffers there, too, for files named .storage.spv; 16 bytes of push constants. No work is
 // submitted, so a driver over a fake kernel device (Mesa's drm-shim) serves as well as a board.
@@ -102,7 +102,7 @@ int main(int argc, char **argv) {
     check("no device", n == 0);
     VkPhysicalDeviceProperties properties;
     vkGetPhysicalDeviceProperties(physical[0], &properties);
-    fprintf(stderr, "%s\n", properties.deviceName);
+    fprintf(stderr, "%s (vendor %04x)\n", properties.deviceName, properties.vendorID);
     float one = 1;
     VkDeviceQueueCreateInfo queue = {.sType = VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO, .queueCount = 1,
                                      .pQueuePriorities = &one};
@@ -119,9 +119,9 @@ int main(int argc, char **argv) {
     LOAD(vkCreateComputePipelines);
 
     char label[128], file[128], path[512];
-    uint32_t values[8];
-    while (scanf("%127s %127s %u %u %u %u %u %u %u %u", label, file, values, values + 1, values + 2, values + 3, values + 4,
-                 values + 5, values + 6, values + 7) == 10) {
+    uint32_t values[9];
+    while (scanf("%127s %127s %u %u %u %u %u %u %u %u %u", label, file, values, values + 1, values + 2, values + 3, values + 4,
+                 values + 5, values + 6, values + 7, values + 8) == 11) {
         static uint32_t code[1 << 18];
         snprintf(path, sizeof path, "%s/%s", argv[1], file);
         FILE *in = fopen(path, "rb");
@@ -137,9 +137,9 @@ int main(int argc, char **argv) {
         VkShaderModuleCreateInfo text = {.sType = VK_STRUCTURE_TYPE_SHADER_MODULE_CREATE_INFO, .codeSize = words * 4,
                                          .pCode = code};
         VkShaderModule module;
-        VkSpecializationMapEntry entries[8];
-        for (uint32_t i = 0; i < 8; i++) entries[i] = (VkSpecializationMapEntry){i, 4 * i, 4};
-        VkSpecializationInfo special = {8, entries, sizeof values, values};
+        VkSpecializationMapEntry entries[9];
+        for (uint32_t i = 0; i < 9; i++) entries[i] = (VkSpecializationMapEntry){i, 4 * i, 4};
+        VkSpecializationInfo special = {9, entries, sizeof values, values};
         VkPipeline pipeline;
         int failed = vkCreateShaderModule(device, &text, NULL, &module);
         VkComputePipelineCreateInfo wanted = {

@@ -11,3 +11,8 @@ vec4 finite(vec4 g, inout bool all_finite) {
     all_finite = all_finite && !any(bad);
     return mix(g, vec4(0.0), bad);
 }
+
+vec4 finite(vec4 g) {
+    bool ignored;
+    return finite(g, ignored);
+}

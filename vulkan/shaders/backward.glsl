@@ -138,7 +138,7 @@ void main() {
 #endif
             i++;
         }
-        live = most_of_tile(most) > 0.0 || to_the_end;
+        live = any_of_tile(most > 0.0) || to_the_end;
     }
     // Slots behind an opaque tile: a total of zero says that the other two vectors were not written. Many in a turn,
     // because llvmpipe ends the loops of an invocation after 65,535 turns in all.

@@ -58,7 +58,7 @@ void main() {
             }
             i++;
         }
-        live = most_of_tile(most) > 0.0 || to_the_end;
+        live = any_of_tile(most > 0.0) || to_the_end;
     }
     // Counted work: how many Gaussians were blended before the tile was opaque.
     if (own_run == 0) starts[counters + t] = i - first;

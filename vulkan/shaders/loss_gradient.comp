@@ -1,6 +1,6 @@
 #version 450
 // The loss's gradient at every pixel: L1, SSIM (second pass of its gradient, along columns) and Pearson depth; the
-// values of L1 and the exposure's gradient are left as one partial sum per strip.
+// value of L1 is left as one partial sum per strip.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "window.glsl"
@@ -14,16 +14,13 @@ layout(std430, set = 0, binding = 3) readonly buffer StatusWords { Status status
 
 void main() {
     // Before any branch, as in ssim_rows.comp.
-    vec3 gain = frame.exposure_gain, offset = frame.exposure_offset, depth_line = vec3(0.0);
+    vec3 gain = frame.exposure_gain, offset = frame.exposure_offset;
     float l1_weight = frame.l1_weight, ssim_weight = frame.ssim_weight, min_confidence = frame.min_confidence;
-    vec3 line = vec3(status.depth_by_prior, status.depth_by_rendered, status.depth_constant);
-    depth_line = (frame.flags & FLAG_DEPTH) != 0u ? line : depth_line;
     uint width = frame.size.x, i = gl_GlobalInvocationID.x;
     int height = int(frame.size.y);
     if (i >= width * uint((height + STRIP - 1) / STRIP)) return;
     uint column = i % width, pixels = width * uint(height);
     int strip = int(i / width) * STRIP;
-    vec3 gain_gradient = vec3(0.0), offset_gradient = vec3(0.0);
     float l1 = 0.0;
     PARTS(first) {
         int y0 = strip + first;
@@ -60,18 +57,14 @@ void main() {
                 vec3 g = l1_weight * sign(d)
                     - ssim_weight * (by_mean[o] + 2.0 * x * by_square[o] + y.xyz * by_product[o]);
                 g = compared ? g : vec3(0.0);
-                offset_gradient += g;
-                g *= gain;
-                gain_gradient += g * raw.xyz; // by the logarithm of the gain
                 float depth = 0.0;
-                if (compared && y.w > 0.0 && y.w >= min_confidence) {
-                    depth = depth_line.x * float(wanted.y) * (1.0 / 65535.0) + depth_line.y * raw.w + depth_line.z;
+                if ((frame.flags & FLAG_DEPTH) != 0u && compared && y.w > 0.0 && y.w >= min_confidence) {
+                    vec3 line = vec3(status.depth_by_prior, status.depth_by_rendered, status.depth_constant);
+                    depth = line.x * float(wanted.y) * (1.0 / 65535.0) + line.y * raw.w + line.z;
                 }
-                image_gradient[at] = vec4(g, depth);
+                image_gradient[at] = vec4(g * gain, depth);
             }
         }
     }
-    strip_sums[i].gain = gain_gradient;
     strip_sums[i].l1 = l1;
-    strip_sums[i].offset = offset_gradient;
 }

@@ -20,11 +20,10 @@ layout(std430, set = 0, binding = 3) writeonly buffer ByPlace { vec4 by_place[];
 layout(std430, set = 0, binding = 4) writeonly buffer Sh { vec4 sh[]; };
 
 // One of a Gaussian's columns of SH; what it was before this step.
-vec4 step_column(uint g, uint c, uint held, vec4 gradient, inout bool all_finite) {
+vec4 step_column(uint g, uint c, uint held, vec4 gradient) {
     if (c >= SH_COLUMNS || (OWN_DEGREES && c >= held)) return vec4(0.0);
     int at = int(g * SH_COLUMNS + c);
     vec4 before = FETCH(sh_texels, at);
-    gradient = finite(gradient, all_finite);
     if (push.mode == 1u) {
         store_moments(uint(at), gradient, gradient * gradient);
     } else {
@@ -40,11 +39,11 @@ vec4 step_column(uint g, uint c, uint held, vec4 gradient, inout bool all_finite
 }
 
 // Four coefficients in three columns, the first of them `c`; what they were times the colour's gradient `gc`.
-vec4 step_four(uint g, uint c, uint held, vec4 basis, vec3 gc, inout bool all_finite) {
+vec4 step_four(uint g, uint c, uint held, vec4 basis, vec3 gc) {
     if (c >= SH_COLUMNS) return vec4(0.0);
-    vec4 p = step_column(g, c, held, vec4(basis.x * gc, basis.y * gc.x), all_finite);
-    vec4 q = step_column(g, c + 1u, held, vec4(basis.y * gc.yz, basis.z * gc.xy), all_finite);
-    vec4 r = step_column(g, c + 2u, held, vec4(basis.z * gc.z, basis.w * gc), all_finite);
+    vec4 p = step_column(g, c, held, vec4(basis.x * gc, basis.y * gc.x));
+    vec4 q = step_column(g, c + 1u, held, vec4(basis.y * gc.yz, basis.z * gc.xy));
+    vec4 r = step_column(g, c + 2u, held, vec4(basis.z * gc.z, basis.w * gc));
     return vec4(dot(gc, p.xyz), dot(gc, vec3(p.w, q.xy)), dot(gc, vec3(q.zw, r.x)), dot(gc, r.yzw));
 }
 
@@ -54,17 +53,18 @@ void main() {
         uint g = order[r];
         int third = int(r) * 3 + 2;
         vec3 mean = FETCH(geometry_texels, int(g) * 9).xyz;
-        vec3 gc = FETCH(reduced, third).xyz;
+        // The basis functions of a direction are finite and at most 1.5.
+        bool all_finite = true;
+        vec3 gc = finite(vec4(FETCH(reduced, third).xyz, 0.0), all_finite).xyz;
         vec3 away = mean - frame.camera_center;
         float distance = max(length(away), 1.0e-12);
         vec3 direction = away / distance;
         uint own = SH_DEGREE;
         if (OWN_DEGREES) own = state_degree(floatBitsToUint(FETCH(geometry_texels, int(g) * 9 + 1).w));
         uint held = columns_up_to(own), degree = min(frame.sh_degree, own);
-        bool all_finite = true;
         vec3 by_direction = vec3(0.0);
         [[unroll]] for (uint i = 0u; i < 16u; i += 4u) {
-            vec4 weight = step_four(g, i * 3u / 4u, held, harmonics_from(i, direction, degree), gc, all_finite);
+            vec4 weight = step_four(g, i * 3u / 4u, held, harmonics_from(i, direction, degree), gc);
             by_direction += gradient_from(i, direction, degree, weight);
         }
         vec3 place = (by_direction - direction * dot(direction, by_direction)) / distance;

@@ -1,6 +1,7 @@
 #version 450
-// From a Gaussian's summed screen-space gradient to that of its place, scales, rotation and opacity, through projection; it lies
-// where the projections did, for `optimise`. `optimise_sh` went before. Also sums the camera pose's gradient (one partial per lane).
+// From a Gaussian's summed screen-space gradient to that of its point, scales and turn in camera space, through projection; it lies where
+// the projections did, for `pose_sums` and `optimise`, which know what the camera's axes are in the world: a Raspberry Pi's lane has no
+// registers for all of that at once. `optimise_sh` went before.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 // Orthographic views are drawn, never trained on.
@@ -12,7 +13,8 @@ TEXELS(vec4, 9, reduced)
 TEXELS(vec4, 10, geometry_texels)
 layout(std430, set = 0, binding = 1) readonly buffer Order { uint order[]; };
 layout(std430, set = 0, binding = 2) readonly buffer StatusWords { Status status; };
-layout(std430, set = 0, binding = 3) writeonly buffer Gradients { vec4 gradients[]; }; // three rows of each visible Gaussian, where `projected` was
+// Three rows of each visible Gaussian, where `projected` was: point and logarithm of the opacity; log scales; turn.
+layout(std430, set = 0, binding = 3) writeonly buffer Gradients { vec4 gradients[]; };
 layout(std430, set = 0, binding = 4) writeonly buffer LaneSums { PoseSums lane_sums[]; };
 
 // The gradient of one scaled axis in camera space.
@@ -21,18 +23,23 @@ vec3 axis_gradient(vec2 f, vec2 ratio, float ga, float gb) {
     return vec3(x, y, -ratio.x * x - ratio.y * y);
 }
 
+// One register instead of three.
+uint packed(bvec3 flags) {
+    return uint(flags.x) | uint(flags.y) << 1 | uint(flags.z) << 2;
+}
+
 void main() {
     uint n = status.visible, lane = gl_GlobalInvocationID.x, non_finite = 0u;
-    vec3 pose_turn = vec3(0.0), pose_shift = vec3(0.0);
     for (uint r = lane; r < n; r += LOOP_LANES) {
         uint g = order[r];
         int sum = int(r) * 3, row = int(g) * 9;
-        vec4 p0 = FETCH(geometry_texels, row), p1 = FETCH(geometry_texels, row + 1);
-        vec4 p2 = FETCH(geometry_texels, row + 2);
-        Projection s = project_gaussian(p0.xyz, p1.xyz, p2);
+        vec3 mean = FETCH(geometry_texels, row).xyz, own_scales = FETCH(geometry_texels, row + 1).xyz;
+        Projection s = project_gaussian(mean, own_scales, FETCH(geometry_texels, row + 2));
+        uint clamped = packed(s.scale_clamped);
         float inverse_z = 1.0 / s.p.z, inverse_det = 1.0 / s.det;
         vec3 conic = vec3(s.cov.z, -s.cov.y, s.cov.x) * inverse_det;
         vec2 f = frame.focal * inverse_z;
+        bool all_finite = true;
 
         // Covariance: dL/dM = K S K M for the projected axes M = (a, b).
         vec4 s1 = FETCH(reduced, sum + 1);
@@ -45,37 +52,26 @@ void main() {
         ratio = mix(ratio, vec2(0.0), s.clamped);
         float nearer = dot(ratio, s.p.xy * inverse_z) + dot(ga, s.a) + dot(gb, s.b);
 
-        // The axes turned together and stretched each, in camera space: no gradient of a rotation matrix is needed. A turn by t moves
-        // the quaternion q by (0, t/2) q, and what the turn's gradient gives for q is tangent to the sphere.
+        // Screen position, then the camera-space point.
+        vec4 s0 = FETCH(reduced, sum);
+        vec2 screen = vec2(conic.x * s0.y + conic.y * s0.z, conic.y * s0.y + conic.z * s0.z);
+        vec3 point = vec3(screen * f + ratio * inverse_z, 0.0);
+        point.z = s1.w - (dot(screen * f, s.p.xy) + nearer) * inverse_z;
+        gradients[sum] = finite(vec4(point, s0.x), all_finite);
+
+        // The axes turned together and stretched each: no gradient of a rotation matrix is needed.
         vec3 axis_x = axis_gradient(f, s.ratio, ga.x, gb.x);
         vec3 axis_y = axis_gradient(f, s.ratio, ga.y, gb.y);
         vec3 axis_z = axis_gradient(f, s.ratio, ga.z, gb.z);
         vec3 turn = cross(s.axes[0], axis_x) + cross(s.axes[1], axis_y) + cross(s.axes[2], axis_z);
         vec3 log_scale = vec3(dot(s.axes[0], axis_x), dot(s.axes[1], axis_y), dot(s.axes[2], axis_z));
-        log_scale = mix(log_scale, vec3(0.0), s.scale_clamped);
-        vec3 t = to_world(turn) * (2.0 / s.q_length);
-        bool all_finite = true;
+        log_scale = mix(log_scale, vec3(0.0), bvec3(clamped & 1u, clamped & 2u, clamped & 4u));
         gradients[sum + 1] = finite(vec4(log_scale, 0.0), all_finite);
-        gradients[sum + 2] = finite(vec4(-dot(t, s.q.yzw), s.q.x * t + cross(t, s.q.yzw)), all_finite);
+        gradients[sum + 2] = finite(vec4(turn, 0.0), all_finite);
 
-        // Screen position, then the camera-space point.
-        vec4 s0 = FETCH(reduced, sum), by_colour = FETCH(reduced, sum + 2);
-        vec2 screen = vec2(conic.x * s0.y + conic.y * s0.z, conic.y * s0.y + conic.z * s0.z);
-        vec3 point = vec3(screen * f + ratio * inverse_z, 0.0);
-        point.z = s1.w - (dot(screen * f, s.p.xy) + nearer) * inverse_z;
-
-        // Camera: p' = exp(turn) p + shift.
-        pose_turn += cross(s.p, point) + turn;
-
-        float opacity = sigmoid(p0.w);
-        // d/dx of the binary entropy of sigmoid(x) is -x sigmoid'(x); the mean is over those in view.
-        float entropy = -frame.entropy_weight / float(n) * p0.w * opacity * (1.0 - opacity);
-        vec4 place = finite(vec4(to_world(point) + by_colour.xyz, s0.x * (1.0 - opacity) + entropy), all_finite);
-        gradients[sum] = place;
-        pose_shift += place.xyz;
+        vec4 by_colour = finite(FETCH(reduced, sum + 2), all_finite);
         all_finite = all_finite && by_colour.w == 0.0;
         non_finite += all_finite ? 0u : 1u;
     }
-    // The camera sees the world move; with it moves the direction that SH are seen from.
-    lane_sums[lane] = PoseSums(pose_turn, non_finite, to_camera(pose_shift), 0.0);
+    lane_sums[lane].non_finite = non_finite;
 }

@@ -1,6 +1,8 @@
 // Projection of one Gaussian, shared by `project` (forward) and `optimise` (backward): gsplat's EWA splatting, with the
 // determinant as a sum of squares (Cauchy-Binet), which stays positive where a*c - b*b cancels.
 
+#include "camera.glsl"
+
 struct Projection {
     vec3 p;          // camera space
     float divisor;   // z; 1 in an orthographic view
@@ -26,14 +28,6 @@ mat3 rotation_of(vec4 q) {
         2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-vec3 to_camera(vec3 v) {
-    return vec3(dot(frame.view_rows[0].xyz, v), dot(frame.view_rows[1].xyz, v), dot(frame.view_rows[2].xyz, v));
-}
-
-vec3 to_world(vec3 v) {
-    return v.x * frame.view_rows[0].xyz + v.y * frame.view_rows[1].xyz + v.z * frame.view_rows[2].xyz;
-}
-
 #ifdef PERSPECTIVE_ONLY
 const bool ORTHOGRAPHIC = false;
 #else
@@ -43,7 +37,7 @@ const bool ORTHOGRAPHIC = false;
 // p.z must be positive. In an orthographic view nothing is divided by depth: J = [[fx, 0, 0], [0, fy, 0]], f in pixels per metre.
 Projection project_gaussian(vec3 mean, vec3 log_scale, vec4 rotation) {
     Projection s;
-    s.p = to_camera(mean) + vec3(frame.view_rows[0].w, frame.view_rows[1].w, frame.view_rows[2].w);
+    s.p = point_in_camera(mean);
     s.divisor = ORTHOGRAPHIC ? 1.0 : s.p.z;
     float inverse_z = 1.0 / s.divisor;
     vec2 ratio = ORTHOGRAPHIC ? vec2(0.0) : s.p.xy * inverse_z;

@@ -106,15 +106,23 @@ uint first_run() {
     return gl_SubgroupInvocationID & ~uint(LANES - 1);
 }
 
-float most_of_tile(float own) {
-    float most = subgroupShuffle(own, first_run());
-    [[unroll]] for (uint run = 1u; run < uint(LANES); run++) most = max(most, subgroupShuffle(own, first_run() + run));
-    return most;
+// Whether any lane of the tile says so.
+bool any_of_tile(bool own) {
+    uint first = first_run();
+    return ((subgroupBallot(own)[first >> 5] >> (first & 31u)) & ((1u << LANES) - 1u)) != 0u;
 }
 
+// Whether the lanes of a tile are summed in a loop; see `pipelines.rs`.
+layout(constant_id = 8) const bool ROLLED = false;
+
+// In the order of the runs, so that the sum has the bits of one lane's.
 vec4 sum_of_tile(vec4 own) {
     vec4 sum = subgroupShuffle(own, first_run());
-    [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
+    if (ROLLED) {
+        [[dont_unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
+    } else {
+        [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
+    }
     return sum;
 }
 
@@ -135,7 +143,7 @@ Splat next_splat(uint i, uint first, uint end, inout Splat held) {
 #define WHILE(working) while (working)
 #define IF(working)
 
-float most_of_tile(float own) {
+bool any_of_tile(bool own) {
     return own;
 }
 

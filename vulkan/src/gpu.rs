@@ -51,7 +51,9 @@ impl GpuInfo {
 
 /// What the kernels with several lanes per tile ask of a subgroup.
 const SHUFFLES: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::from_raw(
-    vk::SubgroupFeatureFlags::SHUFFLE.as_raw() | vk::SubgroupFeatureFlags::VOTE.as_raw(),
+    vk::SubgroupFeatureFlags::SHUFFLE.as_raw()
+        | vk::SubgroupFeatureFlags::VOTE.as_raw()
+        | vk::SubgroupFeatureFlags::BALLOT.as_raw(),
 );
 
 /// An opened device with its one compute queue. Cheap to clone; closed when the last clone is dropped.

@@ -130,6 +130,7 @@ kernels! {
     SsimColumns "ssim_columns" Loss Strips ["adjoint" "strip_sums"] ["moments"];
     SsimBackRows "ssim_back_rows" Loss Strips ["moments"] ["adjoint"];
     LossGradient "loss_gradient" Loss Strips ["image_gradient" "strip_sums" "status"] ["moments" "image" "target"];
+    ExposureSums "exposure_sums" Loss Wide ["strip_sums"] ["image" "image_gradient"];
     RasteriseBackward "rasterise_backward" RasteriseBackward Tiles ["tile_starts" "slots"]
         ["shaded" "instances" "image" "image_gradient"];
     RasteriseBackwardDepth "rasterise_backward_depth" RasteriseBackward Tiles ["tile_starts" "slots"]
@@ -138,7 +139,8 @@ kernels! {
     OptimiseSh "optimise_sh" Optimise Wide ["order" "status" "reduced" "sh" "sh_first_moment" "sh_second_moment"]
         ["reduced" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
     ProjectBackward "project_backward" Optimise Wide ["order" "status" "projected" "lane_sums"] ["reduced" "geometry"];
-    Optimise "optimise" Optimise Wide ["order" "status" "geometry"] ["projected" "geometry"];
+    PoseSums "pose_sums" Optimise Wide ["order" "status" "lane_sums"] ["projected" "geometry" "reduced"];
+    Optimise "optimise" Optimise Wide ["order" "status" "geometry"] ["projected" "geometry" "reduced"];
 }
 
 /// A number that changes whenever any kernel does (FNV-1a over names and SPIR-V): what was measured with other kernels

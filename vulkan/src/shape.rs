@@ -36,7 +36,7 @@ impl KernelShape {
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
         let few = if info.is_cpu { 8 } else { 32 };
-        // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 6/5, Adreno
+        // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 7/6, Adreno
         // 49/49 and nothing (tests/data/boards.md).
         let runs = info.shuffles && !info.is_cpu && 8 * RUNS <= info.limits.workgroup_lanes;
         let (tiles, tile_lanes) = if runs { (8, RUNS) } else { (few, 1) };

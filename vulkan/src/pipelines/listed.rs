@@ -25,13 +25,15 @@ fn lines() -> BTreeSet<String> {
                 (true, _) => "_group",
             };
             let (lanes, staged) = (local_size(kernel.group, shape), u32::from(shape.fetched > 1));
-            let halves = kernel.bindings.contains(&"sh_first_moment");
-            for half in 0..=u32::from(halves) {
+            let halves = u32::from(kernel.bindings.contains(&"sh_first_moment"));
+            // Nothing else is summed over a tile.
+            let sums = u32::from(suffix == "_runs" && kernel.file.starts_with("rasterise_backward"));
+            for (half, rolled) in (0..=halves).flat_map(|half| (0..=sums).map(move |rolled| (half, rolled))) {
                 let name = format!("{}{suffix}", kernel.file);
-                let chosen = [("", 1), ("+half", half), ("+staged", staged)];
+                let chosen = [("", 1), ("+half", half), ("+staged", staged), ("+rolled", rolled)];
                 let label: String = chosen.iter().filter(|c| c.1 == 1).map(|c| c.0).collect();
-                let board = Lanes::BOARD;
-                let constants = format!("{lanes} {} 3 {} {} 0 {half} {staged}", sh_columns(3), board.sort, board.loops);
+                let Lanes { sort, loops } = Lanes::BOARD;
+                let constants = format!("{lanes} {} 3 {sort} {loops} 0 {half} {staged} {rolled}", sh_columns(3));
                 lines.insert(format!("{name}:{lanes}{label} {name}.spv {constants}"));
                 let strips = shape == other && kernel.group == Group::Strips;
                 if kernel.spirv.storage.is_some() && half == 0 && (shape == one || strips) {
@@ -53,5 +55,5 @@ fn the_boards_compile_every_kernel_in_every_kind_of_shape() {
     let stored = std::fs::read_to_string(&path).unwrap_or_default();
     assert!(stored == text, "tests/boards/kernels.txt is older than src/kernels.rs: DGTR_BLESS=1 remakes it");
     // The kernels whose sums over a tile are taken by its lanes are what the drivers have most trouble with.
-    assert!(text.lines().count() > 40 && text.contains("rasterise_backward_runs:64+staged "), "{text}");
+    assert!(text.lines().count() > 40 && text.contains("rasterise_backward_runs:64+staged+rolled "), "{text}");
 }

@@ -171,6 +171,19 @@ impl Trainer {
         r.run(Kernel::SsimColumns, columns, Push::default());
         r.run(Kernel::SsimBackRows, rows, Push::default());
         r.run(Kernel::LossGradient, columns, Push::default());
+        if self.wants_exposure() {
+            r.run(Kernel::ExposureSums, columns, Push::default());
+        }
+    }
+
+    /// Whether the gradient of the view's exposure is asked for.
+    fn wants_exposure(&self) -> bool {
+        self.gradients_only || self.settings.refine_exposure
+    }
+
+    /// Whether the gradient of the view's pose is asked for.
+    fn wants_pose(&self) -> bool {
+        self.gradients_only || self.settings.refine_poses
     }
 
     /// Second submission (one per band where there are several): blend, loss, gradient, Adam.
@@ -206,6 +219,9 @@ impl Trainer {
         let push = Push { mode: u32::from(self.gradients_only), ..Push::default() };
         r.run(Kernel::OptimiseSh, lanes, push);
         r.run(Kernel::ProjectBackward, lanes, push);
+        if self.wants_pose() {
+            r.run(Kernel::PoseSums, lanes, push);
+        }
         r.run(Kernel::Optimise, lanes, push);
         r.submit_and_read(&["status", "tile_starts", "lane_sums", "strip_sums"])?;
         Ok(())
@@ -272,12 +288,13 @@ impl Trainer {
         Weighed { loss: loss as f32, l1: l1 as f32, ssim: ssim as f32, correlation }
     }
 
-    /// The device's partial sums, added in order.
+    /// The device's partial sums, added in order; those of pose and exposure where they are asked for, else zero.
     pub(super) fn partial_sums(&self) -> PartialSums {
         let mut sums = PartialSums::default();
+        let (pose, exposure) = (self.wants_pose(), self.wants_exposure());
         let lanes = self.arena.slice::<PoseSums>(self.arena.section("lane_sums"));
         for p in &lanes[..self.plan.lanes.loops as usize] {
-            for i in 0..3 {
+            for i in (0..3).filter(|_| pose) {
                 sums.pose[i] += f64::from(p.turn[i]);
                 sums.pose[i + 3] += f64::from(p.shift[i]);
             }
@@ -286,7 +303,7 @@ impl Trainer {
         let [width, height] = self.frame.size.map(|n| n as usize);
         let strips = self.arena.slice::<LossSums>(self.arena.section("strip_sums"));
         for p in &strips[..height.div_ceil(STRIP) * width] {
-            for i in 0..3 {
+            for i in (0..3).filter(|_| exposure) {
                 sums.exposure[i] += f64::from(p.gain[i]);
                 sums.exposure[i + 3] += f64::from(p.offset[i]);
             }
