@@ -116,8 +116,10 @@ kernels! {
     SortScan "sort_scan" Sort Scan ["digits" "status"] [];
     SortScatter "sort_scatter" Sort Sort ["keys" "order" "keys_other" "order_other" "digits" "status"] [];
     SortScatterBack "sort_scatter" Sort Sort ["keys_other" "order_other" "keys" "order" "digits" "status"] [];
-    Shade "shade" Shade Wide ["order" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment" "shaded"]
+    // SH and its moments at the bindings that `optimise_sh` has them at.
+    CatchUp "catch_up" Shade Wide ["keys" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment"]
         ["projected" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
+    Shade "shade" Shade Wide ["order" "status" "shaded"] ["projected" "geometry" "sh"];
     Count "count" Count Walk ["tiles" "status"] ["projected" "order"];
     TilePrefix "tile_prefix" Count Wide ["tiles" "tile_starts"] [];
     TileScan "tile_scan" Count Scan ["tile_starts" "status"] [];

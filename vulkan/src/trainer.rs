@@ -345,7 +345,7 @@ impl Trainer {
         let all = Push { mode: 1, ..Push::default() };
         let recording = self.take_recording()?;
         recording.run(Kernel::Project, self.gaussians, all);
-        recording.run(Kernel::Shade, self.plan.lanes.loops as usize, all);
+        recording.run(Kernel::CatchUp, self.plan.lanes.loops as usize, all);
         recording.submit()?;
         self.flushed = true;
         Ok(())

@@ -41,7 +41,8 @@ pub fn work(stage: Stage, load: &Load) -> Work {
         Stage::Project => (52 * n + 48 * v, 260 * n),
         // Four passes: key twice, row once in; key and row out; the first pass reads all keys.
         Stage::Sort => (8 * n + 4 * 20 * v, 4 * 8 * v),
-        Stage::Shade => (v * (4 + 64 + 48 + 16 * c), v * (60 + 24 * c)),
+        // Keys, and of the visible the step they were last moved in; then their place, what was projected and SH in, three vec4 out.
+        Stage::Shade => (4 * n + v * (16 + 52 + 48 + 16 * c), v * (60 + 24 * c)),
         Stage::Count => (v * 36 + 8 * m, v * 60 + 2 * m),
         Stage::Emit => (v * 44 + 20 * m, v * 60 + 6 * m),
         // List entry and three vec4 per instance; image and transmittance out.

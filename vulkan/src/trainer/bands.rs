@@ -30,7 +30,9 @@ pub(crate) struct Counted {
 impl Trainer {
     /// Depth sort, colours, instances per tile; everything up to where the number of instances is needed.
     pub(super) fn record_counting(&self, recording: &Recording<'_>) {
+        let lanes = self.plan.lanes.loops as usize;
         recording.run(Kernel::Project, self.gaussians, Push::default());
+        recording.run(Kernel::CatchUp, lanes, Push::default());
         let blocks = self.plan.lanes.sort as usize;
         for pass in 0..4 {
             let push = Push { pass, ..Push::default() };
@@ -43,7 +45,7 @@ impl Trainer {
             recording.run(Kernel::SortScan, 256, push);
             recording.run(scatter, blocks, push);
         }
-        recording.run(Kernel::Shade, self.plan.lanes.loops as usize, Push::default());
+        recording.run(Kernel::Shade, lanes, Push::default());
         self.record_tiles(recording);
     }
 
