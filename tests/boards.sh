@@ -5,7 +5,7 @@
 # kernels' names when one spills more or no longer compiles; DGTR_BLESS=1 writes the table instead.
 #   tests/boards.sh [--spirv FOLDER] [BOARD...]     boards: pi5 pi4 g610 adreno660 adreno730, default all
 # Packages (150 MB, Debian sid: the newer the Mesa, the more GPUs its shim knows) go to ${XDG_CACHE_HOME:-~/.cache}/dgtr/boards;
-# nothing is installed. Half an hour on two cores. What it needs and does not find it names, and skips.
+# nothing is installed. Five minutes on two cores once they are there (half an hour on a slow day). What it needs and does not find it names, and skips.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 spirv=$here/../vulkan/shaders/spirv
