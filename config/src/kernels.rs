@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART` such as `64x8x1x8x1x1x8`.
+/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART` such as `64x8x1x8x1x1x1x8`.
 pub const VARIABLE: &str = "DGTR_KERNELS";
 
 /// Who decides.
@@ -15,7 +15,7 @@ pub enum KernelChoice {
     Calibrated,
     /// `default`: the built-in sizes; nothing is measured, nothing is read or written.
     Standard,
-    /// `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART`: these.
+    /// `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART`: these.
     Fixed {
         /// Lanes of a workgroup of the plain loops over Gaussians or pixels.
         wide: u32,
@@ -29,6 +29,8 @@ pub enum KernelChoice {
         tile_lanes: u32,
         /// Gaussians that the lanes of a tile fetch at once: 1, or `tile_lanes`.
         fetched: u32,
+        /// Lanes of a tile whose sums are added at once: 1, in a loop, or `tile_lanes`.
+        summed: u32,
         /// Pixels of a strip whose SSIM sums a lane holds at once: 8, or 2.
         part: u32,
     },
@@ -37,7 +39,7 @@ pub enum KernelChoice {
 /// A value that is none of the three.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART (such as 64x8x1x8x1x1x8)"
+    "{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART (such as 64x8x1x8x1x1x1x8)"
 )]
 pub struct KernelChoiceError(String);
 
@@ -55,7 +57,8 @@ impl FromStr for KernelChoice {
 
 fn fixed(text: &str) -> Option<KernelChoice> {
     let mut numbers = text.split('x').map(|n| n.parse().ok());
-    let [wide, narrow, share_lanes, tiles, tile_lanes, fetched, part] = [(); 7].map(|()| numbers.next().flatten());
+    let [wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part] =
+        [(); 8].map(|()| numbers.next().flatten());
     let none_left = numbers.next().is_none();
     none_left.then_some(KernelChoice::Fixed {
         wide: wide?,
@@ -64,6 +67,7 @@ fn fixed(text: &str) -> Option<KernelChoice> {
         tiles: tiles?,
         tile_lanes: tile_lanes?,
         fetched: fetched?,
+        summed: summed?,
         part: part?,
     })
 }
@@ -94,10 +98,12 @@ mod tests {
             tiles: 8,
             tile_lanes: 8,
             fetched: 1,
+            summed: 8,
             part: 2,
         };
-        assert_eq!("128x16x16x8x8x1x2".parse(), Ok(fixed));
-        let bad = "off 64 64x8 64x8x1x8x1x1 64x8x1x8x1x1x x8x1x8x1x1x8 64x-8x1x8x1x1x8 99999999999x8x1x8x1x1x8 64x8x1x8x1x1x8x1";
+        assert_eq!("128x16x16x8x8x1x8x2".parse(), Ok(fixed));
+        let bad = "off 64 64x8 64x8x1x8x1x1x8 64x8x1x8x1x1x1x x8x1x8x1x1x1x8 64x-8x1x8x1x1x1x8 99999999999x8x1x8x1x1x1x8 \
+                   64x8x1x8x1x1x1x8x1";
         for bad in bad.split(' ') {
             let refused = bad.parse::<KernelChoice>().unwrap_err().to_string();
             assert!(refused.contains(VARIABLE) && refused.contains(bad), "{refused}");

@@ -49,8 +49,8 @@ fn found(info: &GpuInfo, choice: KernelChoice) -> (KernelShape, Source) {
     let standard = (KernelShape::standard(info), Source::Standard);
     match choice {
         KernelChoice::Standard => standard,
-        KernelChoice::Fixed { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part } => {
-            let fixed = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part };
+        KernelChoice::Fixed { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } => {
+            let fixed = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part };
             if fixed.fits(info) {
                 return (fixed, Source::Fixed);
             }

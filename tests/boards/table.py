@@ -15,8 +15,8 @@ HEAD = """# Kernels by driver
 Instructions, then: V3D (Pi 5, Pi 4): t threads per core (4 best), spills/fills, bytes of memory per lane for them and for arrays.
 Mali (G610): t threads (2: full occupancy, at most 32 registers), spills/fills. Adreno: w waves per core (16 best), stores/loads
 of private memory. `name:lanes`; `+half` moments in 16 bits, `+staged` Gaussians fetched by the lanes of a tile for each other,
-`+rolled` their sums over a tile in a loop, `+storage` reads storage buffers instead of texels. Without `_runs` and `_group`: one lane per tile or share. `_short`: a lane holds the
-sums of two pixels of a strip at once instead of eight.
+`+rolled` their sums over a tile in a loop, `+storage` reads storage buffers instead of texels. Without `_runs` and `_group`: one lane
+per tile or share. `_short`: a lane holds the sums of two pixels of a strip at once instead of eight.
 
 """
 

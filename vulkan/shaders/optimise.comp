@@ -65,7 +65,7 @@ void main() {
         float q_length = max(length(q), 1.0e-20);
         q /= q_length;
         vec3 t = to_world(FETCH(gradients, at + 2).xyz) * (2.0 / q_length);
-        p = step_row(row + 2, vec4(-dot(t, q.yzw), q.x * t + cross(t, q.yzw)), vec4(frame.rotation_rate));
+        p = step_row(row + 2, finite(vec4(-dot(t, q.yzw), q.x * t + cross(t, q.yzw))), vec4(frame.rotation_rate));
         if (push.mode == 0u) geometry[row + 2] = p;
     }
 }

@@ -67,6 +67,8 @@ void main() {
         vec3 log_scale = vec3(dot(s.axes[0], axis_x), dot(s.axes[1], axis_y), dot(s.axes[2], axis_z));
         log_scale = mix(log_scale, vec3(0.0), bvec3(clamped & 1u, clamped & 2u, clamped & 4u));
         gradients[sum + 1] = finite(vec4(log_scale, 0.0), all_finite);
+        // What `optimise` makes of it for a quaternion that is nearly nothing is as long as that is short.
+        finite(vec4(turn * (2.0 / s.q_length), 0.0), all_finite);
         gradients[sum + 2] = finite(vec4(turn, 0.0), all_finite);
 
         vec4 by_colour = finite(FETCH(reduced, sum + 2), all_finite);

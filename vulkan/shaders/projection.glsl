@@ -1,4 +1,4 @@
-// Projection of one Gaussian, shared by `project` (forward) and `optimise` (backward): gsplat's EWA splatting, with the
+// Projection of one Gaussian, shared by `project` (forward) and `project_backward`: gsplat's EWA splatting, with the
 // determinant as a sum of squares (Cauchy-Binet), which stays positive where a*c - b*b cancels.
 
 #include "camera.glsl"

@@ -112,7 +112,7 @@ bool any_of_tile(bool own) {
     return ((subgroupBallot(own)[first >> 5] >> (first & 31u)) & ((1u << LANES) - 1u)) != 0u;
 }
 
-// Whether the lanes of a tile are summed in a loop; see `pipelines.rs`.
+// Whether the lanes of a tile are summed in a loop (`KernelShape::summed`).
 layout(constant_id = 8) const bool ROLLED = false;
 
 // In the order of the runs, so that the sum has the bits of one lane's.

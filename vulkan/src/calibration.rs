@@ -125,35 +125,37 @@ impl Candidates {
     }
 }
 
-/// What a shape says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched or pixels held at once.
-type Sizes = (u32, u32, u32);
+/// What a shape says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched or pixels held at once, lanes summed
+/// at once.
+type Sizes = (u32, u32, u32, u32);
 
 fn wide(shape: KernelShape) -> Sizes {
-    (shape.wide, 1, shape.part)
+    (shape.wide, 1, shape.part, 1)
 }
 
 fn narrow(shape: KernelShape) -> Sizes {
-    (shape.narrow, shape.share_lanes, 1)
+    (shape.narrow, shape.share_lanes, 1, 1)
 }
 
 fn tiles(shape: KernelShape) -> Sizes {
-    (shape.tiles, shape.tile_lanes, shape.fetched)
+    (shape.tiles, shape.tile_lanes, shape.fetched, shape.summed)
 }
 
 const KINDS: [fn(KernelShape) -> Sizes; 3] = [wide, narrow, tiles];
 
 /// The shape with these sizes, by kind.
 fn with_sizes([of_wide, of_narrow, of_tiles]: [Sizes; 3]) -> KernelShape {
-    let ((wide, _, part), (narrow, share_lanes, _), (tiles, tile_lanes, fetched)) = (of_wide, of_narrow, of_tiles);
-    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }
+    let ((wide, _, part, _), (narrow, share_lanes, ..), (tiles, tile_lanes, fetched, summed)) =
+        (of_wide, of_narrow, of_tiles);
+    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
 }
 
 /// The shapes to try, the standard one first.
 fn shapes(all: &Candidates, standard: KernelShape, timed: bool) -> Vec<KernelShape> {
     let own = KINDS.map(|kind| kind(standard));
     let listed = [
-        all.wide.iter().map(|(n, part)| (*n, 1, *part)).collect::<Vec<_>>(),
-        all.narrow.iter().map(|(n, lanes)| (*n, *lanes, 1)).collect(),
+        all.wide.iter().map(|(n, part)| (*n, 1, *part, 1)).collect::<Vec<_>>(),
+        all.narrow.iter().map(|(n, lanes)| (*n, *lanes, 1, 1)).collect(),
         all.tiles.clone(),
     ];
     let others: [Vec<Sizes>; 3] = std::array::from_fn(|k| {
@@ -232,11 +234,16 @@ fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 3], TrainError> {
 mod tests {
     use super::*;
 
-    const STANDARD: KernelShape =
-        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, part: 8 };
+    const STANDARD: KernelShape = with_sizes_of(64, (32, 1), (32, 1, 1, 1));
+
+    const fn with_sizes_of(wide: u32, narrow: (u32, u32), of_tiles: Sizes) -> KernelShape {
+        let (tiles, tile_lanes, fetched, summed) = of_tiles;
+        let (narrow, share_lanes) = narrow;
+        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part: 8 }
+    }
 
     fn trial(wide: u32, narrow: (u32, u32), tiles: Sizes, ms: [f64; 3]) -> Trial {
-        Trial { shape: with_sizes([(wide, 1, 8), (narrow.0, narrow.1, 1), tiles]), ms }
+        Trial { shape: with_sizes_of(wide, narrow, tiles), ms }
     }
 
     #[test]
@@ -244,7 +251,7 @@ mod tests {
         let all = Candidates {
             wide: vec![(32, 8), (64, 8), (128, 8), (64, 2)],
             narrow: vec![(16, 1), (32, 1), (16, 16), (32, 32)],
-            tiles: vec![(16, 1, 1), (32, 1, 1), (8, 4, 1), (8, 4, 4), (16, 4, 1), (16, 4, 4)],
+            tiles: vec![(16, 1, 1, 1), (32, 1, 1, 1), (8, 4, 1, 1), (8, 4, 4, 1), (16, 4, 1, 4), (16, 4, 4, 4)],
         };
         for (timed, count) in [(true, 6), (false, 12)] {
             let tried = shapes(&all, STANDARD, timed);
@@ -259,25 +266,25 @@ mod tests {
     #[test]
     fn the_kinds_are_judged_apart() {
         let timed = [
-            trial(32, (16, 1), (8, 4, 1), [9.0, 1.0, 4.0]),
-            trial(64, (32, 1), (32, 1, 1), [5.0, 5.0, 5.0]),
-            trial(128, (32, 32), (16, 4, 1), [2.0, 7.0, 3.0]),
+            trial(32, (16, 1), (8, 4, 1, 1), [9.0, 1.0, 4.0]),
+            trial(64, (32, 1), (32, 1, 1, 1), [5.0, 5.0, 5.0]),
+            trial(128, (32, 32), (16, 4, 1, 4), [2.0, 7.0, 3.0]),
         ];
-        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4x1x8");
-        // Whole steps: (128, …, (8, 4, 1)) says nothing about narrow sizes, nor about tiles.
+        assert_eq!(fastest(&timed, STANDARD, true).to_string(), "128x16x1x16x4x1x4x8");
+        // Whole steps: (128, …, (8, 4, 1, 1)) says nothing about narrow sizes, nor about tiles.
         let whole = [
-            trial(64, (32, 1), (32, 1, 1), [5.0; 3]),
-            trial(128, (32, 1), (8, 4, 1), [1.0; 3]),
-            trial(64, (16, 16), (32, 1, 1), [4.0; 3]),
-            trial(64, (32, 1), (8, 4, 1), [3.0; 3]),
+            trial(64, (32, 1), (32, 1, 1, 1), [5.0; 3]),
+            trial(128, (32, 1), (8, 4, 1, 1), [1.0; 3]),
+            trial(64, (16, 16), (32, 1, 1, 1), [4.0; 3]),
+            trial(64, (32, 1), (8, 4, 1, 1), [3.0; 3]),
         ];
-        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4x1x8");
+        assert_eq!(fastest(&whole, STANDARD, false).to_string(), "64x16x16x8x4x1x1x8");
     }
 
     #[test]
     fn a_gain_within_the_noise_changes_nothing() {
-        let close = [trial(64, (32, 1), (32, 1, 1), [10.0; 3]), trial(128, (32, 32), (8, 4, 1), [9.8, 9.6, 9.8])];
-        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1x1x8");
+        let close = [trial(64, (32, 1), (32, 1, 1, 1), [10.0; 3]), trial(128, (32, 32), (8, 4, 1, 1), [9.8, 9.6, 9.8])];
+        assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1x1x1x8");
         assert_eq!(fastest(&[], STANDARD, true), STANDARD);
     }
 }

@@ -116,7 +116,7 @@ kernels! {
     SortScan "sort_scan" Sort Scan ["digits" "status"] [];
     SortScatter "sort_scatter" Sort Sort ["keys" "order" "keys_other" "order_other" "digits" "status"] [];
     SortScatterBack "sort_scatter" Sort Sort ["keys_other" "order_other" "keys" "order" "digits" "status"] [];
-    // SH and its moments at the bindings that `optimise_sh` has them at.
+    // `status` and `projected` it does not read: they keep SH and its moments at the bindings that `moments.glsl` has them at.
     CatchUp "catch_up" Shade Wide ["keys" "status" "geometry" "sh" "sh_first_moment" "sh_second_moment"]
         ["projected" "geometry" "sh" "sh_first_moment" "sh_second_moment"];
     Shade "shade" Shade Wide ["order" "status" "shaded"] ["projected" "geometry" "sh"];

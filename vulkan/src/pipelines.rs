@@ -5,7 +5,7 @@ mod listed;
 
 use crate::arena::{Arena, Section};
 use crate::constants::STRIP;
-use crate::gpu::{DeviceLimits, Gpu, GpuError, GpuInfo};
+use crate::gpu::{DeviceLimits, Gpu, GpuError};
 use crate::kernels::{
     DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
 };
@@ -64,16 +64,6 @@ struct Specialisation {
     half_moments: u32,
     staged: u32,
     rolled: u32,
-}
-
-/// PCI vendor of VideoCore GPUs (a Raspberry Pi's).
-const BROADCOM: u32 = 0x14e4;
-
-/// Whether the lanes of a tile are summed in a loop instead of one after the other: what a compiler does to the latter takes a Mali-G610
-/// 282 spills and 300 fills in the blend's gradient, where the loop takes 15 and 36, and an Adreno two thirds of its waves; V3D's is the
-/// better for it, 7/6 against 19/32 (`tests/data/boards.md`). Cards have registers for it.
-fn rolled(info: &GpuInfo) -> bool {
-    (info.is_integrated || info.is_cpu) && info.ids.0 != BROADCOM
 }
 
 /// What a kernel sees of the arena under a section's name.
@@ -292,7 +282,7 @@ impl Pipelines {
             own_degrees: own_degrees.into(),
             half_moments: plan.half_moments.into(),
             staged: (self.shape.fetched > 1).into(),
-            rolled: rolled(self.gpu.info()).into(),
+            rolled: (self.shape.summed < self.shape.tile_lanes).into(),
         };
         let entries: [_; 9] = std::array::from_fn(|i| vk::SpecializationMapEntry {
             constant_id: i as u32,

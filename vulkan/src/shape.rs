@@ -22,6 +22,8 @@ pub struct KernelShape {
     pub tile_lanes: u32,
     /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
     pub fetched: u32,
+    /// Lanes of a tile whose sums are added at once: 1, one after the other in a loop, or all of them.
+    pub summed: u32,
     /// Pixels of a strip whose SSIM sums a lane holds at once: all of it, or [`SHORT_PART`].
     pub part: u32,
 }
@@ -30,6 +32,9 @@ pub struct KernelShape {
 const WIDE: [u32; 4] = [32, 64, 128, 256];
 const NARROW: [u32; 3] = [8, 16, 32];
 const TILES: [u32; 3] = [8, 16, 32];
+
+/// PCI vendor of VideoCore GPUs (a Raspberry Pi's).
+const BROADCOM: u32 = 0x14e4;
 
 impl KernelShape {
     /// What is used where nothing was measured.
@@ -40,11 +45,23 @@ impl KernelShape {
         // 49/49 and nothing (tests/data/boards.md).
         let runs = info.shuffles && !info.is_cpu && 8 * RUNS <= info.limits.workgroup_lanes;
         let (tiles, tile_lanes) = if runs { (8, RUNS) } else { (few, 1) };
+        // Of the blend's gradient a Mali-G610's compiler spills 282/300 where all are added at once, 15/36 where in a loop, and an Adreno
+        // loses two thirds of its waves; V3D's 7/6 and 19/32 (tests/data/boards.md). Cards have registers for it.
+        let summed = if info.is_integrated && info.ids.0 != BROADCOM { 1 } else { tile_lanes };
         // A card has lanes enough for every share's histogram (an H100: sorting, counting and emitting 0.3 ms instead of 1.4).
         let card = !info.is_cpu && !info.is_integrated && few >= info.subgroup_size;
         // The sums of a whole strip are more than a small GPU's lane has registers for, too.
         let part = if info.is_cpu || !info.is_integrated { STRIP } else { SHORT_PART };
-        Self { wide: 64, narrow: few, share_lanes: if card { few } else { 1 }, tiles, tile_lanes, fetched: 1, part }
+        Self {
+            wide: 64,
+            narrow: few,
+            share_lanes: if card { few } else { 1 },
+            tiles,
+            tile_lanes,
+            fetched: 1,
+            summed,
+            part,
+        }
     }
 
     /// Sizes of wide workgroups that this device can run and that fill its subgroups, the standard one among them.
@@ -65,14 +82,14 @@ impl KernelShape {
         sizes.into_iter().map(|n| (n, 1)).chain(groups.map(|n| (n, n))).collect()
     }
 
-    /// Tiles of a workgroup, lanes of a tile and Gaussians they fetch at once, under the same conditions; those with one
-    /// lane per tile first.
-    pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32, u32)> {
+    /// Tiles of a workgroup, lanes of a tile, Gaussians they fetch and lanes they sum at once, under the same conditions; those with
+    /// one lane per tile first.
+    pub fn tile_candidates(info: &GpuInfo) -> Vec<(u32, u32, u32, u32)> {
         let usual = if info.is_cpu { 8 } else { 32 };
-        let mut all: Vec<_> = candidates(&TILES, usual, 1, info).into_iter().map(|n| (n, 1, 1)).collect();
+        let mut all: Vec<_> = candidates(&TILES, usual, 1, info).into_iter().map(|n| (n, 1, 1, 1)).collect();
         if info.shuffles {
             for tiles in candidates(&TILES, 0, RUNS, info) {
-                all.extend([1, RUNS].map(|fetched| (tiles, RUNS, fetched)));
+                all.extend([(1, 1), (1, RUNS), (RUNS, 1), (RUNS, RUNS)].map(|(f, s)| (tiles, RUNS, f, s)));
             }
         }
         all
@@ -82,10 +99,10 @@ impl KernelShape {
     pub fn fits(&self, info: &GpuInfo) -> bool {
         let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && TILES.contains(&self.tiles);
         let runs = self.tile_lanes == 1 || (self.tile_lanes == RUNS && info.shuffles);
-        let fetched = self.fetched == 1 || self.fetched == self.tile_lanes;
+        let at_once = [self.fetched, self.summed].iter().all(|n| *n == 1 || *n == self.tile_lanes);
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
         let part = self.part == STRIP || self.part == SHORT_PART;
-        sizes && runs && fetched && shares && part && self.largest_workgroup() <= info.limits.workgroup_lanes
+        sizes && runs && at_once && shares && part && self.largest_workgroup() <= info.limits.workgroup_lanes
     }
 
     /// Lanes of its largest workgroup.
@@ -97,8 +114,8 @@ impl KernelShape {
 /// As `config::kernels::VARIABLE` takes it.
 impl fmt::Display for KernelShape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part } = self;
-        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}x{fetched}x{part}")
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } = self;
+        write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}x{fetched}x{summed}x{part}")
     }
 }
 
@@ -149,19 +166,22 @@ mod tests {
 
     #[test]
     fn several_lanes_per_tile_are_tried_only_where_lanes_can_read_each_other() {
-        assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1), (16, 1, 1), (32, 1, 1)]);
+        assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1, 1), (16, 1, 1, 1), (32, 1, 1, 1)]);
         let pi5 = device(false, 16, 256);
-        let staged = [(8, 8, 1), (8, 8, 8), (16, 8, 1), (16, 8, 8), (32, 8, 1), (32, 8, 8)];
-        assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1), (32, 1, 1)], &staged[..]].concat());
-        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1)], &staged[..]].concat());
-        let runs = KernelShape { wide: 64, narrow: 32, share_lanes: 32, tiles: 8, tile_lanes: 8, fetched: 8, part: 2 };
+        let at_once = [(1, 1), (1, 8), (8, 1), (8, 8)];
+        let runs: Vec<_> = [8, 16, 32].into_iter().flat_map(|n| at_once.map(|(f, s)| (n, 8, f, s))).collect();
+        assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1, 1), (32, 1, 1, 1)], &runs[..]].concat());
+        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1, 1)], &runs[..]].concat());
+        let (wide, narrow, share_lanes, tiles, tile_lanes) = (64, 32, 32, 8, 8);
+        let runs = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched: 8, summed: 1, part: 2 };
         assert!(runs.fits(&pi5) && !runs.fits(&device(false, 8, 256)));
         assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
+        assert!(!KernelShape { summed: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
         assert!(!KernelShape { share_lanes: 16, ..runs }.fits(&pi5));
         assert!(!KernelShape { part: 4, ..runs }.fits(&pi5));
-        assert_eq!(runs.to_string(), "64x32x32x8x8x8x2");
+        assert_eq!(runs.to_string(), "64x32x32x8x8x8x1x2");
     }
 
     #[test]
@@ -173,9 +193,19 @@ mod tests {
         for info in [device(false, 16, 64), device(false, 16, 256), device(true, 8, 1024), device(false, 64, 128)] {
             assert!(KernelShape::standard(&info).fits(&info));
             let listed = KernelShape::tile_candidates(&info);
-            let KernelShape { tiles, tile_lanes, fetched, .. } = KernelShape::standard(&info);
-            assert!(listed.contains(&(tiles, tile_lanes, fetched)), "{info:?}");
+            let KernelShape { tiles, tile_lanes, fetched, summed, .. } = KernelShape::standard(&info);
+            assert!(listed.contains(&(tiles, tile_lanes, fetched, summed)), "{info:?}");
         }
+    }
+
+    #[test]
+    fn sums_over_a_tile_begin_as_the_compiler_of_the_device_spills_least() {
+        let of = |vendor: u32, is_integrated: bool| {
+            let info = GpuInfo { ids: (vendor, 2), is_integrated, ..device(false, 16, 256) };
+            KernelShape::standard(&info).summed
+        };
+        let (mali, adreno, nvidia) = (0x13b5, 0x5143, 0x10de);
+        assert_eq!([of(mali, true), of(adreno, true), of(BROADCOM, true), of(nvidia, false)], [1, 1, RUNS, RUNS]);
     }
 
     #[test]
@@ -184,9 +214,9 @@ mod tests {
             let (wide, narrow) = (KernelShape::wide_candidates(&info), KernelShape::narrow_candidates(&info));
             let tiles = KernelShape::tile_candidates(&info);
             for (wide, (narrow, share_lanes)) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
-                assert!(tiles.iter().copied().all(|(tiles, tile_lanes, fetched)| {
+                assert!(tiles.iter().copied().all(|(tiles, tile_lanes, fetched, summed)| {
                     [2, STRIP].into_iter().all(|part| {
-                        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }.fits(&info)
+                        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }.fits(&info)
                     })
                 }));
                 for Lanes { sort, loops } in [Lanes::SOFTWARE, Lanes::BOARD, Lanes::CARD] {
@@ -198,7 +228,8 @@ mod tests {
         for (wide, narrow, tiles) in
             [(256, 32, 8), (64, 0, 8), (48, 32, 8), (64, 64, 8), (0, 8, 8), (64, 8, 9), (64, 8, 0), (64, 8, u32::MAX)]
         {
-            let shape = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1, part: 8 };
+            let one = KernelShape::standard(&device(true, 8, 128));
+            let shape = KernelShape { wide, narrow, tiles, ..one };
             assert!(!shape.fits(&info), "{shape}");
         }
     }

@@ -73,7 +73,7 @@ fn bits(model: &GaussianCloud) -> Vec<u32> {
 }
 
 /// Together with the standard shape: the smallest and the largest of each size, with one lane per tile and share and with
-/// several, fetching for themselves and for each other, where the device can, with strips in parts and at once (each shape costs a
+/// several, fetching for themselves and for each other, summed in a loop and at once, where the device can, with strips in parts and at once (each shape costs a
 /// compilation).
 fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
     let info = gpu.info();
@@ -82,16 +82,17 @@ fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
     if !info.shuffles {
         println!("skipped: four lanes per tile ({} has no shuffles)", info.name);
     }
-    let of = |wide, narrow, share_lanes, (tiles, tile_lanes, fetched)| KernelShape {
+    let of = |wide, narrow, share_lanes, (tiles, tile_lanes, fetched, summed)| KernelShape {
         wide,
         narrow,
         share_lanes,
         tiles,
         tile_lanes,
         fetched,
+        summed,
         part: if wide == 64 { STRIP } else { SHORT_PART },
     };
-    let direct = tiles.iter().rev().find(|t| t.1 > 1 && t.2 == 1);
+    let direct = tiles.iter().rev().find(|t| t.1 > 1 && (t.2, t.3) == (1, 1));
     // A workgroup per share is never chosen in software, but does the same there, too.
     let mut all = vec![of(wide[0], 32, 32, tiles[tiles.len() - 1]), of(wide[wide.len() - 1], 16, 1, tiles[0])];
     all.extend(direct.map(|t| of(64, 32, 1, *t)));

@@ -58,8 +58,9 @@ fn work() {
     let standard = KernelShape::standard(gpu.info());
     // Every kernel with several lanes that the device can run.
     let tiles = KernelShape::tile_candidates(gpu.info());
-    let (tiles, tile_lanes, fetched) = tiles[tiles.len() - 1];
-    let several = KernelShape { narrow: 32, share_lanes: 32, tiles, tile_lanes, fetched, part: SHORT_PART, ..standard };
+    let (tiles, tile_lanes, fetched, summed) = tiles[tiles.len() - 1];
+    let several =
+        KernelShape { narrow: 32, share_lanes: 32, tiles, tile_lanes, fetched, summed, part: SHORT_PART, ..standard };
     for (instances, shape) in [(1 << 16, standard), (400, standard), (1 << 16, several), (400, several)] {
         let plan = Plan::with_capacities(&request, 300, instances);
         let mut settings = plain();

@@ -88,18 +88,21 @@ struct Entry {
     tiles: u32,
     tile_lanes: u32,
     fetched: u32,
+    /// Not in files of before there was a choice; what those say is of other kernels.
+    #[serde(default)]
+    summed: u32,
     part: u32,
 }
 
 impl Entry {
     fn of(info: &GpuInfo, shape: KernelShape) -> Self {
-        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part } = shape;
-        Self { id: Id::of(info), wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }
+        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } = shape;
+        Self { id: Id::of(info), wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
     }
 
     fn shape(&self) -> KernelShape {
-        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part, .. } = *self;
-        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, part }
+        let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part, .. } = *self;
+        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
     }
 }
 
@@ -225,9 +228,9 @@ pub(crate) mod tests {
     use vulkan::gpu::DeviceLimits;
 
     const SHAPE: KernelShape =
-        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 8, part: 2 };
+        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 8, summed: 1, part: 2 };
     const OTHER: KernelShape =
-        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, part: 8 };
+        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, summed: 1, part: 8 };
 
     /// A board's GPU.
     pub(crate) fn device(name: &str) -> GpuInfo {

@@ -4,7 +4,7 @@ use super::device::{ready, survive};
 use super::scenes::{Answer, cloud, empty_trainer, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
 use crate::gpu::Gpu;
-use crate::trainer::{Rendering, TrainError};
+use crate::trainer::{Rendering, RunBudget, TrainError};
 use crate::twin::camera::Camera;
 use crate::twin::gaussian::{Gaussian, PARAMETERS};
 use crate::twin::loss::Target;
@@ -14,6 +14,7 @@ use config::training::{RateSettings, Strategy, TrainSettings};
 use glam::DVec3;
 use models::camera::View;
 use models::cloud::GaussianCloud;
+use std::ops::ControlFlow;
 
 /// One grey level and a bit: a contribution at the cut-off may fall on the other side.
 const GREY_LEVEL: f32 = 1.1 / 255.0;
@@ -233,9 +234,22 @@ pub fn a_quaternion_of_length_zero_is_dropped_and_any_other_length_is_normalised
             promise!((a - b).abs() < GREY_LEVEL, "length {length}: {a} instead of {b}");
         }
     }
-    let mut c = base;
+    let mut c = base.clone();
     c.rotations[2] = [0.0; 4];
     promise_eq!(t.load(&c)?.dropped_non_finite, 1);
+    // The shorter it is, the longer its gradient: one whose square is no number is dropped and counted.
+    let mut settings = plain();
+    settings.loss.l1 = 1e17;
+    let mut t = ready(gpu, 1, &v, &settings)?;
+    let mut c = base;
+    c.rotations.as_flattened_mut().iter_mut().for_each(|x| *x *= 1e-6);
+    t.load(&c)?;
+    let mut gradient = GaussianCloud::default();
+    t.gradient(0, &mut gradient)?;
+    let largest = gradient.rotations.as_flattened().iter().fold(0.0f32, |most, x| most.max(x.abs()));
+    promise!(largest < 1e18, "a gradient of {largest:e} reaches the moments");
+    let summary = t.run(&RunBudget { steps: Some(1), seconds: None }, &mut |_| ControlFlow::Continue(()))?;
+    promise!(summary.counters.non_finite_gradients > 0, "dropped without being counted");
     Ok(counted.said())
 }
 

@@ -10,8 +10,9 @@ use std::path::Path;
 /// A line per kernel and shape: a name for the table, the SPIR-V, the specialisation constants in order.
 fn lines() -> BTreeSet<String> {
     // What a GPU gets where nothing was measured, and what calibration may choose instead (`KernelShape`).
-    let one = KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, part: STRIP };
-    let other = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, part: SHORT_PART, ..one };
+    let (wide, narrow, tiles) = (64, 32, 32);
+    let one = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1, summed: 1, part: STRIP };
+    let other = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, summed: 8, part: SHORT_PART, ..one };
     let mut lines = BTreeSet::new();
     for kernel in KERNELS {
         for shape in [one, other, KernelShape { fetched: 8, ..other }] {
