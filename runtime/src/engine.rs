@@ -27,6 +27,7 @@ use vulkan::trainer::Trainer;
 use crate::error::JobError;
 use crate::run_json::RunReport;
 
+mod average;
 mod budget;
 mod carry;
 mod crops;
@@ -144,6 +145,8 @@ pub struct Reconstruction {
     meter: Option<energy::Meter>,
     /// What has been done to the model for its delivery.
     delivery: delivery::Delivery,
+    /// What the cloud is the mean of.
+    average: average::Average,
     /// Seconds of training over all continuations.
     train_s: f64,
     /// What was done and what it took.
@@ -155,8 +158,12 @@ impl Reconstruction {
     ///
     /// # Errors
     /// Anything missing that the job cannot do without: ONNX Runtime, a Vulkan device, memory.
-    pub fn open(settings: EngineSettings, header: ModelHeader, command: &str) -> Result<Self, JobError> {
+    pub fn open(mut settings: EngineSettings, header: ModelHeader, command: &str) -> Result<Self, JobError> {
         let _span = tracing::info_span!("open").entered();
+        if settings.delivers.is_some() {
+            // What varies less takes fewer bytes.
+            settings.training.loss.view_dependence_visits = 0;
+        }
         let meter = energy::Meter::of(&settings.training)?;
         let (views, mut init) = (settings.device.views, settings.init.clone());
         let depth = settings.network.depth.as_deref().filter(|_| settings.training.loss.depth > 0.0);
@@ -225,6 +232,7 @@ impl Reconstruction {
             mapped: 0,
             meter,
             delivery: delivery::Delivery::default(),
+            average: average::Average::default(),
             train_s: 0.0,
             header,
             settings,

@@ -17,6 +17,7 @@ const int TILE_HEIGHT = 4;
 const int RUN = 4;
 const int BLOCK_WIDTH = 2;
 const int BLOCK_HEIGHT = 4;
+const float SH_SMALL = 0.004;
 const float SH_C0 = 0.28209479;
 const float SH_C1 = 0.48860251;
 const float SH_C2[5] = float[5](1.0925484, -1.0925484, 0.31539157, -1.0925484, 0.5462742);

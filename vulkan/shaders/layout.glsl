@@ -157,9 +157,10 @@ layout(std140, set = 0, binding = 0) uniform Frame {
     uint depth_offset;
     // Weight of the mean entropy of the opacities in view.
     float entropy_weight;
+    // Weight of the magnitude of each SH coefficient above degree 0.
+    float sh_weight;
     uint unused_0;
     uint unused_1;
-    uint unused_2;
     // By the number of steps missed.
     MissedSteps deferred[512];
 } frame;

@@ -19,11 +19,19 @@ layout(std430, set = 0, binding = 2) readonly buffer StatusWords { Status status
 layout(std430, set = 0, binding = 3) writeonly buffer ByPlace { vec4 by_place[]; }; // in `reduced`; w: 1 where not finite
 layout(std430, set = 0, binding = 4) writeonly buffer Sh { vec4 sh[]; };
 
+// The derivative of what coefficients above degree 0 amount to. Where a picture has no gradient they count for nothing: it does not show the
+// Gaussian, or not yet that degree.
+vec4 magnitude_gradient(uint c, vec4 p, vec4 gradient) {
+    vec4 g = mix(p / (abs(p) + SH_SMALL), vec4(0.0), equal(gradient, vec4(0.0)));
+    return c == 0u ? vec4(0.0, 0.0, 0.0, g.w) : g;
+}
+
 // One of a Gaussian's columns of SH; what it was before this step.
 vec4 step_column(uint g, uint c, uint held, vec4 gradient) {
     if (c >= SH_COLUMNS || (OWN_DEGREES && c >= held)) return vec4(0.0);
     int at = int(g * SH_COLUMNS + c);
     vec4 before = FETCH(sh_texels, at);
+    gradient += frame.sh_weight * magnitude_gradient(c, before, gradient);
     if (push.mode == 1u) {
         store_moments(uint(at), gradient, gradient * gradient);
     } else {

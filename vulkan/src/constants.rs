@@ -53,6 +53,9 @@ pub const RUN: u32 = 4;
 pub const BLOCK: [u32; 2] = [2, 4];
 /// Runs of a tile.
 pub const RUNS: u32 = TILE_WIDTH * TILE_HEIGHT / RUN;
+/// An SH coefficient is penalised by its square below about this, by its size above it: a tenth of a grey level of 256 and of a basis
+/// function.
+pub const SH_SMALL: f32 = 0.004;
 /// Real spherical harmonics: Y₀₀.
 pub const SH_C0: f32 = 0.282_094_79;
 /// Degree 1.

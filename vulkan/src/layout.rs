@@ -158,9 +158,10 @@ layout! {
         depth_offset: u32,
         /// Weight of the mean entropy of the opacities in view.
         entropy_weight: f32,
+        /// Weight of the magnitude of each SH coefficient above degree 0.
+        sh_weight: f32,
         unused_0: u32,
         unused_1: u32,
-        unused_2: u32,
         /// By the number of steps missed.
         deferred: [MissedSteps; DEFERRED_STEPS],
     }

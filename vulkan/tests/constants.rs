@@ -35,6 +35,7 @@ fn shaders_and_twins_share_every_constant() {
         ("RUN", c::RUN as f32),
         ("BLOCK_WIDTH", c::BLOCK[0] as f32),
         ("BLOCK_HEIGHT", c::BLOCK[1] as f32),
+        ("SH_SMALL", c::SH_SMALL),
         ("SH_C0", c::SH_C0),
         ("SH_C1", c::SH_C1),
     ];

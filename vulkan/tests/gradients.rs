@@ -13,6 +13,7 @@ use vulkan::twin::gaussian::{Gaussian, PARAMETERS};
 use vulkan::twin::loss::{Exposure, Target, loss};
 use vulkan::twin::project::Limits;
 use vulkan::twin::step::{Forward, ViewGradient, backward, forward};
+use vulkan::twin::view_dependence::magnitude;
 
 const SIZE: [u32; 2] = [29, 21];
 
@@ -32,6 +33,8 @@ struct Scene {
     degree: u8,
     settings: LossSettings,
     background: [f64; 3],
+    /// What the weight of view dependence counts.
+    shown: Vec<[[bool; 3]; 16]>,
 }
 
 fn quaternion(rng: &mut impl Rng) -> [f64; 4] {
@@ -87,8 +90,16 @@ impl Scene {
             prior: (0..n).map(|_| rng.random_range(0.0..1.0)).collect(),
             confidence: (0..n).map(|_| rng.random_range(0.0..1.0)).collect(),
             degree,
-            settings: LossSettings { l1: 0.0, ssim: 0.0, depth: 0.0, freeze_shape: false, ..Default::default() },
+            settings: LossSettings {
+                l1: 0.0,
+                ssim: 0.0,
+                depth: 0.0,
+                freeze_shape: false,
+                view_dependence: 0.0,
+                ..Default::default()
+            },
             background: [0.3, 0.6, 0.1],
+            shown: Vec::new(),
         }
     }
 
@@ -119,8 +130,19 @@ impl Scene {
             .map(|(g, _)| entropy(g.opacity_logit))
             .collect();
         let hesitation = seen.iter().sum::<f64>() / seen.len().max(1) as f64;
+        let of = |(g, counts): (&Gaussian<f64>, &[[bool; 3]; 16])| -> f64 {
+            let all = g.sh.as_flattened().iter().zip(counts.as_flattened()).skip(3);
+            all.filter(|(_, counts)| **counts).map(|(c, _)| magnitude(*c)).sum()
+        };
+        let varies: f64 = self.cloud.iter().zip(&self.shown).map(of).sum();
         loss(&rendered.picture, &self.target(), &self.exposure, &self.settings).total
             + f64::from(self.settings.entropy) * hesitation
+            + f64::from(self.settings.view_dependence) * varies
+    }
+
+    /// Says which coefficients the picture shows: a small change makes no other ones.
+    fn look(&mut self) {
+        self.shown = self.gradient().gaussians.iter().map(|g| g.sh.map(|c| c.map(|by| by != 0.0))).collect();
     }
 }
 
@@ -157,14 +179,22 @@ impl Check {
 
 /// Each term alone and all together. (L1 has a kink where x = y; with random photographs the rendering is practically never
 /// within a step of one.)
-fn terms() -> [(&'static str, LossSettings); 5] {
-    let none = LossSettings { l1: 0.0, ssim: 0.0, depth: 0.0, freeze_shape: false, ..Default::default() };
+fn terms() -> [(&'static str, LossSettings); 6] {
+    let none = LossSettings {
+        l1: 0.0,
+        ssim: 0.0,
+        depth: 0.0,
+        freeze_shape: false,
+        view_dependence: 0.0,
+        ..Default::default()
+    };
     [
         ("l1", LossSettings { l1: 0.8, ..none }),
         ("ssim", LossSettings { ssim: 0.2, ..none }),
         ("depth", LossSettings { depth: 0.05, ..none }),
         ("entropy", LossSettings { entropy: 0.5, ..none }),
-        ("all", LossSettings { freeze_shape: false, entropy: 0.1, ..Default::default() }),
+        ("view dependence", LossSettings { l1: 0.8, view_dependence: 1e-3, ..none }),
+        ("all", LossSettings { freeze_shape: false, entropy: 0.1, view_dependence: 1e-3, ..Default::default() }),
     ]
 }
 
@@ -182,6 +212,7 @@ fn every_parameter_group_agrees_with_central_differences() {
     for (term, settings) in terms() {
         let mut scene = Scene::random(7, 3);
         scene.settings = settings;
+        scene.look();
         let gradient = scene.gradient();
         for (name, range) in &groups {
             let mut check = Check::new(format!("{term}: {name}"));
@@ -235,6 +266,7 @@ fn parallel_rays_have_their_own_gradients() {
     scene.camera = Camera { rays: Rays::Orthographic, focal: [6.0, 6.4], ..scene.camera };
     // The median depth has none.
     scene.settings = LossSettings { depth: 0.0, ..Default::default() };
+    scene.look();
     let gradient = scene.gradient();
     for (name, range) in [("means", 0..3), ("log scales", 3..6), ("rotations", 6..10), ("sh 1", 14..23)] {
         let mut check = Check::new(format!("orthographic: {name}"));

@@ -113,6 +113,31 @@ fn what_comes_out_in_pieces_is_the_snapshot() {
     }
 }
 
+#[test]
+fn a_snapshot_is_blended_with_a_later_one_row_by_row_without_memory_of_its_own() {
+    let _alone = ALONE.lock().unwrap_or_else(|e| e.into_inner());
+    // The device holds all; the file holds most.
+    for (on_device, capacity) in [(1_300, 1_300), (500, 1_300)] {
+        let Some(mut t) = trainer(on_device, capacity) else { return };
+        t.load(&places(4)).unwrap();
+        let earlier = model(&mut t);
+        (0..12).for_each(|_| _ = t.step().unwrap());
+        let (later, mut blended) = (model(&mut t), earlier.clone());
+        let (done, bytes) = peak_of(|| t.blend_into(&mut blended, 0.25));
+        done.unwrap();
+        assert!(bytes < 1 << 12, "{bytes} bytes for {} Gaussians", later.len());
+        let numbers = |c: &GaussianCloud| {
+            let shapes = [c.means.as_flattened(), c.log_scales.as_flattened(), c.rotations.as_flattened()].concat();
+            [shapes, c.opacity_logits.clone(), c.sh.clone()].concat()
+        };
+        let (a, b, c) = (numbers(&earlier), numbers(&later), numbers(&blended));
+        assert!(a != b && a.len() == c.len());
+        for ((a, b), c) in a.iter().zip(&b).zip(&c) {
+            assert_eq!(*c, a + 0.25 * (b - a));
+        }
+    }
+}
+
 /// Ground of `side`² Gaussians, a row at a time.
 fn ground(side: usize, take: &mut dyn FnMut(&GaussianCloud) -> Result<(), TrainError>) -> Result<(), TrainError> {
     (0..side).try_for_each(|y| {

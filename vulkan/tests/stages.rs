@@ -102,6 +102,16 @@ fn steps_that_weigh_the_entropy_of_opacities_move_every_parameter_as_the_twin_do
 }
 
 #[test]
+fn steps_that_hold_colours_back_from_varying_move_every_parameter_as_the_twin_does() {
+    let mut settings = plain();
+    (settings.loss.view_dependence, settings.loss.view_dependence_visits) = (1e-3, 0);
+    steps_follow_the_twin(None, settings.clone());
+    // Of the degrees that are evaluated so far alone.
+    settings.sh.raise_at = [0.0, 0.0, 1.0];
+    steps_follow_the_twin(None, settings);
+}
+
+#[test]
 fn whole_steps_on_a_masked_picture_move_every_parameter_as_the_twin_does() {
     steps_follow_the_twin(Some(Mask::from_fn(37, 29, |x, y| !(x > 9 && x < 24 && y > 4))), plain());
 }

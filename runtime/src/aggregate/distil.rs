@@ -118,7 +118,7 @@ pub struct Effort {
 fn training(recipe: &Recipe, sh_degree: u8) -> TrainSettings {
     let mut t = TrainSettings { seed: recipe.seed, ..Default::default() };
     t.rates = rates(recipe.rate);
-    t.loss.depth = 0.0;
+    (t.loss.depth, t.loss.view_dependence) = (0.0, 0.0);
     t.density.strategy = Strategy::None;
     t.regularise.noise = 0.0;
     t.regularise.opacity_decay = 0.0;

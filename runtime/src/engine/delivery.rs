@@ -10,6 +10,7 @@ use models::formats::delivery;
 use vulkan::trainer::{BoundingBox, Fate, StepReport, Trained};
 
 use super::Reconstruction;
+use super::average::Average;
 use crate::error::JobError;
 
 /// Rates of the colours beside those at the end of the schedule: they have something to mend.
@@ -121,18 +122,16 @@ impl Reconstruction {
 
     /// Rounds what gives a Gaussian its shape, as its delivery will, and trains colours alone from here on.
     fn round(&mut self) -> Result<(), JobError> {
-        self.trainer.snapshot(&mut self.cloud)?;
+        match self.is_average() {
+            true => self.average()?,
+            false => self.trainer.snapshot(&mut self.cloud)?,
+        }
         let rounded = delivery::round_shapes(&self.cloud, &self.settings.delivers.unwrap_or_default())
             .map_err(|e| FormatError::Invalid { path: "the model".into(), what: format!("not rounded: {e}") })?;
         self.cloud.clone_from(&rounded);
         drop(rounded);
-        let ((steps, seconds), begun_at) = (self.trainer.spent(), self.trainer.begun_at());
-        let validated = self.trainer.validated();
-        self.trainer.load(&self.cloud)?;
-        self.trainer.continue_validated(validated);
-        self.trainer.continue_from(steps, seconds);
-        self.trainer.begin_at(begun_at);
-        self.trainer.keep_number();
+        self.average = Average::default();
+        self.reload()?;
         let rates = self.settings.training.rates;
         self.trainer.set_rates(&RateSettings {
             mean_start: 0.0,
@@ -151,6 +150,7 @@ impl Reconstruction {
 
     /// A model that is built anew is trained as a whole. One that is continued is not thinned a second time.
     pub(super) fn begin_delivery(&mut self) -> Result<(), JobError> {
+        self.average = Average::default();
         let thinned = self.is_continued() && self.header.thinned;
         let was = std::mem::replace(&mut self.delivery, Delivery { thinned, rounded: false });
         if was.rounded {

@@ -278,20 +278,25 @@ impl Reconstruct for Reconstruction {
             self.read_power();
             let (due, before, mut next) = (self.delivery_due(), self.trainer.elapsed_s(), None);
             let read_s = if self.meter.is_some() { before + EVERY_S } else { f64::INFINITY };
-            let (mut asked_to_stop, mut reads) = (false, false);
+            let (mut asked_to_stop, mut reads, mut counts) = (false, false, false);
+            let average = self.average_due();
             let summary = self.trainer.run(budget, &mut |step| {
                 next = due.after(step);
                 reads = step.elapsed_s >= read_s;
+                counts = average.is_some_and(|due| due.after(step));
                 asked_to_stop = each(step).is_break();
-                let goes_on = next.is_none() && !reads && !asked_to_stop;
+                let goes_on = next.is_none() && !reads && !counts && !asked_to_stop;
                 if goes_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             })?;
             last = summary.last.or(last);
             self.header.steps += u64::from(summary.steps);
             self.report.steps += u64::from(summary.steps);
             self.train_s += self.trainer.elapsed_s() - before;
+            if counts {
+                self.average()?;
+            }
             next.map_or(Ok(()), |next| self.prepare_delivery(next))?;
-            if (next.is_none() && !reads) || asked_to_stop {
+            if (next.is_none() && !reads && !counts) || asked_to_stop {
                 break summary;
             }
         };
@@ -331,6 +336,9 @@ impl Reconstruct for Reconstruction {
             self.report.stage_ms.insert(format!("device_{name}"), ms);
         }
         self.report.gaussians = self.trainer.gaussians() as u64;
+        if summary.reason != StopReason::Caller {
+            self.settle_average()?;
+        }
         Ok(summary.reason)
     }
 
@@ -353,7 +361,7 @@ impl Reconstruct for Reconstruction {
         let _span = tracing::info_span!("checkpoint").entered();
         let from = Instant::now();
         let in_pieces = self.in_pieces && self.has_model();
-        if self.has_model() && !in_pieces {
+        if self.has_model() && !in_pieces && !self.is_average() {
             self.trainer.snapshot(&mut self.cloud)?;
         }
         self.header.finished = finished;

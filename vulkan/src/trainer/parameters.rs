@@ -238,3 +238,17 @@ pub(super) fn push_record(cloud: &mut GaussianCloud, plan: &Plan, record: &[u8])
     let numbers = 3 * sh_coefficients(plan.sh_degree);
     cloud.sh.extend(rest.chunks_exact(4).take(numbers).map(bytemuck::pod_read_unaligned::<f32>));
 }
+
+/// Moves row `row` of a cloud of the plan's degree by `share` of the way to what a record holds.
+pub(super) fn blend_record(cloud: &mut GaussianCloud, row: usize, plan: &Plan, record: &[u8], share: f32) {
+    let (g, rest) = (Geometry::of_record(record), &record[size_of::<Geometry>()..]);
+    let towards = |to: &mut f32, from: f32| *to += share * (from - *to);
+    let blend = |to: &mut [f32], from: &[f32]| to.iter_mut().zip(from).for_each(|(to, from)| towards(to, *from));
+    blend(&mut cloud.means[row], &g.mean);
+    blend(&mut cloud.log_scales[row], &g.log_scale);
+    blend(&mut cloud.rotations[row], &g.rotation);
+    towards(&mut cloud.opacity_logits[row], g.opacity_logit);
+    let numbers = 3 * sh_coefficients(plan.sh_degree);
+    let sh = &mut cloud.sh[row * numbers..(row + 1) * numbers];
+    sh.iter_mut().zip(rest.chunks_exact(4)).for_each(|(to, from)| towards(to, bytemuck::pod_read_unaligned(from)));
+}

@@ -59,6 +59,13 @@ impl Trainer {
             _ => self.settings.steps,
         }
     }
+
+    /// Weight of view dependence: none where views are looked at too seldom to be learnt by heart.
+    pub(super) fn view_dependence(&self) -> f32 {
+        let loss = &self.settings.loss;
+        let looks = u64::from(loss.view_dependence_visits) * self.views.len() as u64;
+        if u64::from(self.expected_steps()) >= looks { loss.view_dependence } else { 0.0 }
+    }
 }
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
 //! The trained Gaussians out of the trainer: as a whole, or piece by piece, where they are more than the host's memory holds.
 
-use super::parameters::{Held, clear, push_record};
+use super::parameters::{Held, blend_record, clear, push_record};
 use super::{TrainError, Trainer};
+use config::plan::Plan;
 use models::cloud::GaussianCloud;
 
 /// Gaussians of a piece.
@@ -15,7 +16,24 @@ impl Trainer {
     pub fn snapshot(&mut self, cloud: &mut GaussianCloud) -> Result<(), TrainError> {
         clear(cloud, self.plan.sh_degree);
         cloud.reserve_exact(self.gaussians());
-        self.each_held(cloud, |_| Ok::<(), TrainError>(()))
+        self.each_record(|plan, record| {
+            push_record(cloud, plan, record);
+            Ok::<(), TrainError>(())
+        })
+    }
+
+    /// Moves every parameter of `cloud`, which is an earlier [`Trainer::snapshot`] of as many Gaussians, by `share` of the way to the present
+    /// one. Allocates nothing.
+    ///
+    /// # Errors
+    /// As [`Trainer::snapshot`]; the cloud is of no use then.
+    pub fn blend_into(&mut self, cloud: &mut GaussianCloud, share: f32) -> Result<(), TrainError> {
+        let mut row = 0;
+        self.each_record(|plan, record| {
+            blend_record(cloud, row, plan, record, share);
+            row += 1;
+            Ok::<(), TrainError>(())
+        })
     }
 
     /// Gives the present parameters to `take` piece by piece, in the order of [`Trainer::snapshot`]. What it has not flushed before it
@@ -28,34 +46,31 @@ impl Trainer {
         take: &mut dyn FnMut(&GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
         let mut piece = GaussianCloud::with_capacity(self.plan.sh_degree, PIECE.min(self.gaussians()));
-        self.each_held::<E>(&mut piece, |piece| {
+        self.each_record::<E>(|plan, record| {
+            push_record(&mut piece, plan, record);
             if piece.len() == PIECE {
-                take(piece)?;
-                clear(piece, piece.sh_degree);
+                take(&piece)?;
+                clear(&mut piece, plan.sh_degree);
             }
             Ok(())
         })?;
         if piece.is_empty() { Ok(()) } else { take(&piece) }
     }
 
-    /// Adds every Gaussian to `cloud`, which `added` sees after each.
-    fn each_held<E: From<TrainError>>(
+    /// Gives the record of every Gaussian to `take`, up to date.
+    fn each_record<E: From<TrainError>>(
         &mut self,
-        cloud: &mut GaussianCloud,
-        mut added: impl FnMut(&mut GaussianCloud) -> Result<(), E>,
+        mut take: impl FnMut(&Plan, &[u8]) -> Result<(), E>,
     ) -> Result<(), E> {
         self.flush()?;
         let (parameters, arena, plan) = (self.parameters, &self.arena, &self.plan);
         let mut record = std::mem::take(&mut self.record);
-        let done = self.scene.each_record(self.gaussians, |from| {
-            match from {
-                Held::OnDevice(index) => {
-                    parameters.read_record(arena, index, &mut record);
-                    push_record(cloud, plan, &record);
-                }
-                Held::InFile(record) => push_record(cloud, plan, record),
+        let done = self.scene.each_record(self.gaussians, |from| match from {
+            Held::OnDevice(index) => {
+                parameters.read_record(arena, index, &mut record);
+                take(plan, &record)
             }
-            added(cloud)
+            Held::InFile(record) => take(plan, record),
         });
         self.record = record;
         done?;

@@ -89,7 +89,7 @@ impl Trainer {
         let pixels_share = f64::from(width) * f64::from(height) / whole;
         let (share, whole) = (pixels_share as f32, whole as f32);
         (lens.cx, lens.cy, lens.width, lens.height) = (lens.cx - x as f32, lens.cy - y as f32, width, height);
-        let t = self.adam_step();
+        let (t, sh_weight) = (self.adam_step(), share * self.view_dependence());
         let f = &mut *self.frame;
         f.look(&view);
         let has_depth = depth_at != 0 && s.loss.depth > 0.0;
@@ -107,6 +107,7 @@ impl Trainer {
         f.exposure_offset = std::array::from_fn(|i| e[i + 3] as f32);
         (f.min_confidence, f.depth_weight) = (s.loss.depth_confidence, share * s.loss.depth);
         f.entropy_weight = share * s.loss.entropy;
+        f.sh_weight = sh_weight;
         f.background = [0.0; 3];
         if s.regularise.background > 0.0 {
             let rng = self.sampler.rng();

@@ -11,6 +11,7 @@ use super::project::{Culled, Limits, Projected, project};
 use super::project_backward::project_backward;
 use super::rasterise::{Pixel, rasterise, rasterise_backward};
 use super::real::Real;
+use super::view_dependence::magnitude_gradient;
 
 /// What the forward half leaves behind.
 #[derive(Clone, Debug)]
@@ -98,8 +99,14 @@ pub fn backward<R: Real>(
     }
     let seen = out.seen.iter().filter(|seen| **seen).count();
     let weight = R::of(f64::from(settings.entropy) / seen.max(1) as f64);
+    let sh_weight = R::of(f64::from(settings.view_dependence));
     for (i, g) in cloud.iter().enumerate().filter(|(i, _)| out.seen[*i]) {
         out.gaussians[i].opacity_logit += weight * entropy_gradient(g.opacity_logit);
+        let by_sh = out.gaussians[i].sh.as_flattened_mut().iter_mut().zip(g.sh.as_flattened()).skip(3);
+        // Where the picture has no gradient it does not show the Gaussian, or not that degree.
+        for (by, c) in by_sh.filter(|(by, _)| **by != R::ZERO) {
+            *by += sh_weight * magnitude_gradient(*c);
+        }
     }
     out
 }

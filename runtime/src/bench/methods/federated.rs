@@ -57,7 +57,7 @@ fn recipe(seed: u64, sh_degree: u8) -> TrainSettings {
         final_share: 1.0,
         ..RateSettings::default()
     };
-    t.loss.depth = 0.0;
+    (t.loss.depth, t.loss.view_dependence) = (0.0, 0.0);
     t.density.strategy = Strategy::None;
     (t.regularise.noise, t.regularise.opacity_decay) = (0.0, 0.0);
     (t.resolution.quarter_until, t.resolution.half_until) = (0.0, 0.0);

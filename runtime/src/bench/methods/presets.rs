@@ -54,7 +54,7 @@ macro_rules! growing {
     };
 }
 
-const NO_DEPTH: &str = growing!("[training.loss]\ndepth = 0.0\n", "");
+const NO_DEPTH: &str = growing!("[training.loss]\ndepth = 0.0\nview_dependence = 0.0\n", "");
 /// Each region has its own aircraft's Gaussians, up to its border.
 const PLAIN_UNION: &str = "border_m = 0.0\nepochs = 0\n";
 const GROWTH: &str = "growth by relocation and splitting under the cap (3DGS-MCMC), not by gradients";
@@ -97,7 +97,10 @@ pub const METHODS: &[Method] = &[
         name: "vastgaussian",
         start: "sfm",
         pictures: Pictures::Seen,
-        settings: growing!("[training]\nrefine_exposure = true\n[training.loss]\ndepth = 0.0\n", ""),
+        settings: growing!(
+            "[training]\nrefine_exposure = true\n[training.loss]\ndepth = 0.0\nview_dependence = 0.0\n",
+            ""
+        ),
         merge: Merge::ByRegion(PLAIN_UNION),
         ablation: false,
         what: "VastGaussian (Lin et al. 2024): regions with the pictures of others that see them (airspace-aware, 25 %), appearance, union",
@@ -117,7 +120,7 @@ pub const METHODS: &[Method] = &[
         name: "dngaussian",
         start: "random",
         pictures: Pictures::All,
-        settings: growing!("[init]\ndepth_priors = true\n", ""),
+        settings: growing!("[init]\ndepth_priors = true\n[training.loss]\nview_dependence = 0.0\n", ""),
         merge: Merge::None,
         ablation: false,
         what: "DNGaussian (Li et al. 2024) on all pictures, as in the paper's table: random start, depth-regularised with frozen shapes",
@@ -229,13 +232,14 @@ mod tests {
     fn every_method_changes_exactly_the_settings_that_its_definition_states() {
         let growth = [("training.density.growth", "0.5"), ("training.density.strategy", "\"relocate\"")];
         let no_depth = ("training.loss.depth", "0.0");
+        let theirs = [no_depth, ("training.loss.view_dependence", "0.0")];
         let wanted: &[(&str, Vec<(&str, &str)>)] = &[
             ("dgtr", vec![]),
-            ("central-3dgs", [&growth[..], &[no_depth]].concat()),
-            ("distributed-3dgs", [&growth[..], &[no_depth]].concat()),
-            ("vastgaussian", [&growth[..], &[no_depth, ("training.refine_exposure", "true")]].concat()),
-            ("fed-3dgs", [&growth[..], &[no_depth]].concat()),
-            ("dngaussian", [&[("init.depth_priors", "true")], &growth[..]].concat()),
+            ("central-3dgs", [&growth[..], &theirs].concat()),
+            ("distributed-3dgs", [&growth[..], &theirs].concat()),
+            ("vastgaussian", [&growth[..], &theirs, &[("training.refine_exposure", "true")]].concat()),
+            ("fed-3dgs", [&growth[..], &theirs].concat()),
+            ("dngaussian", [&[("init.depth_priors", "true")], &growth[..], &theirs[1..]].concat()),
             ("dgtr-sfm", [&[("init.depth_priors", "true")], &growth[..]].concat()),
             ("dgtr-no-depth", vec![no_depth]),
             ("dgtr-free-shapes", vec![("training.loss.freeze_shape", "false")]),
