@@ -19,16 +19,12 @@ pub(super) struct Average {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Due {
     from: f32,
-    /// Steps of a schedule that is long enough.
-    least: f32,
     step: u32,
 }
 
 impl Due {
     pub fn after(&self, step: &StepReport) -> bool {
-        // Progress is that before the step.
-        let before = step.step.saturating_sub(1) as f32;
-        (self.from..1.0).contains(&step.progress) && step.step >= self.step && before >= self.least * step.progress
+        (self.from..1.0).contains(&step.progress) && step.step >= self.step
     }
 }
 
@@ -40,9 +36,18 @@ impl Reconstruction {
         // Training that ends early counts epochs itself and must not be interrupted.
         (whole && !self.flying && !self.delivery.rounded && !t.stop.enabled).then(|| Due {
             from: t.average.from.max(t.density.until),
-            least: t.average.visits as f32 * self.views.len() as f32,
             step: self.average.step + self.views.len() as u32,
         })
+    }
+
+    /// An epoch is over: its end counts where the schedule is long enough.
+    pub(super) fn end_epoch(&mut self) -> Result<(), JobError> {
+        let looks = u64::from(self.settings.training.average.visits) * self.views.len() as u64;
+        if u64::from(self.trainer.expected_steps()) >= looks {
+            return self.average();
+        }
+        self.average.step = self.trainer.steps();
+        Ok(())
     }
 
     /// Whether the cloud is the mean of epochs of the present Gaussians.

@@ -293,7 +293,7 @@ impl Reconstruct for Reconstruction {
             self.report.steps += u64::from(summary.steps);
             self.train_s += self.trainer.elapsed_s() - before;
             if counts {
-                self.average()?;
+                self.end_epoch()?;
             }
             next.map_or(Ok(()), |next| self.prepare_delivery(next))?;
             if (next.is_none() && !reads && !counts) || asked_to_stop {

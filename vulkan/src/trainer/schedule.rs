@@ -52,7 +52,7 @@ impl Trainer {
     }
 
     /// How many steps the schedule takes, wherever it begins. With a budget in seconds that is what the pace so far promises.
-    pub(super) fn expected_steps(&self) -> u32 {
+    pub fn expected_steps(&self) -> u32 {
         let share = self.spent_share();
         match self.settings.seconds {
             Some(_) if share > 0.01 => (self.spent().0 as f32 / share) as u32,
