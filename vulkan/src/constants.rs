@@ -53,8 +53,8 @@ pub const RUN: u32 = 4;
 pub const BLOCK: [u32; 2] = [2, 4];
 /// Runs of a tile.
 pub const RUNS: u32 = TILE_WIDTH * TILE_HEIGHT / RUN;
-/// An SH coefficient is penalised by its square below about this, by its size above it: a tenth of a grey level of 256 and of a basis
-/// function.
+/// An SH coefficient is penalised by its square below about this, by its size above it. Times a basis function (0.5) half a grey level of
+/// 256.
 pub const SH_SMALL: f32 = 0.004;
 /// Real spherical harmonics: Y₀₀.
 pub const SH_C0: f32 = 0.282_094_79;

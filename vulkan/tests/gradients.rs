@@ -90,14 +90,7 @@ impl Scene {
             prior: (0..n).map(|_| rng.random_range(0.0..1.0)).collect(),
             confidence: (0..n).map(|_| rng.random_range(0.0..1.0)).collect(),
             degree,
-            settings: LossSettings {
-                l1: 0.0,
-                ssim: 0.0,
-                depth: 0.0,
-                freeze_shape: false,
-                view_dependence: 0.0,
-                ..Default::default()
-            },
+            settings: nothing(),
             background: [0.3, 0.6, 0.1],
             shown: Vec::new(),
         }
@@ -177,17 +170,15 @@ impl Check {
     }
 }
 
+/// No term at all, shapes free.
+fn nothing() -> LossSettings {
+    LossSettings { l1: 0.0, ssim: 0.0, depth: 0.0, freeze_shape: false, view_dependence: 0.0, ..Default::default() }
+}
+
 /// Each term alone and all together. (L1 has a kink where x = y; with random photographs the rendering is practically never
 /// within a step of one.)
 fn terms() -> [(&'static str, LossSettings); 6] {
-    let none = LossSettings {
-        l1: 0.0,
-        ssim: 0.0,
-        depth: 0.0,
-        freeze_shape: false,
-        view_dependence: 0.0,
-        ..Default::default()
-    };
+    let none = nothing();
     [
         ("l1", LossSettings { l1: 0.8, ..none }),
         ("ssim", LossSettings { ssim: 0.2, ..none }),

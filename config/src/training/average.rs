@@ -4,7 +4,8 @@ use crate::settings::{Limits, table};
 
 table! {
     /// Of a schedule that looks at each view often, the model is the mean of what its last epochs end with (stochastic weight averaging,
-    /// Izmailov et al. 2018): each of them has learnt a little more by heart of the pictures it saw last.
+    /// Izmailov et al. 2018): each of them has learnt a little more by heart of the pictures it saw last. Of a scene that the device holds
+    /// as a whole.
     #[derive(Copy)]
     pub struct AverageSettings {
         /// Progress from which on epochs count, once nothing is densified any more; 1 = none does.

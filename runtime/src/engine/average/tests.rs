@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use models::cloud::GaussianCloud;
-use models::formats::delivery::Rounding;
+use models::formats::delivery::{Rounding, round_shapes};
 use models::formats::model::ModelHeader;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{RunBudget, StopReason};
@@ -13,14 +13,20 @@ use crate::engine::testing::{picture, settings};
 use crate::engine::{EngineSettings, Reconstruct};
 
 /// An engine that has built its model from three pictures and averages from progress 0.5 on where a schedule has so many looks at each.
-fn built(visits: u32, delivers: bool) -> Option<Reconstruction> {
+fn built(visits: u32) -> Option<Reconstruction> {
+    built_with(visits, |_| ())
+}
+
+/// The same with other settings.
+fn built_with(visits: u32, change: impl Fn(&mut EngineSettings)) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
         return None;
     }
-    let mut settings = EngineSettings { delivers: delivers.then(Rounding::default), ..settings() };
+    let mut settings = settings();
     (settings.training.average.from, settings.training.average.visits) = (0.5, visits);
     (settings.training.density.until, settings.training.thinned_share) = (0.5, 0.0);
+    change(&mut settings);
     let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
     engine.land();
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
@@ -39,20 +45,12 @@ fn train(engine: &mut Reconstruction, until: u32) -> (GaussianCloud, StopReason)
     (now, reason)
 }
 
-fn furthest(a: &GaussianCloud, b: &GaussianCloud) -> f32 {
-    let numbers = |c: &GaussianCloud| {
-        let shapes = [c.means.as_flattened(), c.log_scales.as_flattened(), c.rotations.as_flattened()].concat();
-        [shapes, c.opacity_logits.clone(), c.sh.clone()].concat()
-    };
-    let (a, b) = (numbers(a), numbers(b));
-    assert_eq!(a.len(), b.len());
-    a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+/// What an engine has at those of its steps.
+fn at<const N: usize>(mut engine: Reconstruction, steps: [u32; N]) -> [GaussianCloud; N] {
+    steps.map(|step| train(&mut engine, step).0)
 }
 
-/// The mean of what a schedule without averaging has when its epochs of three steps end, and what it ends with.
-fn by_hand() -> Option<(GaussianCloud, GaussianCloud)> {
-    let mut engine = built(1_000, false)?;
-    let ends = [11, 14, 17, 20].map(|step| train(&mut engine, step).0);
+fn mean(ends: &[GaussianCloud]) -> GaussianCloud {
     let mut mean = ends[0].clone();
     for (n, end) in ends.iter().enumerate().skip(1) {
         let share = 1.0 / (n + 1) as f32;
@@ -63,30 +61,35 @@ fn by_hand() -> Option<(GaussianCloud, GaussianCloud)> {
         blend(&mut mean.opacity_logits, &end.opacity_logits);
         blend(&mut mean.sh, &end.sh);
     }
-    let [.., last] = ends;
-    Some((mean, last))
+    mean
 }
+
+/// Epochs of three steps that end after progress 0.5 of a schedule of 20.
+const ENDS: [u32; 4] = [11, 14, 17, 20];
 
 #[test]
 fn a_long_schedule_ends_with_the_mean_of_what_its_epochs_end_with() {
-    let Some((mean, last)) = by_hand() else { return };
-    let Some(mut engine) = built(6, false) else { return };
+    let Some(ends) = built(1_000).map(|engine| at(engine, ENDS)) else { return };
+    let Some(mut engine) = built(6) else { return };
     // A checkpoint in the midst of it holds the mean so far and leaves no trace in what follows.
     assert_eq!(train(&mut engine, 15).1, StopReason::Caller);
     let folder = tempfile::tempdir().expect("a folder");
-    engine.checkpoint(folder.path(), false).expect("written");
+    let (path, _) = engine.checkpoint(folder.path(), false).expect("written");
+    let (_, so_far) = models::formats::model::read(&path).expect("read");
+    assert!(so_far == mean(&ends[..2]) && so_far != ends[1]);
     let (got, reason) = train(&mut engine, 21);
-    assert_eq!(reason, StopReason::Schedule);
-    let (from_mean, moved) = (furthest(&got, &mean), furthest(&last, &mean));
-    assert!(from_mean < 1e-4 * moved, "{from_mean} from the mean, which is {moved} from the last step");
+    assert!(reason == StopReason::Schedule && got == mean(&ends) && got != ends[3]);
     assert_eq!(engine.report.more.get("averaged_epochs"), Some(&4.into()));
     assert!(!engine.is_average() && engine.is_done(&RunBudget { steps: Some(20), seconds: None }));
 }
 
 #[test]
 fn a_schedule_that_looks_at_each_view_less_often_ends_with_its_last_step() {
-    let Some((_, last)) = by_hand() else { return };
-    let Some(mut engine) = built(7, false) else { return };
+    let Some([.., last]) = built(1_000).map(|engine| at(engine, ENDS)) else { return };
+    let Some(mut engine) = built(7) else { return };
+    for step in [11, 14, 17] {
+        train(&mut engine, step);
+    }
     let (got, reason) = train(&mut engine, 21);
     assert!(reason == StopReason::Schedule && got == last, "twenty steps are less than seven looks at three views");
     assert_eq!(engine.report.more.get("averaged_epochs"), None);
@@ -94,16 +97,26 @@ fn a_schedule_that_looks_at_each_view_less_often_ends_with_its_last_step() {
 
 #[test]
 fn what_is_rounded_for_delivery_is_the_mean_and_colours_go_on_from_there() {
-    let Some(mut engine) = built(1, true) else { return };
-    train(&mut engine, 16);
-    assert!(engine.is_average());
-    let (_, reason) = train(&mut engine, 21);
+    let delivers = |settings: &mut EngineSettings| settings.delivers = Some(Rounding::default());
+    let never_rounds = |settings: &mut EngineSettings| {
+        delivers(settings);
+        settings.training.rounded_share = 0.0;
+    };
+    // It is rounded after step 18, the first of the last 15 %.
+    let Some(ends) = built_with(1_000, never_rounds).map(|engine| at(engine, [11, 14, 17, 18])) else { return };
+    let Some(mut engine) = built_with(1, delivers) else { return };
+    let (got, reason) = train(&mut engine, 21);
     assert!(reason == StopReason::Schedule && engine.delivery.rounded && !engine.is_average());
+    let rounded = |cloud: &GaussianCloud| round_shapes(cloud, &Rounding::default()).expect("rounded");
+    let (expected, last) = (rounded(&mean(&ends)), rounded(&ends[3]));
+    let shape = |c: &GaussianCloud| (c.means.clone(), c.log_scales.clone(), c.opacity_logits.clone());
+    assert!(shape(&got) == shape(&expected) && shape(&got) != shape(&last));
+    assert!(got.sh != expected.sh, "colours are trained on top");
 }
 
 #[test]
 fn gaussians_that_are_no_longer_as_many_are_no_part_of_a_mean() {
-    let Some(mut engine) = built(1, false) else { return };
+    let Some(mut engine) = built(1) else { return };
     train(&mut engine, 14);
     assert!(engine.is_average());
     engine.shrink().expect("the device works");
