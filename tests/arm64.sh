@@ -41,8 +41,12 @@ build() {
     aarch64-linux-gnu-strip -o "$out/stripped" "$out/dgtr" && stat -c 'everything: %s bytes, stripped' "$out/stripped"
 }
 
-# qemu's vfork is a fork: who starts a program that is not there does not hear of it.
-test_units() { cross test -p config -p hal -p models --lib -- --skip a_program_that_does_not_exist_is_named; }
+# qemu's vfork is a fork: who starts a program that is not there does not hear of it. And a test that starts itself once more asks
+# the kernel for an arm64 program, without the emulator.
+test_units() {
+    cross test -p config -p hal -p models --lib -- \
+        --skip a_program_that_does_not_exist_is_named --skip a_library_that_is_there_but_cannot_be_opened_is_not_called_found
+}
 
 # figure NAME FILE: a number of run.json.
 figure() { python3 -c 'import json, sys; print(json.load(open(sys.argv[2]))[sys.argv[1]])' "$1" "$2"; }

@@ -29,7 +29,7 @@ pub enum KernelChoice {
         tile_lanes: u32,
         /// Gaussians that the lanes of a tile fetch at once: 1, or `tile_lanes`.
         fetched: u32,
-        /// Lanes of a tile whose sums are added at once: 1, in a loop, or `tile_lanes`.
+        /// Lanes of a tile whose sums are added at once: 1, in a loop and with fewer registers, or `tile_lanes`.
         summed: u32,
         /// Pixels of a strip whose SSIM sums a lane holds at once: 8, or 2.
         part: u32,

@@ -20,6 +20,13 @@ struct Slot {
 };
 layout(std430, set = 0, binding = 2) writeonly buffer Slots { Slot slots[]; };
 
+#ifdef LANE_PER_RUN
+#define STORED_BY(run) if (own_run == run)
+#else
+#define STORED_BY(run)
+const bool ROLLED = false;
+#endif
+
 const int AT_ONCE = 16;
 
 void main() {
@@ -27,8 +34,8 @@ void main() {
     bool to_the_end = (frame.flags & FLAG_NO_EARLY_END) != 0u;
     float thaw = (frame.flags & FLAG_FREEZE_SHAPE) != 0u ? 0.0 : 1.0;
     uint t = tile_of_lane();
-    if (t >= push.last) return;
-    uint base = starts[push.first], first = starts[t] - base, end = starts[t + 1u] - base;
+    ENTER(t);
+    uint base = starts[push.first], first = starts[t] - base, end = present ? starts[t + 1u] - base : first;
     int own_run = run_of_lane();
     ivec2 origin = tile_origin(t);
     vec2 corner = vec2(origin) + 0.5;
@@ -38,6 +45,8 @@ void main() {
 #ifdef DEPTH
     float depth_behind[PIXELS], depth_gradient[PIXELS];
 #endif
+    // Where the run's pixels are, to fetch their gradients from again.
+    uint own_first = 0u, own_last = 0u;
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         ivec2 p = origin + pixel_of(own_run, k);
         bool inside = pixel_inside(p);
@@ -47,6 +56,8 @@ void main() {
         vec4 g = FETCH(image_gradient, int(at)), c = FETCH(image, int(at));
         gradient[k] = g.xyz;
         behind[k] = dot(g.xyz, c.xyz);
+        if (k == 0) own_first = at;
+        own_last = max(own_last, at);
 #ifdef DEPTH
         depth_gradient[k] = g.w;
         depth_behind[k] = g.w * c.w;
@@ -57,7 +68,6 @@ void main() {
     Splat held;
     WHILE (i < end && live) {
         uint slot = 0u;
-        float most = -1.0;
         // `precise`: two runs of a row share a factor, which a compiler would take out of their sum.
         precise vec4 line = vec4(0.0), square = vec4(0.0);
         precise vec3 colour = vec3(0.0);
@@ -91,15 +101,24 @@ void main() {
                     float odds = taken && follows ? alpha / (1.0 - alpha) : 0.0;
                     float own = follows ? weight : 0.0;
                     T[k] = taken ? next : -abs(T[k]);
-                    float value = fma(s2.z, gradient[k].z, fma(s2.y, gradient[k].y, s2.x * gradient[k].x));
+                    vec4 g;
+                    if (ROLLED) {
+                        g = FETCH(image_gradient, int(min(own_first + uint(k), own_last)));
+                    } else {
+                        g.xyz = gradient[k];
+#ifdef DEPTH
+                        g.w = depth_gradient[k];
+#endif
+                    }
+                    float value = fma(s2.z, g.z, fma(s2.y, g.y, s2.x * g.x));
                     behind[k] = fma(-weight, value, behind[k]);
                     float term = fma(own, value, -(odds * behind[k]));
-                    run_colour = fma(vec3(weight), gradient[k], run_colour);
+                    run_colour = fma(vec3(weight), g.xyz, run_colour);
 #ifdef DEPTH
-                    float z_value = s0.z * depth_gradient[k];
+                    float z_value = s0.z * g.w;
                     depth_behind[k] = fma(-weight, z_value, depth_behind[k]);
                     float z_term = fma(own, z_value, -(odds * depth_behind[k]));
-                    depth = fma(weight, depth_gradient[k], depth);
+                    depth = fma(weight, g.w, depth);
                     float shape_term = fma(thaw, z_term, term);
                     term += z_term;
                     shape += shape_term;
@@ -109,7 +128,6 @@ void main() {
                     sums = vec3(sums.x + term, fma(term, float(x), sums.y), fma(term, float(x * x), sums.z));
 #endif
                     total += weight;
-                    most = max(most, T[k]);
                 }
                 // From the run's first pixel to the Gaussian's centre.
                 float run_x = fma(dx0, sums.x, sums.y);
@@ -123,21 +141,22 @@ void main() {
                 colour += run_colour;
             }
         }
+        // Each sum is stored before the next one is made: fewer registers.
         line = sum_of_tile(line);
+        IF (i < end && live) {
+            STORED_BY(0) slots[slot].line = line;
+        }
         square = sum_of_tile(square);
+        IF (i < end && live) {
+            STORED_BY(1) slots[slot].square = STORED_SQUARE(square);
+        }
         colour = sum_of_tile(vec4(colour, 0.0)).xyz;
         IF (i < end && live) {
-#ifdef LANE_PER_RUN
-            if (own_run == 0) slots[slot].line = line;
-            if (own_run == 1) slots[slot].square = STORED_SQUARE(square);
-            if (own_run == 2) slots[slot].colour = colour;
-#else
-            slots[slot].line = line;
-            slots[slot].square = STORED_SQUARE(square);
-            slots[slot].colour = colour;
-#endif
+            STORED_BY(2) slots[slot].colour = colour;
             i++;
         }
+        float most = T[0];
+        [[unroll]] for (int k = 1; k < PIXELS; k++) most = max(most, T[k]);
         live = any_of_tile(most > 0.0) || to_the_end;
     }
     // Slots behind an opaque tile: a total of zero says that the other two vectors were not written. Many in a turn,

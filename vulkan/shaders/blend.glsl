@@ -12,8 +12,8 @@ void main() {
     vec3 background = frame.background;
     uint counters = frame.window.x * frame.window.y + 1u;
     uint t = tile_of_lane();
-    if (t >= push.last) return;
-    uint base = starts[push.first], first = starts[t] - base, end = starts[t + 1u] - base;
+    ENTER(t);
+    uint base = starts[push.first], first = starts[t] - base, end = present ? starts[t + 1u] - base : first;
     int own_run = run_of_lane();
     ivec2 origin = tile_origin(t);
     vec2 corner = vec2(origin) + 0.5;
@@ -61,10 +61,10 @@ void main() {
         live = any_of_tile(most > 0.0) || to_the_end;
     }
     // Counted work: how many Gaussians were blended before the tile was opaque.
-    if (own_run == 0) starts[counters + t] = i - first;
+    if (own_run == 0 && present) starts[counters + t] = i - first;
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         ivec2 p = origin + pixel_of(own_run, k);
-        if (pixel_inside(p)) {
+        if (pixel_inside(p) && present) {
             uint at = pixel_index(p);
             float left = abs(T[k]);
             image[at] = sum[k] + vec4(left * background, 0.0);

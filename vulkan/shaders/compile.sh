@@ -1,7 +1,8 @@
 #!/bin/sh
 # Compiles every kernel to FOLDER (default: spirv, what is checked in): compile.sh [FOLDER]. Needs glslangValidator.
 # Kernels that fetch texels are compiled a second time, to read storage buffers instead (frame.glsl), and those that hold strips
-# once more, to hold less of them at a time (window.glsl).
+# once more, to hold less of them at a time (window.glsl). Those of a lane per run are compiled for lanes that cannot read each other,
+# too (tile.glsl).
 set -eu
 cd "$(dirname "$0")"
 to=${1:-spirv}
@@ -20,6 +21,10 @@ for source in *.comp; do
     if grep -q 'PARTS(' "$source"; then
         name=${name}_short
         compile_reads -DSHORT
+    fi
+    if grep -q '#define LANE_PER_RUN' "$source"; then
+        name=${name}_shared
+        compile_reads -DSHARED
     fi
 done
 rm "$to/log"

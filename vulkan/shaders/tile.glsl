@@ -1,6 +1,7 @@
 // Who blends a tile: one lane, all pixels in registers, so that a Gaussian's data is read once per tile and the backward
 // pass needs no reduction; or, with LANE_PER_RUN, eight neighbouring lanes of a subgroup, a run of four pixels each, which
-// takes an eighth of the registers and has eight times the lanes, for devices that have many lanes and few registers each.
+// takes an eighth of the registers and has eight times the lanes, for devices that have many lanes and few registers each. With
+// SHARED, lanes that cannot read each other's registers (VideoCore 6) do it through shared memory.
 // Sums over a tile are taken over each run first and then over the runs, in order, so that both leave the same bits.
 // Products are added by fma: llvmpipe fuses nothing by itself.
 
@@ -32,6 +33,13 @@ uint tile_of_lane() {
     uint in_block = column < window.x && row < window.y ? row * window.x + column : push.last;
     return whole ? in_block : push.first + place;
 }
+
+// A lane beyond the last tile ends at once; where others wait for it, it goes on with an empty list and writes nothing.
+#ifdef SHARED
+#define ENTER(t) bool present = t < push.last; t = present ? t : push.first
+#else
+#define ENTER(t) if (t >= push.last) return; const bool present = true
+#endif
 
 // First run of the tile that this lane holds.
 int run_of_lane() {
@@ -98,9 +106,46 @@ Splat fetch(uint i) {
 }
 
 #ifdef LANE_PER_RUN
+#define IF(working) if (working)
+
+// Registers are few (`KernelShape::summed` of one): the lanes of a tile are summed in a loop, and a pixel's gradient is fetched again
+// for each Gaussian instead of being held.
+layout(constant_id = 8) const bool ROLLED = false;
+
+#ifdef SHARED
+// The lanes of a workgroup turn together, whether their tiles have ended or not: each meets every barrier.
+#define WHILE(working) while (any_of_group(working))
+
+shared vec4 shown[gl_WorkGroupSize.x];
+shared bool said[gl_WorkGroupSize.x];
+
+uint first_run() {
+    return gl_LocalInvocationID.x & ~uint(LANES - 1);
+}
+
+// Whether any of `lanes` lanes from `first` on says so.
+bool any_of(bool own, uint first, uint lanes) {
+    barrier();
+    said[gl_LocalInvocationID.x] = own;
+    barrier();
+    bool any = false;
+    [[dont_unroll]] for (uint lane = first; lane < first + lanes; lane++) any = any || said[lane];
+    return any;
+}
+
+bool any_of_group(bool own) {
+    return any_of(own, 0u, gl_WorkGroupSize.x);
+}
+
+bool any_of_tile(bool own) {
+    return any_of(own, first_run(), uint(LANES));
+}
+
+#define SHOW(own) barrier(); shown[gl_LocalInvocationID.x] = own; barrier()
+#define SHOWN(own, lane) shown[lane]
+#else
 // The lanes of a subgroup turn together, whether their tiles have ended or not: a shuffle reads lanes that are there.
 #define WHILE(working) while (subgroupAny(working))
-#define IF(working) if (working)
 
 uint first_run() {
     return gl_SubgroupInvocationID & ~uint(LANES - 1);
@@ -112,20 +157,27 @@ bool any_of_tile(bool own) {
     return ((subgroupBallot(own)[first >> 5] >> (first & 31u)) & ((1u << LANES) - 1u)) != 0u;
 }
 
-// Whether the lanes of a tile are summed in a loop (`KernelShape::summed`).
-layout(constant_id = 8) const bool ROLLED = false;
+#define SHOW(own)
+#define SHOWN(own, lane) subgroupShuffle(own, lane)
+#endif
 
 // In the order of the runs, so that the sum has the bits of one lane's.
 vec4 sum_of_tile(vec4 own) {
-    vec4 sum = subgroupShuffle(own, first_run());
+    SHOW(own);
+    vec4 sum = SHOWN(own, first_run());
     if (ROLLED) {
-        [[dont_unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
+        [[dont_unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += SHOWN(own, first_run() + run);
     } else {
-        [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
+        [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += SHOWN(own, first_run() + run);
     }
     return sum;
 }
 
+#ifdef SHARED
+Splat next_splat(uint i, uint first, uint end, inout Splat held) {
+    return fetch(i);
+}
+#else
 layout(constant_id = 7) const bool STAGED = false;
 
 // Instance i of those from `first` to `end`, asked for in turn. Staged, every lane fetches one of the next eight into
@@ -139,6 +191,7 @@ Splat next_splat(uint i, uint first, uint end, inout Splat held) {
         subgroupShuffle(held.s0, lane), subgroupShuffle(held.s1, lane), subgroupShuffle(held.s2, lane),
         subgroupShuffle(held.slot, lane));
 }
+#endif
 #else
 #define WHILE(working) while (working)
 #define IF(working)

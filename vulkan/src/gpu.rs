@@ -118,6 +118,19 @@ impl Gpu {
     /// # Errors
     /// As [`Gpu::list`]; [`GpuError::NoDevice`] names what is present when nothing matches.
     pub fn open(name: Option<&str>) -> Result<Self, GpuError> {
+        Self::open_as(name, |info| info)
+    }
+
+    /// As [`Gpu::open`], taking the lanes of the device for such that cannot read each other, as those of a Raspberry Pi 4 cannot: what runs
+    /// there can be tried on any other.
+    ///
+    /// # Errors
+    /// As [`Gpu::open`].
+    pub fn open_without_shuffles(name: Option<&str>) -> Result<Self, GpuError> {
+        Self::open_as(name, |info| GpuInfo { shuffles: false, ..info })
+    }
+
+    fn open_as(name: Option<&str>, taken_for: impl Fn(GpuInfo) -> GpuInfo) -> Result<Self, GpuError> {
         let instance = instance()?;
         let (physical, info, device, family, timestamp_ns) = {
             // One after the other: of four threads that opened NVIDIA's at once (580.159) none came back, once.
@@ -128,7 +141,7 @@ impl Gpu {
         // SAFETY: queue 0 of `family` was requested when the device was made.
         let queue = unsafe { device.get_device_queue(family, 0) };
         let inner = Inner {
-            info,
+            info: taken_for(info),
             device,
             instance,
             physical,

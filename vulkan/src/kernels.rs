@@ -52,6 +52,8 @@ pub(crate) struct KernelInfo {
     pub spirv: Spirv,
     /// Its group's other variant: `_runs`, `_short` or `_group`.
     pub variant: Option<Spirv>,
+    /// `_runs_shared`: a lane per run where lanes cannot read each other.
+    pub shared: Option<Spirv>,
     pub bindings: &'static [&'static str],
     /// Sections read through texel fetches, from binding [`FIRST_TEXELS`] on.
     pub texels: &'static [&'static str],
@@ -84,6 +86,12 @@ macro_rules! spirv {
     (variant $other:ident $file:literal $texels:tt) => {
         None
     };
+    (shared Tiles $file:literal $texels:tt) => {
+        Some(spirv!($file "_runs_shared" $texels))
+    };
+    (shared $other:ident $file:literal $texels:tt) => {
+        None
+    };
 }
 
 macro_rules! kernels {
@@ -100,6 +108,7 @@ macro_rules! kernels {
             file: $file,
             spirv: spirv!($file "" [$($texels)*]),
             variant: spirv!(variant $group $file [$($texels)*]),
+            shared: spirv!(shared $group $file [$($texels)*]),
             bindings: &[$($binding),*],
             texels: &[$($texels),*],
             group: Group::$group,
@@ -148,7 +157,7 @@ kernels! {
 /// A number that changes whenever any kernel does (FNV-1a over names and SPIR-V): what was measured with other kernels
 /// says nothing about these.
 pub(crate) fn fingerprint() -> u64 {
-    let variants = |k: &KernelInfo| [Some(k.spirv), k.variant].into_iter().flatten().flat_map(|s| s.texels);
+    let variants = |k: &KernelInfo| [Some(k.spirv), k.variant, k.shared].into_iter().flatten().flat_map(|s| s.texels);
     let bytes = KERNELS.iter().flat_map(|k| k.name.bytes().chain(variants(k).copied()));
     bytes.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3))
 }

@@ -290,7 +290,8 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
-        let variant = kernel.variant.filter(|_| takes_variant(kernel.group, self.shape));
+        let other = if self.gpu.info().shuffles { kernel.variant } else { kernel.shared.or(kernel.variant) };
+        let variant = other.filter(|_| takes_variant(kernel.group, self.shape));
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
         unsafe {
             self.gpu.compute_pipeline(

@@ -22,7 +22,8 @@ pub struct KernelShape {
     pub tile_lanes: u32,
     /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
     pub fetched: u32,
-    /// Lanes of a tile whose sums are added at once: 1, one after the other in a loop, or all of them.
+    /// Lanes of a tile whose sums are added at once: 1, where registers are few (one after the other in a loop, and the gradients of a
+    /// tile's pixels are fetched again for each Gaussian), or all of them.
     pub summed: u32,
     /// Pixels of a strip whose SSIM sums a lane holds at once: all of it, or [`SHORT_PART`].
     pub part: u32,
@@ -32,6 +33,8 @@ pub struct KernelShape {
 const WIDE: [u32; 4] = [32, 64, 128, 256];
 const NARROW: [u32; 3] = [8, 16, 32];
 const TILES: [u32; 3] = [8, 16, 32];
+/// The same where a tile's lanes meet in shared memory: all of a workgroup wait for each other.
+const MEETING_TILES: [u32; 2] = [2, 8];
 
 /// PCI vendor of VideoCore GPUs (a Raspberry Pi's).
 const BROADCOM: u32 = 0x14e4;
@@ -41,13 +44,20 @@ impl KernelShape {
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
         let few = if info.is_cpu { 8 } else { 32 };
-        // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 7/6, Adreno
-        // 49/49 and nothing (tests/data/boards.md).
-        let runs = info.shuffles && !info.is_cpu && 8 * RUNS <= info.limits.workgroup_lanes;
-        let (tiles, tile_lanes) = if runs { (8, RUNS) } else { (few, 1) };
-        // Of the blend's gradient a Mali-G610's compiler spills 282/300 where all are added at once, 15/36 where in a loop, and an Adreno
-        // loses two thirds of its waves; V3D's 7/6 and 19/32 (tests/data/boards.md). Cards have registers for it.
-        let summed = if info.is_integrated && info.ids.0 != BROADCOM { 1 } else { tile_lanes };
+        // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 4/4, Adreno
+        // 47/49 and nothing (tests/data/boards.md).
+        let (tiles, tile_lanes) = match (info.is_cpu, info.shuffles) {
+            (true, _) => (few, 1),
+            (false, true) if 8 * RUNS <= info.limits.workgroup_lanes => (8, RUNS),
+            (false, false) if MEETING_TILES[0] * RUNS >= info.subgroup_size => (MEETING_TILES[0], RUNS),
+            (false, false) => (MEETING_TILES[1], RUNS),
+            (false, true) => (few, 1),
+        };
+        // Of the blend's gradient a Mali-G610's compiler spills 292/383 where all are added at once, 4/4 where in a loop, and an Adreno
+        // loses two thirds of its waves; V3D 7's 4/4 and 23/25, V3D 4.2's, which has no shuffles, 8/7 and nothing
+        // (tests/data/boards.md). Cards have registers for it.
+        let shuffles_at_once = info.ids.0 == BROADCOM && info.shuffles;
+        let summed = if info.is_integrated && !shuffles_at_once { 1 } else { tile_lanes };
         // A card has lanes enough for every share's histogram (an H100: sorting, counting and emitting 0.3 ms instead of 1.4).
         let card = !info.is_cpu && !info.is_integrated && few >= info.subgroup_size;
         // The sums of a whole strip are more than a small GPU's lane has registers for, too.
@@ -91,14 +101,23 @@ impl KernelShape {
             for tiles in candidates(&TILES, 0, RUNS, info) {
                 all.extend([(1, 1), (1, RUNS), (RUNS, 1), (RUNS, RUNS)].map(|(f, s)| (tiles, RUNS, f, s)));
             }
+        } else if !info.is_cpu {
+            for tiles in candidates(&MEETING_TILES, Self::standard(info).tiles, RUNS, info) {
+                all.extend([1, RUNS].map(|s| (tiles, RUNS, 1, s)));
+            }
         }
         all
     }
 
     /// Whether the kernels are written for this shape and the device can run it.
     pub fn fits(&self, info: &GpuInfo) -> bool {
-        let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow) && TILES.contains(&self.tiles);
-        let runs = self.tile_lanes == 1 || (self.tile_lanes == RUNS && info.shuffles);
+        let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow);
+        let runs = match self.tile_lanes {
+            1 => TILES.contains(&self.tiles),
+            RUNS if info.shuffles => TILES.contains(&self.tiles),
+            RUNS => MEETING_TILES.contains(&self.tiles) && self.fetched == 1,
+            _ => false,
+        };
         let at_once = [self.fetched, self.summed].iter().all(|n| *n == 1 || *n == self.tile_lanes);
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
         let part = self.part == STRIP || self.part == SHORT_PART;
@@ -165,16 +184,25 @@ mod tests {
     }
 
     #[test]
-    fn several_lanes_per_tile_are_tried_only_where_lanes_can_read_each_other() {
+    fn several_lanes_per_tile_fetch_for_each_other_only_where_they_can_read_each_other() {
         assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1, 1), (16, 1, 1, 1), (32, 1, 1, 1)]);
         let pi5 = device(false, 16, 256);
         let at_once = [(1, 1), (1, 8), (8, 1), (8, 8)];
         let runs: Vec<_> = [8, 16, 32].into_iter().flat_map(|n| at_once.map(|(f, s)| (n, 8, f, s))).collect();
         assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1, 1), (32, 1, 1, 1)], &runs[..]].concat());
         assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1, 1)], &runs[..]].concat());
+        // A Raspberry Pi 4: they meet in shared memory.
+        let pi4 = GpuInfo { shuffles: false, ..pi5.clone() };
+        let meeting = [2, 8].into_iter().flat_map(|n| [1, 8].map(|s| (n, 8, 1, s)));
+        let meeting: Vec<_> = [(16, 1, 1, 1), (32, 1, 1, 1)].into_iter().chain(meeting).collect();
+        assert_eq!(KernelShape::tile_candidates(&pi4), meeting);
         let (wide, narrow, share_lanes, tiles, tile_lanes) = (64, 32, 32, 8, 8);
         let runs = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched: 8, summed: 1, part: 2 };
-        assert!(runs.fits(&pi5) && !runs.fits(&device(false, 8, 256)));
+        assert!(runs.fits(&pi5) && !runs.fits(&pi4));
+        assert!(
+            KernelShape { fetched: 1, ..runs }.fits(&pi4) && !KernelShape { fetched: 1, tiles: 16, ..runs }.fits(&pi4)
+        );
+        assert!(!KernelShape { fetched: 1, tiles: 2, ..runs }.fits(&pi5), "half of what a workgroup is worth there");
         assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { summed: 2, ..runs }.fits(&pi5));
@@ -185,12 +213,15 @@ mod tests {
     }
 
     #[test]
-    fn a_gpu_whose_lanes_read_each_other_begins_with_a_lane_per_run_and_a_processor_with_one_per_tile() {
+    fn a_gpu_begins_with_a_lane_per_run_and_a_processor_with_one_per_tile() {
         let lanes = |info: &GpuInfo| (KernelShape::standard(info).tiles, KernelShape::standard(info).tile_lanes);
         assert_eq!(lanes(&device(false, 16, 256)), (8, RUNS));
-        assert_eq!(lanes(&device(false, 4, 256)), (32, 1), "no shuffles");
+        assert_eq!(lanes(&device(false, 4, 256)), (2, RUNS), "no shuffles");
+        assert_eq!(lanes(&GpuInfo { shuffles: false, ..device(false, 128, 256) }), (8, RUNS));
         assert_eq!(lanes(&device(true, 16, 1024)), (8, 1));
-        for info in [device(false, 16, 64), device(false, 16, 256), device(true, 8, 1024), device(false, 64, 128)] {
+        let no_shuffles = [4, 16, 128].map(|n| GpuInfo { shuffles: false, ..device(false, n, 256) });
+        let others = [device(false, 16, 64), device(false, 16, 256), device(true, 8, 1024), device(false, 64, 128)];
+        for info in no_shuffles.into_iter().chain(others) {
             assert!(KernelShape::standard(&info).fits(&info));
             let listed = KernelShape::tile_candidates(&info);
             let KernelShape { tiles, tile_lanes, fetched, summed, .. } = KernelShape::standard(&info);
@@ -206,6 +237,8 @@ mod tests {
         };
         let (mali, adreno, nvidia) = (0x13b5, 0x5143, 0x10de);
         assert_eq!([of(mali, true), of(adreno, true), of(BROADCOM, true), of(nvidia, false)], [1, 1, RUNS, RUNS]);
+        let pi4 = GpuInfo { ids: (BROADCOM, 2), shuffles: false, ..device(false, 16, 256) };
+        assert_eq!(KernelShape::standard(&pi4).summed, 1);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::time::Duration;
 use vulkan::calibration::calibrate;
-use vulkan::constants::{SHORT_PART, STRIP};
+use vulkan::constants::{RUNS, SHORT_PART, STRIP};
 use vulkan::gpu::Gpu;
 use vulkan::shape::KernelShape;
 use vulkan::trainer::{Rendering, Trainer};
@@ -108,6 +108,23 @@ fn the_trained_model_and_its_pictures_are_the_same_to_the_bit_with_every_shape()
         let (other, other_drawn, _) = trained(&gpu, shape, 200_000, 110);
         assert!(bits(&other) == bits(&model), "{shape:?}: another model");
         assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{shape:?}: another picture");
+    }
+}
+
+/// As on a Raspberry Pi 4.
+#[test]
+fn lanes_that_meet_in_shared_memory_leave_the_same_bits_at_once_and_in_bands() {
+    let Some(gpu) = gpu() else { return };
+    let standard = KernelShape::standard(gpu.info());
+    let meeting = Gpu::open_without_shuffles(Some(&gpu.info().name)).unwrap();
+    for (instances, steps) in [(200_000, 110), (3000, 6)] {
+        let (model, drawn, _) = trained(&gpu, standard, instances, steps);
+        for (tiles, summed) in [(2, 1), (8, RUNS)] {
+            let shape = KernelShape { tiles, tile_lanes: RUNS, fetched: 1, summed, ..standard };
+            let (other, other_drawn, _) = trained(&meeting, shape, instances, steps);
+            assert!(bits(&other) == bits(&model), "{shape:?}, {instances} instances: another model");
+            assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{shape:?}: another picture");
+        }
     }
 }
 

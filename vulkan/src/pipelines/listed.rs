@@ -15,12 +15,15 @@ fn lines() -> BTreeSet<String> {
     let other = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, summed: 8, part: SHORT_PART, ..one };
     let mut lines = BTreeSet::new();
     for kernel in KERNELS {
-        for shape in [one, other, KernelShape { fetched: 8, ..other }] {
-            if shape != one && kernel.variant.is_none() || shape.fetched > 1 && kernel.group != Group::Tiles {
+        let (staged, meeting) = (KernelShape { fetched: 8, ..other }, KernelShape { tiles: 2, ..other });
+        for shape in [one, other, staged, meeting] {
+            let of_tiles = kernel.group == Group::Tiles;
+            if shape != one && kernel.variant.is_none() || [staged, meeting].contains(&shape) && !of_tiles {
                 continue;
             }
             let suffix = match (takes_variant(kernel.group, shape), kernel.group) {
                 (false, _) => "",
+                (true, Group::Tiles) if shape == meeting => "_runs_shared",
                 (true, Group::Tiles) => "_runs",
                 (true, Group::Strips) => "_short",
                 (true, _) => "_group",
@@ -28,7 +31,7 @@ fn lines() -> BTreeSet<String> {
             let (lanes, staged) = (local_size(kernel.group, shape), u32::from(shape.fetched > 1));
             let halves = u32::from(kernel.bindings.contains(&"sh_first_moment"));
             // Nothing else is summed over a tile.
-            let sums = u32::from(suffix == "_runs" && kernel.file.starts_with("rasterise_backward"));
+            let sums = u32::from(suffix.starts_with("_runs") && kernel.file.starts_with("rasterise_backward"));
             for (half, rolled) in (0..=halves).flat_map(|half| (0..=sums).map(move |rolled| (half, rolled))) {
                 let name = format!("{}{suffix}", kernel.file);
                 let chosen = [("", 1), ("+half", half), ("+staged", staged), ("+rolled", rolled)];
