@@ -290,8 +290,8 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
-        let other = if self.gpu.info().shuffles { kernel.variant } else { kernel.shared.or(kernel.variant) };
-        let variant = other.filter(|_| takes_variant(kernel.group, self.shape));
+        let shared = kernel.shared.filter(|_| self.shape.meets(self.gpu.info()));
+        let variant = shared.or(kernel.variant).filter(|_| takes_variant(kernel.group, self.shape));
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
         unsafe {
             self.gpu.compute_pipeline(

@@ -33,7 +33,8 @@ pub struct KernelShape {
 const WIDE: [u32; 4] = [32, 64, 128, 256];
 const NARROW: [u32; 3] = [8, 16, 32];
 const TILES: [u32; 3] = [8, 16, 32];
-/// The same where a tile's lanes meet in shared memory: all of a workgroup wait for each other.
+/// The same where a tile's lanes meet in shared memory, where all of a workgroup wait for each other. So few as the first are never
+/// blended otherwise: where lanes can read each other, it says that they meet nevertheless.
 const MEETING_TILES: [u32; 2] = [2, 8];
 
 /// PCI vendor of VideoCore GPUs (a Raspberry Pi's).
@@ -101,10 +102,12 @@ impl KernelShape {
             for tiles in candidates(&TILES, 0, RUNS, info) {
                 all.extend([(1, 1), (1, RUNS), (RUNS, 1), (RUNS, RUNS)].map(|(f, s)| (tiles, RUNS, f, s)));
             }
-        } else if !info.is_cpu {
-            for tiles in candidates(&MEETING_TILES, Self::standard(info).tiles, RUNS, info) {
-                all.extend([1, RUNS].map(|s| (tiles, RUNS, 1, s)));
-            }
+        }
+        // Not in software: barriers cost more there than lanes are worth.
+        let meeting = if info.shuffles { &MEETING_TILES[..1] } else { &MEETING_TILES };
+        let standard = Self::standard(info).tiles;
+        for tiles in candidates(meeting, standard, RUNS, info).into_iter().filter(|_| !info.is_cpu) {
+            all.extend([1, RUNS].map(|s| (tiles, RUNS, 1, s)));
         }
         all
     }
@@ -114,14 +117,19 @@ impl KernelShape {
         let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow);
         let runs = match self.tile_lanes {
             1 => TILES.contains(&self.tiles),
-            RUNS if info.shuffles => TILES.contains(&self.tiles),
-            RUNS => MEETING_TILES.contains(&self.tiles) && self.fetched == 1,
+            RUNS if self.meets(info) => MEETING_TILES.contains(&self.tiles) && self.fetched == 1,
+            RUNS => TILES.contains(&self.tiles),
             _ => false,
         };
         let at_once = [self.fetched, self.summed].iter().all(|n| *n == 1 || *n == self.tile_lanes);
         let shares = self.share_lanes == 1 || (self.share_lanes == self.narrow && !info.is_cpu);
         let part = self.part == STRIP || self.part == SHORT_PART;
         sizes && runs && at_once && shares && part && self.largest_workgroup() <= info.limits.workgroup_lanes
+    }
+
+    /// Whether the lanes of a tile meet in shared memory, where there are several.
+    pub(crate) fn meets(&self, info: &GpuInfo) -> bool {
+        !info.shuffles || self.tiles == MEETING_TILES[0]
     }
 
     /// Lanes of its largest workgroup.
@@ -189,7 +197,8 @@ mod tests {
         let pi5 = device(false, 16, 256);
         let at_once = [(1, 1), (1, 8), (8, 1), (8, 8)];
         let runs: Vec<_> = [8, 16, 32].into_iter().flat_map(|n| at_once.map(|(f, s)| (n, 8, f, s))).collect();
-        assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1, 1), (32, 1, 1, 1)], &runs[..]].concat());
+        let met = [(2, 8, 1, 1), (2, 8, 1, 8)];
+        assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1, 1), (32, 1, 1, 1)], &runs[..], &met].concat());
         assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1, 1)], &runs[..]].concat());
         // A Raspberry Pi 4: they meet in shared memory.
         let pi4 = GpuInfo { shuffles: false, ..pi5.clone() };
@@ -202,7 +211,9 @@ mod tests {
         assert!(
             KernelShape { fetched: 1, ..runs }.fits(&pi4) && !KernelShape { fetched: 1, tiles: 16, ..runs }.fits(&pi4)
         );
-        assert!(!KernelShape { fetched: 1, tiles: 2, ..runs }.fits(&pi5), "half of what a workgroup is worth there");
+        let two = KernelShape { fetched: 1, tiles: 2, ..runs };
+        assert!(two.fits(&pi5) && two.meets(&pi5) && !runs.meets(&pi5));
+        assert!(!KernelShape { tile_lanes: 1, summed: 1, ..two }.fits(&pi5), "too few lanes");
         assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
         assert!(!KernelShape { summed: 2, ..runs }.fits(&pi5));
