@@ -94,7 +94,8 @@ fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
     };
     let direct = tiles.iter().rev().find(|t| t.1 > 1 && (t.2, t.3) == (1, 1));
     // A workgroup per share is never chosen in software, but does the same there, too.
-    let mut all = vec![of(wide[0], 32, 32, tiles[tiles.len() - 1]), of(wide[wide.len() - 1], 16, 1, tiles[0])];
+    let staged = tiles.iter().max_by_key(|t| (t.2, t.0)).unwrap();
+    let mut all = vec![of(wide[0], 32, 32, *staged), of(wide[wide.len() - 1], 16, 1, tiles[0])];
     all.extend(direct.map(|t| of(64, 32, 1, *t)));
     all
 }

@@ -10,7 +10,7 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::process::Command;
-use vulkan::constants::SHORT_PART;
+use vulkan::constants::{RUNS, SHORT_PART};
 use vulkan::gpu::Gpu;
 use vulkan::shape::KernelShape;
 use vulkan::trainer::{Rendering, Trainer};
@@ -56,12 +56,21 @@ fn work() {
         ..Default::default()
     };
     let standard = KernelShape::standard(gpu.info());
-    // Every kernel with several lanes that the device can run.
-    let tiles = KernelShape::tile_candidates(gpu.info());
-    let (tiles, tile_lanes, fetched, summed) = tiles[tiles.len() - 1];
-    let several =
-        KernelShape { narrow: 32, share_lanes: 32, tiles, tile_lanes, fetched, summed, part: SHORT_PART, ..standard };
-    for (instances, shape) in [(1 << 16, standard), (400, standard), (1 << 16, several), (400, several)] {
+    // Every kernel with several lanes that the device can run, those that fetch for each other and those that meet.
+    let several = |(tiles, tile_lanes, fetched, summed)| KernelShape {
+        narrow: 32,
+        share_lanes: 32,
+        tiles,
+        tile_lanes,
+        fetched,
+        summed,
+        part: SHORT_PART,
+        ..standard
+    };
+    let staged = KernelShape::tile_candidates(gpu.info()).into_iter().max_by_key(|t| (t.2, t.0)).map(several).unwrap();
+    for (instances, shape) in
+        [standard, staged, several((2, RUNS, 1, 1))].into_iter().flat_map(|s| [(1 << 16, s), (400, s)])
+    {
         let plan = Plan::with_capacities(&request, 300, instances);
         let mut settings = plain();
         settings.refine_poses = true;
