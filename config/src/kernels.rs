@@ -23,7 +23,8 @@ pub enum KernelChoice {
         narrow: u32,
         /// Lanes that work on a share of the Gaussians: 1, or `narrow`.
         share_lanes: u32,
-        /// Tiles of a workgroup of the blend.
+        /// Tiles of a workgroup of the blend: 8, 16 or 32; or 2, whose 8 lanes each meet in shared memory, as all do (2 or 8 tiles) where
+        /// lanes cannot read each other.
         tiles: u32,
         /// Lanes that blend a tile: 1, or 8.
         tile_lanes: u32,

@@ -18,7 +18,8 @@ pub struct KernelShape {
     pub share_lanes: u32,
     /// Tiles of a workgroup: the blend and its gradient.
     pub tiles: u32,
-    /// Lanes that share a tile: 1, with all its pixels in registers, or one per run of it.
+    /// Lanes that share a tile: 1, with all its pixels in registers, or one per run of it. Those read each other's registers, or meet in
+    /// shared memory: where they cannot read them, and with two tiles.
     pub tile_lanes: u32,
     /// Gaussians that the lanes of a tile fetch at once: 1, or as many as there are lanes, each for all.
     pub fetched: u32,
