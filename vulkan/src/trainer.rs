@@ -115,6 +115,7 @@ pub struct Trainer {
     begun_at: f32,
     /// Pictures looked at and seconds spent when the schedule began anew.
     since: (f64, f64),
+    patience: run::Patience,
     counters: Counters,
 }
 
@@ -196,6 +197,7 @@ impl Trainer {
             elapsed_s: 0.0,
             before: (0, 0.0),
             begun_at: 0.0,
+            patience: run::Patience::default(),
             since: (0.0, 0.0),
             counters: Counters::default(),
             settings: settings.clone(),
@@ -219,6 +221,7 @@ impl Trainer {
         self.density.last_flush = 0;
         self.degrees.reset();
         self.validation.reset();
+        self.patience = run::Patience::default();
         self.commands.clear_times();
     }
 
@@ -241,16 +244,17 @@ impl Trainer {
         let start = (Instant::now(), self.steps());
         let mut reason = StopReason::Schedule;
         let mut last = None;
-        let mut patience = run::Patience::default();
         while self.progress() < 1.0 {
             let report = self.step()?;
             let stop = each(&report).is_break();
             last = Some(report);
+            let converged = self.patience.is_over(&self.settings, &report, self.views.len());
             if stop {
                 reason = StopReason::Caller;
                 break;
             }
-            if patience.is_over(&self.settings, &report, self.views.len()) {
+            if converged {
+                self.patience = run::Patience::default();
                 reason = StopReason::Converged;
                 break;
             }

@@ -33,8 +33,7 @@ impl Reconstruction {
     pub(super) fn average_due(&self) -> Option<Due> {
         let t = &self.settings.training;
         let whole = !self.in_pieces && self.trainer.cells().0 == 0;
-        // Training that ends early counts epochs itself and must not be interrupted.
-        (whole && !self.flying && !self.delivery.rounded && !t.stop.enabled).then(|| Due {
+        (whole && !self.flying && !self.delivery.rounded).then(|| Due {
             from: t.average.from.max(t.density.until),
             step: self.average.step + self.views.len() as u32,
         })

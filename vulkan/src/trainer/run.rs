@@ -107,7 +107,7 @@ pub struct TrainSummary {
 }
 
 /// Early stop: epochs in a row without a useful fall of the mean loss. Losses of small pictures say nothing about those of larger ones,
-/// so that epochs count from where pictures have their full size.
+/// so that epochs count from where pictures have their full size. Whoever interrupts training in between loses none of them.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Patience {
     sum: f64,

@@ -115,6 +115,24 @@ fn what_is_rounded_for_delivery_is_the_mean_and_colours_go_on_from_there() {
 }
 
 #[test]
+fn a_schedule_that_ends_early_is_over_at_the_same_step_and_ends_with_the_mean_of_its_epochs() {
+    // No epoch is ever better: the first at full size, from step 11 on, is the best, and two more are waited for.
+    let stops = |settings: &mut EngineSettings| {
+        let stop = &mut settings.training.stop;
+        (stop.enabled, stop.patience, stop.least_gain) = (true, 2, 0.999);
+    };
+    let Some(mut uninterrupted) = built_with(1_000, stops) else { return };
+    let Some(mut engine) = built_with(1, stops) else { return };
+    for engine in [&mut uninterrupted, &mut engine] {
+        let (_, reason) = train(engine, 21);
+        assert_eq!((reason, engine.trainer.spent().0), (StopReason::Converged, 19));
+    }
+    // Steps 11, 14, 17 and the last one.
+    assert_eq!(uninterrupted.report.more.get("averaged_epochs"), None);
+    assert_eq!(engine.report.more.get("averaged_epochs"), Some(&4.into()));
+}
+
+#[test]
 fn gaussians_that_are_no_longer_as_many_are_no_part_of_a_mean() {
     let Some(mut engine) = built(1) else { return };
     train(&mut engine, 14);
