@@ -15,15 +15,16 @@ use proptest::prelude::*;
 
 const S: u64 = 1_000_000_000;
 
-/// All boot times of a stream that comes in pieces of `cut` bytes and then ends.
-fn all_found(stream: &[u8], cut: usize) -> Vec<u32> {
+/// All boot times of a stream that comes in pieces of `cut` bytes and then ends; `None` where a frame was found that nobody sent: of
+/// 65,536 noises one has a right checksum, and what it reaches over is lost.
+fn all_found(stream: &[u8], cut: usize) -> Option<Vec<u32>> {
     let mut framer = Framer::new();
     let mut all: Vec<u32> = stream.chunks(cut).flat_map(|chunk| found(&mut framer, chunk)).collect();
     framer.end();
     while let Some(frame) = framer.next_frame() {
         all.extend(frame.message::<SYSTEM_TIME_DATA>().map(|m| m.time_boot_ms));
     }
-    all
+    (framer.counters().frames == all.len() as u64).then_some(all)
 }
 
 fn found(framer: &mut Framer, bytes: &[u8]) -> Vec<u32> {
@@ -48,7 +49,9 @@ proptest! {
             stream.extend_from_slice(noise);
             stream.extend_from_slice(encoder.encode(&SYSTEM_TIME_DATA { time_unix_usec: 1, time_boot_ms: i as u32 }, None));
         }
-        prop_assert_eq!(all_found(&stream, cut), (0..8).collect::<Vec<u32>>());
+        let found = all_found(&stream, cut);
+        prop_assume!(found.is_some());
+        prop_assert_eq!(found, Some((0..8).collect::<Vec<u32>>()));
     }
 
     /// Noise that reads as the start of an unknown message, as long as the three frames behind it.
@@ -58,7 +61,7 @@ proptest! {
         for i in 0..16 {
             stream.extend_from_slice(encoder.encode(&SYSTEM_TIME_DATA { time_unix_usec: 1, time_boot_ms: i }, None));
         }
-        prop_assert_eq!(all_found(&stream, cut), (0..16).collect::<Vec<u32>>());
+        prop_assert_eq!(all_found(&stream, cut), Some((0..16).collect::<Vec<u32>>()));
     }
 
     #[test]
