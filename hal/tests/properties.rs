@@ -6,7 +6,7 @@ use hal::frames::{attitude_to_enu, attitude_to_ned, euler_to_ned, ned_to_enu};
 use hal::link::LinkAddress;
 use hal::matcher::{Matcher, MatcherSettings};
 use hal::mavlink::dialect::SYSTEM_TIME_DATA;
-use hal::mavlink::{Encoder, Framer};
+use hal::mavlink::{Encoder, Frame, Framer, MessageData};
 use hal::time::boot::BootClock;
 use hal::time::map::ClockMap;
 use hal::traits::PictureClues;
@@ -15,27 +15,33 @@ use proptest::prelude::*;
 
 const S: u64 = 1_000_000_000;
 
-/// All boot times of a stream that comes in pieces of `cut` bytes and then ends; `None` where a frame was found that nobody sent: of
-/// 65,536 noises one has a right checksum, and what it reaches over is lost.
+/// All boot times of a stream that comes in pieces of `cut` bytes and then ends; `None` where a frame of a message was found that nobody
+/// sent: of 65,536 noises one has a right checksum, and what it reaches over is lost.
 fn all_found(stream: &[u8], cut: usize) -> Option<Vec<u32>> {
     let mut framer = Framer::new();
-    let mut all: Vec<u32> = stream.chunks(cut).flat_map(|chunk| found(&mut framer, chunk)).collect();
+    let mut all: Vec<_> = stream.chunks(cut).flat_map(|chunk| found(&mut framer, chunk)).collect();
     framer.end();
     while let Some(frame) = framer.next_frame() {
-        all.extend(frame.message::<SYSTEM_TIME_DATA>().map(|m| m.time_boot_ms));
+        all.push(boot_time(&frame));
     }
-    (framer.counters().frames == all.len() as u64).then_some(all)
+    all.into_iter().collect()
 }
 
-fn found(framer: &mut Framer, bytes: &[u8]) -> Vec<u32> {
+fn found(framer: &mut Framer, bytes: &[u8]) -> Vec<Option<u32>> {
     let (mut rest, mut found) = (bytes, Vec::new());
     while !rest.is_empty() {
         rest = &rest[framer.push(rest)..];
         while let Some(frame) = framer.next_frame() {
-            found.extend(frame.message::<SYSTEM_TIME_DATA>().map(|m| m.time_boot_ms));
+            found.push(boot_time(&frame));
         }
     }
     found
+}
+
+/// `None`: a frame of another message.
+fn boot_time(frame: &Frame<'_>) -> Option<u32> {
+    let is_ours = frame.id() == SYSTEM_TIME_DATA::ID;
+    is_ours.then(|| frame.message::<SYSTEM_TIME_DATA>().expect("whole").time_boot_ms)
 }
 
 proptest! {

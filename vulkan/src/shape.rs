@@ -47,7 +47,7 @@ impl KernelShape {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
         let few = if info.is_cpu { 8 } else { 32 };
         // A whole tile is more than a GPU's lane has registers for: V3D spills 308/588 then, with a lane per run 4/4, Adreno
-        // 47/49 and nothing (tests/data/boards.md).
+        // 49/49 and nothing (tests/data/boards.md).
         let (tiles, tile_lanes) = match (info.is_cpu, info.shuffles) {
             (true, _) => (few, 1),
             (false, true) if 8 * RUNS <= info.limits.workgroup_lanes => (8, RUNS),

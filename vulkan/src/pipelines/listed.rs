@@ -13,12 +13,12 @@ fn lines() -> BTreeSet<String> {
     let (wide, narrow, tiles) = (64, 32, 32);
     let one = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1, summed: 1, part: STRIP };
     let other = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, summed: 8, part: SHORT_PART, ..one };
+    let (fetching, meeting) = (KernelShape { fetched: 8, ..other }, KernelShape { tiles: 2, ..other });
     let mut lines = BTreeSet::new();
     for kernel in KERNELS {
-        let (staged, meeting) = (KernelShape { fetched: 8, ..other }, KernelShape { tiles: 2, ..other });
-        for shape in [one, other, staged, meeting] {
+        for shape in [one, other, fetching, meeting] {
             let of_tiles = kernel.group == Group::Tiles;
-            if shape != one && kernel.variant.is_none() || [staged, meeting].contains(&shape) && !of_tiles {
+            if shape != one && kernel.variant.is_none() || [fetching, meeting].contains(&shape) && !of_tiles {
                 continue;
             }
             let suffix = match (takes_variant(kernel.group, shape), kernel.group) {
