@@ -45,17 +45,96 @@ impl<'a> Witness<'a> {
         }
     }
 
-    /// Pixel there and depth of a pixel here at a depth; `None` behind the camera.
-    fn project(&self, pixel: Vec3, depth: f32) -> Option<(f32, f32, f32)> {
-        let p = self.turn * pixel * depth + self.shift;
-        (p.z > 1e-6).then(|| (p.x / p.z, p.y / p.z, p.z))
+    /// What this view shows at each of the `places` of a row at `y`. Loop by loop, so that all but the second work on several
+    /// places at once.
+    fn look(&self, y: f32, places: &Places, shown: &mut Shown) {
+        let n = places.depth.len();
+        shown.hold(n);
+        let (xs, depths) = (&places.x[..n], &places.depth[..n]);
+        let [us, vs, zs] = [&mut shown.u, &mut shown.v, &mut shown.z].map(|values| &mut values[..n]);
+        let at = &mut shown.at[..n];
+        let ([a, b], [c, shift]) = ([self.turn.x_axis, self.turn.y_axis * y], [self.turn.z_axis, self.shift]);
+        let (stride, width, height) = (self.grid.stride as f32, self.grid.width as f32, self.grid.height as f32);
+        for k in 0..n {
+            let (x, depth) = (xs[k], depths[k]);
+            let z = (a.z * x + b.z + c.z) * depth + shift.z;
+            let u = ((a.x * x + b.x + c.x) * depth + shift.x) / z;
+            let v = ((a.y * x + b.y + c.y) * depth + shift.y) / z;
+            // Whole numbers divide several times slower.
+            let (column, line) = (u / stride, v / stride);
+            let seen = (z > 1e-6) & (u >= 0.0) & (v >= 0.0) & (column < width) & (line < height);
+            (us[k], vs[k], zs[k]) = (u, v, z);
+            at[k] = if seen { line as i32 * self.grid.width as i32 + column as i32 } else { -1 };
+        }
+        let (depth, confidence) = (&mut shown.depth[..n], &mut shown.confidence[..n]);
+        for k in 0..n {
+            let at = at[k] as u32 as usize;
+            let known = self.grid.depth.get(at).zip(self.grid.confidence.get(at));
+            (depth[k], confidence[k]) = known.map_or((0.0, 0.0), |(d, c)| (*d, *c));
+        }
+    }
+}
+
+/// Places that a row of a picture shows.
+#[derive(Default)]
+struct Places {
+    /// Columns of the grid.
+    i: Vec<usize>,
+    /// Pixels from the left edge.
+    x: Vec<f32>,
+    /// Metres along the optical axis.
+    depth: Vec<f32>,
+}
+
+impl Places {
+    fn clear(&mut self) {
+        self.i.clear();
+        self.x.clear();
+        self.depth.clear();
     }
 
-    /// Depth here of what lies at a pixel there; `None` behind the camera.
-    fn depth_here(&self, (x, y): (f32, f32), depth: f32) -> Option<f32> {
-        let z = self.back.dot(Vec3::new(x, y, 1.0)) * depth + self.back_shift;
-        (z > 1e-6).then_some(z)
+    fn push(&mut self, i: usize, x: f32, depth: f32) {
+        self.i.push(i);
+        self.x.push(x);
+        self.depth.push(depth);
     }
+}
+
+/// What another view shows at places.
+#[derive(Default)]
+struct Shown {
+    /// Pixel there, and depth there.
+    u: Vec<f32>,
+    v: Vec<f32>,
+    z: Vec<f32>,
+    /// Its sample; negative where it does not see the place.
+    at: Vec<i32>,
+    /// What it knows there; confidence 0: nothing.
+    depth: Vec<f32>,
+    confidence: Vec<f32>,
+}
+
+impl Shown {
+    fn hold(&mut self, n: usize) {
+        for values in [&mut self.u, &mut self.v, &mut self.z, &mut self.depth, &mut self.confidence] {
+            values.resize(n, 0.0);
+        }
+        self.at.resize(n, 0);
+    }
+}
+
+/// What all views say of the places of a row, and the room to find out.
+#[derive(Default)]
+struct Row {
+    known: Places,
+    /// Places nobody knows, at depths that continue their surroundings.
+    unknown: Places,
+    shown: Shown,
+    /// Σ confidence·depth and Σ confidence of those that agree; confidence of the others that do and that look through.
+    sum: Vec<f32>,
+    weight: Vec<f32>,
+    support: Vec<f32>,
+    against: Vec<f32>,
 }
 
 /// K.
@@ -80,6 +159,17 @@ pub struct ConsistencyCount {
     pub filled: usize,
 }
 
+impl ConsistencyCount {
+    fn and(self, other: Self) -> Self {
+        Self {
+            supported: self.supported + other.supported,
+            alone: self.alone + other.alone,
+            removed: self.removed + other.removed,
+            filled: self.filled + other.filled,
+        }
+    }
+}
+
 /// The depth grid of `frames[r]` after comparison with `others`; `None` when it has no depth.
 ///
 /// # Errors
@@ -101,106 +191,121 @@ pub fn resolve(
     }
     let others: Vec<Witness<'_>> =
         grids.iter().map(|(n, grid)| Witness::new(&frames[r].view, &frames[*n].view, grid.as_ref())).collect();
-    let rows: Vec<(Vec<(f32, f32)>, ConsistencyCount)> = (0..own.height)
+    let mut grid = DepthGrid { depth: vec![0.0; own.depth.len()], confidence: vec![0.0; own.depth.len()], ..*own };
+    let width = own.width.max(1);
+    let total = (grid.depth.par_chunks_mut(width), grid.confidence.par_chunks_mut(width))
         .into_par_iter()
-        .map(|j| {
-            let mut count = ConsistencyCount::default();
-            let row = (0..own.width)
-                .map(|i| {
-                    let at = j * own.width + i;
-                    let judged = if own.confidence[at] > 0.0 {
-                        judge(own, (i, j), &others, tolerance, &mut count)
-                    } else {
-                        (0.0, 0.0)
-                    };
-                    match fill {
-                        Some(fill) if judged.1 < FILLED && fill[at] > 0.0 => {
-                            let (x, y) = own.pixel(i, j);
-                            if known_elsewhere(Vec3::new(x, y, 1.0), fill[at], &others) {
-                                return judged;
-                            }
-                            count.filled += 1;
-                            (fill[at], FILLED)
-                        }
-                        _ => judged,
-                    }
-                })
-                .collect();
-            (row, count)
+        .enumerate()
+        .map_init(Row::default, |row, (j, (depth, confidence))| {
+            let mut count = row.judge(own, j, &others, tolerance, (depth, confidence));
+            if let Some(fill) = fill {
+                count.filled = row.fill(own, j, &others, fill, (depth, confidence));
+            }
+            count
         })
-        .collect();
-    let mut total = ConsistencyCount::default();
-    let mut grid = DepthGrid {
-        depth: Vec::with_capacity(own.depth.len()),
-        confidence: Vec::with_capacity(own.depth.len()),
-        ..*own
-    };
-    for (row, count) in rows {
-        for (d, c) in row {
-            grid.depth.push(d);
-            grid.confidence.push(c);
-        }
-        total.supported += count.supported;
-        total.alone += count.alone;
-        total.removed += count.removed;
-        total.filled += count.filled;
-    }
+        .reduce(ConsistencyCount::default, ConsistencyCount::and);
     Ok(Some((grid, total)))
 }
 
-/// Whether another picture that sees a place has a depth for it.
-fn known_elsewhere(pixel: Vec3, depth: f32, others: &[Witness<'_>]) -> bool {
-    others.iter().any(|o| {
-        o.project(pixel, depth)
-            .and_then(|(u, v, _)| o.grid.index_at(u, v))
-            .is_some_and(|k| o.grid.confidence[k] > KNOWS)
-    })
-}
+impl Row {
+    /// The depths of row `j` after comparison, and their confidence.
+    fn judge(
+        &mut self,
+        own: &DepthGrid,
+        j: usize,
+        others: &[Witness<'_>],
+        tolerance: f32,
+        (depth, confidence): (&mut [f32], &mut [f32]),
+    ) -> ConsistencyCount {
+        let row = j * own.width;
+        self.known.clear();
+        for i in (0..own.width).filter(|i| own.confidence[row + i] > 0.0) {
+            self.known.push(i, own.pixel(i, j).0, own.depth[row + i]);
+        }
+        let n = self.known.i.len();
+        let confidences = self.known.i.iter().map(|i| own.confidence[row + i]);
+        self.weight.clear();
+        self.weight.extend(confidences);
+        self.sum.clear();
+        self.sum.extend(self.known.depth.iter().zip(&self.weight).map(|(d, c)| d * c));
+        for values in [&mut self.support, &mut self.against] {
+            values.clear();
+            values.resize(n, 0.0);
+        }
+        for other in others {
+            other.look(own.pixel(0, j).1, &self.known, &mut self.shown);
+            self.hear(other, tolerance);
+        }
+        let mut count = ConsistencyCount::default();
+        for k in 0..n {
+            let (i, own_depth) = (self.known.i[k], self.known.depth[k]);
+            let own = own.confidence[row + i];
+            let (support, against) = (self.support[k], self.against[k]);
+            (depth[i], confidence[i]) = if against > support + own {
+                count.removed += 1;
+                (0.0, 0.0)
+            } else if support > 0.0 {
+                count.supported += 1;
+                // Independent opinions: the chance that all are wrong.
+                let doubt = (1.0 - own) * (1.0 - support.min(1.0));
+                (self.sum[k] / self.weight[k], (1.0 - doubt) * (1.0 + support) / (1.0 + support + against))
+            } else {
+                count.alone += 1;
+                (own_depth, own * ALONE * own / (own + against))
+            };
+        }
+        count
+    }
 
-fn judge(
-    own: &DepthGrid,
-    (i, j): (usize, usize),
-    others: &[Witness<'_>],
-    tolerance: f32,
-    count: &mut ConsistencyCount,
-) -> (f32, f32) {
-    let at = j * own.width + i;
-    let (depth, confidence) = (own.depth[at], own.confidence[at]);
-    let (x, y) = own.pixel(i, j);
-    let pixel = Vec3::new(x, y, 1.0);
-    let (mut sum, mut weight) = (depth * confidence, confidence);
-    let (mut support, mut against) = (0.0f32, 0.0f32);
-    for other in others {
-        let Some((u, v, z)) = other.project(pixel, depth) else { continue };
-        let Some(k) = other.grid.index_at(u, v) else { continue };
-        let (d, c) = (other.grid.depth[k], other.grid.confidence[k]);
-        if c <= 0.0 {
-            continue;
-        }
-        let difference = (z - d) / d;
-        if difference.abs() < tolerance {
+    /// Adds what a view shows at the places to what the views before it said.
+    fn hear(&mut self, other: &Witness<'_>, tolerance: f32) {
+        let n = self.known.depth.len();
+        let shown = &self.shown;
+        let [us, vs, zs] = [&shown.u, &shown.v, &shown.z].map(|values| &values[..n]);
+        let [depths, confidences] = [&shown.depth, &shown.confidence].map(|values| &values[..n]);
+        let [sum, weight] = [&mut self.sum, &mut self.weight].map(|values| &mut values[..n]);
+        let [support, against] = [&mut self.support, &mut self.against].map(|values| &mut values[..n]);
+        for k in 0..n {
+            let (d, c) = (depths[k], confidences[k]);
+            let difference = (zs[k] - d) / d;
             // Their surface at that pixel, seen from here.
-            if let Some(mine) = other.depth_here((u, v), d) {
-                sum += mine * c;
-                weight += c;
-                support += c;
-            }
-        } else if difference < -CONFLICT * tolerance {
-            against += c;
+            let mine = (other.back.x * us[k] + other.back.y * vs[k] + other.back.z) * d + other.back_shift;
+            let agrees = (c > 0.0) & (difference.abs() < tolerance) & (mine > 1e-6);
+            let contradicts = (c > 0.0) & (difference < -CONFLICT * tolerance);
+            sum[k] += if agrees { mine * c } else { 0.0 };
+            weight[k] += if agrees { c } else { 0.0 };
+            support[k] += if agrees { c } else { 0.0 };
+            against[k] += if contradicts { c } else { 0.0 };
         }
     }
-    if against > support + confidence {
-        count.removed += 1;
-        return (0.0, 0.0);
-    }
-    if support > 0.0 {
-        count.supported += 1;
-        // Independent opinions: the chance that all are wrong.
-        let doubt = (1.0 - confidence) * (1.0 - support.min(1.0));
-        (sum / weight, (1.0 - doubt) * (1.0 + support) / (1.0 + support + against))
-    } else {
-        count.alone += 1;
-        (depth, confidence * ALONE * confidence / (confidence + against))
+
+    /// Continues row `j` with the depths of `fill` where neither this picture nor another one knows; returns in how many places.
+    fn fill(
+        &mut self,
+        own: &DepthGrid,
+        j: usize,
+        others: &[Witness<'_>],
+        fill: &[f32],
+        (depth, confidence): (&mut [f32], &mut [f32]),
+    ) -> usize {
+        let fill = &fill[j * own.width..][..own.width];
+        self.unknown.clear();
+        for i in (0..own.width).filter(|i| confidence[*i] < FILLED && fill[*i] > 0.0) {
+            self.unknown.push(i, own.pixel(i, j).0, fill[i]);
+        }
+        let n = self.unknown.i.len();
+        self.weight.clear();
+        self.weight.resize(n, 0.0);
+        for other in others {
+            other.look(own.pixel(0, j).1, &self.unknown, &mut self.shown);
+            self.weight.iter_mut().zip(&self.shown.confidence).for_each(|(most, c)| *most = most.max(*c));
+        }
+        let mut filled = 0;
+        for (k, i) in self.unknown.i.iter().enumerate().filter(|(k, _)| self.weight[*k] <= KNOWS) {
+            (depth[*i], confidence[*i]) = (self.unknown.depth[k], FILLED);
+            filled += 1;
+        }
+        filled
     }
 }
 
@@ -238,6 +343,26 @@ mod tests {
         let (grid, count) = resolve(&frames, 1, &[0], 0.01, None).unwrap().unwrap();
         assert_eq!(count.removed, 0);
         assert!(grid.confidence.iter().all(|&c| c > 0.2));
+    }
+
+    #[test]
+    fn a_view_that_looks_away_or_whose_pose_is_no_number_says_nothing() {
+        let away = |rotation: DQuat, x: f64| {
+            let mut frame = frame(x, |_| 50.0);
+            frame.view.pose.rotation = rotation;
+            frame
+        };
+        let frames = [frame(0.0, |_| 50.0), away(DQuat::IDENTITY, 5.0), frame(f64::NAN, |_| 50.0)];
+        let fill = vec![49.0; 64 * 48];
+        let (grid, count) = resolve(&frames, 0, &[1, 2], 0.01, Some(&fill)).unwrap().unwrap();
+        assert_eq!((count.alone, count.filled), (64 * 48, 0));
+        assert!(grid.depth.iter().all(|&d| d == 50.0));
+        // Nor does it keep a place from being continued.
+        let mut frames = frames;
+        let nothing = DepthGrid { confidence: vec![0.0; 64 * 48], ..frames[0].depth().unwrap().unwrap().into_owned() };
+        frames[0].set_depth(Some(nothing)).unwrap();
+        let (grid, count) = resolve(&frames, 0, &[1, 2], 0.01, Some(&fill)).unwrap().unwrap();
+        assert_eq!((count, grid.depth), (ConsistencyCount { filled: 64 * 48, ..Default::default() }, fill));
     }
 
     #[test]

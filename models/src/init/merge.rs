@@ -4,17 +4,16 @@
 //!
 //! A cell's Gaussian has the samples' own spread and normal, so a flat lawn becomes a few flat discs.
 
-use std::collections::HashMap;
-
-use foldhash::fast::FixedState;
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
 
 use crate::morton::{BITS, morton, unmorton};
 
+mod bricks;
 mod cell;
 mod tree;
 
+use bricks::Bricks;
 pub use cell::Cell;
 
 /// One pixel-aligned proposal.
@@ -49,8 +48,6 @@ pub struct Merged {
 const LEVELS: usize = 4;
 /// Samples whose cells are looked up together.
 const AT_ONCE: usize = 32;
-/// Of a hash table: key and index, and what it leaves empty.
-const LOOKED_UP_BYTES: u64 = 40;
 
 /// The merging voxels; memory never exceeds [`VoxelMerge::planned_bytes`].
 #[derive(Debug)]
@@ -59,8 +56,8 @@ pub struct VoxelMerge {
     origin: Vec3,
     /// In the order in which they were met.
     cells: Vec<Cell>,
-    /// Where each is, by its key.
-    at: HashMap<u64, u32, FixedState>,
+    /// Where each is.
+    at: Bricks,
     capacity: usize,
     outside: usize,
     coarsened: u32,
@@ -75,7 +72,7 @@ impl VoxelMerge {
             edge,
             origin: center - Vec3::splat(half),
             cells: Vec::with_capacity(capacity),
-            at: HashMap::with_capacity_and_hasher(capacity, FixedState::default()),
+            at: Bricks::for_voxels(capacity),
             capacity,
             outside: 0,
             coarsened: 0,
@@ -85,17 +82,18 @@ impl VoxelMerge {
     /// Host bytes for a capacity: the cells, and as many again for the coarser levels of the tree; the table that finds them; `budget`
     /// Gaussians at the end.
     pub fn planned_bytes(capacity: usize, budget: usize) -> u64 {
-        capacity as u64 * (2 * size_of::<Cell>() as u64 + LOOKED_UP_BYTES) + (budget * size_of::<Merged>()) as u64
+        let cells = capacity as u64 * 2 * size_of::<Cell>() as u64;
+        cells + Bricks::planned_bytes(capacity) + (budget * size_of::<Merged>()) as u64
     }
 
     /// Adds those of the samples that are `own`; those that are not finite or without weight are dropped and counted.
     pub fn push_all(&mut self, samples: &[Sample], own: impl Fn(&Sample) -> bool) {
-        let mut met = [None; AT_ONCE];
+        let (mut met, mut last) = ([None; AT_ONCE], None);
         for few in samples.chunks(AT_ONCE) {
             // Looked up side by side: each lies somewhere else in memory.
             let coarsened = self.coarsened;
             for (met, sample) in met.iter_mut().zip(few) {
-                *met = self.key(sample.position).map(|key| (key, self.at.get(&key).copied()));
+                *met = self.key(sample.position).map(|key| (key, self.at.find(key, &mut last)));
             }
             for (met, sample) in met.iter().zip(few).filter(|(_, sample)| own(sample)) {
                 let finite = sample.weight > 0.0
@@ -105,7 +103,10 @@ impl VoxelMerge {
                 match met.filter(|_| finite) {
                     None => self.outside += 1,
                     Some((key, Some(at))) if self.coarsened == coarsened => self.add(at as usize, key, sample),
-                    Some(_) => self.place(sample),
+                    Some(_) => {
+                        self.place(sample);
+                        last = last.filter(|_| self.coarsened == coarsened);
+                    }
                 }
             }
         }
@@ -125,14 +126,15 @@ impl VoxelMerge {
     /// Adds a sample that may be the first of its cell; all cells get twice the edge where there is no room for it.
     fn place(&mut self, sample: &Sample) {
         while let Some(key) = self.key(sample.position) {
-            match self.at.get(&key) {
-                Some(at) => return self.add(*at as usize, key, sample),
-                None if self.cells.len() >= self.capacity && self.coarsened < BITS => self.coarsen(),
-                None => {
-                    self.at.insert(key, self.cells.len() as u32);
-                    self.cells.push(Cell::empty(key));
-                }
+            if let Some(at) = self.at.find(key, &mut None) {
+                return self.add(at as usize, key, sample);
             }
+            let room = self.cells.len() < self.capacity && self.at.insert(key, self.cells.len() as u32);
+            if room || self.coarsened >= BITS {
+                self.cells.push(Cell::empty(key));
+                return self.add(self.cells.len() - 1, key, sample);
+            }
+            self.coarsen();
         }
     }
 
@@ -156,16 +158,21 @@ impl VoxelMerge {
         self.origin + (Vec3::new(x as f32, y as f32, z as f32) + 0.5) * self.edge
     }
 
-    /// Doubles the voxels' edge.
+    /// Doubles the voxels' edge, until all of them are found in the memory there is for that.
     fn coarsen(&mut self) {
         self.cells.par_sort_unstable_by_key(|cell| cell.key);
-        let coarse = tree::parents(&self.cells, self.origin, self.edge);
-        self.edge *= 2.0;
-        self.coarsened += 1;
-        self.cells.clear();
-        self.cells.extend(coarse);
-        self.at.clear();
-        self.at.extend(self.cells.iter().enumerate().map(|(i, cell)| (cell.key, i as u32)));
+        loop {
+            let coarse = tree::parents(&self.cells, self.origin, self.edge);
+            self.edge *= 2.0;
+            self.coarsened += 1;
+            self.cells.clear();
+            self.cells.extend(coarse);
+            self.at.clear();
+            let all = self.cells.iter().enumerate().all(|(i, cell)| self.at.insert(cell.key, i as u32));
+            if all || self.coarsened >= BITS {
+                return;
+            }
+        }
     }
 
     /// At most `budget` Gaussians. `spread` multiplies the spread of a cell's samples; 0 leaves only the samples' own
@@ -174,7 +181,7 @@ impl VoxelMerge {
         if budget == 0 || self.cells.is_empty() {
             return Vec::new();
         }
-        self.at = HashMap::default();
+        self.at = Bricks::for_voxels(0);
         self.cells.par_sort_unstable_by_key(|cell| cell.key);
         let levels = tree::Levels::build(self.cells, self.origin, self.edge, LEVELS);
         let cut = levels.cut(budget);

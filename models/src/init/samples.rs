@@ -29,7 +29,7 @@ fn unit_extent(view: &View, stride: usize) -> f32 {
     EXTENT * stride as f32 / view.intrinsics.fx.max(view.intrinsics.fy)
 }
 
-/// Samples of one picture, in reading order; `image` is the frame's.
+/// Samples of one picture, row by row; `image` is the frame's.
 ///
 /// `appearance` is what an unposed network says about the Gaussians; without it extent and colour come from the grid and the
 /// picture.
@@ -40,7 +40,7 @@ pub fn samples(
     appearance: Option<&Appearance>,
     settings: &InitSettings,
     global_scale: f32,
-) -> Vec<Sample> {
+) -> Vec<Vec<Sample>> {
     let unproject = Unprojector::new(view);
     let points: Vec<Vec3> = (0..grid.depth.len())
         .into_par_iter()
@@ -57,11 +57,12 @@ pub fn samples(
         appearance,
         axes: Mat3::from_quat(view.pose.rotation.normalize().as_quat()),
     };
-    let rows: Vec<Vec<Sample>> = (0..grid.height)
-        .into_par_iter()
-        .map(|j| (0..grid.width).filter_map(|i| scene.sample((i, j), settings, global_scale)).collect())
-        .collect();
-    rows.into_iter().flatten().collect()
+    let row = |j| {
+        let mut row = Vec::with_capacity(grid.width);
+        row.extend((0..grid.width).filter_map(|i| scene.sample((i, j), settings, global_scale)));
+        row
+    };
+    (0..grid.height).into_par_iter().map(row).collect()
 }
 
 /// A depth grid with its points in the world.

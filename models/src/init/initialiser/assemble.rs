@@ -77,7 +77,7 @@ impl Initialiser {
                     scope.spawn(|_| checked = check());
                     let started = Instant::now();
                     for done in &mut waiting {
-                        merge.push_all(&done.samples, |s| strips.of(s) == strip);
+                        done.samples.iter().for_each(|row| merge.push_all(row, |s| strips.of(s) == strip));
                         if strip == 0 {
                             let found = strips.found(&done.samples);
                             strips.count_in(&found);
@@ -96,7 +96,7 @@ impl Initialiser {
                     report.consistency_ms += done.consistency_ms;
                     report.samples_ms += done.samples_ms;
                     if strip == 0 {
-                        report.samples += done.samples.len();
+                        report.samples += done.samples.iter().map(Vec::len).sum::<usize>();
                         report.supported += done.count.supported;
                         report.alone += done.count.alone;
                         report.removed += done.count.removed;
@@ -192,7 +192,8 @@ impl Initialiser {
 /// A picture whose depths have been compared with the others'.
 struct Checked {
     index: usize,
-    samples: Vec<Sample>,
+    /// By rows of its grid.
+    samples: Vec<Vec<Sample>>,
     /// Until it is given away.
     prior: Option<DepthPrior>,
     count: ConsistencyCount,

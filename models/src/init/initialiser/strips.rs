@@ -49,9 +49,9 @@ impl Strips {
     }
 
     /// How many of a picture's samples lie in each.
-    pub fn found(&self, samples: &[Sample]) -> Vec<usize> {
+    pub fn found(&self, samples: &[Vec<Sample>]) -> Vec<usize> {
         let mut found = vec![0; self.count()];
-        samples.iter().for_each(|sample| found[self.of(sample)] += 1);
+        samples.iter().flatten().for_each(|sample| found[self.of(sample)] += 1);
         found
     }
 
