@@ -27,6 +27,30 @@ layout(std430, set = 0, binding = 2) writeonly buffer Slots { Slot slots[]; };
 const bool ROLLED = false;
 #endif
 
+#ifdef SHARED
+// What each lane has of a slot's three vectors, for the lane that adds up that one: no lane holds more than one sum.
+shared vec4 shown[3 * gl_WorkGroupSize.x];
+
+void show(vec4 line, vec4 square, vec4 colour) {
+    uint at = 3u * gl_LocalInvocationID.x;
+    shown[at] = line;
+    shown[at + 1u] = square;
+    shown[at + 2u] = colour;
+}
+
+// In the order of the runs, as `sum_of_tile`.
+vec4 sum_of_shown(int vector) {
+    uint at = 3u * first_run() + uint(vector);
+    vec4 sum = shown[at];
+    if (ROLLED) {
+        [[dont_unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += shown[at + 3u * run];
+    } else {
+        [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += shown[at + 3u * run];
+    }
+    return sum;
+}
+#endif
+
 const int AT_ONCE = 16;
 
 void main() {
@@ -140,7 +164,20 @@ void main() {
                 square += vec4(run_xx, moved * dy, shape * dy * dy, depth);
                 colour += run_colour;
             }
+#ifdef SHARED
+            show(line, square, vec4(colour, 0.0));
+#endif
         }
+#ifdef SHARED
+        barrier();
+        IF (i < end && live) {
+            vec4 sum = sum_of_shown(min(own_run, 2));
+            STORED_BY(0) slots[slot].line = sum;
+            STORED_BY(1) slots[slot].square = STORED_SQUARE(sum);
+            STORED_BY(2) slots[slot].colour = sum.xyz;
+            i++;
+        }
+#else
         // Each sum is stored before the next one is made: fewer registers.
         line = sum_of_tile(line);
         IF (i < end && live) {
@@ -155,6 +192,7 @@ void main() {
             STORED_BY(2) slots[slot].colour = colour;
             i++;
         }
+#endif
         float most = T[0];
         [[unroll]] for (int k = 1; k < PIXELS; k++) most = max(most, T[k]);
         live = any_of_tile(most > 0.0) || to_the_end;

@@ -116,33 +116,30 @@ layout(constant_id = 8) const bool ROLLED = false;
 // The lanes of a workgroup turn together, whether their tiles have ended or not: each meets every barrier.
 #define WHILE(working) while (any_of_group(working))
 
-shared vec4 shown[gl_WorkGroupSize.x];
-shared bool said[gl_WorkGroupSize.x];
+// Of each tile whether one of its lanes says so; of the workgroup, the last one.
+shared uint said[gl_WorkGroupSize.x / uint(LANES) + 1u];
 
 uint first_run() {
     return gl_LocalInvocationID.x & ~uint(LANES - 1);
 }
 
-// Whether any of `lanes` lanes from `first` on says so.
-bool any_of(bool own, uint first, uint lanes) {
+// Whether any of the lanes that ask at `place` says so.
+bool any_of(bool own, uint place) {
     barrier();
-    said[gl_LocalInvocationID.x] = own;
+    said[place] = 0u;
     barrier();
-    bool any = false;
-    [[dont_unroll]] for (uint lane = first; lane < first + lanes; lane++) any = any || said[lane];
-    return any;
+    if (own) atomicOr(said[place], 1u);
+    barrier();
+    return said[place] != 0u;
 }
 
 bool any_of_group(bool own) {
-    return any_of(own, 0u, gl_WorkGroupSize.x);
+    return any_of(own, gl_WorkGroupSize.x / uint(LANES));
 }
 
 bool any_of_tile(bool own) {
-    return any_of(own, first_run(), uint(LANES));
+    return any_of(own, gl_LocalInvocationID.x / uint(LANES));
 }
-
-#define SHOW(own) barrier(); shown[gl_LocalInvocationID.x] = own; barrier()
-#define SHOWN(own, lane) shown[lane]
 #else
 // The lanes of a subgroup turn together, whether their tiles have ended or not: a shuffle reads lanes that are there.
 #define WHILE(working) while (subgroupAny(working))
@@ -157,21 +154,17 @@ bool any_of_tile(bool own) {
     return ((subgroupBallot(own)[first >> 5] >> (first & 31u)) & ((1u << LANES) - 1u)) != 0u;
 }
 
-#define SHOW(own)
-#define SHOWN(own, lane) subgroupShuffle(own, lane)
-#endif
-
 // In the order of the runs, so that the sum has the bits of one lane's.
 vec4 sum_of_tile(vec4 own) {
-    SHOW(own);
-    vec4 sum = SHOWN(own, first_run());
+    vec4 sum = subgroupShuffle(own, first_run());
     if (ROLLED) {
-        [[dont_unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += SHOWN(own, first_run() + run);
+        [[dont_unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
     } else {
-        [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += SHOWN(own, first_run() + run);
+        [[unroll]] for (uint run = 1u; run < uint(LANES); run++) sum += subgroupShuffle(own, first_run() + run);
     }
     return sum;
 }
+#endif
 
 #ifdef SHARED
 Splat next_splat(uint i, uint first, uint end, inout Splat held) {

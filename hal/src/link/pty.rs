@@ -4,7 +4,7 @@
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags};
@@ -16,6 +16,9 @@ use super::NOTHING;
 use crate::error::HalError;
 use crate::traits::{Link, Received};
 
+/// How long a write waits for a reader that is held up: a pseudo-terminal holds some 12 KiB, a second of telemetry at the most.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
+
 /// A pseudo-terminal; dropping it hangs up on the far end.
 pub struct PtyLink {
     near: OwnedFd,
@@ -24,6 +27,8 @@ pub struct PtyLink {
     path: PathBuf,
     alias: Option<PathBuf>,
     address: String,
+    /// Nobody read while a write waited: no other one waits before somebody does.
+    unread: bool,
 }
 
 impl PtyLink {
@@ -53,7 +58,9 @@ impl PtyLink {
             Ok((near, far, path))
         };
         match open() {
-            Ok((near, far, path)) => Ok(Self { near, _far: far, path, alias: alias.map(Path::to_path_buf), address }),
+            Ok((near, far, path)) => {
+                Ok(Self { near, _far: far, path, alias: alias.map(Path::to_path_buf), address, unread: false })
+            }
             Err(source) => Err(HalError::Open { address, source }),
         }
     }
@@ -97,11 +104,61 @@ impl Link for PtyLink {
     }
 
     fn write(&mut self, frame: &[u8]) -> Result<(), HalError> {
-        match rustix::io::write(&self.near, frame) {
-            Ok(n) if n == frame.len() => Ok(()),
-            // A full line: the rest is lost, as on a real one; the peer's framer resynchronises.
-            Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Err(HalError::Full { address: self.address.clone() }),
-            Err(e) => Err(self.failed(e)),
+        let (mut rest, until) = (frame, Instant::now() + WRITE_TIMEOUT);
+        loop {
+            match rustix::io::write(&self.near, rest) {
+                Ok(n) => {
+                    rest = &rest[n..];
+                    self.unread &= n == 0;
+                }
+                Err(Errno::AGAIN | Errno::INTR) => {}
+                Err(e) => return Err(self.failed(e)),
+            }
+            if rest.is_empty() {
+                return Ok(());
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if self.unread || left.is_zero() {
+                // A full line: the rest is lost, as on a real one; the peer's framer resynchronises.
+                self.unread = true;
+                return Err(HalError::Full { address: self.address.clone() });
+            }
+            let wait = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
+            match poll(&mut [PollFd::new(&self.near, PollFlags::OUT)], Some(&wait)) {
+                Ok(_) | Err(Errno::INTR) => {}
+                Err(e) => return Err(self.failed(e)),
+            }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::link::SerialLink;
+
+    #[test]
+    fn a_reader_that_is_held_up_loses_nothing_and_one_that_is_not_there_holds_nobody_up() {
+        let mut pty = PtyLink::create(None).expect("a pty");
+        let mut far = SerialLink::open(pty.path(), 921_600).expect("its far end");
+        // Several times what the system holds.
+        let all: Vec<u8> = (0..64 << 10).map(|k| (k % 251) as u8).collect();
+        std::thread::scope(|scope| {
+            let writer = scope.spawn(|| all.chunks(64).try_for_each(|frame| pty.write(frame)));
+            std::thread::sleep(WRITE_TIMEOUT / 5);
+            let (mut read, mut buffer) = (Vec::new(), [0; 512]);
+            while read.len() < all.len() {
+                let received = far.read(&mut buffer, WRITE_TIMEOUT).expect("open");
+                assert!(received.bytes > 0, "{} of {}", read.len(), all.len());
+                read.extend_from_slice(&buffer[..received.bytes]);
+            }
+            assert!(read == all && writer.join().expect("no panic").is_ok());
+        });
+        // Nobody reads: one write waits, the others know.
+        let full = all.chunks(64).filter(|frame| matches!(pty.write(frame), Err(HalError::Full { .. }))).count();
+        assert!(full > 100 && pty.unread, "{full}");
+        let mut buffer = [0; 4096];
+        while far.read(&mut buffer, Duration::ZERO).expect("open").bytes > 0 {}
+        assert!(pty.write(b"again").is_ok() && !pty.unread);
     }
 }
