@@ -160,9 +160,9 @@ impl Reconstruction {
     /// Anything missing that the job cannot do without: ONNX Runtime, a Vulkan device, memory.
     pub fn open(mut settings: EngineSettings, header: ModelHeader, command: &str) -> Result<Self, JobError> {
         let _span = tracing::info_span!("open").entered();
-        if settings.delivers.is_some() {
-            // What varies less takes fewer bytes.
+        if let Some(rounding) = &settings.delivers {
             settings.training.loss.view_dependence_visits = 0;
+            settings.training.loss.view_dependence *= rounding.view_dependence;
         }
         let meter = energy::Meter::of(&settings.training)?;
         let (views, mut init) = (settings.device.views, settings.init.clone());

@@ -63,6 +63,9 @@ pub struct Rounding {
     pub shape: ShapeSteps,
     /// Colours.
     pub color: ColorSteps,
+    /// Of what training says against colours that vary with the view (`training.loss.view_dependence`), the share for a model that
+    /// is rounded so: what varies less takes fewer bytes, and from near some of it is seen.
+    pub view_dependence: f32,
 }
 
 impl Default for Rounding {
@@ -72,6 +75,7 @@ impl Default for Rounding {
             position_power: 0.5,
             shape: ShapeSteps { log_scale: 0.27, rotation_bits: 4, opacity_bits: 4 },
             color: ColorSteps { luma: 1.0 / 60.0, chroma: 1.6, variation: 0.016, by_importance: 0.3, rounding: 0.45 },
+            view_dependence: 1.0,
         }
     }
 }
@@ -85,6 +89,7 @@ impl Rounding {
             position_power: 0.6,
             shape: ShapeSteps { log_scale: 0.15, rotation_bits: 5, opacity_bits: 6 },
             color: ColorSteps { luma: 1.0 / 96.0, chroma: 1.4, variation: 0.009, by_importance: 0.3, rounding: 0.5 },
+            view_dependence: 0.35,
         }
     }
 

@@ -160,3 +160,18 @@ fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colou
         assert!(places(&of_exact) != places(&exact));
     }
 }
+
+#[test]
+fn colours_of_what_is_delivered_vary_less_and_of_what_is_delivered_finely_a_third_as_much_less() {
+    let Some(exact) = built_as(None, false) else { return };
+    let loss = |engine: &Reconstruction| {
+        let loss = &engine.settings.training.loss;
+        (loss.view_dependence, loss.view_dependence_visits > 0)
+    };
+    let (weight, waits) = loss(&exact);
+    assert!(weight > 0.0 && waits);
+    for (rounding, share) in [(Rounding::default(), 1.0), (Rounding::fine(), 0.35)] {
+        let engine = built_as(Some(rounding), false).expect("as before");
+        assert_eq!(loss(&engine), (weight * share, false));
+    }
+}
