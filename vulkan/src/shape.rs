@@ -57,7 +57,7 @@ impl KernelShape {
         };
         // Of the blend's gradient a Mali-G610's compiler spills 292/383 where all are added at once, 4/4 where in a loop, and an Adreno
         // loses two thirds of its waves; V3D 7's 4/4 and 23/25 (tests/data/boards.md). Where lanes meet in shared memory each adds up
-        // what another one does not, and all of them spill less at once. Cards have registers for it.
+        // what another one does not, and none of them spills more at once. Cards have registers for it.
         let in_a_loop = info.is_integrated && info.shuffles && info.ids.0 != BROADCOM;
         let summed = if in_a_loop { 1 } else { tile_lanes };
         // A card has lanes enough for every share's histogram (an H100: sorting, counting and emitting 0.3 ms instead of 1.4).

@@ -4,7 +4,7 @@
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags};
@@ -16,8 +16,10 @@ use super::NOTHING;
 use crate::error::HalError;
 use crate::traits::{Link, Received};
 
-/// How long a write waits for a reader that is held up: a pseudo-terminal holds some 12 KiB, a second of telemetry at the most.
-const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
+/// How long and how often a write waits for a reader that is held up: a pseudo-terminal holds some 12 KiB. Counted, so that a machine
+/// that stood still has not waited all of it.
+const WAIT: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+const WAITS: u32 = 10;
 
 /// A pseudo-terminal; dropping it hangs up on the far end.
 pub struct PtyLink {
@@ -104,7 +106,7 @@ impl Link for PtyLink {
     }
 
     fn write(&mut self, frame: &[u8]) -> Result<(), HalError> {
-        let (mut rest, until) = (frame, Instant::now() + WRITE_TIMEOUT);
+        let (mut rest, mut waited) = (frame, 0);
         loop {
             match rustix::io::write(&self.near, rest) {
                 Ok(n) => {
@@ -117,14 +119,13 @@ impl Link for PtyLink {
             if rest.is_empty() {
                 return Ok(());
             }
-            let left = until.saturating_duration_since(Instant::now());
-            if self.unread || left.is_zero() {
+            if self.unread || waited == WAITS {
                 // A full line: the rest is lost, as on a real one; the peer's framer resynchronises.
                 self.unread = true;
                 return Err(HalError::Full { address: self.address.clone() });
             }
-            let wait = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
-            match poll(&mut [PollFd::new(&self.near, PollFlags::OUT)], Some(&wait)) {
+            match poll(&mut [PollFd::new(&self.near, PollFlags::OUT)], Some(&WAIT)) {
+                Ok(0) => waited += 1,
                 Ok(_) | Err(Errno::INTR) => {}
                 Err(e) => return Err(self.failed(e)),
             }
@@ -145,11 +146,11 @@ mod tests {
         let all: Vec<u8> = (0..64 << 10).map(|k| (k % 251) as u8).collect();
         std::thread::scope(|scope| {
             let writer = scope.spawn(|| all.chunks(64).try_for_each(|frame| pty.write(frame)));
-            std::thread::sleep(WRITE_TIMEOUT / 5);
-            let (mut read, mut buffer) = (Vec::new(), [0; 512]);
-            while read.len() < all.len() {
-                let received = far.read(&mut buffer, WRITE_TIMEOUT).expect("open");
-                assert!(received.bytes > 0, "{} of {}", read.len(), all.len());
+            std::thread::sleep(Duration::from_millis(200));
+            let (mut read, mut buffer, mut nothing) = (Vec::new(), [0; 512], 0);
+            while read.len() < all.len() && nothing < WAITS {
+                let received = far.read(&mut buffer, Duration::from_millis(100)).expect("open");
+                nothing = if received.bytes == 0 { nothing + 1 } else { 0 };
                 read.extend_from_slice(&buffer[..received.bytes]);
             }
             assert!(read == all && writer.join().expect("no panic").is_ok());

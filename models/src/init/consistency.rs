@@ -47,7 +47,7 @@ impl<'a> Witness<'a> {
 
     /// What this view shows at each of the `places` of a row at `y`. Loop by loop, so that all but the second work on several
     /// places at once.
-    fn look(&self, y: f32, places: &Places, shown: &mut Shown) {
+    fn reproject(&self, y: f32, places: &Places, shown: &mut Reprojected) {
         let n = places.depth.len();
         shown.hold(n);
         let (xs, depths) = (&places.x[..n], &places.depth[..n]);
@@ -102,7 +102,7 @@ impl Places {
 
 /// What another view shows at places.
 #[derive(Default)]
-struct Shown {
+struct Reprojected {
     /// Pixel there, and depth there.
     u: Vec<f32>,
     v: Vec<f32>,
@@ -114,7 +114,7 @@ struct Shown {
     confidence: Vec<f32>,
 }
 
-impl Shown {
+impl Reprojected {
     fn hold(&mut self, n: usize) {
         for values in [&mut self.u, &mut self.v, &mut self.z, &mut self.depth, &mut self.confidence] {
             values.resize(n, 0.0);
@@ -129,7 +129,7 @@ struct Row {
     known: Places,
     /// Places nobody knows, at depths that continue their surroundings.
     unknown: Places,
-    shown: Shown,
+    shown: Reprojected,
     /// Σ confidence·depth and Σ confidence of those that agree; confidence of the others that do and that look through.
     sum: Vec<f32>,
     weight: Vec<f32>,
@@ -233,8 +233,8 @@ impl Row {
             values.resize(n, 0.0);
         }
         for other in others {
-            other.look(own.pixel(0, j).1, &self.known, &mut self.shown);
-            self.hear(other, tolerance);
+            other.reproject(own.pixel(0, j).1, &self.known, &mut self.shown);
+            self.accumulate(other, tolerance);
         }
         let mut count = ConsistencyCount::default();
         for k in 0..n {
@@ -258,7 +258,7 @@ impl Row {
     }
 
     /// Adds what a view shows at the places to what the views before it said.
-    fn hear(&mut self, other: &Witness<'_>, tolerance: f32) {
+    fn accumulate(&mut self, other: &Witness<'_>, tolerance: f32) {
         let n = self.known.depth.len();
         let shown = &self.shown;
         let [us, vs, zs] = [&shown.u, &shown.v, &shown.z].map(|values| &values[..n]);
@@ -297,7 +297,7 @@ impl Row {
         self.weight.clear();
         self.weight.resize(n, 0.0);
         for other in others {
-            other.look(own.pixel(0, j).1, &self.unknown, &mut self.shown);
+            other.reproject(own.pixel(0, j).1, &self.unknown, &mut self.shown);
             self.weight.iter_mut().zip(&self.shown.confidence).for_each(|(most, c)| *most = most.max(*c));
         }
         let mut filled = 0;

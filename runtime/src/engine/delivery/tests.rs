@@ -162,7 +162,7 @@ fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colou
 }
 
 #[test]
-fn colours_of_what_is_delivered_vary_less_and_of_what_is_delivered_finely_a_third_as_much_less() {
+fn what_is_delivered_rounded_pays_for_view_dependence_in_any_schedule_and_finely_for_a_share_of_it() {
     let Some(exact) = built_as(None, false) else { return };
     let loss = |engine: &Reconstruction| {
         let loss = &engine.settings.training.loss;
@@ -170,7 +170,9 @@ fn colours_of_what_is_delivered_vary_less_and_of_what_is_delivered_finely_a_thir
     };
     let (weight, waits) = loss(&exact);
     assert!(weight > 0.0 && waits);
-    for (rounding, share) in [(Rounding::default(), 1.0), (Rounding::fine(), 0.35)] {
+    assert!(Rounding::fine().view_dependence < Rounding::default().view_dependence);
+    for rounding in [Rounding::default(), Rounding::fine()] {
+        let share = rounding.view_dependence;
         let engine = built_as(Some(rounding), false).expect("as before");
         assert_eq!(loss(&engine), (weight * share, false));
     }
