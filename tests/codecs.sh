@@ -33,8 +33,7 @@ echo "| --- | ---: | ---: | ---: | ---: |"
 while IFS="$(printf '\t')" read -r file each writing reading; do
     scored=$file
     case $file in
-    *.spz) scored=$file.dgtr && "$dgtr" import "$file" --out "$scored" >/dev/null ;;
-    *.ply) scored=exact.dgtr ;;
+    *.spz | *.ply) scored=$file.dgtr && "$dgtr" import "$file" --out "$scored" >/dev/null ;;
     esac
     row "$file" "$scored" "$each" "$writing" "$reading"
 done < measured
