@@ -26,13 +26,13 @@ choice! {
 
 /// Visits to each picture, half of the schedule at half its size, that a point needs before a larger one is preferred. On sheffield_cross,
 /// scored at full size, pictures of half the size have 0.08 dB more than whole ones of the same time after 0.9 visits to whole ones, and
-/// 0.27 and 0.23 less after 2.2 and 5.0 (tests/BENCHMARKS.md, "What a step is forecast to cost").
+/// 0.27 and 0.23 less after 2.2 and 5.0 (measured at dc27ca5).
 pub const VISITS: u32 = 3;
 /// Gaussians in view per pixel of a picture, at the most and at the least worth having: those of the presets of whole pictures (100,000
 /// Gaussians, of which a picture of 640×480 sees 29 %), and half as many, which at half the size cost 0.15 dB.
 pub const DENSITIES: [f64; 2] = [0.05, 0.1];
 /// Seconds for which a size is chosen where nobody says how long: those of [`Preset::Longest`]. Half as many had 0.06 dB less
-/// (25.02 and 25.08 after 160 and 300 s, tests/BENCHMARKS.md, "Run time against error").
+/// (25.02 and 25.08 after 160 and 300 s, tests/BENCHMARKS.md).
 pub const SECONDS: f64 = 300.0;
 /// Pictures of a survey that show each place; one of so many shows that share of the scene, where nothing else says how much it does. Of
 /// sheffield_cross's 43 pictures each shows 20 to 30 %.

@@ -124,7 +124,7 @@ table! {
         /// Weight of what the SH coefficients above degree 0 amount to of the Gaussians that a picture shows: colours vary with the view only
         /// as far as pictures insist on it.
         pub view_dependence: f32 = 2e-7, in Limits::at_least(0.0),
-            from "sheffield_cross +0.2 dB in long schedules, fox the same, a seventh less to deliver (BENCHMARKS)";
+            from "sheffield_cross +0.2 dB in long schedules, fox the same, a seventh less to deliver (a89875d)";
         /// Schedules that look at each view less often than this have no such weight, unless their model is delivered rounded.
         pub view_dependence_visits: u32 = 50, unit "looks at each view",
             from "as validation.visits: what is learnt by heart is learnt late";

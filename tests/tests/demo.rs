@@ -35,7 +35,7 @@ fn the_demo_flies_trains_uploads_and_merges_under_its_memory_limit_and_beats_the
         // Fifteen seconds on a busy machine are few steps; the initialisation alone is well above both guesses.
         assert!(psnr(&own) > psnr(&naive["ground_warp"]) + 0.5, "{aircraft}: {own}");
         assert!(psnr(&own) > psnr(&naive["mean_color"]) + 4.0, "{aircraft}: {own}");
-        // What merging costs an aircraft on its own views: nothing at the demo's length (BENCHMARKS), 0.1 to 0.5 dB were seen after fifteen
+        // What merging costs an aircraft on its own views: nothing at the demo's length (3dcdf4e), 0.1 to 0.5 dB were seen after fifteen
         // seconds of training beside other tests.
         assert!(psnr(&global) > psnr(&own) - 0.5, "{aircraft}: {global}\n{own}");
         let run = json_file(&out.join(aircraft).join("out/run.json"));

@@ -55,7 +55,7 @@ use config::training::{MOST_STEPS, Strategy, TrainSettings, scene_extent};
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-/// Of so many steps one is timed: on lavapipe timestamps make a step longer (`tests/BENCHMARKS.md`).
+/// Of so many steps one is timed: on lavapipe timestamps make a step longer (`tests/results/TRIED.md`).
 const TIMED_EVERY: u32 = 16;
 
 /// How many steps the times of the one after `steps` stand for.

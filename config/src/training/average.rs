@@ -10,7 +10,7 @@ table! {
     pub struct AverageSettings {
         /// Progress from which on epochs count, once nothing is densified any more; 1 = none does.
         pub from: f32 = 0.75, in Limits::within(0.0, 1.0),
-            from "fox, 4,000 steps: +0.12 dB from 0.7, +0.13 from 0.8; sheffield_cross, 3,700: +0.06, +0.05 (BENCHMARKS)";
+            from "fox, 4,000 steps: +0.12 dB from 0.7, +0.13 from 0.8; sheffield_cross, 3,700: +0.06, +0.05 (a89875d)";
         /// Schedules that look at each view less often than this still learn what is true: their last epoch is their best.
         pub visits: u32 = 50, in Limits::at_least(1.0), unit "looks at each view", from "fox after 23 loses 0.1 dB from 0.7";
     }

@@ -25,7 +25,7 @@ table! {
         /// Longest distance between two densifications.
         pub every: u32 = 300, unit "steps", from "the paper, 4.1";
         /// A short schedule still densifies this often before `until`.
-        pub at_least: u32 = 10, from "6 to 10: fox at 1,000 steps and 40,000 Gaussians +0.12 dB (BENCHMARKS)";
+        pub at_least: u32 = 10, from "6 to 10: fox at 1,000 steps and 40,000 Gaussians +0.12 dB (1b428c2)";
         /// No densification after this progress.
         pub until: f32 = 0.7;
         /// At most this share of the present Gaussians is added at one densification.

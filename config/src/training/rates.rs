@@ -35,7 +35,7 @@ table! {
         pub exposure: f32 = 1e-3, in Limits::at_least(0.0), from "3DGS exposure_lr_final";
         /// Share of their rate that log scales, rotations, opacities and SH still have at progress 1; exponential in between.
         pub final_share: f32 = 0.2, in Limits::within(1e-6, 1.0),
-            from "0.1 to 0.2: fox +0.31 dB, sheffield_cross +0.13, brighton_beach −0.06; 0.3 is the same (BENCHMARKS)";
+            from "0.1 to 0.2: fox +0.31 dB, sheffield_cross +0.13, brighton_beach −0.06; 0.3 is the same (1b428c2)";
     }
 }
 

@@ -34,10 +34,10 @@ table! {
     pub struct ResolutionSettings {
         /// A quarter of the size until this progress.
         pub quarter_until: f32 = 0.0,
-            from "0.2 gains 0.1 dB on fox in 45 s and loses 0.007 of SSIM on sheffield_cross (BENCHMARKS)";
+            from "0.2 gains 0.1 dB on fox in 45 s and loses 0.007 of SSIM on sheffield_cross (dc27ca5)";
         /// Half the size until this progress.
         pub half_until: f32 = 0.5,
-            from "0.1 to 0.5, in the same time: fox +0.4 to +0.7 dB (45 s), sheffield_cross +0.13 (38 s); BENCHMARKS";
+            from "0.1 to 0.5, in the same time: fox +0.4 to +0.7 dB (45 s), sheffield_cross +0.13 (38 s); dc27ca5";
         /// No picture becomes shorter than this on either side.
         pub least_side: u32 = 64, unit "pixels";
         /// The size is reduced at least by this, whatever the progress: 1, 2 or 4.
@@ -73,7 +73,7 @@ table! {
     pub struct ViewSettings {
         /// Most visits to each view where nobody says how many steps or seconds there are: few pictures are learnt by heart.
         pub visits: u32 = 100, in Limits::within(1.0, 1e6),
-            from "fox gains 1.0 dB from 50 visits to 100 and 0.4 from 100 to 200; sheffield_cross loses 0.1, brighton_beach 0.2 (BENCHMARKS)";
+            from "fox gains 1.0 dB from 50 visits to 100 and 0.4 from 100 to 200; sheffield_cross loses 0.1, brighton_beach 0.2 (b2e25c7)";
         /// Share of extra visits per epoch that go to the views with the largest last loss.
         pub residual_share: f32 = 0.0, in Limits::within(0.0, 1.0);
     }

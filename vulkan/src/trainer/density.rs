@@ -81,7 +81,7 @@ fn logit(opacity: f64) -> f32 {
 }
 
 /// In proportion to this a Gaussian is copied: its opacity (3DGS-MCMC) times the root of its sensitivity. +0.5 dB on fox after 1,000 steps
-/// (tests/BENCHMARKS.md, "Where Gaussians are copied").
+/// (tests/results/TRIED.md).
 fn worth(g: &Geometry, opacity: f64) -> f64 {
     // Where no gradient ever was, opacity alone decides.
     opacity * f64::from(g.sensitivity(1.0)).max(f64::MIN_POSITIVE).sqrt()

@@ -24,7 +24,7 @@ const FEWEST_VIEWS: usize = 8;
 const KEPT: [usize; 2] = [2, 16];
 /// Where the loss of the views kept back rises by this share of what the others' falls by (logarithms of both), the most is left out. Two
 /// forests have -0.11 and 0.29, a room of 15 pictures 0.02 to 0.05 and of 43 0.51, and only the first of them gains by leaving much out
-/// (tests/BENCHMARKS.md, "Learnt by heart").
+/// (measured at 59f7a9a).
 const HARM: f64 = 0.1;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

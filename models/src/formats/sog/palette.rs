@@ -10,7 +10,7 @@ use rayon::prelude::*;
 /// Leaves that are one another's neighbours: a row is compared with so many entries, not with 65,536; at degree 3 they are 11 KiB,
 /// which a processor has near.
 const FAMILY: usize = 64;
-/// Rounds of k-means within a family; what they leave costs sheffield_cross 0.04 dB (tests/BENCHMARKS.md).
+/// Rounds of k-means within a family; what they leave costs sheffield_cross 0.04 dB (81e2322).
 const ROUNDS: usize = 6;
 
 /// What rows were replaced by.
