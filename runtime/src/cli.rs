@@ -6,8 +6,8 @@ use std::process::ExitCode;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use config::error::ErrorKind;
 
-use crate::console;
-use crate::trace::Trace;
+use job::console;
+use job::trace::Trace;
 
 mod aggregate;
 #[cfg(feature = "lab")]
@@ -165,12 +165,12 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     };
     console::install(cli.verbose, cli.quiet, cli.log_format, trace.clone());
     if let Some(mib) = cli.limit_mib
-        && let Err(e) = crate::resources::limit_data(mib)
+        && let Err(e) = job::resources::limit_data(mib)
     {
         console::error(&format!("--limit-mib {mib}: {e}"));
         return exit_code(ErrorKind::Input);
     }
-    if let Err(e) = crate::resources::survive_file_size_limit() {
+    if let Err(e) = job::resources::survive_file_size_limit() {
         tracing::debug!("SIGXFSZ: {e}");
     }
     let result = match cli.command {

@@ -11,7 +11,7 @@ use models::coverage::{CoverageMap, geojson, raster};
 use models::formats::FormatError;
 use models::formats::flight_plan::{FlightPlan, Waypoint};
 
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 #[cfg(feature = "lab")]
 mod route;

@@ -17,7 +17,7 @@ mod summary;
 pub use evaluate::Figures;
 pub use summary::Summary;
 
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 use crate::kernels;
 use crate::keys::{self, GROUND};
 use processes::Process;

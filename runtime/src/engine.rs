@@ -25,7 +25,7 @@ use models::refine::{RefineReport, Refiner};
 use vulkan::trainer::Trainer;
 
 use crate::error::JobError;
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 mod average;
 mod budget;

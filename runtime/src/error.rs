@@ -6,6 +6,7 @@ use config::error::{Error, ErrorKind};
 use config::mission::MissionError;
 use config::plan::PlanError;
 use hal::error::HalError;
+use job::interrupt::InterruptError;
 use models::dataset::DatasetError;
 use models::formats::FormatError;
 use models::init::InitError;
@@ -82,6 +83,9 @@ pub enum JobError {
     /// Figures that JSON cannot hold.
     #[error("figures cannot be written as JSON: {0}")]
     Json(#[from] serde_json::Error),
+    /// Signal handlers.
+    #[error(transparent)]
+    Interrupt(#[from] InterruptError),
     /// A file or folder that no format owns.
     #[error("{}: {source}", path.display())]
     Io {
@@ -160,6 +164,7 @@ impl Error for JobError {
             Self::Train(e) => e.kind(),
             Self::Upload(e) => e.kind(),
             Self::Report(e) => e.kind(),
+            Self::Interrupt(e) => e.kind(),
             Self::Io { source, .. } => Error::kind(source),
             Self::HostMemory { .. } | Self::Request(_) | Self::TooFewKeyframes { .. } => ErrorKind::Input,
             Self::Json(_) | Self::System(_) | Self::RenderingSize(_) | Self::Encode { .. } => ErrorKind::Failed,

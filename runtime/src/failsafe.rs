@@ -9,7 +9,7 @@ use vulkan::trainer::{RunBudget, StepReport};
 
 use crate::engine::Reconstruct;
 use crate::error::JobError;
-use crate::health::Health;
+use job::health::Health;
 
 /// In the middle of training the flags are read this often.
 const LOOK_EVERY_NS: u64 = 1_000_000_000;

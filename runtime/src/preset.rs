@@ -16,7 +16,7 @@ use serde_json::Value;
 use crate::cost::loads::{Footprint, Sight};
 use crate::cost::model::CostModel;
 use crate::engine::device::DeviceRequest;
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 mod flight;
 mod memory;

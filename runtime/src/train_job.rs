@@ -20,17 +20,17 @@ use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
 use vulkan::trainer::RunBudget;
 
-use crate::console::Progress;
+use job::console::Progress;
 use crate::engine::device::DeviceRequest;
 use crate::engine::source::Folder;
 use crate::engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
 use crate::error::JobError;
 use crate::evaluate::{self, IntoModel};
 use crate::failsafe::Failsafe;
-use crate::health::Health;
-use crate::interrupt::Interrupt;
+use job::health::Health;
+use job::interrupt::Interrupt;
 use crate::preset::Choice;
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 use scale::largest;
 use slices::{REST, Slices};
 

@@ -12,7 +12,7 @@ use config::geodesy::Geodetic;
 use config::mission::Mission;
 use serde_json::Value;
 
-use crate::console;
+use job::console;
 use crate::report::ground::{Ground, Ortho};
 use crate::report::{Craft, MapRegion, ReportData, ReportError};
 

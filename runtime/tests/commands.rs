@@ -251,7 +251,7 @@ fn training_improves_on_naive_guesses_and_its_report_says_what_it_took() {
         "5",
     ]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let report = runtime::run_json::RunReport::read(&dir.path().join("out")).unwrap();
+    let report = job::run_json::RunReport::read(&dir.path().join("out")).unwrap();
     assert_eq!((report.outcome.as_str(), report.steps, report.views), ("done", 150, 10));
     assert!(report.device_bytes_peak > 0 && report.device_bytes_peak <= report.device_bytes_planned);
     assert!(report.stage_ms.contains_key("train") && report.host_rss_peak > 0);
@@ -285,11 +285,11 @@ fn training_improves_on_naive_guesses_and_its_report_says_what_it_took() {
 }
 
 /// A short training of `set` without held-out figures.
-fn short_training(set: &str, out: &str, more: &[&str]) -> runtime::run_json::RunReport {
+fn short_training(set: &str, out: &str, more: &[&str]) -> job::run_json::RunReport {
     let few = ["--init", "random", "--max-gaussians", "500", "--budget-mib", "64", "--steps", "20", "--no-eval"];
     let output = dgtr(&[&["train", set, "--out", out], &few[..], more].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    runtime::run_json::RunReport::read(Path::new(out)).unwrap()
+    job::run_json::RunReport::read(Path::new(out)).unwrap()
 }
 
 #[test]

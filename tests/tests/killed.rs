@@ -16,7 +16,7 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms;
 use runtime::keys::Identity;
-use runtime::run_json::RunReport;
+use job::run_json::RunReport;
 use runtime::upload::{Offerer, Source};
 use support::{Running, change_mission, small_mission, wait_until};
 

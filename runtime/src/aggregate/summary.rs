@@ -1,7 +1,7 @@
 //! An aggregation as `run.json` and as a report.
 
 use crate::report::{Comparison, MapRegion, ModelRow, ReportData, Table, Timing, count};
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 use super::Outcome;
 use super::register::Registration;

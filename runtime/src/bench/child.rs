@@ -8,7 +8,7 @@ use std::time::Instant;
 use config::error::ErrorKind;
 
 use crate::error::JobError;
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 /// How a child ended.
 #[derive(Clone, Debug)]

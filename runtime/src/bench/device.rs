@@ -15,8 +15,8 @@ use vulkan::trainer::{TrainError, check_device, check_training};
 use super::stages::{Scene, SizeFigures, measure as measure_stages};
 use super::{child, world};
 use crate::error::JobError;
-use crate::health::board::Board;
-use crate::health::power::pmic_watts;
+use job::health::board::Board;
+use job::health::power::pmic_watts;
 
 mod machine;
 

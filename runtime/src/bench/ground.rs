@@ -15,7 +15,7 @@ use super::child;
 use super::figures::write_text;
 use crate::aggregate::frame::Motion;
 use crate::error::JobError;
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 use crate::upload::{Offerer, Source};
 use field::{BEYOND, Field, id};
 

@@ -23,7 +23,7 @@ use crate::engine::host::{HostPlan, HostRequest};
 use crate::engine::{model_path, pieces};
 use crate::error::JobError;
 use crate::evaluate::save_png;
-use crate::resources::peak_rss_bytes;
+use job::resources::peak_rss_bytes;
 
 /// Training pictures and pictures drawn, and their focal length, pixels.
 const SIZE: [u32; 2] = [640, 480];

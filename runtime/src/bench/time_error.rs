@@ -11,7 +11,7 @@ use super::front::{Group, Speedup, mark_front, speedup};
 use crate::error::JobError;
 use crate::report::chart::{Chart, ChartPoint, Series};
 use crate::report::{Table, count};
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 /// What to measure.
 #[derive(Clone, Debug)]

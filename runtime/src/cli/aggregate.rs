@@ -11,9 +11,9 @@ use crate::aggregate::compare::{add_to, compare, perceptual};
 use crate::aggregate::member::Member;
 use crate::aggregate::{self, LocalModel, Outcome, summary};
 use crate::cli::output::outln;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 use crate::report::{REPORT, ReportData};
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 use super::CliError;
 

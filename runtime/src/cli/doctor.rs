@@ -16,7 +16,8 @@ use super::CliError;
 use crate::cli::output::outln;
 use crate::cost::loads::{Footprint, Sight};
 use crate::kernels::{self, Source};
-use crate::{cost, devices, resources};
+use job::resources;
+use crate::{cost, devices};
 
 mod trust;
 

@@ -11,14 +11,14 @@ use super::http::HttpArgs;
 use crate::cli::output::outln;
 use crate::engine::device::training_lens;
 use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 use crate::ortho::keep_scratch_in;
 use crate::preset;
 use crate::report::{REPORT, ReportData, Timing, count, seconds};
-use crate::resources::return_freed_memory;
-use crate::run_json::RunReport;
-use crate::service::Supervisor;
-use crate::session::{Owner, Session};
+use job::resources::return_freed_memory;
+use job::run_json::RunReport;
+use job::service::Supervisor;
+use job::session::{Owner, Session};
 use crate::watch::Watch;
 
 /// Reads pose and triggers from the autopilot and pictures from the camera, and builds the model while flying.

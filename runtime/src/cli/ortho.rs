@@ -9,7 +9,8 @@ use super::CliError;
 use crate::engine::device::map_renderer;
 use crate::error::JobError;
 use crate::ortho::{Map, MapRequest, keep_scratch_in};
-use crate::{console, interrupt};
+use job::console;
+use job::interrupt;
 
 /// Arguments of `dgtr ortho`.
 #[derive(Debug, clap::Args)]

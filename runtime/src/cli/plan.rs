@@ -19,7 +19,7 @@ use crate::engine::device::DeviceRequest;
 use crate::engine::scratch_bytes;
 use crate::fly::delivered_bytes;
 use crate::preset;
-use crate::service::limits::{DeviceMemory, ServiceLimits};
+use job::service::limits::{DeviceMemory, ServiceLimits};
 
 /// Arguments of `dgtr plan`.
 #[derive(Debug, clap::Args)]

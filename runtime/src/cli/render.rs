@@ -13,7 +13,8 @@ use super::CliError;
 use crate::engine::device::file_renderer;
 use crate::evaluate::save_png;
 use crate::transfer::stem;
-use crate::{console, interrupt};
+use job::console;
+use job::interrupt;
 
 /// Where less than this share of a pixel is covered, it has no depth.
 const LEAST_COVER: f32 = 0.5;

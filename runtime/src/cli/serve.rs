@@ -8,13 +8,13 @@ use config::disk::Disk;
 use config::mission::Mission;
 
 use crate::aggregate::summary;
-use crate::console::Progress;
-use crate::interrupt::Interrupt;
+use job::console::Progress;
+use job::interrupt::Interrupt;
 use crate::ortho::{draw_file, keep_scratch_in};
 use crate::report::{ReportData, Timing, bytes};
 use crate::serve::{self, Board, Joining, Reception, ServeError};
-use crate::service::Supervisor;
-use crate::session::{Owner, Session};
+use job::service::Supervisor;
+use job::session::{Owner, Session};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};

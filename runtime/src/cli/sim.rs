@@ -20,7 +20,7 @@ mod card;
 use super::CliError;
 use crate::cli::output::outln;
 use crate::coverage::route;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
 /// the camera folder; or, with --autopilot, the camera alone beside an autopilot that runs already.

@@ -6,7 +6,7 @@ use std::process::Command;
 use serde::Deserialize;
 
 use super::{AIRCRAFT, DemoError, DemoOptions};
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 /// What `dgtr eval --json --baselines` prints, as far as the demo shows it.
 #[derive(Clone, Debug, Deserialize)]

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::{DemoError, io};
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 /// After one part failed or Ctrl-C, the others may still save for this long.
 const GRACE: Duration = Duration::from_secs(15);

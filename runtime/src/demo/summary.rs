@@ -11,7 +11,7 @@ use super::processes::Process;
 use super::{AIRCRAFT, DemoError, DemoOptions};
 use crate::report::ground::{Ortho, Shot};
 use crate::report::{Comparison, MapRegion, ModelRow, REPORT, ReportData, Table, Timing, bytes};
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 use crate::transfer::stem;
 
 /// Views shown per aircraft.

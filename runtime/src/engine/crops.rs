@@ -6,7 +6,7 @@ use models::picture::mask::Mask;
 use vulkan::trainer::CropPlace;
 
 use super::{PictureSource, Reconstruction};
-use crate::console::Progress;
+use job::console::Progress;
 use crate::error::JobError;
 
 /// Shares of the camera's size at which crops are cut: halves, which JPEG files are decoded at for less.

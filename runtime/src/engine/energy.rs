@@ -4,7 +4,7 @@ use config::training::TrainSettings;
 
 use super::Reconstruction;
 use crate::error::JobError;
-use crate::health::power::Power;
+use job::health::power::Power;
 
 /// Power is read this often, seconds of training.
 pub(super) const EVERY_S: f64 = 1.0;

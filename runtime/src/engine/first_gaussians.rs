@@ -9,7 +9,7 @@ use models::init::{InitReport, Initialiser, from_sfm, random};
 use models::light::Light;
 
 use super::Reconstruction;
-use crate::console::Progress;
+use job::console::Progress;
 use crate::error::JobError;
 
 /// Points of a random start (3DGS: 100,000).

@@ -13,12 +13,12 @@ use vulkan::trainer::RunBudget;
 use super::fault_table::{ORIGIN, usual};
 use super::handover::handover;
 use super::intake::FlightCounters;
-use super::job::Job;
+use super::onboard::Job;
 use super::rehearsal::{Ledger, intrinsics};
 use crate::engine::Reconstruct;
 use crate::failsafe::Failsafe;
-use crate::health::Health;
-use crate::interrupt::Interrupt;
+use job::health::Health;
+use job::interrupt::Interrupt;
 use crate::upload::{Offerer, Source};
 
 /// Half a second passes whenever somebody looks.

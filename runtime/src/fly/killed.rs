@@ -17,7 +17,7 @@ use super::fault_table::ORIGIN;
 use super::rehearsal::{Ledger, Promise, intrinsics};
 use crate::engine::{Reconstruct, model_path};
 use crate::keyframe_store::KeyFrame;
-use crate::session::{Owner, Session};
+use job::session::{Owner, Session};
 
 /// Tells the child where to fly.
 const FOLDER: &str = "DGTR_KILLED_FOLDER";

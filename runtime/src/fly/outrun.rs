@@ -14,12 +14,12 @@ use vulkan::trainer::RunBudget;
 
 use super::fault_table::{ORIGIN, usual};
 use super::handover::{AHEAD, handover};
-use super::job::Job;
+use super::onboard::Job;
 use super::rehearsal::{Ledger, intrinsics};
 use crate::engine::PictureSource;
 use crate::failsafe::Failsafe;
-use crate::health::Health;
-use crate::interrupt::Interrupt;
+use job::health::Health;
+use job::interrupt::Interrupt;
 use crate::keyframe_store::KeyFrame;
 use crate::upload::{Offerer, Source};
 

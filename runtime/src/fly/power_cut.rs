@@ -19,16 +19,16 @@ use super::fault_table::{ORIGIN, usual};
 use super::geotags::Geotags;
 use super::handover::handover;
 use super::intake::FlightCounters;
-use super::job::Job;
+use super::onboard::Job;
 use super::rehearsal::{Ledger, Promise, intrinsics, rehearse_on};
 use crate::engine::model_path;
 use crate::failsafe::Failsafe;
-use crate::health::Health;
-use crate::interrupt::Interrupt;
+use job::health::Health;
+use job::interrupt::Interrupt;
 use crate::keyframe_store::{KeyFrame, KeyframeStore};
 use crate::power_cut::states::{State, each};
 use crate::power_cut::{Done, Recorder};
-use crate::session::{Owner, Session};
+use job::session::{Owner, Session};
 use crate::upload::{Offerer, Source};
 
 /// States checked at a time.

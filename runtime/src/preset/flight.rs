@@ -13,7 +13,8 @@ use crate::cost::model::CostModel;
 use crate::engine::device::DeviceRequest;
 use crate::engine::energy::{Meter, shorter};
 use crate::engine::model_path;
-use crate::{cost, devices, kernels, session};
+use job::session;
+use crate::{cost, devices, kernels};
 
 /// Fills what the mission leaves to its device, and says what was chosen; `None` where the mission gives its numbers, and where nothing may
 /// be or was measured: then the defaults of the mission file hold. A device that was never measured is, which takes seconds. Whoever owns

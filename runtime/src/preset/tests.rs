@@ -218,7 +218,7 @@ mod flights {
 
     use super::*;
     use crate::preset::flight::choose;
-    use crate::session;
+    use job::session;
 
     fn mission(more: &str) -> Mission {
         let text = format!(

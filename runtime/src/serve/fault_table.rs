@@ -9,7 +9,7 @@ use config::keys::PublicKey;
 use super::*;
 use crate::aggregate::testing::{carpet, model};
 use crate::keys;
-use crate::session::{Owner, Session};
+use job::session::{Owner, Session};
 use crate::upload::testing::{Proxy, Weather, certificates, free_port, knows_localhost, noise};
 use crate::upload::{Offerer, Source};
 

@@ -13,7 +13,7 @@ use models::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled};
 use models::formats::transforms;
 use models::refine::Refiner;
 
-use crate::console::Progress;
+use job::console::Progress;
 use crate::engine::host::settling_bytes;
 use crate::engine::{matching_file_bytes, waiting_file};
 use crate::error::JobError;

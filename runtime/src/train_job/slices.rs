@@ -7,11 +7,11 @@ use hal::failsafe::{Action, Flags};
 use hal::traits::Clock;
 use vulkan::trainer::{RunBudget, StopReason};
 
-use crate::console::Progress;
+use job::console::Progress;
 use crate::engine::Reconstruct;
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 /// While training rests, its cause is looked at this often.
 pub(super) const REST: Duration = Duration::from_secs(1);
@@ -113,7 +113,7 @@ mod tests {
     use vulkan::trainer::StepReport;
 
     use super::*;
-    use crate::health::Health;
+    use job::health::Health;
 
     /// A second a step.
     #[derive(Default)]

@@ -13,7 +13,7 @@ use super::Request;
 use super::data::{OWN, SEEN, Written};
 use super::presets::{Method, Pictures};
 use crate::error::JobError;
-use crate::run_json::RunReport;
+use job::run_json::RunReport;
 
 /// Digits of the hash in a folder's name.
 const DIGITS: usize = 12;

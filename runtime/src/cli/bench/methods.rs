@@ -9,7 +9,7 @@ use crate::bench::methods::presets::{METHODS, Method};
 use crate::bench::methods::{Request, measure, survey, table};
 use crate::cli::CliError;
 use crate::cli::output::{out, outln};
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 /// Most regions that a data set is divided into.
 const MOST_REGIONS: u64 = 256;

@@ -9,7 +9,7 @@ use crate::aggregate::plan::Plan;
 use crate::aggregate::store::{Store, hex};
 use crate::aggregate::{AggregateError, job, join};
 use crate::cli::output::outln;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 /// Arguments of `dgtr ground cell`.
 #[derive(Debug, clap::Args)]

@@ -14,7 +14,7 @@ use crate::aggregate::store::Store;
 use crate::aggregate::{LocalModel, REGISTRATION};
 use crate::cli::aggregate::Merging;
 use crate::cli::output::outln;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 use crate::serve::admit::admit;
 
 /// Arguments of `dgtr ground plan`.

@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn the_page_on_formats_states_this_version() {
         let row = format!("| `run.json` | schema {SCHEMA} |");
-        assert!(include_str!("../../models/FORMATS.md").contains(&row), "{row}");
+        assert!(include_str!("../../../models/FORMATS.md").contains(&row), "{row}");
     }
 
     #[test]

@@ -3,9 +3,19 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use config::error::{Error, ErrorKind};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-use crate::error::JobError;
+/// The system refused to install the handlers.
+#[derive(Debug, thiserror::Error)]
+#[error("signal handlers: {0}")]
+pub struct InterruptError(#[from] std::io::Error);
+
+impl Error for InterruptError {
+    fn kind(&self) -> ErrorKind {
+        ErrorKind::Failed
+    }
+}
 
 /// Whether somebody asked this process to end.
 #[derive(Clone, Debug, Default)]
@@ -16,13 +26,12 @@ impl Interrupt {
     ///
     /// # Errors
     /// The system refuses to install the handlers.
-    pub fn install() -> Result<Self, JobError> {
-        let refused = |e| JobError::System(format!("signal handlers: {e}"));
+    pub fn install() -> Result<Self, InterruptError> {
         let flag = Arc::new(AtomicBool::new(false));
         for signal in [SIGINT, SIGTERM] {
             // In this order: the second signal finds the flag set and ends the process; the first only sets it.
-            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag)).map_err(refused)?;
-            signal_hook::flag::register(signal, Arc::clone(&flag)).map_err(refused)?;
+            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag))?;
+            signal_hook::flag::register(signal, Arc::clone(&flag))?;
         }
         Ok(Self(flag))
     }

@@ -12,7 +12,7 @@ use crate::engine::{Reconstruct, model_path};
 use crate::error::JobError;
 use crate::fly::intake::FlightCounters;
 use crate::fly::shortage::likely_cause;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 
 impl<R: Reconstruct, K: Clock> Job<R, K> {
     /// After capture, which counted `flight`: the last build, the rest of the schedule, and the model that remains.
@@ -95,7 +95,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         // is no flight's time any more that training could be behind.
         let seen = Flags { battery_low: capture.flags().battery_low, ..Flags::default() };
         let (at_leisure, views) = (RunBudget { seconds: None, ..self.budget }, self.reconstruction.keyframes());
-        let mut progress = crate::console::Progress::new("training", 100);
+        let mut progress = job::console::Progress::new("training", 100);
         // When this training began, and how much of the schedule was behind it then.
         let (began, mut behind) = (self.clock.now_ns(), None);
         while !self.reconstruction.is_done(&self.budget)

@@ -13,7 +13,7 @@ const FIRMWARE_THROTTLED: i64 = 1 << 1 | 1 << 2 | 1 << 3;
 
 /// Where the sensors are.
 #[derive(Debug, Default)]
-pub(crate) struct Board {
+pub struct Board {
     zones: Vec<PathBuf>,
     /// The Raspberry Pi's `get_throttled`, hexadecimal.
     firmware: Vec<PathBuf>,
@@ -27,17 +27,20 @@ pub(crate) struct Board {
 
 /// What they say.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct BoardState {
-    pub(crate) hottest_c: Option<f32>,
-    pub(crate) under_voltage: bool,
-    pub(crate) throttled: bool,
+pub struct BoardState {
+    /// Of the warmest sensor.
+    pub hottest_c: Option<f32>,
+    /// The supply is low.
+    pub under_voltage: bool,
+    /// The clock is held back.
+    pub throttled: bool,
     /// Of the rail that takes most: where there are several, one feeds the others.
-    pub(crate) watts: Option<f32>,
+    pub watts: Option<f32>,
 }
 
 impl Board {
     /// Looks for sensors below `sys`.
-    pub(crate) fn find(sys: &Path) -> Self {
+    pub fn find(sys: &Path) -> Self {
         let platform = files(&sys.join("devices/platform"), |name| name.starts_with("soc"));
         let firmware = platform.iter().flat_map(|soc| files(soc, |name| name.ends_with(":firmware")));
         let hwmon: Vec<PathBuf> = files(&sys.join("class/hwmon"), |name| name.starts_with("hwmon"));
@@ -61,7 +64,8 @@ impl Board {
         }
     }
 
-    pub(crate) fn read(&self) -> BoardState {
+    /// Reads the sensors.
+    pub fn read(&self) -> BoardState {
         let any = |paths: &[PathBuf]| paths.iter().any(|p| number(p, 10).is_some_and(|v| v != 0));
         let firmware = self.firmware.iter().filter_map(|p| number(p, 16)).fold(0, |a, b| a | b);
         let slowed = self.clocks.iter().any(|(path, first)| number(path, 10).is_some_and(|khz| khz < *first));

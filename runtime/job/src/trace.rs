@@ -18,6 +18,8 @@ use tracing_subscriber::filter::filter_fn;
 use tracing_subscriber::layer::{Context, Layer};
 use tracing_subscriber::registry::LookupSpan;
 
+use crate::CRATES;
+
 /// Largest file: some two million spans, more than a browser shows without pain.
 const LIMIT: u64 = 256 << 20;
 /// Kept back of it for the last words.
@@ -83,7 +85,7 @@ impl Sheet {
 /// Whether our own crates say it: what libraries have on their minds is for the log.
 pub fn is_ours(what: &tracing::Metadata<'_>) -> bool {
     let name = what.target().split("::").next().unwrap_or_default();
-    ["runtime", "vulkan", "models", "hal", "config"].contains(&name)
+    CRATES.contains(&name)
 }
 
 /// Number of a thread in the trace.

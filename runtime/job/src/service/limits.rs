@@ -74,7 +74,7 @@ mod tests {
     /// What the package ships holds for a board of four processors and a mission that says nothing of memory.
     #[test]
     fn the_shipped_unit_has_the_bounds_of_a_missions_defaults() {
-        let unit = include_str!("../../package/dgtr-fly.service");
+        let unit = include_str!("../../../package/dgtr-fly.service");
         let limits = ServiceLimits::of_flight(&MemorySettings::default(), DeviceMemory::Shared, 4).to_string();
         for line in limits.lines().filter(|l| l.contains('=') && !l.starts_with('#')) {
             assert!(unit.lines().any(|l| l == line), "{line} is not in the unit");

@@ -16,9 +16,9 @@ use super::show::ShownJob;
 use crate::engine::{PictureSource, Reconstruct, model_path};
 use crate::error::JobError;
 use crate::failsafe::Failsafe;
-use crate::interrupt::Interrupt;
+use job::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
-use crate::service::Supervisor;
+use job::service::Supervisor;
 use crate::upload::Offerer;
 use crate::watch::Watch;
 

@@ -1,8 +1,8 @@
 //! The companion's own state as flags of the failsafe ladder, beside those of the HAL: temperature, supply, clock, memory, disk,
 //! and whether training keeps its time budget.
 
-pub(crate) mod board;
-pub(crate) mod power;
+pub mod board;
+pub mod power;
 
 use std::path::{Path, PathBuf};
 

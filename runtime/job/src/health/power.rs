@@ -7,31 +7,31 @@ use super::board::Board;
 
 /// Where that is known from.
 #[derive(Debug)]
-pub(crate) struct Power {
+pub struct Power {
     said: Option<f32>,
     board: Board,
 }
 
 impl Power {
     /// What was `said`, else what the board's sensors say.
-    pub(crate) fn new(said: Option<f32>) -> Self {
+    pub fn new(said: Option<f32>) -> Self {
         Self::with_sensors(Path::new("/sys"), said)
     }
 
     /// As [`Power::new`], with the sensors below `sys`.
-    pub(crate) fn with_sensors(sys: &Path, said: Option<f32>) -> Self {
+    pub fn with_sensors(sys: &Path, said: Option<f32>) -> Self {
         Self { said, board: Board::find(sys) }
     }
 
     /// Watts now: of the rail that takes most (power monitors of hwmon), or of all rails of a Raspberry Pi; `None` where nothing tells.
-    pub(crate) fn watts(&self) -> Option<f64> {
+    pub fn watts(&self) -> Option<f64> {
         let measured = || self.board.read().watts.or_else(pmic_watts);
         self.said.or_else(measured).filter(|watts| *watts > 0.0 && watts.is_finite()).map(f64::from)
     }
 }
 
 /// What a Raspberry Pi 5's power management says, watts; `None` elsewhere.
-pub(crate) fn pmic_watts() -> Option<f32> {
+pub fn pmic_watts() -> Option<f32> {
     let said = Command::new("vcgencmd").arg("pmic_read_adc").output().ok()?;
     watts_of_rails(&String::from_utf8_lossy(&said.stdout))
 }

@@ -16,6 +16,7 @@ use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 use tracing_subscriber::layer::{Context, SubscriberExt};
 use tracing_subscriber::{EnvFilter, Layer};
 
+use crate::CRATES;
 use crate::trace::{Trace, is_ours};
 
 /// Between two plain progress lines.
@@ -54,12 +55,13 @@ pub fn install(verbose: u8, quiet: bool, format: Format, trace: Option<Trace>) {
     // Bars are for people.
     let _ = QUIET.set(quiet || format == Format::Json);
     let _ = FORMAT.set(format);
-    let level = match (quiet, verbose) {
-        (true, _) => "warn",
-        (_, 0) => "warn,runtime=info,models=info,vulkan=info,hal=info",
-        (_, 1) => "info,runtime=debug,models=debug,vulkan=debug,hal=debug",
-        _ => "debug",
+    let (others, ours) = match (quiet, verbose) {
+        (true, _) => ("warn", "warn"),
+        (_, 0) => ("warn", "info"),
+        (_, 1) => ("info", "debug"),
+        _ => ("debug", "debug"),
     };
+    let level = CRATES.iter().fold(others.to_owned(), |all, name| format!("{all},{name}={ours}"));
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let lines = tracing_subscriber::fmt::layer().with_writer(AroundBars);
     let lines = match format {
