@@ -19,7 +19,7 @@ pub use summary::Summary;
 
 use job::interrupt::Interrupt;
 use crate::kernels;
-use crate::keys::{self, GROUND};
+use uplink::keys::{self, GROUND};
 use processes::Process;
 
 /// What the command line may change.

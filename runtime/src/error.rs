@@ -18,7 +18,7 @@ use vulkan::trainer::TrainError;
 
 use crate::keyframe_store::StoreError;
 use crate::report::ReportError;
-use crate::upload::UploadError;
+use uplink::UploadError;
 
 /// Every variant's text is one line that says what, where and how to mend it.
 #[derive(Debug, thiserror::Error)]

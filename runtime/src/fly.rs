@@ -63,7 +63,7 @@ use crate::keyframe_store::KeyframeStore;
 use job::resources;
 use job::run_json::RunReport;
 use job::service::Supervisor;
-use crate::upload::{Offerer, Source, UploadError};
+use uplink::{Offerer, Source, UploadError};
 use crate::watch::Watch;
 use flight::Flight;
 use geotags::Geotags;

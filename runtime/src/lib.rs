@@ -17,15 +17,18 @@ pub mod failsafe;
 pub mod fly;
 pub mod kernels;
 pub mod keyframe_store;
-pub mod keys;
 pub mod ortho;
 #[cfg(test)]
+#[path = "../../tests/power_cut/mod.rs"]
 mod power_cut;
+#[cfg(test)]
+#[path = "../../tests/bad_link.rs"]
+#[allow(dead_code, reason = "all of it is used where links are tested")]
+mod bad_link;
 pub mod preset;
 pub mod report;
 pub mod serve;
 pub mod train_job;
 pub mod transfer;
-pub mod upload;
 pub mod viewer;
 pub mod watch;

@@ -13,10 +13,10 @@ use config::mission::Mission;
 
 use crate::aggregate::member::Member;
 use crate::aggregate::{self, AggregateError, Outcome};
-use crate::keys::{GROUND, Identity};
-use crate::upload::UploadError;
-use crate::upload::admission::{Admission, ModelRefusal, Refusals};
-use crate::upload::receive::{ReceiveCounters, Received, Receiver};
+use uplink::keys::{GROUND, Identity};
+use uplink::UploadError;
+use uplink::admission::{Admission, ModelRefusal, Refusals};
+use uplink::receive::{ReceiveCounters, Received, Receiver};
 
 pub mod admit;
 mod board;

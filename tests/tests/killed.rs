@@ -15,9 +15,9 @@ use config::mission::Mission;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms;
-use runtime::keys::Identity;
+use uplink::keys::Identity;
 use job::run_json::RunReport;
-use runtime::upload::{Offerer, Source};
+use uplink::{Offerer, Source};
 use support::{Running, change_mission, small_mission, wait_until};
 
 const PATIENCE: Duration = Duration::from_secs(300);

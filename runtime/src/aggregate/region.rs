@@ -10,6 +10,7 @@ use glam::{DVec2, DVec3};
 use models::coverage::hull;
 use models::formats::model::ModelHeader;
 use serde::{Deserialize, Serialize};
+use uplink::polygon;
 
 use super::member::{Bounds, Member};
 use super::sight::Sight;
@@ -70,19 +71,7 @@ impl Region {
 
     /// Metres to the region; 0 inside.
     pub fn distance(&self, p: DVec2) -> f64 {
-        let mut inside = false;
-        let mut nearest = f64::INFINITY;
-        for (i, &a) in self.corners.iter().enumerate() {
-            let b = self.corners[(i + 1) % self.corners.len()];
-            let (edge, to) = (b - a, p - a);
-            let along =
-                if edge.length_squared() > 0.0 { (to.dot(edge) / edge.length_squared()).clamp(0.0, 1.0) } else { 0.0 };
-            nearest = nearest.min((to - edge * along).length());
-            if (a.y > p.y) != (b.y > p.y) && p.x < a.x + (p.y - a.y) / (b.y - a.y) * (b.x - a.x) {
-                inside = !inside;
-            }
-        }
-        if inside { 0.0 } else { nearest }
+        polygon::distance(&self.corners, p)
     }
 }
 

@@ -16,7 +16,7 @@ use super::figures::write_text;
 use crate::aggregate::frame::Motion;
 use crate::error::JobError;
 use job::run_json::RunReport;
-use crate::upload::{Offerer, Source};
+use uplink::{Offerer, Source};
 use field::{BEYOND, Field, id};
 
 pub mod field;

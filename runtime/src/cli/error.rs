@@ -75,7 +75,7 @@ mod tests {
     use crate::aggregate::AggregateError;
     use crate::error::JobError;
     use crate::serve::ServeError;
-    use crate::upload::UploadError;
+    use uplink::UploadError;
 
     #[test]
     fn every_kind_has_one_row_and_the_documented_code() {

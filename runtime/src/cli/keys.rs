@@ -6,7 +6,7 @@ use config::mission::Mission;
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::keys::{self, GROUND};
+use uplink::keys::{self, GROUND};
 
 /// Arguments of `dgtr keys`.
 #[derive(Debug, clap::Args)]

@@ -14,12 +14,12 @@ use super::fault_table::{ORIGIN, usual};
 use super::handover::handover;
 use super::intake::FlightCounters;
 use super::onboard::Job;
-use super::rehearsal::{Ledger, intrinsics};
+use super::rehearsal::{Ledger, intrinsics, unsigned};
 use crate::engine::Reconstruct;
 use crate::failsafe::Failsafe;
 use job::health::Health;
 use job::interrupt::Interrupt;
-use crate::upload::{Offerer, Source};
+use uplink::Offerer;
 
 /// Half a second passes whenever somebody looks.
 struct Ticking(Cell<u64>);
@@ -52,7 +52,7 @@ fn land(temperature: &str) -> (u64, bool) {
             .add(PosedImage { name: format!("{i}.png"), time_ns: 0, image, view, mask: None, sigma }, false)
             .expect("taken");
     }
-    let offerer = Offerer::start(&UploadSettings::default(), Source::unsigned("rehearsal", "one")).expect("a thread");
+    let offerer = Offerer::start(&UploadSettings::default(), unsigned("rehearsal", "one")).expect("a thread");
     let limits = FailsafeSettings { disk_low_mib: 0, ..FailsafeSettings::default() };
     let failsafe = Failsafe::new(Health::with_sensors(&sys, limits, 1 << 20, &out), &limits);
     let budget = RunBudget { steps: Some(200), seconds: None };

@@ -19,7 +19,7 @@ use crate::failsafe::Failsafe;
 use job::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
 use job::service::Supervisor;
-use crate::upload::Offerer;
+use uplink::Offerer;
 use crate::watch::Watch;
 
 mod landing;

@@ -15,13 +15,13 @@ use vulkan::trainer::RunBudget;
 use super::fault_table::{ORIGIN, usual};
 use super::handover::{AHEAD, handover};
 use super::onboard::Job;
-use super::rehearsal::{Ledger, intrinsics};
+use super::rehearsal::{Ledger, intrinsics, unsigned};
 use crate::engine::PictureSource;
 use crate::failsafe::Failsafe;
 use job::health::Health;
 use job::interrupt::Interrupt;
 use crate::keyframe_store::KeyFrame;
-use crate::upload::{Offerer, Source};
+use uplink::Offerer;
 
 /// Steps trained in flight while `turns` key frames are taken in and others always wait.
 fn trained_while_others_wait(train_steps: u32, turns: usize) -> u64 {
@@ -31,7 +31,7 @@ fn trained_while_others_wait(train_steps: u32, turns: usize) -> u64 {
     let (ledger, _) = Ledger::open(&Disk::default(), &lens, ORIGIN, out).expect("opens");
     let limits = FailsafeSettings { disk_low_mib: 0, ..FailsafeSettings::default() };
     let failsafe = Failsafe::new(Health::with_sensors(Path::new("/nonexistent"), limits, 1 << 20, out), &limits);
-    let offerer = Offerer::start(&UploadSettings::default(), Source::unsigned("rehearsal", "one")).expect("a thread");
+    let offerer = Offerer::start(&UploadSettings::default(), unsigned("rehearsal", "one")).expect("a thread");
     let budget = RunBudget { steps: Some(10_000), seconds: None };
     let (mut capture, end) = handover();
     let mut job = Job::new(ledger, offerer, out, budget, failsafe, ManualClock::default()).without_waiting();

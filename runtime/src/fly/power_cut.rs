@@ -20,7 +20,7 @@ use super::geotags::Geotags;
 use super::handover::handover;
 use super::intake::FlightCounters;
 use super::onboard::Job;
-use super::rehearsal::{Ledger, Promise, intrinsics, rehearse_on};
+use super::rehearsal::{Ledger, Promise, intrinsics, rehearse_on, unsigned};
 use crate::engine::model_path;
 use crate::failsafe::Failsafe;
 use job::health::Health;
@@ -29,7 +29,7 @@ use crate::keyframe_store::{KeyFrame, KeyframeStore};
 use crate::power_cut::states::{State, each};
 use crate::power_cut::{Done, Recorder};
 use job::session::{Owner, Session};
-use crate::upload::{Offerer, Source};
+use uplink::Offerer;
 
 /// States checked at a time.
 const AT_ONCE: usize = 256;
@@ -90,7 +90,7 @@ fn go_on(state: &State, promised: &[Promise], r: &Recording) -> Result<(), Strin
     let here: Vec<String> = ledger.names().map(str::to_owned).collect();
     ledger.landed = true;
     let offerer =
-        Offerer::start(&UploadSettings::default(), Source::unsigned("rehearsal", "one")).map_err(|e| e.to_string())?;
+        Offerer::start(&UploadSettings::default(), unsigned("rehearsal", "one")).map_err(|e| e.to_string())?;
     let budget = RunBudget { steps: Some(200), seconds: None };
     let (mut capture, end) = handover();
     capture.keep_in(store, model_path(out));

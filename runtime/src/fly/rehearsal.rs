@@ -39,13 +39,20 @@ use job::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
 use crate::report::{Craft, ReportData};
 use job::service::Supervisor;
-use crate::upload::{Offerer, Source};
+use uplink::keys::Identity;
+use uplink::{Offerer, Source};
 use crate::watch::Watch;
 
 /// Time between two turns; one training step is taken in each.
 const TURN_NS: u64 = 20_000_000;
 /// No rehearsal takes longer, turns: ten minutes.
 const MOST_TURNS: u32 = 30_000;
+
+/// An aircraft without keys, every start of which is its first flight.
+pub(super) fn unsigned(mission: &str, aircraft: &str) -> Source {
+    let (mission, aircraft, identity) = (mission.into(), aircraft.into(), Identity::unsigned());
+    Source { mission, aircraft, identity, flight_number: None, disk: Disk::default(), territory: None }
+}
 
 /// What would have been reconstructed. Key frames and checkpoints are kept on disk as the real one keeps them.
 pub(super) struct Ledger {
@@ -260,7 +267,7 @@ pub(super) fn rehearse_on(
     };
     capture.keep_in(store, model_path(&out));
     let mut intake = Some(Intake::new(plan, vehicle, clock.clone(), end));
-    let offerer = Offerer::start(&UploadSettings::default(), Source::unsigned("rehearsal", "one")).expect("a thread");
+    let offerer = Offerer::start(&UploadSettings::default(), unsigned("rehearsal", "one")).expect("a thread");
     let budget = RunBudget { steps: Some(200), seconds: None };
     let limits = FailsafeSettings { disk_low_mib: 0, ..FailsafeSettings::default() };
     let health = Health::with_sensors(Path::new("/nonexistent"), limits, 1 << 20, &out);

@@ -10,7 +10,7 @@ use models::camera::View;
 use crate::aggregate::frame::{MAX_APART_M, Motion};
 use crate::aggregate::region::Region;
 use crate::aggregate::{AggregateError, LocalModel};
-use crate::upload::admission::ModelRefusal;
+use uplink::admission::ModelRefusal;
 
 /// Reads a received model and checks that it may count as `aircraft`'s. Its region is the mission's, whatever it says
 /// itself: one model that claims the ground of all would cost the others theirs.

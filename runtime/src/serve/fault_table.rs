@@ -6,12 +6,13 @@ use std::fmt::Write;
 use config::disk::Disk;
 use config::keys::PublicKey;
 
+use super::tests::unsigned;
 use super::*;
 use crate::aggregate::testing::{carpet, model};
-use crate::keys;
+use uplink::keys;
 use job::session::{Owner, Session};
-use crate::upload::testing::{Proxy, Weather, certificates, free_port, knows_localhost, noise};
-use crate::upload::{Offerer, Source};
+use crate::bad_link::{Proxy, Weather, certificates, free_port, knows_localhost, noise};
+use uplink::{Offerer, Source};
 
 /// One mission of two aircraft, keyed, over the network of one machine.
 struct Field {
@@ -137,7 +138,7 @@ fn rogue_peer() -> Outcome {
     let source = Source {
         identity: Identity::stranger(),
         flight_number: Some(numbers),
-        ..Source::unsigned(&field.mission.name, "west")
+        ..unsigned(&field.mission.name, "west")
     };
     let rogue = Offerer::start(&field.mission.upload, source).expect("offerer");
     rogue.offer_final(&junk);
@@ -159,7 +160,7 @@ fn stolen_certificate() -> Outcome {
     let field = Field::new(true);
     let theirs = field.of("west");
     let identity = Identity::of(&field.mission, "east").expect("even with the key");
-    let source = Source { identity, ..Source::unsigned(&field.mission.name, "east") };
+    let source = Source { identity, ..unsigned(&field.mission.name, "east") };
     let rogue = Offerer::start(&theirs.upload, source).expect("offerer");
     rogue.offer_final(&field.model("rogue"));
     let _aircraft = ["west", "east"].map(|id| field.fly(id));

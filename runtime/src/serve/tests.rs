@@ -2,7 +2,13 @@
 
 use super::*;
 use crate::aggregate::testing::{carpet, model};
-use crate::upload::{Offerer, Source};
+use uplink::{Offerer, Source};
+
+/// An aircraft without keys, every start of which is its first flight.
+pub(super) fn unsigned(mission: &str, aircraft: &str) -> Source {
+    let (mission, aircraft, identity) = (mission.into(), aircraft.into(), Identity::unsigned());
+    Source { mission, aircraft, identity, flight_number: None, disk: Default::default(), territory: None }
+}
 
 pub(super) fn mission(dir: &Path) -> Mission {
     let text = r#"
@@ -29,7 +35,7 @@ fn fly(mission: &Mission, dir: &Path, id: &str) {
     let path = dir.join(format!("{id}.dgtr"));
     let local = model(id, &[], carpet([-40.0, -20.0], [40.0, 20.0], 1.0));
     models::formats::model::write(&path, &local.header, &local.cloud).expect("write");
-    let offerer = Offerer::start(&mission.upload, Source::unsigned(&mission.name, id)).expect("offerer");
+    let offerer = Offerer::start(&mission.upload, unsigned(&mission.name, id)).expect("offerer");
     offerer.offer_final(&path);
     assert!(offerer.wait_delivered(Duration::from_secs(30), || true));
     offerer.shutdown();
@@ -88,7 +94,7 @@ fn a_received_file_that_is_no_model_does_not_cost_the_others() {
     fly(&mission, dir.path(), "west");
     let path = dir.path().join("junk.dgtr");
     std::fs::write(&path, b"not a model").expect("write");
-    let offerer = Offerer::start(&mission.upload, Source::unsigned(&mission.name, "east")).expect("offerer");
+    let offerer = Offerer::start(&mission.upload, unsigned(&mission.name, "east")).expect("offerer");
     offerer.offer_final(&path);
     assert!(offerer.wait_delivered(Duration::from_secs(30), || true));
     let reception = receive(&mission, &out, None, &AtomicBool::new(false), &mut |_| {}).expect("received");

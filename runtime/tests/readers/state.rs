@@ -11,11 +11,11 @@ use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use runtime::aggregate::register::edge::{Edges, Fitted};
 use runtime::kernels::cache;
 use runtime::keyframe_store::{KeyFrame, KeyframeStore};
-use runtime::keys;
+use uplink::keys;
 use job::run_json::RunReport;
 use job::session::{Owner, Session};
 use runtime::train_job::log;
-use runtime::upload::flight_number::FlightNumber;
+use uplink::flight_number::FlightNumber;
 use vulkan::gpu::{DeviceLimits, GpuInfo};
 
 use crate::driver::{Read, Reader, Shell, Verdict, line, memory_folder, survive};

@@ -10,13 +10,13 @@ use config::upload::UploadSettings;
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
-use runtime::keys::Identity;
+use uplink::keys::Identity;
 use runtime::serve::admit::admit;
-use runtime::upload::Source;
-use runtime::upload::folder::{FolderInlet, FolderOutlet};
-use runtime::upload::offer::{Offer, OfferedModel, Order, hex};
-use runtime::upload::receipt::{Receipt, Verdict};
-use runtime::upload::transport::{Inlet, Outlet, Patience};
+use uplink::Source;
+use uplink::folder::{FolderInlet, FolderOutlet};
+use uplink::offer::{Offer, OfferedModel, Order, hex};
+use uplink::receipt::{Receipt, Verdict};
+use uplink::transport::{Inlet, Outlet, Patience};
 
 use crate::driver::{Read, Reader, Shell, line, memory_folder, survive};
 

@@ -5,7 +5,7 @@ use config::mission::Mission;
 use hal::link::LinkAddress;
 
 use super::Finding;
-use crate::keys::{GROUND, Identity, private_path};
+use uplink::keys::{GROUND, Identity, private_path};
 
 /// One line per kind of protection.
 pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {

@@ -7,13 +7,14 @@ use glam::DVec2;
 use models::formats::model::ModelHeader;
 use models::ground_cell::{CellKey, Grid};
 
-use crate::aggregate::region::Region;
+use crate::polygon::distance;
 
 /// The ground that one aircraft answers for, among the others of its mission.
 #[derive(Clone, Debug)]
 pub struct Territory {
-    own: Region,
-    others: Vec<Region>,
+    /// Corners of its region.
+    own: Vec<DVec2>,
+    others: Vec<Vec<DVec2>>,
 }
 
 impl Territory {
@@ -21,7 +22,7 @@ impl Territory {
     pub fn of(mission: &Mission, aircraft: &str) -> Option<Self> {
         let region = |a: &config::mission::Aircraft| {
             let corners: Vec<DVec2> = mission.region(a).into_iter().map(DVec2::from).collect();
-            (corners.len() >= 3).then(|| Region::declared(corners))
+            (corners.len() >= 3).then_some(corners)
         };
         let (own, others): (Vec<_>, Vec<_>) = mission.aircraft.iter().partition(|a| a.id == aircraft);
         Some(Self { own: region(own.first()?)?, others: others.into_iter().filter_map(region).collect() })
@@ -33,8 +34,8 @@ impl Territory {
         let middle = (DVec2::new(key.x.into(), key.y.into()) + 0.5) * side;
         // No distance changes by more than this from the middle to any place in the cell.
         let half = side * std::f64::consts::FRAC_1_SQRT_2;
-        let own = self.own.distance(middle) - half;
-        own <= margin || !self.others.iter().any(|other| other.distance(middle) + half < own)
+        let own = distance(&self.own, middle) - half;
+        own <= margin || !self.others.iter().any(|other| distance(other, middle) + half < own)
     }
 }
 
@@ -51,8 +52,8 @@ pub fn margin(header: &ModelHeader, ground: f32) -> f64 {
 mod tests {
     use super::*;
 
-    fn square(west: f64, east: f64) -> Region {
-        Region::declared([(west, 0.0), (east, 0.0), (east, 100.0), (west, 100.0)].map(DVec2::from).to_vec())
+    fn square(west: f64, east: f64) -> Vec<DVec2> {
+        [(west, 0.0), (east, 0.0), (east, 100.0), (west, 100.0)].map(DVec2::from).to_vec()
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Five aircraft, one ground and a rogue over bad links, in the manner of Jepsen: every node is a process, which is killed
-//! and started again at random; links are slow, late, lossy, cut and reset. When the storm is over, every honest final
+//! and started again at random; links are slow, late, lossy, cut and reset. When the chaos is over, every honest final
 //! model is at the ground, byte for byte, and nothing else is.
 //!
-//! `DGTR_STORM_S` sets the length of the storm (12 s without it), `DGTR_STORM_SEED` what happens in it.
+//! `DGTR_CHAOS_S` sets its length (12 s without it), `DGTR_CHAOS_SEED` what happens in it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ use crate::keys::testing::identities;
 const AIRCRAFT: [&str; 5] = ["a1", "a2", "a3", "a4", "a5"];
 /// One way, milliseconds.
 const DELAYS: [u64; 5] = [50, 100, 200, 400, 1000];
-/// After the storm everything must be in within so long.
+/// After that everything must be in within so long.
 const CALM: Duration = Duration::from_secs(120);
 
 fn checkpoint_of(aircraft: usize) -> Vec<u8> {
@@ -52,11 +52,11 @@ fn settings(dir: &Path, name: &str, port: u16) -> UploadSettings {
     }
 }
 
-/// One process of the storm.
+/// One process of the test.
 #[test]
-#[ignore = "a process that the storm starts"]
+#[ignore = "a process that the test starts"]
 fn node() {
-    let of = |name: &str| std::env::var(format!("DGTR_STORM_{name}")).ok();
+    let of = |name: &str| std::env::var(format!("DGTR_CHAOS_{name}")).ok();
     let (Some(role), Some(dir), Some(port)) = (of("ROLE"), of("DIR"), of("PORT")) else { return };
     let (dir, port) = (PathBuf::from(dir), port.parse().expect("a port"));
     match AIRCRAFT.iter().position(|id| *id == role) {
@@ -145,9 +145,9 @@ struct Node {
 impl Node {
     fn start(&mut self, dir: &Path) {
         let mut command = Command::new(std::env::current_exe().expect("this program"));
-        command.args(["--exact", "upload::storm::node", "--ignored", "--nocapture"]);
-        command.env("DGTR_STORM_ROLE", self.role).env("DGTR_STORM_DIR", dir);
-        command.env("DGTR_STORM_PORT", self.port.to_string());
+        command.args(["--exact", "chaos::node", "--ignored", "--nocapture"]);
+        command.env("DGTR_CHAOS_ROLE", self.role).env("DGTR_CHAOS_DIR", dir);
+        command.env("DGTR_CHAOS_PORT", self.port.to_string());
         let path = dir.join(format!("{}.log", self.role));
         let log = std::fs::File::options().create(true).append(true).open(path).expect("log");
         let (out, err) = (Stdio::from(log.try_clone().expect("log")), Stdio::from(log));
@@ -190,13 +190,13 @@ fn counted(dir: &Path) -> (BTreeMap<String, u64>, BTreeMap<String, u64>, bool) {
 }
 
 #[test]
-fn after_the_storm_every_final_model_is_here_once_and_nothing_else() {
+fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
     if !knows_localhost() {
         return;
     }
     let number =
         |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(otherwise);
-    let (length, seed) = (number("DGTR_STORM_S", 12), number("DGTR_STORM_SEED", 1));
+    let (length, seed) = (number("DGTR_CHAOS_S", 12), number("DGTR_CHAOS_SEED", 1));
     let dir = tempfile::tempdir().expect("temp dir");
     for name in AIRCRAFT.into_iter().chain(["ground"]) {
         certificates(&dir.path().join("tls"), name);
@@ -218,9 +218,9 @@ fn after_the_storm_every_final_model_is_here_once_and_nothing_else() {
 
     let mut dice = Dice(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
     let (mut kills, mut cuts, mut resets) = (0, 0, 0);
-    let storm = Instant::now() + Duration::from_secs(length);
+    let until = Instant::now() + Duration::from_secs(length);
     let mut mend_at = vec![None::<Instant>; proxies.len()];
-    while Instant::now() < storm {
+    while Instant::now() < until {
         std::thread::sleep(Duration::from_millis(200 + dice.roll(800)));
         for (proxy, at) in proxies.iter().zip(&mut mend_at) {
             if at.is_some_and(|at| Instant::now() >= at) {
@@ -258,7 +258,7 @@ fn after_the_storm_every_final_model_is_here_once_and_nothing_else() {
     nodes.iter_mut().for_each(Node::kill);
     let (counters, refused, done) = counted(dir.path());
     println!(
-        "{length} s of storm, seed {seed}: {kills} kills, {cuts} cuts, {resets} resets\n{counters:?}\n{refused:#?}"
+        "{length} s of chaos, seed {seed}: {kills} kills, {cuts} cuts, {resets} resets\n{counters:?}\n{refused:#?}"
     );
     assert!(done, "not everything arrived");
     for (i, id) in AIRCRAFT.iter().enumerate() {

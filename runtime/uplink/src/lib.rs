@@ -12,26 +12,33 @@ use config::mission::Mission;
 use crate::keys::{Identity, KeyError};
 
 pub mod admission;
+#[cfg(test)]
+#[cfg(feature = "zenoh")]
+mod chaos;
 pub mod flight_number;
 pub mod folder;
 mod medium;
 #[cfg(feature = "zenoh")]
 pub mod network;
+pub mod keys;
 pub mod offer;
 mod offerer;
+pub mod polygon;
+#[cfg(test)]
+#[path = "../../../tests/power_cut/mod.rs"]
+#[allow(dead_code, reason = "all of it is used where flights are cut")]
+mod power_cut;
 pub mod receipt;
 pub mod receive;
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
 mod slow_link;
 pub mod store;
-#[cfg(test)]
-#[cfg(feature = "zenoh")]
-mod storm;
 mod territory;
 #[cfg(test)]
+#[path = "../../../tests/bad_link.rs"]
 #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "bad links are the network's"))]
-pub(crate) mod testing;
+mod testing;
 pub mod transport;
 
 use config::error::{Error, ErrorKind};

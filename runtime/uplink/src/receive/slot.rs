@@ -10,11 +10,11 @@ use config::upload::UploadSettings;
 use super::sight::Shown;
 use super::{ANSWER, ReceiveCounters, Received};
 use crate::keys::{Domain, SignatureBytes};
-use crate::upload::admission::{Admission, ModelRefusal, Refusals};
-use crate::upload::offer::{Hash, Offer, Order};
-use crate::upload::receipt::{Receipt, Verdict};
-use crate::upload::store::{Store, StoreError};
-use crate::upload::transport::{Inlet, Patience, TransportError};
+use crate::admission::{Admission, ModelRefusal, Refusals};
+use crate::offer::{Hash, Offer, Order};
+use crate::receipt::{Receipt, Verdict};
+use crate::store::{Store, StoreError};
+use crate::transport::{Inlet, Patience, TransportError};
 
 /// Remembered refusals of one aircraft.
 const MAX_REMEMBERED: usize = 256;

@@ -1,7 +1,7 @@
 //! Promises about models whose chunks are cells.
 
 use super::*;
-use crate::upload::testing::write_in_cells;
+use crate::testing::write_in_cells;
 
 fn in_cells(b: &Bench, corner: f32, counter: u64, finished: bool) -> (OfferedModel, Vec<u8>) {
     let path = b.dir.path().join("source.dgtr");

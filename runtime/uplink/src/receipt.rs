@@ -100,7 +100,7 @@ impl Receipt {
 mod tests {
     use super::*;
     use crate::keys::testing::identities;
-    use crate::upload::offer::testing::offer;
+    use crate::offer::testing::offer;
 
     #[test]
     fn only_the_grounds_own_receipt_is_believed() {

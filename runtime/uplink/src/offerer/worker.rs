@@ -9,11 +9,11 @@ use models::formats::{FormatError, delivery::Rounding, model};
 use models::ground_cell::{CellKey, Grid};
 
 use super::inbox::{Inbox, Kind, locked};
-use crate::upload::flight_number::FlightNumber;
-use crate::upload::offer::{OfferedModel, Order};
-use crate::upload::receipt::Delivery;
-use crate::upload::transport::{Outlet, TransportError};
-use crate::upload::{Source, territory};
+use crate::flight_number::FlightNumber;
+use crate::offer::{OfferedModel, Order};
+use crate::receipt::Delivery;
+use crate::transport::{Outlet, TransportError};
+use crate::{Source, territory};
 
 /// A model that took so long to deliver keeps the next checkpoint back for so many times as long.
 const REST: f64 = 4.0;

@@ -333,7 +333,7 @@ pub(super) mod testing {
     use super::*;
 
     /// An unsigned offer of a small model in flight 1.
-    pub(in crate::upload) fn offer(mission: &str, aircraft: &str, counter: u64) -> Offer {
+    pub(crate) fn offer(mission: &str, aircraft: &str, counter: u64) -> Offer {
         let order = Order { flight: 1, counter };
         let (mission, aircraft) = (mission.into(), aircraft.into());
         let (model, chunks) = ([counter as u8; 32], vec![[counter as u8; 32]]);

@@ -9,14 +9,14 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Bytes that do not compress and follow from their seed.
-pub(crate) fn noise(n: usize, seed: u8) -> Vec<u8> {
+pub fn noise(n: usize, seed: u8) -> Vec<u8> {
     let mut bytes = vec![0; n];
     blake3::Hasher::new_keyed(&[seed; 32]).finalize_xof().fill(&mut bytes);
     bytes
 }
 
 /// A model of 12,000 Gaussians in cells; `corner` is the colour of those in one corner.
-pub(crate) fn write_in_cells(path: &Path, corner: f32) {
+pub fn write_in_cells(path: &Path, corner: f32) {
     let mut cloud = models::cloud::GaussianCloud::with_capacity(0, 12_000);
     let mut dice = Dice(7);
     for _ in 0..12_000 {
@@ -31,11 +31,11 @@ pub(crate) fn write_in_cells(path: &Path, corner: f32) {
 }
 
 /// Small and seeded (xorshift64).
-pub(crate) struct Dice(pub(crate) u64);
+pub struct Dice(pub u64);
 
 impl Dice {
     /// Evenly within 0..below.
-    pub(crate) fn roll(&mut self, below: u64) -> u64 {
+    pub fn roll(&mut self, below: u64) -> u64 {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
         self.0 ^= self.0 << 17;
@@ -45,14 +45,14 @@ impl Dice {
 
 /// How bad a link is.
 #[derive(Clone, Copy)]
-pub(crate) struct Weather {
+pub struct Weather {
     /// Bytes per second each way.
-    pub(crate) rate: f64,
+    pub rate: f64,
     /// One way.
-    pub(crate) delay: Duration,
+    pub delay: Duration,
     /// Segments lost, in percent: each costs the time until TCP sends it again.
-    pub(crate) loss_pct: u64,
-    pub(crate) seed: u64,
+    pub loss_pct: u64,
+    pub seed: u64,
 }
 
 /// Bytes at a time.
@@ -61,8 +61,8 @@ const SEGMENT: usize = 4096;
 const RETRANSMISSION: Duration = Duration::from_millis(200);
 
 /// A TCP link between the aircraft and the ground. Dropped, it lets go of its port and its connections.
-pub(crate) struct Proxy {
-    pub(crate) port: u16,
+pub struct Proxy {
+    pub port: u16,
     shared: Arc<Shared>,
 }
 
@@ -76,7 +76,7 @@ struct Shared {
 }
 
 impl Proxy {
-    pub(crate) fn to(ground: u16, weather: Weather) -> Self {
+    pub fn to(ground: u16, weather: Weather) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("bind");
         listener.set_nonblocking(true).expect("non-blocking");
         let port = listener.local_addr().expect("address").port();
@@ -111,19 +111,19 @@ impl Proxy {
     }
 
     /// Cuts the line, or mends it: what is under way stands still.
-    pub(crate) fn cut(&self, cut: bool) {
+    pub fn cut(&self, cut: bool) {
         self.shared.is_cut.store(cut, Ordering::Relaxed);
     }
 
     /// Ends every connection.
-    pub(crate) fn reset(&self) {
+    pub fn reset(&self) {
         for connection in self.shared.connections.lock().expect("lock").drain(..) {
             let _ = connection.shutdown(Shutdown::Both);
         }
     }
 
     /// Bytes that the aircraft sent so far.
-    pub(crate) fn sent(&self) -> u64 {
+    pub fn sent(&self) -> u64 {
         self.shared.sent.load(Ordering::Relaxed)
     }
 }
@@ -170,13 +170,13 @@ fn write(shared: &Shared, mut to: TcpStream, segments: &Receiver<(Instant, Vec<u
 }
 
 /// A port that was free a moment ago.
-pub(crate) fn free_port() -> u16 {
+pub fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").expect("bind").local_addr().expect("address").port()
 }
 
 /// Writes a certificate authority, once, and one certificate for `localhost` under the name `name` signed by it; returns
 /// the settings that use them.
-pub(crate) fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
+pub fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
     use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
     std::fs::create_dir_all(dir).expect("folder");
     let ca_path = dir.join("ca.pem");
@@ -203,7 +203,7 @@ pub(crate) fn certificates(dir: &Path, name: &str) -> config::upload::TlsSetting
 }
 
 /// Whether the name that the certificates are for is known here; an empty container may not know it.
-pub(crate) fn knows_localhost() -> bool {
+pub fn knows_localhost() -> bool {
     let known = std::net::ToSocketAddrs::to_socket_addrs(&("localhost", 0)).is_ok();
     if !known {
         println!("skipped: this machine does not know the name localhost (no /etc/hosts?)");

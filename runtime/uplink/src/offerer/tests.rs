@@ -8,11 +8,11 @@ use models::formats::model;
 
 use super::*;
 use crate::keys::Identity;
-use crate::upload::admission::Admission;
-use crate::upload::receive::Receiver;
-use crate::upload::testing::noise;
+use crate::admission::Admission;
+use crate::receive::Receiver;
+use crate::testing::noise;
 #[cfg(feature = "zenoh")]
-use crate::upload::testing::{certificates, free_port, knows_localhost};
+use crate::testing::{certificates, free_port, knows_localhost};
 
 /// Writes a model as checkpoints are written: aside, then renamed.
 fn write_model(path: &Path, bytes: &[u8]) {

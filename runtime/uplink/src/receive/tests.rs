@@ -7,12 +7,12 @@ use super::*;
 use crate::keys::Domain;
 use crate::keys::Identity;
 use crate::keys::testing::identities;
-use crate::upload::Source;
-use crate::upload::admission::ModelRefusal;
-use crate::upload::offer::{OfferedModel, Order};
-use crate::upload::receipt::{Delivery, Receipt};
-use crate::upload::testing::noise;
-use crate::upload::transport::TransportError;
+use crate::Source;
+use crate::admission::ModelRefusal;
+use crate::offer::{OfferedModel, Order};
+use crate::receipt::{Delivery, Receipt};
+use crate::testing::noise;
+use crate::transport::TransportError;
 
 mod aircraft;
 mod cells;

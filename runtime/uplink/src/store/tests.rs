@@ -2,8 +2,8 @@ use super::*;
 use crate::keys::Identity;
 use crate::power_cut::states::{State, each};
 use crate::power_cut::{Done, Recorder};
-use crate::upload::Source;
-use crate::upload::offer::{OfferedModel, Order};
+use crate::Source;
+use crate::offer::{OfferedModel, Order};
 
 fn settings() -> UploadSettings {
     UploadSettings { chunk_kib: 16, max_model_mib: 1, ..UploadSettings::default() }

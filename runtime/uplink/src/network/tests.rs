@@ -7,12 +7,12 @@ use std::time::Instant;
 use super::*;
 use crate::keys::Identity;
 use crate::keys::testing::identities;
-use crate::upload::admission::Admission;
-use crate::upload::offer::{OfferedModel, Order};
-use crate::upload::receipt::{Receipt, Verdict};
-use crate::upload::receive::Receiver;
-use crate::upload::testing::{certificates, free_port, knows_localhost, noise};
-use crate::upload::{Offerer, Source};
+use crate::admission::Admission;
+use crate::offer::{OfferedModel, Order};
+use crate::receipt::{Receipt, Verdict};
+use crate::receive::Receiver;
+use crate::testing::{certificates, free_port, knows_localhost, noise};
+use crate::{Offerer, Source};
 
 const LIMIT: Duration = Duration::from_secs(60);
 

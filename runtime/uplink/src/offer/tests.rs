@@ -32,7 +32,7 @@ fn an_offer_survives_the_wire() {
 fn in_cells() -> OfferedModel {
     let dir = tempfile::tempdir().expect("temp dir");
     let path = dir.path().join("m.dgtr");
-    crate::upload::testing::write_in_cells(&path, 0.2);
+    crate::testing::write_in_cells(&path, 0.2);
     let order = Order { flight: 2, counter: 5 };
     OfferedModel::open(&path, &settings(), &Source::unsigned("m", "a1"), order, true).expect("offer")
 }
