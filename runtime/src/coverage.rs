@@ -12,6 +12,7 @@ use models::formats::FormatError;
 use models::formats::flight_plan::{FlightPlan, Waypoint};
 
 use job::run_json::RunReport;
+use pages::watch::GAPS;
 
 #[cfg(feature = "lab")]
 mod route;
@@ -22,8 +23,6 @@ mod tests;
 #[cfg(feature = "lab")]
 pub use route::route;
 
-/// The gaps, in the output folder.
-pub const GAPS: &str = "coverage.geojson";
 /// Every square with its figures, for a GIS.
 pub const RASTER: &str = "coverage.tif";
 /// The flight that closes them.

@@ -18,7 +18,7 @@ pub use evaluate::Figures;
 pub use summary::Summary;
 
 use job::interrupt::Interrupt;
-use crate::kernels;
+use engine::kernels;
 use uplink::keys::{self, GROUND};
 use processes::Process;
 

@@ -17,7 +17,7 @@ use vulkan::gpu::GpuError;
 use vulkan::trainer::TrainError;
 
 use crate::keyframe_store::StoreError;
-use crate::report::ReportError;
+use pages::report::ReportError;
 use uplink::UploadError;
 
 /// Every variant's text is one line that says what, where and how to mend it.

@@ -15,8 +15,8 @@ use models::formats::delivery::Rounding;
 use models::formats::model::{self, Chunks, ModelHeader, piece_bytes};
 use models::ortho::extent::SAMPLE;
 use peak_allocator::peak_of;
-use runtime::engine::device::{file_renderer, renderer};
-use runtime::ortho::{Map, MapRequest};
+use engine::device::{file_renderer, renderer};
+use engine::ortho::{Map, MapRequest};
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{Rendering, Trainer};
 

@@ -7,8 +7,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use config::geodesy::Geodetic;
-use runtime::report::{Craft, ReportData};
-use runtime::watch::{Server, Token, Watch, parse};
+use pages::report::{Craft, ReportData};
+use pages::watch::{Server, Token, Watch, parse};
 
 const PATIENCE: Duration = Duration::from_secs(20);
 const TOKEN: &str = "a-token-of-32-characters-or-so~~";

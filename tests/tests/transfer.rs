@@ -5,7 +5,7 @@
 use models::camera::View;
 use models::dataset::{Dataset, PoseSource};
 use models::refine::Refiner;
-use runtime::transfer::PoseTransfer;
+use engine::transfer::PoseTransfer;
 
 #[path = "../shared_data.rs"]
 mod shared_data;

@@ -12,11 +12,11 @@ use vulkan::trainer::{Rendering, Trainer};
 
 use super::region::Region;
 
-use crate::engine::device::renderer;
+use engine::device::renderer;
 use crate::error::JobError;
-use crate::evaluate::{IntoModel, Perceptual, Scores, evaluate, open_metric};
-use crate::report::{Comparison, ReportData};
-use crate::transfer::stem;
+use engine::evaluate::{IntoModel, Perceptual, Scores, evaluate, open_metric};
+use pages::report::{Comparison, ReportData};
+use engine::transfer::stem;
 
 /// A global model this much worse than a local one on its own ground is worth a warning, dB.
 const WORTH_A_WARNING_DB: f64 = 0.3;
@@ -180,7 +180,7 @@ pub fn add_to(data: &mut ReportData, held: Vec<Held>) {
             Some(table) => table.rows.push(row),
             None => data.tables.insert(
                 0,
-                crate::report::Table {
+                pages::report::Table {
                     title: TABLE.into(),
                     note: format!(
                         "Each picture counts for the aircraft with the nearest training view; the last three columns are of those \
@@ -210,7 +210,7 @@ mod tests {
     use glam::{DVec2, DVec3};
 
     use super::*;
-    use crate::evaluate::ViewScore;
+    use engine::evaluate::ViewScore;
 
     #[test]
     fn pictures_near_a_border_are_those_in_or_beside_anothers_region() {

@@ -23,7 +23,7 @@ use super::block::Block;
 use super::merge::{Merged, opacity};
 use super::plan::Recipe;
 use super::seam::Seams;
-use crate::engine::device::DeviceRequest;
+use engine::device::DeviceRequest;
 use lesson::{Errors, Lesson, choose, draw, psnr};
 
 pub use lesson::psnr_of;

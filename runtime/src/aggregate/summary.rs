@@ -1,6 +1,6 @@
 //! An aggregation as `run.json` and as a report.
 
-use crate::report::{Comparison, MapRegion, ModelRow, ReportData, Table, Timing, count};
+use pages::report::{Comparison, MapRegion, ModelRow, ReportData, Table, Timing, count};
 use job::run_json::RunReport;
 
 use super::Outcome;

@@ -1,9 +1,7 @@
-//! Small clouds, models and cameras for tests.
+//! Small models for tests, and merges of them.
 
 use std::path::{Path, PathBuf};
 
-use glam::{DQuat, DVec3};
-use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
 
@@ -16,22 +14,7 @@ use super::merge::{Merged, merge};
 use super::plan::Plan;
 use super::planning::{lay_out, plan, publish};
 use super::store::Store;
-
-/// A grid of flat round Gaussians on z = 0, coloured by place.
-pub fn carpet(low: [f64; 2], high: [f64; 2], spacing: f64) -> GaussianCloud {
-    let count = |k: usize| ((high[k] - low[k]) / spacing).round() as usize;
-    let mut cloud = GaussianCloud::with_capacity(0, count(0) * count(1));
-    let s = (0.5 * spacing as f32).ln();
-    for v in 0..count(1) {
-        for u in 0..count(0) {
-            let at = |k: usize, i: usize| (low[k] + (i as f64 + 0.5) * spacing) as f32;
-            let (x, y) = (at(0, u), at(1, v));
-            let sh = [(0.5 * x).sin(), (0.4 * y).cos(), (0.2 * (x + y)).sin()];
-            cloud.push([x, y, 0.0], [s, s, s - 3.0], [1.0, 0.0, 0.0, 0.0], 3.0, &sh);
-        }
-    }
-    cloud
-}
+pub use crate::carpet::{carpet, nadir};
 
 /// A model with a region and no views.
 pub fn model(name: &str, region: &[[f64; 2]], cloud: GaussianCloud) -> LocalModel {
@@ -79,13 +62,5 @@ pub fn merged(members: &mut [Member], budget: usize) -> Merged {
         [] => Merged::default(),
         [cell] => merge(&Block::new(&plan.inputs(cell), &store)).expect("merged"),
         more => panic!("{} squares", more.len()),
-    }
-}
-
-/// A 64 × 48 camera looking straight down.
-pub fn nadir(x: f64, y: f64, height: f64) -> View {
-    View {
-        intrinsics: Intrinsics { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 },
-        pose: Pose { rotation: DQuat::from_rotation_x(std::f64::consts::PI), center: DVec3::new(x, y, height) },
     }
 }

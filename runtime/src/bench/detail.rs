@@ -8,9 +8,9 @@ use models::formats::{model, write_atomic};
 use serde::Serialize;
 
 use super::child;
-use crate::engine::device::renderer;
+use engine::device::renderer;
 use crate::error::JobError;
-use crate::evaluate::{IntoModel, Scores, evaluate};
+use engine::evaluate::{IntoModel, Scores, evaluate};
 
 /// One way to train.
 #[derive(Clone, Debug, Serialize)]

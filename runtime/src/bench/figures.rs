@@ -1,4 +1,4 @@
-//! One table, four ways out: Markdown on standard output, CSV, JSON and (through [`crate::report`]) HTML.
+//! One table, four ways out: Markdown on standard output, CSV, JSON and (through [`pages::report`]) HTML.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use models::formats::write_atomic;
 use serde::Serialize;
 
 use crate::error::JobError;
-use crate::report::Table;
+use pages::report::Table;
 
 /// The table as GitHub writes tables: first column text, the others right-aligned figures.
 pub fn markdown(table: &Table) -> String {

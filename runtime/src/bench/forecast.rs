@@ -8,12 +8,12 @@ use vulkan::shape::KernelShape;
 use super::device::SIZES;
 use super::figures::short;
 use super::stages::{Scene, measure as measure_stages};
-use crate::cost::loads::{Footprint, Sight};
-use crate::cost::model::{CostModel, load};
-use crate::cost::synthetic::IN_VIEW;
-use crate::cost::{measure, threads};
+use engine::cost::loads::{Footprint, Sight};
+use engine::cost::model::{CostModel, load};
+use engine::cost::synthetic::IN_VIEW;
+use engine::cost::{measure, threads};
 use crate::error::JobError;
-use crate::report::Table;
+use pages::report::Table;
 
 /// One size.
 #[derive(Clone, Debug, Serialize)]

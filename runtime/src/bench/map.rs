@@ -14,10 +14,10 @@ use models::ortho::grid::{Block, Grid};
 use serde::Serialize;
 
 use super::{child, world};
-use crate::engine::device::map_renderer;
+use engine::device::map_renderer;
 use crate::error::JobError;
-use crate::evaluate::heights::HeightScores;
-use crate::ortho::{DrawnBlock, Map, MapRequest};
+use engine::evaluate::heights::HeightScores;
+use engine::ortho::{DrawnBlock, Map, MapRequest};
 
 /// Roofs and ground within so many pixels of a step in height are left out of the figures: there, half a pixel aside is
 /// metres up or down.

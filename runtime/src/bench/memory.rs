@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::child;
 use super::figures::short;
 use crate::error::JobError;
-use crate::report::{Table, bytes, count};
+use pages::report::{Table, bytes, count};
 
 /// How every budget is trained.
 #[derive(Clone, Debug)]

@@ -17,12 +17,12 @@ use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::frustum::{Frustum, mean, reach};
 use super::levels::{SPACING_M, write_scene};
-use crate::cost::synthetic::picture;
-use crate::engine::device::DeviceRequest;
-use crate::engine::host::{HostPlan, HostRequest};
-use crate::engine::{model_path, pieces};
+use engine::cost::synthetic::picture;
+use engine::device::DeviceRequest;
+use engine::host::{HostPlan, HostRequest};
+use engine::{model_path, pieces};
 use crate::error::JobError;
-use crate::evaluate::save_png;
+use engine::evaluate::save_png;
 use job::resources::peak_rss_bytes;
 
 /// Training pictures and pictures drawn, and their focal length, pixels.

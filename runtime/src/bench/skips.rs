@@ -11,7 +11,7 @@ use super::child;
 use super::figures::{short, write_text};
 use crate::capture::KeyframeSelector;
 use crate::error::JobError;
-use crate::report::Table;
+use pages::report::Table;
 
 /// A skip that saves less than this share of the time …
 pub const LEAST_SAVING: f64 = 0.02;

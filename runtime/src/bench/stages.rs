@@ -15,13 +15,13 @@ use vulkan::stages::work::{Load, work};
 use vulkan::stages::{STAGE_NAMES, STAGES};
 
 use super::figures::short;
-use crate::cost::measure::{Stopwatch, settings};
-use crate::cost::model::{SH_DEGREE, Sample};
-use crate::cost::slopes::{DRIVERS, Driver, Line, fit};
-use crate::cost::synthetic;
-use crate::engine::device::DeviceRequest;
+use engine::cost::measure::{Stopwatch, settings};
+use engine::cost::model::{SH_DEGREE, Sample};
+use engine::cost::slopes::{DRIVERS, Driver, Line, fit};
+use engine::cost::synthetic;
+use engine::device::DeviceRequest;
 use crate::error::JobError;
-use crate::report::Table;
+use pages::report::Table;
 
 /// Steps before the measured ones: the first compiles the kernels, the second finds the number of counting rounds.
 const WARM_UP: u32 = 3;

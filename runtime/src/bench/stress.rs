@@ -4,7 +4,7 @@ use serde::Serialize;
 use vulkan::cases::{CASES, ELSEWHERE, Outcome, extremes};
 use vulkan::gpu::Gpu;
 
-use crate::report::Table;
+use pages::report::Table;
 
 /// One case on one path.
 #[derive(Clone, Debug, Serialize)]

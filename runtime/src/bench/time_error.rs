@@ -9,8 +9,8 @@ use super::child;
 use super::figures::short;
 use super::front::{Group, Speedup, mark_front, speedup};
 use crate::error::JobError;
-use crate::report::chart::{Chart, ChartPoint, Series};
-use crate::report::{Table, count};
+use pages::report::chart::{Chart, ChartPoint, Series};
+use pages::report::{Table, count};
 use job::run_json::RunReport;
 
 /// What to measure.

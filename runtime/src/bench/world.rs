@@ -9,7 +9,7 @@ use models::formats::transforms::pose_to_opengl;
 
 use super::figures::write_json;
 use crate::error::JobError;
-use crate::evaluate::save_png;
+use engine::evaluate::save_png;
 
 /// Height of flight above the world's zero, metres.
 const HEIGHT_M: f64 = 42.0;

@@ -12,7 +12,7 @@ use crate::aggregate::member::Member;
 use crate::aggregate::{self, LocalModel, Outcome, summary};
 use crate::cli::output::outln;
 use job::interrupt::Interrupt;
-use crate::report::{REPORT, ReportData};
+use pages::report::{REPORT, ReportData};
 use job::run_json::RunReport;
 
 use super::CliError;

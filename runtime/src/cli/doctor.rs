@@ -14,10 +14,11 @@ use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::cost::loads::{Footprint, Sight};
-use crate::kernels::{self, Source};
+use engine::cost::loads::{Footprint, Sight};
+use engine::kernels::{self, Source};
 use job::resources;
-use crate::{cost, devices};
+use engine::cost;
+use engine::devices;
 
 mod trust;
 

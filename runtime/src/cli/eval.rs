@@ -11,10 +11,10 @@ use serde::Serialize;
 use super::CliError;
 use super::plan::largest;
 use crate::cli::output::outln;
-use crate::engine::device::{file_renderer, map_renderer};
-use crate::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
-use crate::ortho::{Map, MapRequest};
-use crate::transfer::stem;
+use engine::device::{file_renderer, map_renderer};
+use engine::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
+use engine::ortho::{Map, MapRequest};
+use engine::transfer::stem;
 
 /// Arguments of `dgtr eval`.
 #[derive(Debug, clap::Args)]

@@ -18,7 +18,7 @@ use models::ortho::georef::{FROM_Y_UP, Georef, shifted};
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::viewer::{self, ViewerRequest};
+use pages::viewer::{self, ViewerRequest};
 
 /// Formats that can be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

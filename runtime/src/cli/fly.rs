@@ -9,17 +9,17 @@ use config::mission::Mission;
 use super::CliError;
 use super::http::HttpArgs;
 use crate::cli::output::outln;
-use crate::engine::device::training_lens;
+use engine::device::training_lens;
 use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
 use job::interrupt::Interrupt;
-use crate::ortho::keep_scratch_in;
-use crate::preset;
-use crate::report::{REPORT, ReportData, Timing, count, seconds};
+use engine::ortho::keep_scratch_in;
+use engine::preset;
+use pages::report::{REPORT, ReportData, Timing, count, seconds};
 use job::resources::return_freed_memory;
 use job::run_json::RunReport;
 use job::service::Supervisor;
 use job::session::{Owner, Session};
-use crate::watch::Watch;
+use pages::watch::Watch;
 
 /// Reads pose and triggers from the autopilot and pictures from the camera, and builds the model while flying.
 #[derive(Debug, clap::Args)]

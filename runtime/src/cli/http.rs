@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use config::http::HttpSettings;
 
 use super::CliError;
-use crate::watch::{Server, Token, Watch};
+use pages::watch::{Server, Token, Watch};
 
 /// The live page.
 #[derive(Debug, clap::Args)]

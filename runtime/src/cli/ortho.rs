@@ -6,9 +6,9 @@ use config::disk::Disk;
 use models::formats::model::Chunks;
 
 use super::CliError;
-use crate::engine::device::map_renderer;
+use engine::device::map_renderer;
 use crate::error::JobError;
-use crate::ortho::{Map, MapRequest, keep_scratch_in};
+use engine::ortho::{Map, MapRequest, keep_scratch_in};
 use job::console;
 use job::interrupt;
 

@@ -14,11 +14,11 @@ use vulkan::gpu::GpuInfo;
 
 use super::CliError;
 use crate::cli::output::{out, outln};
-use crate::devices;
-use crate::engine::device::DeviceRequest;
-use crate::engine::scratch_bytes;
+use engine::devices;
+use engine::device::DeviceRequest;
+use engine::scratch_bytes;
 use crate::fly::delivered_bytes;
-use crate::preset;
+use engine::preset;
 use job::service::limits::{DeviceMemory, ServiceLimits};
 
 /// Arguments of `dgtr plan`.

@@ -10,9 +10,9 @@ use models::metrics::to_rgb8;
 use vulkan::trainer::Rendering;
 
 use super::CliError;
-use crate::engine::device::file_renderer;
-use crate::evaluate::save_png;
-use crate::transfer::stem;
+use engine::device::file_renderer;
+use engine::evaluate::save_png;
+use engine::transfer::stem;
 use job::console;
 use job::interrupt;
 

@@ -19,7 +19,7 @@ use serde::Deserialize;
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::engine::InitKind;
+use engine::InitKind;
 use crate::train_job::{TrainJob, log};
 
 /// A settings file has a few KiB.

@@ -9,10 +9,10 @@ use models::formats::model;
 use super::evaluate::Figures;
 use super::processes::Process;
 use super::{AIRCRAFT, DemoError, DemoOptions};
-use crate::report::ground::{Ortho, Shot};
-use crate::report::{Comparison, MapRegion, ModelRow, REPORT, ReportData, Table, Timing, bytes};
+use pages::report::ground::{Ortho, Shot};
+use pages::report::{Comparison, MapRegion, ModelRow, REPORT, ReportData, Table, Timing, bytes};
 use job::run_json::RunReport;
-use crate::transfer::stem;
+use engine::transfer::stem;
 
 /// Views shown per aircraft.
 const SHOWN: usize = 2;

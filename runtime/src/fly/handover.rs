@@ -15,7 +15,7 @@ use image::RgbImage;
 use models::camera::{Pose, PosedImage};
 use models::picture::mask::Mask;
 
-use crate::engine::PictureSource;
+use engine::PictureSource;
 use crate::error::JobError;
 use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 

@@ -25,7 +25,7 @@ use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::coverage::Coverage;
 use crate::error::JobError;
 use crate::keyframe_store::KeyFrame;
-use crate::watch::Watch;
+use pages::watch::Watch;
 
 mod ground;
 mod station;

@@ -15,7 +15,7 @@ use vulkan::trainer::RunBudget;
 
 use super::fault_table::ORIGIN;
 use super::rehearsal::{Ledger, Promise, intrinsics};
-use crate::engine::{Reconstruct, model_path};
+use engine::{Reconstruct, model_path};
 use crate::keyframe_store::KeyFrame;
 use job::session::{Owner, Session};
 

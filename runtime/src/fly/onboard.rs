@@ -13,14 +13,14 @@ use vulkan::trainer::{RunBudget, StepReport};
 
 use super::handover::Handover;
 use super::show::ShownJob;
-use crate::engine::{PictureSource, Reconstruct, model_path};
+use engine::{PictureSource, Reconstruct, model_path};
 use crate::error::JobError;
-use crate::failsafe::Failsafe;
+use engine::failsafe::Failsafe;
 use job::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
 use job::service::Supervisor;
 use uplink::Offerer;
-use crate::watch::Watch;
+use pages::watch::Watch;
 
 mod landing;
 

@@ -23,8 +23,8 @@ use models::camera::Pose;
 use serde_json::{Value, json};
 
 use super::handover::Told;
-use crate::report::craft::Thumbnail;
-use crate::report::picture;
+use pages::report::craft::Thumbnail;
+use pages::report::picture;
 
 mod mcap;
 mod schemas;

@@ -31,17 +31,17 @@ use super::intake::Intake;
 use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::onboard::Job;
 use super::record::Recorder;
-use crate::engine::{Reconstruct, model_path};
+use engine::{Reconstruct, model_path};
 use crate::error::JobError;
-use crate::failsafe::Failsafe;
+use engine::failsafe::Failsafe;
 use job::health::Health;
 use job::interrupt::Interrupt;
 use crate::keyframe_store::KeyframeStore;
-use crate::report::{Craft, ReportData};
+use pages::report::{Craft, ReportData};
 use job::service::Supervisor;
 use uplink::keys::Identity;
 use uplink::{Offerer, Source};
-use crate::watch::Watch;
+use pages::watch::Watch;
 
 /// Time between two turns; one training step is taken in each.
 const TURN_NS: u64 = 20_000_000;

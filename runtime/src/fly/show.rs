@@ -9,8 +9,8 @@ use models::coverage::CoverageMap;
 use vulkan::trainer::StepReport;
 
 use crate::coverage::Coverage;
-use crate::report::ground::Shot;
-use crate::watch::Watch;
+use pages::report::ground::Shot;
+use pages::watch::Watch;
 
 /// Between two looks at the squares of ground: some milliseconds each on a small board.
 const SURVEY_EVERY_NS: u64 = 2_000_000_000;

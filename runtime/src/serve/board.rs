@@ -9,9 +9,9 @@ use models::coverage::{CoverageMap, Region};
 use models::formats::model::{self, ModelHeader};
 
 use super::{Progress, Received};
-use crate::report::Thumbnail;
-use crate::report::ground::Shot;
-use crate::watch::Watch;
+use pages::report::Thumbnail;
+use pages::report::ground::Shot;
+use pages::watch::Watch;
 
 /// Which file was looked at last.
 type Seen = Option<(SystemTime, u64)>;

@@ -14,10 +14,10 @@ use models::formats::transforms;
 use models::refine::Refiner;
 
 use job::console::Progress;
-use crate::engine::host::settling_bytes;
-use crate::engine::{matching_file_bytes, waiting_file};
+use engine::host::settling_bytes;
+use engine::{matching_file_bytes, waiting_file};
 use crate::error::JobError;
-use crate::evaluate::surveyed;
+use engine::evaluate::surveyed;
 
 mod control;
 

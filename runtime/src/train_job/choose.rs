@@ -6,11 +6,13 @@ use models::dataset::Dataset;
 
 use super::TrainJob;
 use super::scale::largest;
-use crate::engine::device::DeviceRequest;
-use crate::engine::energy::{Meter, shorter};
+use engine::device::DeviceRequest;
+use engine::energy::{Meter, shorter};
 use crate::error::JobError;
-use crate::preset::{Choice, Room, Wanted, most_side, shown};
-use crate::{cost, devices, kernels};
+use engine::preset::{Choice, Room, Wanted, most_side, shown};
+use engine::cost;
+use engine::devices;
+use engine::kernels;
 
 /// Points and pictures that are looked at for the share of a scene that a picture shows, at the most; and the least of points that says
 /// something.

@@ -5,7 +5,7 @@ use std::path::Path;
 use models::dataset::Dataset;
 use models::formats::model::Chunks;
 
-use crate::engine::model_path;
+use engine::model_path;
 use crate::error::JobError;
 
 /// Opens the model `from`. It is read once more, piece by piece, when it is trained, and must still be there then.

@@ -4,9 +4,9 @@ use config::plan::{Lanes, Plan, WORKING_SIDE};
 use models::dataset::{Dataset, scaled};
 
 use super::TrainJob;
-use crate::engine::device::DeviceRequest;
+use engine::device::DeviceRequest;
 use crate::error::JobError;
-use crate::preset::SCALES;
+use engine::preset::SCALES;
 
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;

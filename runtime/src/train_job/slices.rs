@@ -8,9 +8,9 @@ use hal::traits::Clock;
 use vulkan::trainer::{RunBudget, StopReason};
 
 use job::console::Progress;
-use crate::engine::Reconstruct;
+use engine::Reconstruct;
 use crate::error::JobError;
-use crate::failsafe::Failsafe;
+use engine::failsafe::Failsafe;
 use job::interrupt::Interrupt;
 
 /// While training rests, its cause is looked at this often.

@@ -3,9 +3,9 @@
 use models::camera::View;
 use models::dataset::{Dataset, scaled};
 
-use crate::engine::Reconstruction;
+use engine::Reconstruction;
 use crate::error::JobError;
-use crate::evaluate::surveyed;
+use engine::evaluate::surveyed;
 
 /// How far the model's renderings put a card's surveyed points off, those that held its poses and those that did not.
 ///

@@ -9,7 +9,7 @@ use config::mission::CameraSettings;
 use hal::camera::Picture;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use runtime::aggregate::register::edge::{Edges, Fitted};
-use runtime::kernels::cache;
+use engine::kernels::cache;
 use runtime::keyframe_store::{KeyFrame, KeyframeStore};
 use uplink::keys;
 use job::run_json::RunReport;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use models::metrics::to_rgb8;
-use runtime::evaluate::save_png;
+use engine::evaluate::save_png;
 
 /// Picture size and focal length, pixels.
 pub const SIZE: (u32, u32) = (192, 144);

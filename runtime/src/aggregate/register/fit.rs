@@ -17,7 +17,7 @@ use super::graph::TILT_RAD;
 use super::{Fitter, POINTS_ALIKE, SCALE_BY_GPS, SCALE_BY_NOTHING};
 use crate::aggregate::frame::Motion;
 use crate::aggregate::member::Member;
-use crate::engine::device::renderer;
+use engine::device::renderer;
 
 /// Views of one model that are looked at through the other.
 const VIEWS: usize = 12;

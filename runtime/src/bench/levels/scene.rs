@@ -11,7 +11,7 @@ use models::levels::Rows;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::bench::frustum::{Frustum, mean, reach};
-use crate::engine::device::renderer_of_parts;
+use engine::device::renderer_of_parts;
 use crate::error::JobError;
 
 /// Gaussians that are drawn at once.

@@ -12,7 +12,7 @@ use models::formats::model::{self, ModelHeader};
 use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, RunBudget, StopReason, Trainer};
 
-use crate::engine::device::DeviceRequest;
+use engine::device::DeviceRequest;
 use crate::error::JobError;
 
 /// Rate of the opacity logits.

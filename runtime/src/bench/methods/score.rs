@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::territory::Territory;
 use crate::aggregate::region::Region;
-use crate::evaluate::{Scores, ViewScore};
+use engine::evaluate::{Scores, ViewScore};
 
 /// A picture whose middle shows ground no farther from another region shows a seam, metres (as `dgtr aggregate --compare` has it).
 const NEAR_M: f64 = 10.0;

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use super::super::figures::write_json;
 use super::data::write_points;
 use crate::error::JobError;
-use crate::evaluate::save_png;
+use engine::evaluate::save_png;
 
 /// Aircraft that fly at least and at most: the depths of all pictures are in memory together.
 pub const AIRCRAFT: std::ops::RangeInclusive<usize> = 2..=24;

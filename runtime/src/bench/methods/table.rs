@@ -4,7 +4,7 @@ use super::presets::Method;
 use super::score::Means;
 use super::{Comparison, MethodResult};
 use crate::bench::figures::short;
-use crate::report::{Table, count};
+use pages::report::{Table, count};
 
 const NONE: &str = "–";
 const MB: f64 = 1e6;

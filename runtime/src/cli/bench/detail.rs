@@ -9,7 +9,7 @@ use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::world;
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::report::Table;
+use pages::report::Table;
 
 /// How much larger than the survey of the other benchmarks the pictures of this one are: 2,400 × 1,800 pixels.
 const LARGER: f64 = 7.5;

@@ -7,7 +7,7 @@ use crate::bench::device::{Extent, SIZES, measure};
 use crate::bench::figures::{markdown, write_json};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::report::Table;
+use pages::report::Table;
 
 /// Arguments of `dgtr bench device`.
 #[derive(Debug, clap::Args)]

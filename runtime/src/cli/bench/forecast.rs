@@ -9,7 +9,7 @@ use crate::bench::figures::{markdown, write_json};
 use crate::bench::forecast::{measured, table};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::kernels;
+use engine::kernels;
 
 /// Arguments of `dgtr bench forecast`.
 #[derive(Debug, clap::Args)]

@@ -6,7 +6,7 @@ use crate::bench::figures::{markdown, write_json};
 use crate::bench::ground::{field::Field, measure};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::report::{Table, count};
+use pages::report::{Table, count};
 
 /// Arguments of `dgtr bench ground`.
 #[derive(Debug, clap::Args)]

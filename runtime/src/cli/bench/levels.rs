@@ -7,7 +7,7 @@ use crate::bench::levels::{FARTHER, measure, write_scene};
 use crate::cli::CliError;
 use crate::cli::output::outln;
 use crate::error::JobError;
-use crate::report::Table;
+use pages::report::Table;
 
 /// Arguments of `dgtr bench levels`.
 #[derive(Debug, clap::Args)]

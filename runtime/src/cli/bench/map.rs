@@ -6,9 +6,9 @@ use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::map::measure;
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::evaluate::heights::HeightScores;
-use crate::ortho::MapRequest;
-use crate::report::Table;
+use engine::evaluate::heights::HeightScores;
+use engine::ortho::MapRequest;
+use pages::report::Table;
 
 /// Arguments of `dgtr bench map`.
 #[derive(Debug, clap::Args)]

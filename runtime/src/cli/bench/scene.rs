@@ -7,7 +7,7 @@ use crate::bench::scene::{Figures, Request, measure};
 use crate::cli::CliError;
 use crate::cli::output::outln;
 use crate::error::JobError;
-use crate::report::{Table, bytes, count};
+use pages::report::{Table, bytes, count};
 
 /// Arguments of `dgtr bench scene`.
 #[derive(Debug, clap::Args)]

@@ -9,8 +9,8 @@ use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::stages::{Scene, SizeFigures, growth, growth_table, measure, overview_table, size_table};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::kernels;
-use crate::report::Table;
+use engine::kernels;
+use pages::report::Table;
 
 /// Arguments of `dgtr bench stages`.
 #[derive(Debug, clap::Args)]

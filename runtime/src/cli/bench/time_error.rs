@@ -7,7 +7,7 @@ use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::time_error::{Request, chart, groups, measure, points_table, speedups, table};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use crate::report::{ReportData, Table};
+use pages::report::{ReportData, Table};
 
 /// Arguments of `dgtr bench time-error`.
 #[derive(Debug, clap::Args)]

@@ -8,7 +8,7 @@ use hal::traits::Clock;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::{CHECKPOINT_EVERY_NS, Handover, Job, JobEnd};
-use crate::engine::{Reconstruct, model_path};
+use engine::{Reconstruct, model_path};
 use crate::error::JobError;
 use crate::fly::intake::FlightCounters;
 use crate::fly::shortage::likely_cause;

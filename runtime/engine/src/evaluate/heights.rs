@@ -1,0 +1,142 @@
+//! Heights of a model's map against points whose height is known.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use glam::{DQuat, DVec2, DVec3};
+use models::camera::Pose;
+use models::dataset::Dataset;
+use models::formats::model::ModelHeader;
+use models::ortho::check_points;
+use models::ortho::files::NO_HEIGHT;
+use models::ortho::grid::{BLOCK, Block};
+use models::ortho::height_raster;
+use serde::Serialize;
+use vulkan::trainer::Trainer;
+
+use crate::error::EngineError;
+use crate::ortho::{DrawnBlock, Map};
+use crate::transfer::PoseTransfer;
+
+/// Pictures that a triangulated point must be seen in to be a reference.
+const LEAST_TRACK: usize = 3;
+
+/// How far a map's heights are off, metres; positive where the map is too high.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct HeightScores {
+    /// Points on the map.
+    pub points: usize,
+    /// Points beside it, or where it has no height.
+    pub missing: usize,
+    /// Mean error.
+    pub bias_m: f64,
+    /// Root mean square.
+    pub rmse_m: f64,
+    /// Median of the sizes.
+    pub median_abs_m: f64,
+    /// 90 % are no farther off.
+    pub le90_m: f64,
+}
+
+/// The points of a reference in the model's frame: a file of surveyed points, a raster of heights where `map` has ground, or a data
+/// set's folder, whose triangulated points are carried along with its poses.
+///
+/// # Errors
+/// The reference cannot be read or holds no point.
+pub fn reference(path: &Path, header: &ModelHeader, map: &Map) -> Result<Vec<DVec3>, EngineError> {
+    let is_raster = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("tif") || e.eq_ignore_ascii_case("tiff"));
+    let points = match path.is_dir() {
+        true => sparse_points(path, header)?,
+        false if is_raster => height_raster::read(path, header.origin, map.grid().bounds()?)?,
+        false => check_points::read(path, header.origin)?,
+    };
+    match points.is_empty() {
+        true => Err(EngineError::Request(format!("{}: holds no points to compare heights with", path.display()))),
+        false => Ok(points),
+    }
+}
+
+fn sparse_points(folder: &Path, header: &ModelHeader) -> Result<Vec<DVec3>, EngineError> {
+    let set = Dataset::open(folder)?;
+    let transfer = PoseTransfer::between(&set, &header.views);
+    let carried = |p: [f64; 3]| {
+        let there = Pose { rotation: DQuat::IDENTITY, center: DVec3::from(p) };
+        transfer.apply(&there).center
+    };
+    let points = set.sparse_points()?;
+    let known = points.iter().filter(|p| p.frames.is_empty() || p.frames.len() >= LEAST_TRACK);
+    Ok(known.map(|p| carried(p.position)).collect())
+}
+
+/// Draws the blocks of `map` that hold points and compares.
+///
+/// # Errors
+/// The device fails.
+pub fn compare(map: &Map, trainer: &mut Trainer, points: &[DVec3]) -> Result<HeightScores, EngineError> {
+    let grid = map.grid();
+    let [columns, rows] = grid.size();
+    let mut by_block: BTreeMap<[u32; 2], Vec<(DVec2, f64)>> = BTreeMap::new();
+    let mut missing = 0;
+    for point in points {
+        let at = grid.crs().to_map(*point)?;
+        let pixel = grid.pixel(at.truncate());
+        match pixel.cmpge(DVec2::ZERO).all() && pixel.x < f64::from(columns) && pixel.y < f64::from(rows) {
+            true => by_block.entry([pixel.x as u32 / BLOCK, pixel.y as u32 / BLOCK]).or_default().push((pixel, at.z)),
+            false => missing += 1,
+        }
+    }
+    let (mut drawn, mut errors) = (DrawnBlock::default(), Vec::with_capacity(points.len()));
+    for ([i, j], points) in by_block {
+        let (x, y) = (i * BLOCK, j * BLOCK);
+        let block = Block { x, y, width: BLOCK.min(columns - x), height: BLOCK.min(rows - y) };
+        if !map.draw(trainer, block, &mut drawn)? {
+            missing += points.len();
+            continue;
+        }
+        for (pixel, height) in points {
+            let at = (pixel.y as u32 - y) * block.width + (pixel.x as u32 - x);
+            match drawn.heights[at as usize] {
+                NO_HEIGHT => missing += 1,
+                drawn => errors.push(f64::from(drawn) - height),
+            }
+        }
+    }
+    Ok(HeightScores::of(&errors, missing))
+}
+
+impl HeightScores {
+    /// Of errors in metres, and the number of points without one.
+    pub fn of(errors: &[f64], missing: usize) -> Self {
+        if errors.is_empty() {
+            return Self { missing, ..Self::default() };
+        }
+        let n = errors.len() as f64;
+        let mut sizes: Vec<f64> = errors.iter().map(|e| e.abs()).collect();
+        sizes.sort_by(f64::total_cmp);
+        let quantile = |share: f64| sizes[((sizes.len() - 1) as f64 * share).round() as usize];
+        Self {
+            points: errors.len(),
+            missing,
+            bias_m: errors.iter().sum::<f64>() / n,
+            rmse_m: (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt(),
+            median_abs_m: quantile(0.5),
+            le90_m: quantile(0.9),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_figures_are_those_of_the_errors() {
+        let errors: Vec<f64> = (0..=100).map(|i| f64::from(i) / 100.0 - 0.25).collect();
+        let s = HeightScores::of(&errors, 7);
+        assert_eq!((s.points, s.missing), (101, 7));
+        assert!((s.bias_m - 0.25).abs() < 1e-12, "{s:?}");
+        assert!((s.rmse_m - (0.0625f64 + 0.085).sqrt()).abs() < 1e-9, "{s:?}");
+        assert!((s.median_abs_m - 0.26).abs() < 0.02 && (s.le90_m - 0.65).abs() < 0.011, "{s:?}");
+        assert_eq!(HeightScores::of(&[], 3), HeightScores { missing: 3, ..Default::default() });
+    }
+}
