@@ -16,7 +16,7 @@ use models::refine::RefineError;
 use vulkan::gpu::GpuError;
 use vulkan::trainer::TrainError;
 
-use crate::keyframe_store::StoreError;
+use flight::keyframe_store::StoreError;
 use pages::report::ReportError;
 use uplink::UploadError;
 

@@ -11,4 +11,4 @@ pub mod session;
 pub mod trace;
 
 /// The crates of this workspace, by the targets of their log lines.
-pub const CRATES: [&str; 9] = ["runtime", "engine", "job", "pages", "uplink", "vulkan", "models", "hal", "config"];
+pub const CRATES: [&str; 10] = ["runtime", "engine", "flight", "job", "pages", "uplink", "vulkan", "models", "hal", "config"];

@@ -9,7 +9,7 @@ use toml::{Table as Toml, Value};
 
 use super::child;
 use super::figures::{short, write_text};
-use crate::capture::KeyframeSelector;
+use flight::capture::KeyframeSelector;
 use crate::error::JobError;
 use pages::report::Table;
 

@@ -10,7 +10,7 @@ use super::CliError;
 use super::http::HttpArgs;
 use crate::cli::output::outln;
 use engine::device::training_lens;
-use crate::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
+use flight::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
 use job::interrupt::Interrupt;
 use engine::ortho::keep_scratch_in;
 use engine::preset;

@@ -17,7 +17,7 @@ use crate::cli::output::{out, outln};
 use engine::devices;
 use engine::device::DeviceRequest;
 use engine::scratch_bytes;
-use crate::fly::delivered_bytes;
+use flight::fly::delivered_bytes;
 use engine::preset;
 use job::service::limits::{DeviceMemory, ServiceLimits};
 

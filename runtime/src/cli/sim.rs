@@ -19,7 +19,7 @@ mod card;
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::coverage::route;
+use flight::coverage::route;
 use job::interrupt::Interrupt;
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in

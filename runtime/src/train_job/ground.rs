@@ -7,7 +7,7 @@ use models::camera::View;
 use models::coverage::{CoverageMap, Heights, Region, hull};
 use models::formats::model::ModelHeader;
 
-use crate::coverage::Coverage;
+use flight::coverage::Coverage;
 
 /// Pictures that look down by less than this per unit of length (15° below the horizon) show a thing, not the ground.
 const DOWN: f64 = 0.25;

@@ -10,7 +10,7 @@ use hal::camera::Picture;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use runtime::aggregate::register::edge::{Edges, Fitted};
 use engine::kernels::cache;
-use runtime::keyframe_store::{KeyFrame, KeyframeStore};
+use flight::keyframe_store::{KeyFrame, KeyframeStore};
 use uplink::keys;
 use job::run_json::RunReport;
 use job::session::{Owner, Session};

@@ -9,7 +9,7 @@ use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::{CHECKPOINT_EVERY_NS, Handover, Job, JobEnd};
 use engine::{Reconstruct, model_path};
-use crate::error::JobError;
+use crate::error::FlightError;
 use crate::fly::intake::FlightCounters;
 use crate::fly::shortage::likely_cause;
 use job::interrupt::Interrupt;
@@ -24,7 +24,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         capture: &mut Handover,
         flight: &FlightCounters,
         interrupt: &Interrupt,
-    ) -> Result<JobEnd<R>, JobError> {
+    ) -> Result<JobEnd<R>, FlightError> {
         if !self.training_failed {
             let finished = self.finish_schedule(capture, interrupt);
             self.survive(finished)?;
@@ -44,7 +44,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
         if !self.reconstruction.has_model() {
             let keyframes = self.reconstruction.keyframes();
-            return Err(JobError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
+            return Err(FlightError::TooFewKeyframes { keyframes, cause: likely_cause(flight) });
         }
         let state = self.failsafe.state();
         let spared = state.forbids_training();
@@ -75,7 +75,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         Ok(JobEnd { reconstruction, offerer, supervisor, model, gaussians, finished })
     }
 
-    fn finish_schedule(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
+    fn finish_schedule(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), FlightError> {
         self.reconstruction.land();
         if self.reconstruction.wants_build(true) && !interrupt.requested() {
             self.build(capture)?;

@@ -14,7 +14,8 @@ use vulkan::trainer::{RunBudget, StepReport};
 use super::handover::Handover;
 use super::show::ShownJob;
 use engine::{PictureSource, Reconstruct, model_path};
-use crate::error::JobError;
+use crate::error::FlightError;
+use engine::error::EngineError;
 use engine::failsafe::Failsafe;
 use job::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
@@ -133,7 +134,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// One turn in flight; false when capture is over and everything it handed over is taken.
-    pub(super) fn turn(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<bool, JobError> {
+    pub(super) fn turn(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<bool, FlightError> {
         self.supervisor.alive();
         if interrupt.requested() {
             self.supervisor.stopping();
@@ -156,7 +157,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         Ok(true)
     }
 
-    fn reconstruct(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
+    fn reconstruct(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), FlightError> {
         if capture.earlier_left() == 0 && self.reconstruction.wants_build(false) {
             self.build(capture)?;
         } else if self.reconstruction.wants_growth() {
@@ -166,9 +167,9 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// A device that fails in flight must not end the capture: once there is a checkpoint, it is offered instead.
-    fn survive(&mut self, worked: Result<(), JobError>) -> Result<(), JobError> {
+    fn survive(&mut self, worked: Result<(), FlightError>) -> Result<(), FlightError> {
         match worked {
-            Err(JobError::Train(e)) if model_path(&self.out).is_file() => {
+            Err(FlightError::Engine(EngineError::Train(e))) if model_path(&self.out).is_file() => {
                 tracing::error!("{e}; training is over, the last checkpoint is kept");
                 self.training_failed = true;
                 self.offerer.offer_urgently(&model_path(&self.out));
@@ -178,7 +179,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
     }
 
-    fn take(&mut self, capture: &mut Handover) -> Result<bool, JobError> {
+    fn take(&mut self, capture: &mut Handover) -> Result<bool, FlightError> {
         let patience = if self.reconstruction.has_model() { Duration::ZERO } else { self.for_a_frame };
         let Some(frame) = capture.next(patience)? else { return Ok(false) };
         tracing::info!("key frame {}: {}", self.reconstruction.keyframes() + 1, frame.name);
@@ -189,7 +190,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// One step of the failsafe ladder; says and does what a new rung asks for.
-    fn watch(&mut self, capture: &mut Handover) -> Result<Action, JobError> {
+    fn watch(&mut self, capture: &mut Handover) -> Result<Action, FlightError> {
         let views = self.reconstruction.keyframes();
         self.failsafe.look(self.clock.now_ns(), capture.flags(), self.training_failed, &self.budget, views);
         self.act(capture)?;
@@ -197,7 +198,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     }
 
     /// Does what a new rung asks for, and tells the ground control station.
-    fn act(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+    fn act(&mut self, capture: &mut Handover) -> Result<(), FlightError> {
         let Some(rung) = self.failsafe.act(&mut self.reconstruction)? else { return Ok(()) };
         let line = format!("dgtr: {rung}");
         self.shown.rung(&self.failsafe.state());
@@ -213,7 +214,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         Ok(())
     }
 
-    fn build(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+    fn build(&mut self, capture: &mut Handover) -> Result<(), FlightError> {
         self.act_as(capture, Activity::Building);
         let supervisor = &self.supervisor;
         let at_work = || {
@@ -227,34 +228,37 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
                 self.save(capture)
             }
             // In flight more pictures may mend what too few of them could not do.
-            Err(e @ (JobError::Init(_) | JobError::Network(_))) if capture.is_open() => {
+            Err(e @ (EngineError::Init(_) | EngineError::Network(_))) if capture.is_open() => {
                 tracing::warn!("not built yet: {e}");
                 Ok(())
             }
-            Err(e) => Err(e),
+            Err(e) => Err(e.into()),
         }
     }
 
     /// Adds the newest key frames to the model; the next checkpoint that is due has them.
-    fn grow(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+    fn grow(&mut self, capture: &mut Handover) -> Result<(), FlightError> {
         self.act_as(capture, Activity::Building);
         self.supervisor.alive();
         match self.reconstruction.grow() {
             Ok(whole) => {
                 capture.note_in_model();
-                if whole { capture.refined(|name| self.reconstruction.pose(name)) } else { Ok(()) }
+                if whole {
+                    capture.refined(|name| self.reconstruction.pose(name))?;
+                }
+                Ok(())
             }
             // In flight more pictures may mend what too few of them could not do.
-            Err(e @ (JobError::Init(_) | JobError::Network(_))) if capture.is_open() => {
+            Err(e @ (EngineError::Init(_) | EngineError::Network(_))) if capture.is_open() => {
                 tracing::warn!("not in the model yet: {e}");
                 Ok(())
             }
-            Err(e) => Err(e),
+            Err(e) => Err(e.into()),
         }
     }
 
     /// Trains what is owed, and on until a key frame waits, a checkpoint is due, or capture ends.
-    fn train(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), JobError> {
+    fn train(&mut self, capture: &mut Handover, interrupt: &Interrupt) -> Result<(), FlightError> {
         if !self.reconstruction.has_model() || (self.owed == 0 && capture.waiting() > 0) {
             return Ok(());
         }
@@ -292,7 +296,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         if self.clock.now_ns() >= due_ns { self.save(capture) } else { Ok(()) }
     }
 
-    fn save(&mut self, capture: &mut Handover) -> Result<(), JobError> {
+    fn save(&mut self, capture: &mut Handover) -> Result<(), FlightError> {
         self.saved_ns = self.clock.now_ns();
         match self.checkpoint(capture, false) {
             Ok((path, gaussians)) => {
@@ -301,13 +305,13 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             }
             // The one before is whole; the next is due in the usual time.
             Err(e) if e.may_pass() => tracing::warn!("{e}; no checkpoint this time"),
-            Err(e) => return Err(e),
+            Err(e) => return Err(e.into()),
         }
         Ok(())
     }
 
     /// Writes a checkpoint; while there is no room, gives up what costs least and tries again.
-    fn checkpoint(&mut self, capture: &mut Handover, finished: bool) -> Result<(PathBuf, usize), JobError> {
+    fn checkpoint(&mut self, capture: &mut Handover, finished: bool) -> Result<(PathBuf, usize), EngineError> {
         let mut written = self.reconstruction.checkpoint(&self.out, finished);
         for relief in Relief::LADDER {
             if let Err(e) = &written

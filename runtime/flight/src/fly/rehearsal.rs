@@ -32,7 +32,8 @@ use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan};
 use super::onboard::Job;
 use super::record::Recorder;
 use engine::{Reconstruct, model_path};
-use crate::error::JobError;
+use crate::error::FlightError;
+use engine::error::EngineError;
 use engine::failsafe::Failsafe;
 use job::health::Health;
 use job::interrupt::Interrupt;
@@ -84,11 +85,11 @@ impl Ledger {
         camera: &CameraSettings,
         origin: Geodetic,
         out: &Path,
-    ) -> Result<(Self, KeyframeStore), JobError> {
+    ) -> Result<(Self, KeyframeStore), FlightError> {
         let lens = intrinsics(camera);
         let mut store = KeyframeStore::open(disk, &out.join("keyframes"), camera, &lens, origin)?;
         let views: Vec<_> = (0..).map_while(|i| store.sound(i)).map(|frame| (frame.name, frame.view)).collect();
-        let before = model::read_checkpoint(disk, &model_path(out))?;
+        let before = model::read_checkpoint(disk, &model_path(out)).map_err(EngineError::from)?;
         let steps_total = before.map_or(0, |(header, _)| header.steps);
         let (disk, promised) = (disk.clone(), Box::new(|_| {}));
         let ledger = Self { disk, views, built: 0, steps: 0, steps_total, landed: false, promised };
@@ -107,7 +108,7 @@ impl Ledger {
 }
 
 impl Reconstruct for Ledger {
-    fn add(&mut self, frame: PosedImage, _more: bool) -> Result<(), JobError> {
+    fn add(&mut self, frame: PosedImage, _more: bool) -> Result<(), EngineError> {
         if self.views.iter().any(|(name, _)| *name == frame.name) {
             return Ok(());
         }
@@ -134,7 +135,7 @@ impl Reconstruct for Ledger {
         self.built > 0
     }
 
-    fn build(&mut self, _go_on: &dyn Fn() -> bool) -> Result<bool, JobError> {
+    fn build(&mut self, _go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
         (self.built, self.steps) = (self.views.len(), 0);
         Ok(true)
     }
@@ -149,7 +150,7 @@ impl Reconstruct for Ledger {
         &mut self,
         budget: &RunBudget,
         each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
-    ) -> Result<StopReason, JobError> {
+    ) -> Result<StopReason, EngineError> {
         while !self.is_done(budget) {
             self.steps += 1;
             self.steps_total += 1;
@@ -164,7 +165,7 @@ impl Reconstruct for Ledger {
 
     fn halve_resolution(&mut self, _on: bool) {}
 
-    fn shrink(&mut self) -> Result<(), JobError> {
+    fn shrink(&mut self) -> Result<(), EngineError> {
         Ok(())
     }
 
@@ -172,7 +173,7 @@ impl Reconstruct for Ledger {
         0
     }
 
-    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), JobError> {
+    fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), EngineError> {
         let views = self.views[..self.built].to_vec();
         let header = ModelHeader { views, steps: self.steps_total, finished, ..ModelHeader::default() };
         let path = model_path(out);
@@ -316,7 +317,7 @@ pub(super) fn rehearse_on(
             names.extend(header.views.iter().map(|(name, _)| name.clone()));
             Ok((header.views.len(), header.finished))
         }
-        Err(JobError::TooFewKeyframes { keyframes, cause }) => Err((keyframes, cause)),
+        Err(FlightError::TooFewKeyframes { keyframes, cause }) => Err((keyframes, cause)),
         Err(e) => panic!("the job failed: {e}"),
     };
     let without_room = capture.without_room();

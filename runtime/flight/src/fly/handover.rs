@@ -16,7 +16,7 @@ use models::camera::{Pose, PosedImage};
 use models::picture::mask::Mask;
 
 use engine::PictureSource;
-use crate::error::JobError;
+use engine::error::EngineError;
 use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 
 /// Decoded key frames in the channel.
@@ -136,7 +136,7 @@ impl Handover {
 
     /// Keeps a key frame. On a full disk what costs least is given up first; after that key frames are used and not kept,
     /// each of which tries again, as room may have been made.
-    fn keep(&mut self, frame: &KeyFrame) -> Result<(), JobError> {
+    fn keep(&mut self, frame: &KeyFrame) -> Result<(), StoreError> {
         let Some((store, model)) = &mut self.store else { return Ok(()) };
         let kept = store.add_with_relief(frame, model);
         let room = match kept {
@@ -151,7 +151,7 @@ impl Handover {
                 self.without_room += 1;
                 self.room
             }
-            Err(e) => return Err(e.into()),
+            Err(e) => return Err(e),
         };
         if std::mem::replace(&mut self.room, room) != room {
             let (severity, line) = match room {
@@ -168,7 +168,7 @@ impl Handover {
     ///
     /// # Errors
     /// The store cannot be written.
-    pub fn refined(&mut self, pose: impl FnMut(&str) -> Option<Pose>) -> Result<(), JobError> {
+    pub fn refined(&mut self, pose: impl FnMut(&str) -> Option<Pose>) -> Result<(), StoreError> {
         match self.store.as_mut().map_or(Ok(()), |(store, _)| store.refine(pose)) {
             // For other programs only; written again with the next key frame.
             Err(e) if e.may_pass() => tracing::warn!("refined poses are not listed: {e}"),
@@ -214,7 +214,7 @@ impl Handover {
 }
 
 impl PictureSource for Handover {
-    fn next(&mut self, patience: Duration) -> Result<Option<PosedImage>, JobError> {
+    fn next(&mut self, patience: Duration) -> Result<Option<PosedImage>, EngineError> {
         if let Some(frame) = self.take_up() {
             return Ok(Some(frame));
         }
@@ -222,7 +222,7 @@ impl PictureSource for Handover {
         self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
         let came = self.shared.came.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
         self.taken.extend(came);
-        self.keep(&frame)?;
+        self.keep(&frame).map_err(|e| EngineError::Source(Box::new(e)))?;
         Ok(Some(frame.posed))
     }
 
@@ -234,7 +234,7 @@ impl PictureSource for Handover {
         self.store.as_ref().map(|(store, _)| store.camera_size())
     }
 
-    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<(RgbImage, Option<Mask>)>, JobError> {
+    fn whole(&mut self, name: &str, scale: f64) -> Result<Option<(RgbImage, Option<Mask>)>, EngineError> {
         let Some((store, _)) = &self.store else { return Ok(None) };
         // What is damaged is set aside at the next start.
         let whole = store.whole(name, scale).unwrap_or_else(|e| {

@@ -23,7 +23,7 @@ use super::record::{Entry, Recorder};
 use super::show::ShownCapture;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::coverage::Coverage;
-use crate::error::JobError;
+use crate::error::FlightError;
 use crate::keyframe_store::KeyFrame;
 use pages::watch::Watch;
 
@@ -181,7 +181,7 @@ where
     ///
     /// # Errors
     /// A link or camera that will not come back.
-    pub(super) fn turn(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
+    pub(super) fn turn(&mut self, wait: Duration) -> Result<Option<Ended>, FlightError> {
         let stop = self.end.stop_asked();
         self.show_station();
         match self.phase {
@@ -232,7 +232,7 @@ where
         self.counters
     }
 
-    fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, JobError> {
+    fn fly(&mut self, wait: Duration) -> Result<Option<Ended>, FlightError> {
         while let Ok((severity, text)) = self.end.words.try_recv() {
             self.say(severity, text);
         }
@@ -259,7 +259,7 @@ where
     }
 
     /// Takes what link and camera have; true when the aircraft showed a sign of life.
-    fn listen(&mut self, wait: Duration) -> Result<bool, JobError> {
+    fn listen(&mut self, wait: Duration) -> Result<bool, FlightError> {
         let (mut alive, mut wait) = (false, wait);
         for _ in 0..EVENTS_A_TURN {
             let Some(event) = self.vehicle.poll(wait)? else { break };

@@ -9,7 +9,7 @@ use hal::vehicle::Vehicle;
 
 use super::handover::{Handover, handover};
 use super::intake::{Ended, FlightCounters, FlightPlan, Intake};
-use crate::error::JobError;
+use crate::error::FlightError;
 
 /// How long one turn of the loop waits for the link.
 const TURN: Duration = Duration::from_millis(20);
@@ -17,7 +17,7 @@ const TURN: Duration = Duration::from_millis(20);
 /// The running capture thread.
 pub struct Flight {
     handover: Handover,
-    thread: JoinHandle<Result<(Ended, FlightCounters), JobError>>,
+    thread: JoinHandle<Result<(Ended, FlightCounters), FlightError>>,
 }
 
 impl Flight {
@@ -25,7 +25,7 @@ impl Flight {
     ///
     /// # Errors
     /// The port or the camera cannot be opened.
-    pub fn start(plan: FlightPlan) -> Result<Self, JobError> {
+    pub fn start(plan: FlightPlan) -> Result<Self, FlightError> {
         let vehicle = Vehicle::open(&plan.vehicle)?;
         let (handover, end) = handover();
         let thread = std::thread::Builder::new()
@@ -38,7 +38,7 @@ impl Flight {
                     }
                 }
             })
-            .map_err(|e| JobError::System(format!("the capture thread could not be started: {e}")))?;
+            .map_err(|e| FlightError::Capture(format!("the capture thread could not be started: {e}")))?;
         Ok(Self { handover, thread })
     }
 
@@ -51,9 +51,9 @@ impl Flight {
     ///
     /// # Errors
     /// The error that ended the thread.
-    pub fn finish(self) -> Result<(Handover, Ended, FlightCounters), JobError> {
+    pub fn finish(self) -> Result<(Handover, Ended, FlightCounters), FlightError> {
         self.handover.stop();
-        let crashed = |_| JobError::System("the capture thread ended abnormally".into());
+        let crashed = |_| FlightError::Capture("the capture thread ended abnormally".into());
         let (ended, counters) = self.thread.join().map_err(crashed)??;
         Ok((self.handover, ended, counters))
     }

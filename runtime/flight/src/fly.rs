@@ -55,7 +55,7 @@ pub use record::{RecordError, Recorder, Recording};
 
 use engine::device::{DeviceRequest, training_lens};
 use engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path, scratch_bytes};
-use crate::error::JobError;
+use crate::error::FlightError;
 use engine::failsafe::Failsafe;
 use job::health::Health;
 use job::interrupt::Interrupt;
@@ -119,7 +119,7 @@ pub fn fly(
     options: &FlyOptions,
     interrupt: &Interrupt,
     supervisor: Supervisor,
-) -> Result<FlyOutcome, JobError> {
+) -> Result<FlyOutcome, FlightError> {
     supervisor.status("opening the device and the networks");
     let intrinsics = training_lens(mission);
     let source = Source::of(mission, &aircraft.id, &options.out).map_err(UploadError::from)?;
@@ -144,7 +144,7 @@ pub fn fly(
         earlier_names: store.names().collect(),
         end: options.end,
         geotags: Geotags::open(&disk, &options.out, mission.origin)
-            .map_err(JobError::io(&options.out.join(geotags::FILE)))?,
+            .map_err(FlightError::io(&options.out.join(geotags::FILE)))?,
         watch: options.watch.clone(),
         recorder: options.recorder.clone(),
     })?;
@@ -222,14 +222,14 @@ fn disk_plan(mission: &Mission, recording: u64) -> DiskPlan {
 }
 
 /// The disk a flight writes to, bounded as the mission says; refused when not even a first model would fit.
-fn planned_disk(mission: &Mission, out: &Path, recording: u64) -> Result<Disk, JobError> {
+fn planned_disk(mission: &Mission, out: &Path, recording: u64) -> Result<Disk, FlightError> {
     let plan = disk_plan(mission, recording);
     let here = bytes_below(out);
     let free = resources::free_disk_bytes(out).map_or(u64::MAX, |free| free.saturating_add(here));
     let limit = mission.memory.disk_mib.map_or(u64::MAX, |mib| u64::from(mib) << 20);
     // A folder that holds more than the least already is a flight that goes on: it climbs the ladder instead.
     let room = free.min(limit);
-    if here < plan.min_bytes && !plan.fits(room).map_err(|e| JobError::Request(e.to_string()))? {
+    if here < plan.min_bytes && !plan.fits(room).map_err(|e| FlightError::Disk(e.to_string()))? {
         let (room, total) = (room >> 20, plan.total_bytes >> 20);
         tracing::warn!("disk: {room} MiB for a flight that may take {total} MiB; see dgtr plan for what it is for");
     }
@@ -271,7 +271,7 @@ fn outcome(
 }
 
 /// The engine for `aircraft`, with everything it will ever need.
-fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Disk) -> Result<Reconstruction, JobError> {
+fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Disk) -> Result<Reconstruction, FlightError> {
     let settings = EngineSettings {
         disk: disk.clone(),
         device: DeviceRequest {
