@@ -17,10 +17,10 @@ mod summary;
 pub use evaluate::Figures;
 pub use summary::Summary;
 
-use job::interrupt::Interrupt;
 use engine::kernels;
-use uplink::keys::{self, GROUND};
+use job::interrupt::Interrupt;
 use processes::Process;
+use uplink::keys::{self, GROUND};
 
 /// What the command line may change.
 #[derive(Clone, Debug)]

@@ -16,7 +16,8 @@ use models::refine::RefineError;
 use vulkan::gpu::GpuError;
 use vulkan::trainer::TrainError;
 
-use flight::keyframe_store::StoreError;
+use engine::error::EngineError;
+use flight::error::FlightError;
 use pages::report::ReportError;
 use uplink::UploadError;
 
@@ -29,27 +30,15 @@ pub enum JobError {
     /// The memory budget.
     #[error(transparent)]
     Plan(#[from] PlanError),
-    /// The host's memory.
-    #[error(
-        "memory plan: host_mib = {host_mib} is too little, {needed_mib} MiB are needed, {section_mib} MiB of it for the \
-         {section}; raise memory.host_mib, or lower memory.device_mib, max_gaussians, image_scale or keyframes.max"
-    )]
-    HostMemory {
-        /// What was allowed.
-        host_mib: u32,
-        /// What would do.
-        needed_mib: u64,
-        /// The largest section of the plan.
-        section: &'static str,
-        /// Its MiB.
-        section_mib: u64,
-    },
     /// Link or camera.
     #[error(transparent)]
     Hal(#[from] HalError),
-    /// Stored key frames.
+    /// Training, maps and scores.
     #[error(transparent)]
-    Store(#[from] StoreError),
+    Engine(#[from] EngineError),
+    /// A flight.
+    #[error(transparent)]
+    Flight(#[from] FlightError),
     /// A folder of pictures.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
@@ -100,25 +89,6 @@ pub enum JobError {
     /// What was asked for contradicts the pictures, the model or the settings.
     #[error("{0}")]
     Request(String),
-    /// The flight ended before there was anything to build from.
-    #[error("only {keyframes} key frames, nothing to build a model from: {cause}")]
-    TooFewKeyframes {
-        /// How many there were.
-        keyframes: usize,
-        /// The most likely cause by what was counted, and the remedy.
-        cause: String,
-    },
-    /// A rendering that does not have its camera's size.
-    #[error("{0}: the rendering has another size than its camera")]
-    RenderingSize(String),
-    /// A picture that cannot be encoded.
-    #[error("{}: cannot be encoded: {source}", path.display())]
-    Encode {
-        /// Where it should go.
-        path: PathBuf,
-        /// The encoder's reason.
-        source: image::ImageError,
-    },
     /// A `dgtr` started as a process of its own.
     #[error("{line}")]
     Child {
@@ -136,24 +106,14 @@ impl JobError {
     }
 }
 
-impl JobError {
-    /// Whether it is the disk's fault and room, or a medium that comes back, may mend it.
-    pub fn may_pass(&self) -> bool {
-        match self {
-            Self::Store(e) => e.may_pass(),
-            Self::File(e) => e.may_pass(),
-            _ => false,
-        }
-    }
-}
-
 impl Error for JobError {
     fn kind(&self) -> ErrorKind {
         match self {
             Self::Mission(e) => e.kind(),
             Self::Plan(e) => e.kind(),
             Self::Hal(e) => e.kind(),
-            Self::Store(e) => e.kind(),
+            Self::Engine(e) => e.kind(),
+            Self::Flight(e) => e.kind(),
             Self::Dataset(e) => e.kind(),
             Self::File(e) => e.kind(),
             Self::Network(e) => e.kind(),
@@ -166,8 +126,8 @@ impl Error for JobError {
             Self::Report(e) => e.kind(),
             Self::Interrupt(e) => e.kind(),
             Self::Io { source, .. } => Error::kind(source),
-            Self::HostMemory { .. } | Self::Request(_) | Self::TooFewKeyframes { .. } => ErrorKind::Input,
-            Self::Json(_) | Self::System(_) | Self::RenderingSize(_) | Self::Encode { .. } => ErrorKind::Failed,
+            Self::Request(_) => ErrorKind::Input,
+            Self::Json(_) | Self::System(_) => ErrorKind::Failed,
             Self::Child { kind, .. } => *kind,
         }
     }

@@ -12,7 +12,18 @@ use config::init::InitSettings;
 use config::mission::{DEVICE_MIB, KeyframeSettings, NetworkSettings};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use engine::device::DeviceRequest;
+use engine::evaluate::{self, IntoModel};
+use engine::failsafe::Failsafe;
+use engine::preset::Choice;
+use engine::source::Folder;
+use engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
+use flight::capture::{self, KeyframeCounters};
 use hal::time::MonotonicClock;
+use job::console::Progress;
+use job::health::Health;
+use job::interrupt::Interrupt;
+use job::run_json::RunReport;
 use models::card::CardOptions;
 use models::dataset::{Dataset, PoseSource};
 use models::formats::delivery::Rounding;
@@ -20,17 +31,7 @@ use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
 use vulkan::trainer::RunBudget;
 
-use job::console::Progress;
-use engine::device::DeviceRequest;
-use engine::source::Folder;
-use engine::{EngineSettings, InitKind, PictureSource, Point, Reconstruct, Reconstruction, model_path};
 use crate::error::JobError;
-use engine::evaluate::{self, IntoModel};
-use engine::failsafe::Failsafe;
-use job::health::Health;
-use job::interrupt::Interrupt;
-use engine::preset::Choice;
-use job::run_json::RunReport;
 use scale::largest;
 use slices::{REST, Slices};
 
@@ -168,8 +169,11 @@ impl TrainJob {
         // Matching sees telemetry's pictures whole; where nothing is matched they come at the size they are trained at.
         let refine = self.refine && poses == PoseSource::Telemetry;
         let (load_scale, scale) = if refine { (1.0, picture_scale) } else { (picture_scale, 1.0) };
-        let mut source = Folder::new(&set, frames, load_scale, poses, self.keyframes)?;
-        let frames = source.frames();
+        let (frames, chosen_by_rule) = match self.keyframes {
+            Some(rule) => capture::choose(&set, frames, poses, rule)?,
+            None => (frames, KeyframeCounters::default()),
+        };
+        let mut source = Folder::new(&set, frames.clone(), load_scale, poses);
         if frames.is_empty() {
             return Err(JobError::Request(format!("{}: split {:?} holds no pictures", set.root.display(), self.split)));
         }
@@ -252,7 +256,7 @@ impl TrainJob {
         report.outcome = if finished { "done" } else { "interrupted" }.to_owned();
         report.wall_s = began.elapsed().as_secs_f64();
         report.more.insert("pictures_decoded".to_owned(), source.decoded().into());
-        let k = source.keyframes();
+        let k = chosen_by_rule;
         for (name, count) in [("too_close", k.too_close), ("covered", k.covered), ("over_plan", k.full)] {
             if self.keyframes.is_some() {
                 report.skip(&format!("pictures_{name}"), count.into());

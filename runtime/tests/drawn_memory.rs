@@ -8,6 +8,8 @@ mod peak_allocator;
 use std::sync::PoisonError;
 
 use config::disk::Disk;
+use engine::device::{file_renderer, renderer};
+use engine::ortho::{Map, MapRequest};
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
@@ -15,8 +17,6 @@ use models::formats::delivery::Rounding;
 use models::formats::model::{self, Chunks, ModelHeader, piece_bytes};
 use models::ortho::extent::SAMPLE;
 use peak_allocator::peak_of;
-use engine::device::{file_renderer, renderer};
-use engine::ortho::{Map, MapRequest};
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{Rendering, Trainer};
 

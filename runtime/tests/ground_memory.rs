@@ -8,11 +8,12 @@ mod peak_allocator;
 use std::path::Path;
 
 use config::ground::GroundSettings;
+use ground::LocalModel;
+use ground::jobs::aggregate::{self, Outcome};
+use ground::member::Member;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use peak_allocator::peak_of;
-use runtime::aggregate::member::Member;
-use runtime::aggregate::{self, LocalModel, Outcome};
 
 /// Gaussians along each side of a model, and the bytes that one of degree 3 takes.
 const ALONG: usize = 100;

@@ -12,13 +12,13 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
 use config::mission::Mission;
+use job::run_json::RunReport;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms;
-use uplink::keys::Identity;
-use job::run_json::RunReport;
-use uplink::{Offerer, Source};
 use support::{Running, change_mission, small_mission, wait_until};
+use uplink::keys::Identity;
+use uplink::{Offerer, Source};
 
 const PATIENCE: Duration = Duration::from_secs(300);
 /// Kills of one flight or one session of the ground; then it is left alone to its end.

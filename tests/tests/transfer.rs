@@ -2,10 +2,10 @@
 //! refined pose is then the truth. Needs the reference data (`DGTR_DATA`); says so and passes without.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
+use engine::transfer::PoseTransfer;
 use models::camera::View;
 use models::dataset::{Dataset, PoseSource};
 use models::refine::Refiner;
-use engine::transfer::PoseTransfer;
 
 #[path = "../shared_data.rs"]
 mod shared_data;

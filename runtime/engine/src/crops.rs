@@ -1,12 +1,12 @@
 //! Crops of key frames that are larger than what they are trained at: what the training picture cannot show.
 
 use image::{RgbImage, imageops};
+use job::console::Progress;
 use models::picture::crops::{Crop, crops, finest};
 use models::picture::mask::Mask;
 use vulkan::trainer::CropPlace;
 
 use super::{PictureSource, Reconstruction};
-use job::console::Progress;
 use crate::error::EngineError;
 
 /// Shares of the camera's size at which crops are cut: halves, which JPEG files are decoded at for less.
@@ -75,7 +75,13 @@ impl Reconstruction {
     }
 
     /// Cuts the `share` crops with the most detail out of the picture of view `index`.
-    fn add_crops(&mut self, index: usize, whole: &RgbImage, mask: Option<&Mask>, share: usize) -> Result<(), EngineError> {
+    fn add_crops(
+        &mut self,
+        index: usize,
+        whole: &RgbImage,
+        mask: Option<&Mask>,
+        share: usize,
+    ) -> Result<(), EngineError> {
         let lens = self.views[index].1.intrinsics;
         let factor = (f64::from(whole.width()) / f64::from(lens.width)).ceil() as u32;
         let mut windows = crops(whole, (lens.width, lens.height), factor);

@@ -17,8 +17,8 @@ use rustix::io::Errno;
 use vulkan::trainer::{TrainError, Trainer};
 
 use super::pieces;
-use crate::error::EngineError;
 use crate::devices;
+use crate::error::EngineError;
 use crate::kernels;
 
 /// Gaussian–tile instances that a renderer holds at once, per pixel; pictures with more are rendered in bands.

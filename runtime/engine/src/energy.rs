@@ -1,10 +1,10 @@
 //! A schedule that ends with the energy it may take: seconds that change with what the board takes.
 
 use config::training::TrainSettings;
+use job::health::power::Power;
 
 use super::Reconstruction;
 use crate::error::EngineError;
-use job::health::power::Power;
 
 /// Power is read this often, seconds of training.
 pub(super) const EVERY_S: f64 = 1.0;
@@ -12,7 +12,7 @@ const JOULES_PER_WH: f64 = 3600.0;
 
 /// What a schedule has taken, and may take.
 #[derive(Debug)]
-pub(crate) struct Meter {
+pub struct Meter {
     power: Power,
     allowed_j: f64,
     used_j: f64,
@@ -26,7 +26,7 @@ impl Meter {
     ///
     /// # Errors
     /// Neither the board nor `training.watts` says what is taken.
-    pub(crate) fn of(training: &TrainSettings) -> Result<Option<Self>, EngineError> {
+    pub fn of(training: &TrainSettings) -> Result<Option<Self>, EngineError> {
         let meter = |wh| Self::new(Power::new(training.watts), wh);
         training.energy_wh.map(meter).transpose()
     }
@@ -53,7 +53,7 @@ impl Meter {
     }
 
     /// The same before anything is trained.
-    pub(crate) fn seconds(&self) -> f64 {
+    pub fn seconds(&self) -> f64 {
         self.allowed_j / self.watts
     }
 
@@ -64,7 +64,7 @@ impl Meter {
 }
 
 /// Of two bounds the one that is nearer.
-pub(crate) fn shorter(a: Option<f64>, b: Option<f64>) -> Option<f64> {
+pub fn shorter(a: Option<f64>, b: Option<f64>) -> Option<f64> {
     a.into_iter().chain(b).reduce(f64::min)
 }
 

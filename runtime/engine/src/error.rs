@@ -61,6 +61,9 @@ pub enum EngineError {
     /// Training and rendering.
     #[error(transparent)]
     Train(#[from] TrainError),
+    /// Figures that JSON cannot hold.
+    #[error("figures cannot be written as JSON: {0}")]
+    Json(#[from] serde_json::Error),
     /// A file or folder that no format owns.
     #[error("{}: {source}", path.display())]
     Io {
@@ -115,7 +118,7 @@ impl Error for EngineError {
             Self::Train(e) => e.kind(),
             Self::Io { source, .. } => Error::kind(source),
             Self::HostMemory { .. } | Self::Request(_) => ErrorKind::Input,
-            Self::Unfinished | Self::RenderingSize(_) | Self::Encode { .. } => ErrorKind::Failed,
+            Self::Json(_) | Self::Unfinished | Self::RenderingSize(_) | Self::Encode { .. } => ErrorKind::Failed,
         }
     }
 }

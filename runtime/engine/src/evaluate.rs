@@ -169,7 +169,12 @@ pub fn evaluate(
 ///
 /// # Errors
 /// A picture cannot be read.
-pub fn baselines(set: &Dataset, training: &[usize], frames: &[usize], scale: f64) -> Result<BaselineScores, EngineError> {
+pub fn baselines(
+    set: &Dataset,
+    training: &[usize],
+    frames: &[usize],
+    scale: f64,
+) -> Result<BaselineScores, EngineError> {
     let mut mean = MeanColor::default();
     for &i in training {
         mean.add(&set.load(i, scale)?);

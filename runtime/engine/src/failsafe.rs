@@ -5,11 +5,11 @@ use std::fmt;
 
 use config::failsafe::FailsafeSettings;
 use hal::failsafe::{self, Action, Cause, Flags, State};
+use job::health::Health;
 use vulkan::trainer::{RunBudget, StepReport};
 
 use crate::Reconstruct;
 use crate::error::EngineError;
-use job::health::Health;
 
 /// In the middle of training the flags are read this often.
 const LOOK_EVERY_NS: u64 = 1_000_000_000;

@@ -3,13 +3,13 @@
 use std::collections::HashSet;
 
 use glam::DVec3;
+use job::console::Progress;
 use models::camera::{DepthPrior, Pinhole, View};
 use models::cloud::GaussianCloud;
 use models::init::{InitReport, Initialiser, from_sfm, random};
 use models::light::Light;
 
 use super::Reconstruction;
-use job::console::Progress;
 use crate::error::EngineError;
 
 /// Points of a random start (3DGS: 100,000).

@@ -66,7 +66,8 @@ pub fn measure(gpu: &Gpu) -> Option<(KernelShape, Source)> {
     measured(gpu, cache::path(), None)
 }
 
-pub(crate) fn choice() -> KernelChoice {
+/// What [`VARIABLE`] asks for; what cannot be understood is warned of and is the default.
+pub fn choice() -> KernelChoice {
     KernelChoice::from_environment().unwrap_or_else(|e| {
         tracing::warn!("{e}; the default is used");
         KernelChoice::Standard

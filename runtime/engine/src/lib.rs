@@ -14,6 +14,7 @@ use config::map::MapSettings;
 use config::mission::NetworkSettings;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use job::run_json::RunReport;
 use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::delivery::Rounding;
@@ -25,17 +26,19 @@ use models::refine::{RefineReport, Refiner};
 use vulkan::trainer::Trainer;
 
 use crate::error::EngineError;
-use job::run_json::RunReport;
 
 mod average;
 mod budget;
+#[cfg(test)]
+#[path = "../../../tests/carpet.rs"]
+mod carpet;
 mod carry;
 pub mod cost;
 mod crops;
 mod delivery;
 pub mod device;
 pub mod devices;
-mod energy;
+pub mod energy;
 pub mod error;
 pub mod evaluate;
 pub mod failsafe;
@@ -52,9 +55,6 @@ pub mod preset;
 mod rebuild;
 mod reconstruct;
 pub mod source;
-#[cfg(test)]
-#[path = "../../../tests/carpet.rs"]
-mod carpet;
 #[cfg(test)]
 mod testing;
 pub mod transfer;

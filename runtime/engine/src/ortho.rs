@@ -104,7 +104,9 @@ impl Map {
             (None, None) => Crs::local(),
         };
         let Some(mut gsd) = request.gsd.or(extent.gsd()) else {
-            return Err(EngineError::Request("the model keeps no views to take the pixel size from; give --gsd".into()));
+            return Err(EngineError::Request(
+                "the model keeps no views to take the pixel size from; give --gsd".into(),
+            ));
         };
         let covered = bounds(&crs, &extent)?;
         let bounds = request.bounds.map_or(covered, |[w, s, e, n]| [DVec2::new(w, s), DVec2::new(e, n)]);

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use config::plan::{Lanes, Plan, WORKING_SIDE};
 use config::preset::{DENSITIES, SECONDS, SHOWN_BY, VISITS};
 use config::training::{ResolutionSettings, ShSettings};
+use job::run_json::RunReport;
 use models::formats::{FormatError, read_bounded, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -16,7 +17,6 @@ use serde_json::Value;
 use crate::cost::loads::{Footprint, Sight};
 use crate::cost::model::CostModel;
 use crate::device::DeviceRequest;
-use job::run_json::RunReport;
 
 mod flight;
 mod memory;

@@ -9,6 +9,7 @@
 use config::mission::KeyframeSettings;
 use models::camera::{Intrinsics, Pose, View};
 use models::coverage::CoverageMap;
+use models::dataset::{Dataset, DatasetError, PoseSource};
 use serde::Serialize;
 
 /// What became of a picture.
@@ -181,6 +182,26 @@ impl KeyframeSelector {
             Decision::Key
         }
     }
+}
+
+/// Those of `frames` of a data set that `rule` makes key frames, and what became of all.
+///
+/// # Errors
+/// A picture without the pose that was asked for.
+pub fn choose(
+    set: &Dataset,
+    frames: Vec<usize>,
+    poses: PoseSource,
+    rule: KeyframeSettings,
+) -> Result<(Vec<usize>, KeyframeCounters), DatasetError> {
+    let mut selector = KeyframeSelector::new(rule);
+    let mut chosen = Vec::with_capacity(frames.len());
+    for i in frames {
+        if selector.consider(&set.pose(i, poses)?.0) == Decision::Key {
+            chosen.push(i);
+        }
+    }
+    Ok((chosen, selector.counters()))
 }
 
 /// Angle between two attitudes, radians, 0…π.

@@ -49,23 +49,24 @@ mod reflown;
 #[cfg(feature = "lab")]
 mod rehearsal;
 
+use engine::device::{DeviceRequest, training_lens};
+use engine::error::EngineError;
+use engine::failsafe::Failsafe;
+use engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path, scratch_bytes};
+use flight::Flight;
 pub use handover::Handover;
 pub use intake::{EndOfFlight, Ended, FlightCounters};
-pub use record::{RecordError, Recorder, Recording};
-
-use engine::device::{DeviceRequest, training_lens};
-use engine::{EngineSettings, InitKind, Reconstruct, Reconstruction, model_path, scratch_bytes};
-use crate::error::FlightError;
-use engine::failsafe::Failsafe;
 use job::health::Health;
 use job::interrupt::Interrupt;
-use crate::keyframe_store::KeyframeStore;
 use job::resources;
 use job::run_json::RunReport;
 use job::service::Supervisor;
-use uplink::{Offerer, Source, UploadError};
 use pages::watch::Watch;
-use flight::Flight;
+pub use record::{RecordError, Recorder, Recording};
+use uplink::{Offerer, Source, UploadError};
+
+use crate::error::FlightError;
+use crate::keyframe_store::KeyframeStore;
 use geotags::Geotags;
 use intake::{DECODED_AHEAD, FlightPlan};
 use onboard::{Job, JobEnd};
@@ -271,7 +272,12 @@ fn outcome(
 }
 
 /// The engine for `aircraft`, with everything it will ever need.
-fn open(mission: &Mission, aircraft: &Aircraft, options: &FlyOptions, disk: &Disk) -> Result<Reconstruction, FlightError> {
+fn open(
+    mission: &Mission,
+    aircraft: &Aircraft,
+    options: &FlyOptions,
+    disk: &Disk,
+) -> Result<Reconstruction, EngineError> {
     let settings = EngineSettings {
         disk: disk.clone(),
         device: DeviceRequest {

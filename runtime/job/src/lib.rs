@@ -11,4 +11,5 @@ pub mod session;
 pub mod trace;
 
 /// The crates of this workspace, by the targets of their log lines.
-pub const CRATES: [&str; 10] = ["runtime", "engine", "flight", "job", "pages", "uplink", "vulkan", "models", "hal", "config"];
+pub const CRATES: [&str; 11] =
+    ["runtime", "engine", "flight", "ground", "job", "pages", "uplink", "vulkan", "models", "hal", "config"];

@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use config::error::{Error, ErrorKind};
+use engine::device::renderer;
+use engine::error::EngineError;
 use models::camera::View;
 use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
@@ -18,8 +20,6 @@ use models::metrics::to_rgb8;
 use serde_json::{Value, json};
 use vulkan::trainer::Rendering;
 
-use engine::device::renderer;
-use engine::error::EngineError;
 use crate::report::picture::data_uri;
 use package::Package;
 

@@ -10,9 +10,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use config::error::{Error, ErrorKind};
 use config::geodesy::Geodetic;
 use config::mission::Mission;
+use job::console;
 use serde_json::Value;
 
-use job::console;
 use crate::report::ground::{Ground, Ortho};
 use crate::report::{Craft, MapRegion, ReportData, ReportError};
 

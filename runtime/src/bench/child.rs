@@ -6,9 +6,9 @@ use std::process::{Command, Stdio};
 use std::time::Instant;
 
 use config::error::ErrorKind;
+use job::run_json::RunReport;
 
 use crate::error::JobError;
-use job::run_json::RunReport;
 
 /// How a child ended.
 #[derive(Clone, Debug)]

@@ -3,14 +3,14 @@
 
 use std::path::Path;
 
+use engine::device::renderer;
+use engine::evaluate::{IntoModel, Scores, evaluate};
 use models::dataset::Dataset;
 use models::formats::{model, write_atomic};
 use serde::Serialize;
 
 use super::child;
-use engine::device::renderer;
 use crate::error::JobError;
-use engine::evaluate::{IntoModel, Scores, evaluate};
 
 /// One way to train.
 #[derive(Clone, Debug, Serialize)]

@@ -4,6 +4,8 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use job::health::board::Board;
+use job::health::power::pmic_watts;
 use serde::Serialize;
 use serde_json::{Value, json};
 use vulkan::calibration::calibrate;
@@ -15,8 +17,6 @@ use vulkan::trainer::{TrainError, check_device, check_training};
 use super::stages::{Scene, SizeFigures, measure as measure_stages};
 use super::{child, world};
 use crate::error::JobError;
-use job::health::board::Board;
-use job::health::power::pmic_watts;
 
 mod machine;
 

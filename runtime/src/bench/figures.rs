@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use models::formats::write_atomic;
+use pages::report::Table;
 use serde::Serialize;
 
 use crate::error::JobError;
-use pages::report::Table;
 
 /// The table as GitHub writes tables: first column text, the others right-aligned figures.
 pub fn markdown(table: &Table) -> String {

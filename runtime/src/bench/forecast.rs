@@ -1,5 +1,10 @@
 //! What `auto` forecasts of a step against what the step takes, at the three sizes of `dgtr bench device`.
 
+use engine::cost::loads::{Footprint, Sight};
+use engine::cost::model::{CostModel, load};
+use engine::cost::synthetic::IN_VIEW;
+use engine::cost::{measure, threads};
+use pages::report::Table;
 use serde::Serialize;
 use vulkan::ceiling::Ceiling;
 use vulkan::gpu::Gpu;
@@ -8,12 +13,7 @@ use vulkan::shape::KernelShape;
 use super::device::SIZES;
 use super::figures::short;
 use super::stages::{Scene, measure as measure_stages};
-use engine::cost::loads::{Footprint, Sight};
-use engine::cost::model::{CostModel, load};
-use engine::cost::synthetic::IN_VIEW;
-use engine::cost::{measure, threads};
 use crate::error::JobError;
-use pages::report::Table;
 
 /// One size.
 #[derive(Clone, Debug, Serialize)]

@@ -7,16 +7,16 @@ use std::time::{Duration, Instant};
 use config::error::{Error, ErrorKind};
 use config::mission::{MAX_AIRCRAFT, Mission};
 use glam::{DVec2, DVec3};
+use ground::frame::Motion;
+use job::run_json::RunReport;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use serde::Serialize;
+use uplink::{Offerer, Source};
 
 use super::child;
 use super::figures::write_text;
-use crate::aggregate::frame::Motion;
 use crate::error::JobError;
-use job::run_json::RunReport;
-use uplink::{Offerer, Source};
 use field::{BEYOND, Field, id};
 
 pub mod field;
@@ -200,10 +200,10 @@ fn least_region(field: &Field, cloud: &GaussianCloud) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::aggregate::LocalModel;
-    use crate::aggregate::member::Member;
-    use crate::aggregate::register::Fitter;
-    use crate::aggregate::register::fit::RenderedFitter;
+    use ground::LocalModel;
+    use ground::member::Member;
+    use ground::register::Fitter;
+    use ground::register::fit::RenderedFitter;
 
     const FIELD: Field = Field { aircraft: 4, side_m: 280.0, gaussians: 10_000, limit_mib: 512, seed: 1 };
 

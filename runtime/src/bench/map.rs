@@ -5,6 +5,9 @@ mod picture;
 
 use std::path::Path;
 
+use engine::device::map_renderer;
+use engine::evaluate::heights::HeightScores;
+use engine::ortho::{DrawnBlock, Map, MapRequest};
 use glam::{DMat4, DVec2, DVec3, DVec4};
 use hal::sim::world::{FromAbove, MapKind, World};
 use models::cloud::GaussianCloud;
@@ -14,10 +17,7 @@ use models::ortho::grid::{Block, Grid};
 use serde::Serialize;
 
 use super::{child, world};
-use engine::device::map_renderer;
 use crate::error::JobError;
-use engine::evaluate::heights::HeightScores;
-use engine::ortho::{DrawnBlock, Map, MapRequest};
 
 /// Roofs and ground within so many pixels of a step in height are left out of the figures: there, half a pixel aside is
 /// metres up or down.

@@ -3,12 +3,12 @@
 
 use std::path::Path;
 
+use pages::report::{Table, bytes, count};
 use serde::Serialize;
 
 use super::child;
 use super::figures::short;
 use crate::error::JobError;
-use pages::report::{Table, bytes, count};
 
 /// How every budget is trained.
 #[derive(Clone, Debug)]

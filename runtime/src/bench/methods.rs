@@ -17,17 +17,18 @@ use std::time::Instant;
 
 use config::error::{Error, ErrorKind};
 use config::ground::GroundSettings;
+use engine::device::renderer;
+use engine::evaluate::{IntoModel, evaluate, open_metric};
+use ground::jobs::aggregate;
+use ground::member::Member;
+use ground::{AggregateError, LocalModel};
 use models::dataset::{Dataset, SparsePoint, scaled};
 use models::formats::{model, read_bounded};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::aggregate::member::Member;
-use crate::aggregate::{self, AggregateError, LocalModel};
 use crate::bench::figures::write_json;
-use engine::device::renderer;
 use crate::error::JobError;
-use engine::evaluate::{IntoModel, evaluate, open_metric};
 use data::Written;
 use presets::{Merge, Method, Pictures};
 use score::Quality;

@@ -7,7 +7,14 @@ use std::time::Instant;
 use config::disk::Disk;
 use config::plan::{Lanes, Plan};
 use config::training::TrainSettings;
+use engine::cost::synthetic::picture;
+use engine::device::DeviceRequest;
+use engine::error::EngineError;
+use engine::evaluate::save_png;
+use engine::host::{HostPlan, HostRequest};
+use engine::{model_path, pieces};
 use glam::{DQuat, DVec3};
+use job::resources::peak_rss_bytes;
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{Chunks, ModelHeader};
@@ -17,13 +24,7 @@ use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::frustum::{Frustum, mean, reach};
 use super::levels::{SPACING_M, write_scene};
-use engine::cost::synthetic::picture;
-use engine::device::DeviceRequest;
-use engine::host::{HostPlan, HostRequest};
-use engine::{model_path, pieces};
 use crate::error::JobError;
-use engine::evaluate::save_png;
-use job::resources::peak_rss_bytes;
 
 /// Training pictures and pictures drawn, and their focal length, pixels.
 const SIZE: [u32; 2] = [640, 480];
@@ -129,7 +130,7 @@ pub fn measure(request: &Request, out: &Path) -> Result<Figures, JobError> {
         trainer.render(&view, &mut rendering)?;
         let path = out.join(name);
         let shown = to_rgb8(&rendering.rgb, rendering.width, rendering.height);
-        save_png(&shown.ok_or_else(|| JobError::RenderingSize(name.into()))?, &path)?;
+        save_png(&shown.ok_or_else(|| EngineError::RenderingSize(name.into()))?, &path)?;
         pictures.push((view, rendering, path, clock.lap()));
     }
     let info = trainer.gpu().info();

@@ -3,15 +3,15 @@
 use std::path::Path;
 
 use config::mission::KeyframeSettings;
+use flight::capture::KeyframeSelector;
 use models::camera::Pose;
+use pages::report::Table;
 use serde::Serialize;
 use toml::{Table as Toml, Value};
 
 use super::child;
 use super::figures::{short, write_text};
-use flight::capture::KeyframeSelector;
 use crate::error::JobError;
-use pages::report::Table;
 
 /// A skip that saves less than this share of the time …
 pub const LEAST_SAVING: f64 = 0.02;

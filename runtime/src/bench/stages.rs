@@ -4,9 +4,15 @@
 use std::path::Path;
 
 use config::plan::{Plan, sh_columns};
+use engine::cost::measure::{Stopwatch, settings};
+use engine::cost::model::{SH_DEGREE, Sample};
+use engine::cost::slopes::{DRIVERS, Driver, Line, fit};
+use engine::cost::synthetic;
+use engine::device::DeviceRequest;
 use models::camera::PosedImage;
 use models::cloud::GaussianCloud;
 use models::dataset::Dataset;
+use pages::report::Table;
 use serde::Serialize;
 use vulkan::ceiling::Ceiling;
 use vulkan::gpu::Gpu;
@@ -15,13 +21,7 @@ use vulkan::stages::work::{Load, work};
 use vulkan::stages::{STAGE_NAMES, STAGES};
 
 use super::figures::short;
-use engine::cost::measure::{Stopwatch, settings};
-use engine::cost::model::{SH_DEGREE, Sample};
-use engine::cost::slopes::{DRIVERS, Driver, Line, fit};
-use engine::cost::synthetic;
-use engine::device::DeviceRequest;
 use crate::error::JobError;
-use pages::report::Table;
 
 /// Steps before the measured ones: the first compiles the kernels, the second finds the number of counting rounds.
 const WARM_UP: u32 = 3;

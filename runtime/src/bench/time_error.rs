@@ -3,15 +3,15 @@
 
 use std::path::{Path, PathBuf};
 
+use job::run_json::RunReport;
+use pages::report::chart::{Chart, ChartPoint, Series};
+use pages::report::{Table, count};
 use serde::Serialize;
 
 use super::child;
 use super::figures::short;
 use super::front::{Group, Speedup, mark_front, speedup};
 use crate::error::JobError;
-use pages::report::chart::{Chart, ChartPoint, Series};
-use pages::report::{Table, count};
-use job::run_json::RunReport;
 
 /// What to measure.
 #[derive(Clone, Debug)]

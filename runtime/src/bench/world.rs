@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use engine::evaluate::save_png;
 use glam::{DQuat, DVec3};
 use hal::sim::world::{PinholeView, World, WorldSettings};
 use models::camera::Pose;
@@ -9,7 +10,6 @@ use models::formats::transforms::pose_to_opengl;
 
 use super::figures::write_json;
 use crate::error::JobError;
-use engine::evaluate::save_png;
 
 /// Height of flight above the world's zero, metres.
 const HEIGHT_M: f64 = 42.0;

@@ -5,15 +5,17 @@ use std::time::Instant;
 
 use config::error::{Error, ErrorKind};
 use config::ground::GroundSettings;
-use models::dataset::Dataset;
-
-use crate::aggregate::compare::{add_to, compare, perceptual};
-use crate::aggregate::member::Member;
-use crate::aggregate::{self, LocalModel, Outcome, summary};
-use crate::cli::output::outln;
+use ground::LocalModel;
+use ground::compare::{add_to, compare, perceptual};
+use ground::jobs::aggregate::{self, Outcome};
+use ground::jobs::summary;
+use ground::member::Member;
 use job::interrupt::Interrupt;
-use pages::report::{REPORT, ReportData};
 use job::run_json::RunReport;
+use models::dataset::Dataset;
+use pages::report::{REPORT, ReportData};
+
+use crate::cli::output::outln;
 
 use super::CliError;
 

@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use job::interrupt::Interrupt;
+
 use super::CliError;
 use crate::cli::output::out;
 use crate::demo::{DemoOptions, run as run_demo};
-use job::interrupt::Interrupt;
 
 /// Two simulated aircraft and a ground station, each a process of its own, from MAVLink and pictures to one merged model.
 #[derive(Debug, clap::Args)]

@@ -7,6 +7,11 @@ use config::error::ErrorKind;
 use config::kernels::{KernelChoice, VARIABLE};
 use config::mission::Mission;
 use config::plan::{Plan, PlanRequest};
+use engine::cost;
+use engine::cost::loads::{Footprint, Sight};
+use engine::devices;
+use engine::kernels::{self, Source};
+use job::resources;
 use models::onnx::network::{LazySession, Network};
 use models::onnx::{OnnxError, features::FeatureNetwork, session};
 use vulkan::gpu::{Gpu, GpuInfo};
@@ -14,11 +19,6 @@ use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
 use super::CliError;
 use crate::cli::output::outln;
-use engine::cost::loads::{Footprint, Sight};
-use engine::kernels::{self, Source};
-use job::resources;
-use engine::cost;
-use engine::devices;
 
 mod trust;
 

@@ -72,9 +72,9 @@ mod tests {
     use vulkan::trainer::TrainError;
 
     use super::*;
-    use crate::aggregate::AggregateError;
     use crate::error::JobError;
-    use crate::serve::ServeError;
+    use ground::AggregateError;
+    use ground::jobs::serve::ServeError;
     use uplink::UploadError;
 
     #[test]

@@ -4,6 +4,10 @@
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
+use engine::device::{file_renderer, map_renderer};
+use engine::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
+use engine::ortho::{Map, MapRequest};
+use engine::transfer::stem;
 use models::dataset::Dataset;
 use models::formats::model::{Chunks, ModelHeader};
 use serde::Serialize;
@@ -11,10 +15,6 @@ use serde::Serialize;
 use super::CliError;
 use super::plan::largest;
 use crate::cli::output::outln;
-use engine::device::{file_renderer, map_renderer};
-use engine::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
-use engine::ortho::{Map, MapRequest};
-use engine::transfer::stem;
 
 /// Arguments of `dgtr eval`.
 #[derive(Debug, clap::Args)]

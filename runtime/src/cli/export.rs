@@ -15,10 +15,10 @@ use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use models::formats::{colmap, gltf, model, opensfm, ply, sog, spz, transforms};
 use models::levels;
 use models::ortho::georef::{FROM_Y_UP, Georef, shifted};
+use pages::viewer::{self, ViewerRequest};
 
 use super::CliError;
 use crate::cli::output::outln;
-use pages::viewer::{self, ViewerRequest};
 
 /// Formats that can be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

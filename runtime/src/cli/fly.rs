@@ -5,21 +5,21 @@ use std::time::{Duration, Instant};
 
 use config::disk::Disk;
 use config::mission::Mission;
-
-use super::CliError;
-use super::http::HttpArgs;
-use crate::cli::output::outln;
 use engine::device::training_lens;
-use flight::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
-use job::interrupt::Interrupt;
 use engine::ortho::keep_scratch_in;
 use engine::preset;
-use pages::report::{REPORT, ReportData, Timing, count, seconds};
+use flight::fly::{EndOfFlight, Ended, FlyOptions, FlyOutcome, Recording, fly};
+use job::interrupt::Interrupt;
 use job::resources::return_freed_memory;
 use job::run_json::RunReport;
 use job::service::Supervisor;
 use job::session::{Owner, Session};
+use pages::report::{REPORT, ReportData, Timing, count, seconds};
 use pages::watch::Watch;
+
+use super::CliError;
+use super::http::HttpArgs;
+use crate::cli::output::outln;
 
 /// Reads pose and triggers from the autopilot and pictures from the camera, and builds the model while flying.
 #[derive(Debug, clap::Args)]

@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use config::http::HttpSettings;
+use pages::watch::{Server, Token, Watch};
 
 use super::CliError;
-use pages::watch::{Server, Token, Watch};
 
 /// The live page.
 #[derive(Debug, clap::Args)]

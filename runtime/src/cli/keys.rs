@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 
 use config::mission::Mission;
+use uplink::keys::{self, GROUND};
 
 use super::CliError;
 use crate::cli::output::outln;
-use uplink::keys::{self, GROUND};
 
 /// Arguments of `dgtr keys`.
 #[derive(Debug, clap::Args)]

@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use config::disk::Disk;
-use models::formats::model::Chunks;
-
-use super::CliError;
 use engine::device::map_renderer;
-use crate::error::JobError;
 use engine::ortho::{Map, MapRequest, keep_scratch_in};
 use job::console;
 use job::interrupt;
+use models::formats::model::Chunks;
+
+use super::CliError;
+use crate::error::JobError;
 
 /// Arguments of `dgtr ortho`.
 #[derive(Debug, clap::Args)]

@@ -9,17 +9,17 @@ use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Lanes, Plan};
 use config::refine::RefineSettings;
 use config::training::{CropSettings, ShSettings};
+use engine::device::DeviceRequest;
+use engine::devices;
+use engine::preset;
+use engine::scratch_bytes;
+use flight::fly::delivered_bytes;
+use job::service::limits::{DeviceMemory, ServiceLimits};
 use models::dataset::{Dataset, scaled};
 use vulkan::gpu::GpuInfo;
 
 use super::CliError;
 use crate::cli::output::{out, outln};
-use engine::devices;
-use engine::device::DeviceRequest;
-use engine::scratch_bytes;
-use flight::fly::delivered_bytes;
-use engine::preset;
-use job::service::limits::{DeviceMemory, ServiceLimits};
 
 /// Arguments of `dgtr plan`.
 #[derive(Debug, clap::Args)]

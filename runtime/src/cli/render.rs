@@ -2,7 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use engine::device::file_renderer;
+use engine::evaluate::save_png;
+use engine::transfer::stem;
 use image::{ImageBuffer, Luma};
+use job::console;
+use job::interrupt;
 use models::camera::View;
 use models::formats::reconstruction::Shot;
 use models::formats::{FormatError, transforms, write_atomic};
@@ -10,11 +15,6 @@ use models::metrics::to_rgb8;
 use vulkan::trainer::Rendering;
 
 use super::CliError;
-use engine::device::file_renderer;
-use engine::evaluate::save_png;
-use engine::transfer::stem;
-use job::console;
-use job::interrupt;
 
 /// Where less than this share of a pixel is covered, it has no depth.
 const LEAST_COVER: f32 = 0.5;

@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 use config::disk::Disk;
 use config::mission::Mission;
 
-use crate::aggregate::summary;
+use engine::ortho::{draw_file, keep_scratch_in};
+use ground::jobs::serve::{self, Board, Joining, Reception, ServeError};
+use ground::jobs::summary;
 use job::console::Progress;
 use job::interrupt::Interrupt;
-use engine::ortho::{draw_file, keep_scratch_in};
-use pages::report::{ReportData, Timing, bytes};
-use crate::serve::{self, Board, Joining, Reception, ServeError};
 use job::service::Supervisor;
 use job::session::{Owner, Session};
+use pages::report::{ReportData, Timing, bytes};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};

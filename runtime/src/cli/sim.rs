@@ -17,10 +17,11 @@ use models::formats::flight_plan;
 
 mod card;
 
-use super::CliError;
-use crate::cli::output::outln;
 use flight::coverage::route;
 use job::interrupt::Interrupt;
+
+use super::CliError;
+use crate::cli::output::outln;
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
 /// the camera folder; or, with --autopilot, the camera alone beside an autopilot that runs already.

@@ -11,6 +11,7 @@ use config::mission::{KeyframeSettings, NetworkSettings};
 use config::preset::Preset;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use engine::InitKind;
 use models::card::CardOptions;
 use models::dataset::PoseSource;
 use models::formats::delivery::Rounding;
@@ -19,7 +20,6 @@ use serde::Deserialize;
 
 use super::CliError;
 use crate::cli::output::outln;
-use engine::InitKind;
 use crate::train_job::{TrainJob, log};
 
 /// A settings file has a few KiB.

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use job::interrupt::Interrupt;
 use serde::Deserialize;
 
 use super::{AIRCRAFT, DemoError, DemoOptions};
-use job::interrupt::Interrupt;
 
 /// What `dgtr eval --json --baselines` prints, as far as the demo shows it.
 #[derive(Clone, Debug, Deserialize)]

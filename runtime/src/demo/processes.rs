@@ -6,10 +6,10 @@ use std::process::{Child, Command, Stdio};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use job::interrupt::Interrupt;
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::{DemoError, io};
-use job::interrupt::Interrupt;
 
 /// After one part failed or Ctrl-C, the others may still save for this long.
 const GRACE: Duration = Duration::from_secs(15);

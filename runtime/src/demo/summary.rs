@@ -4,15 +4,15 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use engine::transfer::stem;
+use job::run_json::RunReport;
 use models::formats::model;
+use pages::report::ground::{Ortho, Shot};
+use pages::report::{Comparison, MapRegion, ModelRow, REPORT, ReportData, Table, Timing, bytes};
 
 use super::evaluate::Figures;
 use super::processes::Process;
 use super::{AIRCRAFT, DemoError, DemoOptions};
-use pages::report::ground::{Ortho, Shot};
-use pages::report::{Comparison, MapRegion, ModelRow, REPORT, ReportData, Table, Timing, bytes};
-use job::run_json::RunReport;
-use engine::transfer::stem;
 
 /// Views shown per aircraft.
 const SHOWN: usize = 2;

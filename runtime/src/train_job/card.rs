@@ -7,17 +7,17 @@ use std::path::Path;
 
 use config::geodesy::Geodetic;
 use config::refine::RefineSettings;
+use engine::evaluate::surveyed;
+use engine::host::settling_bytes;
+use engine::{matching_file_bytes, waiting_file};
+use job::console::Progress;
 use models::camera::View;
 use models::card::name_list;
 use models::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled};
 use models::formats::transforms;
 use models::refine::Refiner;
 
-use job::console::Progress;
-use engine::host::settling_bytes;
-use engine::{matching_file_bytes, waiting_file};
 use crate::error::JobError;
-use engine::evaluate::surveyed;
 
 mod control;
 

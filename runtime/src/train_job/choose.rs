@@ -1,18 +1,18 @@
 //! What `--preset auto` chooses for a folder: by its pictures, the share of the scene that each shows, and what a step costs here.
 
 use config::kernels::KernelChoice;
+use engine::cost;
+use engine::device::DeviceRequest;
+use engine::devices;
+use engine::energy::{Meter, shorter};
+use engine::kernels;
+use engine::preset::{Choice, Room, Wanted, most_side, shown};
 use models::camera::Pinhole;
 use models::dataset::Dataset;
 
 use super::TrainJob;
 use super::scale::largest;
-use engine::device::DeviceRequest;
-use engine::energy::{Meter, shorter};
 use crate::error::JobError;
-use engine::preset::{Choice, Room, Wanted, most_side, shown};
-use engine::cost;
-use engine::devices;
-use engine::kernels;
 
 /// Points and pictures that are looked at for the share of a scene that a picture shows, at the most; and the least of points that says
 /// something.

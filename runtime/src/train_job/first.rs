@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
+use engine::model_path;
 use models::dataset::Dataset;
 use models::formats::model::Chunks;
 
-use engine::model_path;
 use crate::error::JobError;
 
 /// Opens the model `from`. It is read once more, piece by piece, when it is trained, and must still be there then.

@@ -1,12 +1,12 @@
 //! At which size pictures are trained, and how many crops of them: what the device's plan holds.
 
 use config::plan::{Lanes, Plan, WORKING_SIDE};
+use engine::device::DeviceRequest;
+use engine::preset::SCALES;
 use models::dataset::{Dataset, scaled};
 
 use super::TrainJob;
-use engine::device::DeviceRequest;
 use crate::error::JobError;
-use engine::preset::SCALES;
 
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;

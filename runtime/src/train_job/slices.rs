@@ -3,15 +3,15 @@
 use std::ops::ControlFlow;
 use std::time::Duration;
 
+use engine::Reconstruct;
+use engine::failsafe::Failsafe;
 use hal::failsafe::{Action, Flags};
 use hal::traits::Clock;
+use job::console::Progress;
+use job::interrupt::Interrupt;
 use vulkan::trainer::{RunBudget, StopReason};
 
-use job::console::Progress;
-use engine::Reconstruct;
 use crate::error::JobError;
-use engine::failsafe::Failsafe;
-use job::interrupt::Interrupt;
 
 /// While training rests, its cause is looked at this often.
 pub(super) const REST: Duration = Duration::from_secs(1);
@@ -135,7 +135,7 @@ mod tests {
     }
 
     impl Reconstruct for Warming<'_> {
-        fn add(&mut self, _: PosedImage, _: bool) -> Result<(), JobError> {
+        fn add(&mut self, _: PosedImage, _: bool) -> Result<(), engine::error::EngineError> {
             Ok(())
         }
 
@@ -155,7 +155,7 @@ mod tests {
             true
         }
 
-        fn build(&mut self, _: &dyn Fn() -> bool) -> Result<bool, JobError> {
+        fn build(&mut self, _: &dyn Fn() -> bool) -> Result<bool, engine::error::EngineError> {
             Ok(true)
         }
 
@@ -169,7 +169,7 @@ mod tests {
             &mut self,
             budget: &RunBudget,
             each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
-        ) -> Result<StopReason, JobError> {
+        ) -> Result<StopReason, engine::error::EngineError> {
             while !self.is_done(budget) {
                 self.steps += 1;
                 if let Some((_, temperature)) = self.script.iter().find(|s| s.0 == self.steps) {
@@ -187,7 +187,7 @@ mod tests {
             self.halved.push(on);
         }
 
-        fn shrink(&mut self) -> Result<(), JobError> {
+        fn shrink(&mut self) -> Result<(), engine::error::EngineError> {
             Ok(())
         }
 
@@ -195,7 +195,7 @@ mod tests {
             0
         }
 
-        fn checkpoint(&mut self, _: &Path, _: bool) -> Result<(PathBuf, usize), JobError> {
+        fn checkpoint(&mut self, _: &Path, _: bool) -> Result<(PathBuf, usize), engine::error::EngineError> {
             Ok((PathBuf::new(), 0))
         }
     }

@@ -1,11 +1,11 @@
 //! A card's surveyed points in the pictures of its model.
 
+use engine::Reconstruction;
+use engine::evaluate::surveyed;
 use models::camera::View;
 use models::dataset::{Dataset, scaled};
 
-use engine::Reconstruction;
 use crate::error::JobError;
-use engine::evaluate::surveyed;
 
 /// How far the model's renderings put a card's surveyed points off, those that held its poses and those that did not.
 ///

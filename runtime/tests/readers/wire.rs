@@ -7,13 +7,13 @@ use std::time::Duration;
 
 use config::mission::Mission;
 use config::upload::UploadSettings;
+use ground::jobs::serve::admit::admit;
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
-use uplink::keys::Identity;
-use runtime::serve::admit::admit;
 use uplink::Source;
 use uplink::folder::{FolderInlet, FolderOutlet};
+use uplink::keys::Identity;
 use uplink::offer::{Offer, OfferedModel, Order, hex};
 use uplink::receipt::{Receipt, Verdict};
 use uplink::transport::{Inlet, Outlet, Patience};

@@ -17,10 +17,10 @@ pub mod admission;
 mod chaos;
 pub mod flight_number;
 pub mod folder;
+pub mod keys;
 mod medium;
 #[cfg(feature = "zenoh")]
 pub mod network;
-pub mod keys;
 pub mod offer;
 mod offerer;
 pub mod polygon;

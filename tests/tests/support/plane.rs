@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use models::metrics::to_rgb8;
 use engine::evaluate::save_png;
+use models::metrics::to_rgb8;
 
 /// Picture size and focal length, pixels.
 pub const SIZE: (u32, u32) = (192, 144);

@@ -6,17 +6,17 @@ use config::kernels::KernelChoice;
 use config::mission::{Aircraft, Mission};
 use config::plan::WORKING_SIDE;
 use config::preset::Preset;
+use job::session;
 use vulkan::gpu::{Gpu, GpuInfo};
 
 use super::{Choice, Room, Wanted, shown};
+use crate::cost;
 use crate::cost::model::CostModel;
 use crate::device::DeviceRequest;
-use crate::energy::{Meter, shorter};
-use crate::model_path;
-use job::session;
-use crate::cost;
 use crate::devices;
+use crate::energy::{Meter, shorter};
 use crate::kernels;
+use crate::model_path;
 
 /// Fills what the mission leaves to its device, and says what was chosen; `None` where the mission gives its numbers, and where nothing may
 /// be or was measured: then the defaults of the mission file hold. A device that was never measured is, which takes seconds. Whoever owns

@@ -8,6 +8,8 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use engine::PictureSource;
+use engine::error::EngineError;
 use hal::failsafe::{Action, Flags};
 use hal::mavlink::dialect::MavSeverity;
 use hal::mavlink_camera::Activity;
@@ -15,8 +17,6 @@ use image::RgbImage;
 use models::camera::{Pose, PosedImage};
 use models::picture::mask::Mask;
 
-use engine::PictureSource;
-use engine::error::EngineError;
 use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 
 /// Decoded key frames in the channel.

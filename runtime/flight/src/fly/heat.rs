@@ -5,9 +5,14 @@ use std::cell::Cell;
 use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::upload::UploadSettings;
+use engine::Reconstruct;
+use engine::failsafe::Failsafe;
 use glam::{DQuat, DVec3};
 use hal::traits::Clock;
+use job::health::Health;
+use job::interrupt::Interrupt;
 use models::camera::{Pose, PoseSigma, PosedImage, View};
+use uplink::Offerer;
 use vulkan::trainer::RunBudget;
 
 use super::fault_table::{ORIGIN, usual};
@@ -15,11 +20,6 @@ use super::handover::handover;
 use super::intake::FlightCounters;
 use super::onboard::Job;
 use super::rehearsal::{Ledger, intrinsics, unsigned};
-use engine::Reconstruct;
-use engine::failsafe::Failsafe;
-use job::health::Health;
-use job::interrupt::Interrupt;
-use uplink::Offerer;
 
 /// Half a second passes whenever somebody looks.
 struct Ticking(Cell<u64>);

@@ -16,6 +16,7 @@ use hal::traits::{Camera, Clock, Link};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use models::picture;
+use pages::watch::Watch;
 
 use super::geotags::Geotags;
 use super::handover::CaptureEnd;
@@ -25,7 +26,6 @@ use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
 use crate::coverage::Coverage;
 use crate::error::FlightError;
 use crate::keyframe_store::KeyFrame;
-use pages::watch::Watch;
 
 mod ground;
 mod station;

@@ -8,16 +8,16 @@ use std::time::Instant;
 
 use config::disk::Disk;
 use config::mission::CameraSettings;
+use engine::{Reconstruct, model_path};
 use glam::{DQuat, DVec3};
 use hal::camera::Picture;
+use job::session::{Owner, Session};
 use models::camera::{Pose, PoseSigma, PosedImage, View};
 use vulkan::trainer::RunBudget;
 
 use super::fault_table::ORIGIN;
 use super::rehearsal::{Ledger, Promise, intrinsics};
-use engine::{Reconstruct, model_path};
 use crate::keyframe_store::KeyFrame;
-use job::session::{Owner, Session};
 
 /// Tells the child where to fly.
 const FOLDER: &str = "DGTR_KILLED_FOLDER";

@@ -5,23 +5,23 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use engine::error::EngineError;
+use engine::failsafe::Failsafe;
+use engine::{PictureSource, Reconstruct, model_path};
 use hal::failsafe::Action;
 use hal::mavlink::dialect::MavSeverity;
 use hal::mavlink_camera::Activity;
 use hal::traits::Clock;
+use job::interrupt::Interrupt;
+use job::service::Supervisor;
+use pages::watch::Watch;
+use uplink::Offerer;
 use vulkan::trainer::{RunBudget, StepReport};
 
 use super::handover::Handover;
 use super::show::ShownJob;
-use engine::{PictureSource, Reconstruct, model_path};
 use crate::error::FlightError;
-use engine::error::EngineError;
-use engine::failsafe::Failsafe;
-use job::interrupt::Interrupt;
 use crate::keyframe_store::Relief;
-use job::service::Supervisor;
-use uplink::Offerer;
-use pages::watch::Watch;
 
 mod landing;
 

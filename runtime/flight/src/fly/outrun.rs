@@ -6,22 +6,22 @@ use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::mission::KeyframeSettings;
 use config::upload::UploadSettings;
+use engine::PictureSource;
+use engine::failsafe::Failsafe;
 use glam::{DQuat, DVec3};
 use hal::camera::Picture;
 use hal::time::ManualClock;
+use job::health::Health;
+use job::interrupt::Interrupt;
 use models::camera::{Pose, PoseSigma, PosedImage, View};
+use uplink::Offerer;
 use vulkan::trainer::RunBudget;
 
 use super::fault_table::{ORIGIN, usual};
 use super::handover::{AHEAD, handover};
 use super::onboard::Job;
 use super::rehearsal::{Ledger, intrinsics, unsigned};
-use engine::PictureSource;
-use engine::failsafe::Failsafe;
-use job::health::Health;
-use job::interrupt::Interrupt;
 use crate::keyframe_store::KeyFrame;
-use uplink::Offerer;
 
 /// Steps trained in flight while `turns` key frames are taken in and others always wait.
 fn trained_while_others_wait(train_steps: u32, turns: usize) -> u64 {

@@ -8,11 +8,17 @@ use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::mission::CameraSettings;
 use config::upload::UploadSettings;
+use engine::failsafe::Failsafe;
+use engine::model_path;
 use hal::camera::Picture;
 use hal::sim::world::{World, WorldSettings};
 use hal::time::ManualClock;
+use job::health::Health;
+use job::interrupt::Interrupt;
+use job::session::{Owner, Session};
 use models::formats::model;
 use rayon::prelude::*;
+use uplink::Offerer;
 use vulkan::trainer::RunBudget;
 
 use super::fault_table::{ORIGIN, usual};
@@ -21,15 +27,9 @@ use super::handover::handover;
 use super::intake::FlightCounters;
 use super::onboard::Job;
 use super::rehearsal::{Ledger, Promise, intrinsics, rehearse_on, unsigned};
-use engine::model_path;
-use engine::failsafe::Failsafe;
-use job::health::Health;
-use job::interrupt::Interrupt;
 use crate::keyframe_store::{KeyFrame, KeyframeStore};
 use crate::power_cut::states::{State, each};
 use crate::power_cut::{Done, Recorder};
-use job::session::{Owner, Session};
-use uplink::Offerer;
 
 /// States checked at a time.
 const AT_ONCE: usize = 256;

@@ -20,11 +20,11 @@ use hal::mavlink::dialect::MavSeverity;
 use hal::vehicle::PoseReport;
 use image::RgbImage;
 use models::camera::Pose;
+use pages::report::craft::Thumbnail;
+use pages::report::picture;
 use serde_json::{Value, json};
 
 use super::handover::Told;
-use pages::report::craft::Thumbnail;
-use pages::report::picture;
 
 mod mcap;
 mod schemas;

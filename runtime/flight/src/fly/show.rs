@@ -6,11 +6,11 @@ use hal::failsafe::State;
 use image::RgbImage;
 use models::camera::{Intrinsics, Pose, View};
 use models::coverage::CoverageMap;
+use pages::report::ground::Shot;
+use pages::watch::Watch;
 use vulkan::trainer::StepReport;
 
 use crate::coverage::Coverage;
-use pages::report::ground::Shot;
-use pages::watch::Watch;
 
 /// Between two looks at the squares of ground: some milliseconds each on a small board.
 const SURVEY_EVERY_NS: u64 = 2_000_000_000;

@@ -8,10 +8,10 @@ use std::net::TcpStream;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use super::{GAPS, Watch};
 use super::access::Token;
 use super::request::{COOKIE, Refusal, Route};
 use super::room::Room;
+use super::{GAPS, Watch};
 use crate::report::{self, SCRIPT, STYLE, picture};
 
 /// A document is sent within this: 1 MB over 100 kB/s three times over.

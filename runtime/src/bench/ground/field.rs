@@ -6,7 +6,7 @@ use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
 
-use crate::aggregate::frame::Motion;
+use ground::frame::Motion;
 
 /// Ground that an aircraft sees beyond its region, as a share of the region's side: neighbours share a fifth of it.
 pub(super) const BEYOND: f64 = 0.1;

@@ -4,6 +4,7 @@
 use std::io;
 use std::path::Path;
 
+use engine::device::renderer_of_parts;
 use glam::DVec3;
 use models::camera::{Intrinsics, View};
 use models::cloud::GaussianCloud;
@@ -11,7 +12,6 @@ use models::levels::Rows;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::bench::frustum::{Frustum, mean, reach};
-use engine::device::renderer_of_parts;
 use crate::error::JobError;
 
 /// Gaussians that are drawn at once.

@@ -6,13 +6,14 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use config::training::{LossSettings, RateSettings, Strategy, TrainSettings};
+use engine::device::DeviceRequest;
+use engine::error::EngineError;
 use models::camera::{Intrinsics, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::metrics::to_rgb8;
 use vulkan::trainer::{Rendering, RunBudget, StopReason, Trainer};
 
-use engine::device::DeviceRequest;
 use crate::error::JobError;
 
 /// Rate of the opacity logits.
@@ -111,7 +112,7 @@ pub fn merge(
         for (_, name, view) in views.iter().filter(|v| v.0 == i) {
             trainer.render(view, &mut drawn)?;
             let Some(image) = to_rgb8(&drawn.rgb, drawn.width, drawn.height) else {
-                return Err(JobError::RenderingSize((*name).to_owned()));
+                return Err(EngineError::RenderingSize((*name).to_owned()).into());
             };
             let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
             // Two clients' pictures may have one name.
@@ -176,7 +177,8 @@ fn doubt(cloud: &mut GaussianCloud, owner: &[usize], clients: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::aggregate::testing::{carpet, model as local, nadir};
+    use crate::carpet::{carpet, nadir};
+    use ground::LocalModel;
 
     #[test]
     fn opacities_are_doubted_only_where_two_clients_have_the_ground() {
@@ -204,7 +206,9 @@ mod tests {
         let dir = tempfile::tempdir().expect("temp dir");
         let mut clients = Vec::new();
         for (i, x) in [0.0, 10.0].into_iter().enumerate() {
-            let mut client = local(&i.to_string(), &[], carpet([x, 0.0], [x + 20.0, 20.0], 1.0));
+            let header = model::ModelHeader { aircraft: i.to_string(), ..Default::default() };
+            let cloud = carpet([x, 0.0], [x + 20.0, 20.0], 1.0);
+            let mut client = LocalModel { path: header.aircraft.clone().into(), header, cloud, content: [0; 32] };
             let at = |k: usize| x + 5.0 + 5.0 * (k % 3) as f64;
             client.header.views = (0..3).map(|k| (format!("{k}.png"), nadir(at(k), 10.0, 20.0))).collect();
             let path = dir.path().join(format!("{i}.dgtr"));

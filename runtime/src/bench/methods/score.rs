@@ -1,13 +1,13 @@
 //! How good a method's model is: all held-out pictures, those of each region, and those that show a border.
 
+use engine::evaluate::{Scores, ViewScore};
 use glam::DVec2;
+use ground::region::Region;
 use models::camera::View;
 use models::dataset::Dataset;
 use serde::{Deserialize, Serialize};
 
 use super::territory::Territory;
-use crate::aggregate::region::Region;
-use engine::evaluate::{Scores, ViewScore};
 
 /// A picture whose middle shows ground no farther from another region shows a seam, metres (as `dgtr aggregate --compare` has it).
 const NEAR_M: f64 = 10.0;

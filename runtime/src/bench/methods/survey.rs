@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use engine::evaluate::save_png;
 use glam::{DQuat, DVec2, DVec3};
 use hal::sim::world::{PinholeView, World, WorldSettings};
 use models::camera::{Pinhole, Pose};
@@ -13,7 +14,6 @@ use serde_json::{Value, json};
 use super::super::figures::write_json;
 use super::data::write_points;
 use crate::error::JobError;
-use engine::evaluate::save_png;
 
 /// Aircraft that fly at least and at most: the depths of all pictures are in memory together.
 pub const AIRCRAFT: std::ops::RangeInclusive<usize> = 2..=24;

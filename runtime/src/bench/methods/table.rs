@@ -1,10 +1,11 @@
 //! A comparison as tables: quality, regions, what it takes, and what each method is.
 
+use pages::report::{Table, count};
+
 use super::presets::Method;
 use super::score::Means;
 use super::{Comparison, MethodResult};
 use crate::bench::figures::short;
-use pages::report::{Table, count};
 
 const NONE: &str = "–";
 const MB: f64 = 1e6;

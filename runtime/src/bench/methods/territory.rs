@@ -1,9 +1,9 @@
 //! Who flies where: the data set's own regions, or as many as wanted with equally many pictures each.
 
 use glam::DVec2;
+use ground::region::Region;
 use models::dataset::Dataset;
 
-use crate::aggregate::region::Region;
 use crate::error::JobError;
 
 /// Ground around the outermost cameras that still belongs to their region, metres: a region has an area even where all cameras are

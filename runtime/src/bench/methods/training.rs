@@ -4,6 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use config::disk::Disk;
+use job::run_json::RunReport;
 use models::formats::delivery::Rounding;
 use models::formats::model;
 
@@ -13,7 +14,6 @@ use super::Request;
 use super::data::{OWN, SEEN, Written};
 use super::presets::{Method, Pictures};
 use crate::error::JobError;
-use job::run_json::RunReport;
 
 /// Digits of the hash in a folder's name.
 const DIGITS: usize = 12;

@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use config::training::CropSettings;
+use pages::report::Table;
 
 use crate::bench::detail::measure;
 use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::world;
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use pages::report::Table;
 
 /// How much larger than the survey of the other benchmarks the pictures of this one are: 2,400 × 1,800 pixels.
 const LARGER: f64 = 7.5;

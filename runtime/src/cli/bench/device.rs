@@ -3,11 +3,12 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use pages::report::Table;
+
 use crate::bench::device::{Extent, SIZES, measure};
 use crate::bench::figures::{markdown, write_json};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use pages::report::Table;
 
 /// Arguments of `dgtr bench device`.
 #[derive(Debug, clap::Args)]

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use engine::kernels;
 use vulkan::gpu::Gpu;
 
 use crate::bench::device::SIZES;
@@ -9,7 +10,6 @@ use crate::bench::figures::{markdown, write_json};
 use crate::bench::forecast::{measured, table};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use engine::kernels;
 
 /// Arguments of `dgtr bench forecast`.
 #[derive(Debug, clap::Args)]

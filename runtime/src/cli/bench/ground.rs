@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
+use pages::report::{Table, count};
+
 use crate::bench::figures::{markdown, write_json};
 use crate::bench::ground::{field::Field, measure};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use pages::report::{Table, count};
 
 /// Arguments of `dgtr bench ground`.
 #[derive(Debug, clap::Args)]

@@ -2,12 +2,13 @@
 
 use std::path::PathBuf;
 
+use pages::report::Table;
+
 use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::levels::{FARTHER, measure, write_scene};
 use crate::cli::CliError;
 use crate::cli::output::outln;
 use crate::error::JobError;
-use pages::report::Table;
 
 /// Arguments of `dgtr bench levels`.
 #[derive(Debug, clap::Args)]

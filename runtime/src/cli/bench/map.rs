@@ -2,13 +2,14 @@
 
 use std::path::PathBuf;
 
+use engine::evaluate::heights::HeightScores;
+use engine::ortho::MapRequest;
+use pages::report::Table;
+
 use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::map::measure;
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use engine::evaluate::heights::HeightScores;
-use engine::ortho::MapRequest;
-use pages::report::Table;
 
 /// Arguments of `dgtr bench map`.
 #[derive(Debug, clap::Args)]

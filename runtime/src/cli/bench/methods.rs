@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use job::interrupt::Interrupt;
 
 use crate::bench::figures::{markdown, write_json, write_text};
 use crate::bench::methods::presets::{METHODS, Method};
 use crate::bench::methods::{Request, measure, survey, table};
 use crate::cli::CliError;
 use crate::cli::output::{out, outln};
-use job::interrupt::Interrupt;
 
 /// Most regions that a data set is divided into.
 const MOST_REGIONS: u64 = 256;

@@ -2,12 +2,13 @@
 
 use std::path::PathBuf;
 
+use pages::report::{Table, bytes, count};
+
 use crate::bench::figures::{markdown, short, write_json};
 use crate::bench::scene::{Figures, Request, measure};
 use crate::cli::CliError;
 use crate::cli::output::outln;
 use crate::error::JobError;
-use pages::report::{Table, bytes, count};
 
 /// Arguments of `dgtr bench scene`.
 #[derive(Debug, clap::Args)]

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use engine::kernels;
+use pages::report::Table;
 use vulkan::ceiling;
 use vulkan::gpu::Gpu;
 
@@ -9,8 +11,6 @@ use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::stages::{Scene, SizeFigures, growth, growth_table, measure, overview_table, size_table};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use engine::kernels;
-use pages::report::Table;
 
 /// Arguments of `dgtr bench stages`.
 #[derive(Debug, clap::Args)]

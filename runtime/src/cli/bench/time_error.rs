@@ -2,12 +2,13 @@
 
 use std::path::PathBuf;
 
+use pages::report::{ReportData, Table};
+
 use super::Init;
 use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::time_error::{Request, chart, groups, measure, points_table, speedups, table};
 use crate::cli::CliError;
 use crate::cli::output::outln;
-use pages::report::{ReportData, Table};
 
 /// Arguments of `dgtr bench time-error`.
 #[derive(Debug, clap::Args)]

@@ -3,9 +3,9 @@
 use config::link::Signing;
 use config::mission::Mission;
 use hal::link::LinkAddress;
+use uplink::keys::{GROUND, Identity, private_path};
 
 use super::Finding;
-use uplink::keys::{GROUND, Identity, private_path};
 
 /// One line per kind of protection.
 pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {

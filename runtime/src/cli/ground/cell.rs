@@ -2,14 +2,15 @@
 
 use std::str::FromStr;
 
+use ground::AggregateError;
+use ground::jobs::{join, make};
+use ground::plan::Plan;
+use ground::store::{Store, hex};
+use job::interrupt::Interrupt;
 use models::ground_cell::CellKey;
 
 use super::CliError;
-use crate::aggregate::plan::Plan;
-use crate::aggregate::store::{Store, hex};
-use crate::aggregate::{AggregateError, job, join};
 use crate::cli::output::outln;
-use job::interrupt::Interrupt;
 
 /// Arguments of `dgtr ground cell`.
 #[derive(Debug, clap::Args)]
@@ -71,7 +72,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
         let is_new = was_there.is_none();
         let head = match was_there {
             Some(head) => head,
-            None => match job::make(&inputs, &store, args.device.as_deref(), &|| !stop.requested())? {
+            None => match make::make(&inputs, &store, args.device.as_deref(), &|| !stop.requested())? {
                 Some(made) => made.head,
                 None => return Err(CliError::interrupted("stopped on request; run the same command again")),
             },

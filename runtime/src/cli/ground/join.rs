@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use ground::jobs::join::{header_in, join};
+use ground::plan::{Hash, Plan};
+use ground::store::{Store, hex};
+
 use super::CliError;
-use crate::aggregate::join::{header_in, join};
-use crate::aggregate::plan::{Hash, Plan};
-use crate::aggregate::store::{Store, hex};
 use crate::cli::output::outln;
 
 /// Arguments of `dgtr ground join`.

@@ -4,18 +4,19 @@ use std::path::PathBuf;
 
 use config::ground::GroundSettings;
 use config::mission::Mission;
+use ground::LocalModel;
+use ground::jobs::aggregate::REGISTRATION;
+use ground::jobs::join::missing;
+use ground::jobs::planning::{lay_out, plan, publish};
+use ground::jobs::serve::admit::admit;
+use ground::member::Member;
+use ground::store::Store;
+use job::interrupt::Interrupt;
 use models::formats::model::read_header;
 
 use super::CliError;
-use crate::aggregate::join::missing;
-use crate::aggregate::member::Member;
-use crate::aggregate::planning::{lay_out, plan, publish};
-use crate::aggregate::store::Store;
-use crate::aggregate::{LocalModel, REGISTRATION};
 use crate::cli::aggregate::Merging;
 use crate::cli::output::outln;
-use job::interrupt::Interrupt;
-use crate::serve::admit::admit;
 
 /// Arguments of `dgtr ground plan`.
 #[derive(Debug, clap::Args)]

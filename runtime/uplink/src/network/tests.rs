@@ -5,9 +5,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use super::*;
+use crate::admission::Admission;
 use crate::keys::Identity;
 use crate::keys::testing::identities;
-use crate::admission::Admission;
 use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::receive::Receiver;

@@ -7,8 +7,8 @@ use config::upload::Encoding;
 use models::formats::model;
 
 use super::*;
-use crate::keys::Identity;
 use crate::admission::Admission;
+use crate::keys::Identity;
 use crate::receive::Receiver;
 use crate::testing::noise;
 #[cfg(feature = "zenoh")]

@@ -9,8 +9,8 @@ use config::upload::UploadSettings;
 
 use super::sight::Shown;
 use super::{ANSWER, ReceiveCounters, Received};
-use crate::keys::{Domain, SignatureBytes};
 use crate::admission::{Admission, ModelRefusal, Refusals};
+use crate::keys::{Domain, SignatureBytes};
 use crate::offer::{Hash, Offer, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::store::{Store, StoreError};

@@ -4,11 +4,11 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use super::*;
+use crate::Source;
+use crate::admission::ModelRefusal;
 use crate::keys::Domain;
 use crate::keys::Identity;
 use crate::keys::testing::identities;
-use crate::Source;
-use crate::admission::ModelRefusal;
 use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Delivery, Receipt};
 use crate::testing::noise;

@@ -1,9 +1,9 @@
 use super::*;
+use crate::Source;
 use crate::keys::Identity;
+use crate::offer::{OfferedModel, Order};
 use crate::power_cut::states::{State, each};
 use crate::power_cut::{Done, Recorder};
-use crate::Source;
-use crate::offer::{OfferedModel, Order};
 
 fn settings() -> UploadSettings {
     UploadSettings { chunk_kib: 16, max_model_mib: 1, ..UploadSettings::default() }

@@ -3,16 +3,16 @@
 use std::ops::ControlFlow;
 use std::time::Duration;
 
+use engine::{Reconstruct, model_path};
 use hal::failsafe::{Cause, Flags};
 use hal::traits::Clock;
+use job::interrupt::Interrupt;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::{CHECKPOINT_EVERY_NS, Handover, Job, JobEnd};
-use engine::{Reconstruct, model_path};
 use crate::error::FlightError;
 use crate::fly::intake::FlightCounters;
 use crate::fly::shortage::likely_cause;
-use job::interrupt::Interrupt;
 
 impl<R: Reconstruct, K: Clock> Job<R, K> {
     /// After capture, which counted `flight`: the last build, the rest of the schedule, and the model that remains.
