@@ -26,7 +26,7 @@ pub use udp::UdpLink;
 pub use wire::WireLink;
 
 use crate::error::HalError;
-use crate::traits::{Link, Received};
+use crate::traits::{Flow, Link, Received};
 
 /// Any of the links.
 pub enum AnyLink {
@@ -35,7 +35,7 @@ pub enum AnyLink {
     /// UDP, either way round.
     Udp(UdpLink),
     /// TCP, either way round.
-    Tcp(TcpLink),
+    Tcp(Box<TcpLink>),
     /// A recorded log.
     Tlog(TlogLink),
     /// The near end of a pseudo-terminal.
@@ -51,8 +51,8 @@ pub fn open(address: &LinkAddress) -> Result<AnyLink, HalError> {
         LinkAddress::Serial { path, baud } => AnyLink::Serial(SerialLink::open(path, *baud)?),
         LinkAddress::UdpIn(host) => AnyLink::Udp(UdpLink::listen(host)?),
         LinkAddress::UdpOut(host) => AnyLink::Udp(UdpLink::connect(host)?),
-        LinkAddress::TcpIn(host) => AnyLink::Tcp(TcpLink::listen(host)?),
-        LinkAddress::TcpOut(host) => AnyLink::Tcp(TcpLink::connect(host)?),
+        LinkAddress::TcpIn(host) => AnyLink::Tcp(TcpLink::listen(host)?.into()),
+        LinkAddress::TcpOut(host) => AnyLink::Tcp(TcpLink::connect(host)?.into()),
         LinkAddress::File(path) => AnyLink::Tlog(TlogLink::open(path)?),
         LinkAddress::Pty(alias) => AnyLink::Pty(PtyLink::create(alias.as_deref())?),
     })
@@ -90,14 +90,23 @@ impl Link for AnyLink {
     }
 
     fn pin(&mut self, peer: SocketAddr) {
-        if let Self::Udp(link) = self {
-            link.pin(peer);
+        match self {
+            Self::Udp(link) => link.pin(peer),
+            Self::Tcp(link) => link.pin(peer),
+            _ => {}
         }
     }
 
-    fn dismiss(&mut self) {
+    fn vouch(&mut self, peer: SocketAddr) {
         if let Self::Tcp(link) = self {
-            link.dismiss();
+            link.vouch(peer);
+        }
+    }
+
+    fn senders(&self) -> usize {
+        match self {
+            Self::Tcp(link) => link.senders(),
+            _ => 1,
         }
     }
 
@@ -113,7 +122,7 @@ impl Link for AnyLink {
 }
 
 /// Nothing came in time: not an error on a live link.
-const NOTHING: Received = Received { bytes: 0, time_ns: None, peer: None };
+const NOTHING: Received = Received { bytes: 0, time_ns: None, peer: None, flow: Flow::Continues };
 
 fn is_timeout(e: &std::io::Error) -> bool {
     use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};

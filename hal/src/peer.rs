@@ -1,13 +1,15 @@
 //! Who is the autopilot, when several speak on one link. A UDP port is open to everybody; MAVLink without signing is believed
-//! by what it says. So a peer has to prove itself, by several messages that agree over seconds, and is pinned from then on.
-//! Only an autopilot that has fallen silent can be replaced, by one that goes on where it stopped.
+//! by what it says. So a peer has to prove itself, by several messages that agree over seconds, before anything it says is
+//! taken, and is pinned from then on. An autopilot that has fallen silent can be replaced by one at the same host that goes
+//! on where it stopped, and takes its place back when it speaks again.
 
 use core::net::SocketAddr;
 
 use heapless::Vec;
 
 use crate::mavlink::dialect::{
-    ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot, SYSTEM_TIME_DATA,
+    ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag,
+    SYSTEM_TIME_DATA,
 };
 use crate::mavlink::{Frame, MessageData};
 
@@ -24,8 +26,6 @@ const SILENT_NS: u64 = 5_000_000_000;
 /// And its boot clock stands where the pinned one's would, give or take this, or has just started.
 const CLOCK_SLACK_MS: u64 = 10_000;
 const JUST_STARTED_MS: u64 = 120_000;
-/// A peer that has not proven itself by then may be sent away.
-const PROOF_NS: u64 = 15_000_000_000;
 
 /// Somebody who claims to be the autopilot: an address (`None` on links without) and MAVLink ids.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,12 +38,18 @@ struct Identity {
 #[derive(Clone, Copy, Debug)]
 struct Candidate {
     who: Identity,
-    since_ns: u64,
     last_ns: u64,
     heartbeat_ns: Option<u64>,
     heartbeats: u8,
     boot_ms: Option<u32>,
     stamped: u8,
+    is_armed: bool,
+}
+
+impl Identity {
+    fn ids(&self) -> (u8, u8) {
+        (self.system, self.component)
+    }
 }
 
 /// The pinned autopilot.
@@ -53,17 +59,23 @@ struct Pinned {
     last_ns: u64,
     /// Its boot clock, and when that was heard.
     boot: Option<(u32, u64)>,
+    /// As its last heartbeat says: an armed one does not restart.
+    is_armed: bool,
 }
 
 /// What to do with a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// It is the autopilot's, or may be.
+    /// It is the autopilot's.
     Take,
     /// It is; what was taken before came from somebody else and is void.
     TakeAfresh,
     /// It is not.
     Refuse,
+    /// Nobody has proven to be the autopilot yet; this one claims to be.
+    Claims,
+    /// Nobody has, and this one does not claim to be.
+    Nobody,
 }
 
 /// Tells the autopilot from others.
@@ -72,15 +84,15 @@ pub struct Peers {
     /// The vehicle's system id; 0 = whichever comes first.
     system: u8,
     pinned: Option<Pinned>,
-    /// Whom frames are taken from until somebody is pinned.
-    provisional: Option<Option<SocketAddr>>,
+    /// Whom the pinned one has replaced.
+    replaced: Option<Pinned>,
     candidates: Vec<Candidate, CANDIDATES>,
 }
 
 impl Peers {
     /// Nobody is known yet; `system` is the mission's, 0 takes the first.
     pub fn new(system: u8) -> Self {
-        Self { system, pinned: None, provisional: None, candidates: Vec::new() }
+        Self { system, pinned: None, replaced: None, candidates: Vec::new() }
     }
 
     /// The pinned autopilot's address, on links that have any.
@@ -93,47 +105,40 @@ impl Peers {
         self.pinned.is_some()
     }
 
-    /// The peer at `address` has had its time and proved nothing; a link that serves one at a time may take the next.
-    pub fn is_idle(&self, address: Option<SocketAddr>, now_ns: u64) -> bool {
-        let ours = |c: &&Candidate| c.who.address == address;
-        let pinned = self.pinned.is_some_and(|p| p.who.address == address);
-        !pinned && self.candidates.iter().find(ours).is_some_and(|c| now_ns.saturating_sub(c.since_ns) > PROOF_NS)
-    }
-
     /// Judges a frame that came from `address` at `now_ns`.
     pub fn judge(&mut self, address: Option<SocketAddr>, frame: &Frame<'_>, now_ns: u64) -> Verdict {
         if address.is_none() {
             // One line, one autopilot: its ids are all there is to go by.
             return Verdict::Take;
         }
+        let ids = (frame.system(), frame.component());
         if let Some(pinned) = &mut self.pinned
             && pinned.who.address == address
         {
-            if (pinned.who.system, pinned.who.component) == (frame.system(), frame.component()) {
-                pinned.last_ns = now_ns;
-                pinned.boot = boot_ms(frame).map(|ms| (ms, now_ns)).or(pinned.boot);
+            if pinned.who.ids() == ids {
+                pinned.hear(frame, now_ns);
             }
             return Verdict::Take;
         }
+        if let Some(mut first) = self.replaced.filter(|r| r.who.address == address && r.who.ids() == ids)
+            && boot_ms(frame).is_some_and(|ms| first.goes_on_at(ms, now_ns))
+        {
+            first.hear(frame, now_ns);
+            (self.pinned, self.replaced) = (Some(first), None);
+            return Verdict::TakeAfresh;
+        }
         let claims = self.system == 0 || frame.system() == self.system;
         let proven = if claims { self.watch(address, frame, now_ns) } else { None };
-        match (&self.pinned, proven) {
+        match (self.pinned, proven) {
             (None, Some(candidate)) => {
-                let afresh = self.provisional.is_some_and(|taken| taken != address);
                 self.pin(&candidate, now_ns);
-                if afresh { Verdict::TakeAfresh } else { Verdict::Take }
+                Verdict::Take
             }
-            (None, None) => match self.provisional {
-                Some(taken) if taken == address => Verdict::Take,
-                None if claims && is_autopilot(frame) => {
-                    self.provisional = Some(address);
-                    Verdict::Take
-                }
-                // Ground stations and peripherals may speak before the autopilot does.
-                None => Verdict::Take,
-                Some(_) => Verdict::Refuse,
-            },
+            (None, None) if claims && is_autopilot(frame) => Verdict::Claims,
+            (None, None) => Verdict::Nobody,
             (Some(pinned), Some(candidate)) if pinned.may_be_replaced_by(&candidate, now_ns) => {
+                // Of several in a row the first stays the one that may come back.
+                self.replaced = self.replaced.or(Some(pinned));
                 self.pin(&candidate, now_ns);
                 Verdict::Take
             }
@@ -143,7 +148,8 @@ impl Peers {
 
     fn pin(&mut self, candidate: &Candidate, now_ns: u64) {
         let boot = candidate.boot_ms.map(|ms| (ms, now_ns));
-        self.pinned = Some(Pinned { who: candidate.who, last_ns: now_ns, boot });
+        let is_armed = candidate.is_armed;
+        self.pinned = Some(Pinned { who: candidate.who, last_ns: now_ns, boot, is_armed });
         self.candidates.clear();
     }
 
@@ -161,9 +167,8 @@ impl Peers {
                     let least = self.candidates.iter().enumerate().min_by_key(|(_, c)| shown(c)).map(|(i, _)| i)?;
                     self.candidates.swap_remove(least);
                 }
-                let (since_ns, last_ns) = (now_ns, now_ns);
-                let new =
-                    Candidate { who, since_ns, last_ns, heartbeat_ns: None, heartbeats: 0, boot_ms: None, stamped: 0 };
+                let (last_ns, heartbeat_ns, boot_ms) = (now_ns, None, None);
+                let new = Candidate { who, last_ns, heartbeat_ns, heartbeats: 0, boot_ms, stamped: 0, is_armed: false };
                 self.candidates.push(new).ok()?;
                 self.candidates.len() - 1
             }
@@ -176,6 +181,7 @@ impl Peers {
             return None;
         }
         c.last_ns = now_ns;
+        c.is_armed = is_armed(frame).unwrap_or(c.is_armed);
         if is_autopilot(frame) && c.heartbeat_ns.is_none_or(|at| now_ns.saturating_sub(at) >= HEARTBEAT_APART_NS) {
             c.heartbeats = c.heartbeats.saturating_add(1);
             c.heartbeat_ns = Some(now_ns);
@@ -191,19 +197,35 @@ impl Peers {
 }
 
 impl Pinned {
-    /// The candidate has the same ids and goes on where this one stopped, or was just started.
-    fn may_be_replaced_by(&self, candidate: &Candidate, now_ns: u64) -> bool {
-        let ids = |who: &Identity| (who.system, who.component);
-        let clock = match (self.boot, candidate.boot_ms) {
-            (Some((then_ms, then_ns)), Some(ms)) => {
-                let expected = u64::from(then_ms) + now_ns.saturating_sub(then_ns) / 1_000_000;
-                expected.abs_diff(ms.into()) < CLOCK_SLACK_MS || u64::from(ms) < JUST_STARTED_MS
-            }
-            (None, _) => true,
-            (Some(_), None) => false,
-        };
-        ids(&self.who) == ids(&candidate.who) && clock && now_ns.saturating_sub(self.last_ns) >= SILENT_NS
+    fn hear(&mut self, frame: &Frame<'_>, now_ns: u64) {
+        self.last_ns = now_ns;
+        self.boot = boot_ms(frame).map(|ms| (ms, now_ns)).or(self.boot);
+        self.is_armed = is_armed(frame).unwrap_or(self.is_armed);
     }
+
+    /// Its boot clock would stand at `ms` now.
+    fn goes_on_at(&self, ms: u32, now_ns: u64) -> bool {
+        self.boot.is_none_or(|(then_ms, then_ns)| {
+            let expected = u64::from(then_ms) + now_ns.saturating_sub(then_ns) / 1_000_000;
+            expected.abs_diff(ms.into()) < CLOCK_SLACK_MS
+        })
+    }
+
+    /// The candidate is at the same host, has the same ids, and goes on where this one stopped, or was just started on the ground.
+    fn may_be_replaced_by(&self, candidate: &Candidate, now_ns: u64) -> bool {
+        let host = |who: &Identity| who.address.map(|a| a.ip());
+        let same = self.who.ids() == candidate.who.ids() && host(&self.who) == host(&candidate.who);
+        let clock = match candidate.boot_ms {
+            Some(ms) => self.goes_on_at(ms, now_ns) || (!self.is_armed && u64::from(ms) < JUST_STARTED_MS),
+            None => self.boot.is_none(),
+        };
+        same && clock && now_ns.saturating_sub(self.last_ns) >= SILENT_NS
+    }
+}
+
+/// What a heartbeat says about arming.
+fn is_armed(frame: &Frame<'_>) -> Option<bool> {
+    frame.message::<HEARTBEAT_DATA>().map(|h| h.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED))
 }
 
 fn is_autopilot(frame: &Frame<'_>) -> bool {
@@ -263,7 +285,9 @@ mod tests {
     fn once_pinned_nobody_else_is_believed_while_the_autopilot_speaks() {
         let mut peers = Peers::new(1);
         for second in 200..210 {
-            assert_eq!(speak(&mut peers, 7, second), Verdict::Take);
+            // Three heartbeats, and three times after the first one, are its proof.
+            let proven = if second < 203 { Verdict::Claims } else { Verdict::Take };
+            assert_eq!(speak(&mut peers, 7, second), proven);
         }
         assert_eq!(peers.address(), address(7));
         for second in 210..300 {
@@ -273,19 +297,48 @@ mod tests {
     }
 
     #[test]
-    fn a_stranger_who_spoke_first_gives_way_to_the_autopilot_that_proves_itself() {
+    fn nothing_is_taken_of_a_stranger_who_speaks_before_the_autopilot_has_proven_itself() {
         let mut peers = Peers::new(1);
-        let mut verdicts = std::vec::Vec::new();
         for second in 200..206 {
-            judge(&mut peers, address(8), &heartbeat(), second * S);
-            let time_boot_ms = (second * 1000) as u32;
-            let attitude = ATTITUDE_DATA { time_boot_ms, ..ATTITUDE_DATA::default() };
-            verdicts.push(judge(&mut peers, address(7), &attitude, second * S));
-            verdicts.push(judge(&mut peers, address(7), &heartbeat(), second * S));
+            let strange = GLOBAL_POSITION_INT_DATA { time_boot_ms: 7, ..GLOBAL_POSITION_INT_DATA::default() };
+            assert_ne!(judge(&mut peers, address(8), &strange, second * S), Verdict::Take);
+            if second % 2 == 0 {
+                assert_ne!(judge(&mut peers, address(8), &heartbeat(), second * S), Verdict::Take);
+            }
+            speak(&mut peers, 7, second);
         }
         assert_eq!(peers.address(), address(7));
-        assert_eq!(verdicts.iter().filter(|v| **v == Verdict::TakeAfresh).count(), 1, "{verdicts:?}");
         assert_eq!(judge(&mut peers, address(8), &heartbeat(), 206 * S), Verdict::Refuse);
+        assert_eq!(speak(&mut peers, 7, 206), Verdict::Take);
+    }
+
+    #[test]
+    fn while_the_autopilot_is_silent_no_other_host_takes_its_place_and_no_restart_is_believed_in_the_air() {
+        let elsewhere = Some(SocketAddr::from(([10, 0, 0, 3], 7)));
+        for (armed, from, clock_s, taken) in [
+            (true, elsewhere, 0, false),
+            (true, address(9), 1010, false),
+            (false, address(9), 1010, true),
+            (true, address(9), 0, true),
+        ] {
+            let mut peers = Peers::new(1);
+            let mut beat = heartbeat();
+            beat.base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, armed);
+            let second = |peers: &mut Peers, from, s: u64, clock: u64| {
+                let attitude = ATTITUDE_DATA { time_boot_ms: (clock * 1000) as u32, ..ATTITUDE_DATA::default() };
+                judge(peers, from, &beat, s * S);
+                judge(peers, from, &attitude, s * S)
+            };
+            for s in 1000..1010 {
+                second(&mut peers, address(7), s, s);
+            }
+            let last = (1010..1030).map(|s| second(&mut peers, from, s, s - clock_s)).last();
+            assert_eq!(last, Some(if taken { Verdict::Take } else { Verdict::Refuse }), "{armed} {from:?} {clock_s}");
+            // The first one comes back: it is the autopilot again, and what was taken in between is void.
+            let back = second(&mut peers, address(7), 1030, 1030);
+            assert_eq!(back, if taken { Verdict::TakeAfresh } else { Verdict::Take });
+            assert_eq!(peers.address(), address(7));
+        }
     }
 
     #[test]

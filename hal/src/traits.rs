@@ -23,6 +23,21 @@ pub struct Received {
     pub time_ns: Option<u64>,
     /// Who sent them, on links where anybody may.
     pub peer: Option<SocketAddr>,
+    /// How they belong to what came from there before.
+    pub flow: Flow,
+}
+
+/// Where the bytes of one [`Link::read`] stand in what their sender says. Half a frame must not be completed by bytes that do
+/// not follow it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Flow {
+    /// They follow what was read from this sender before.
+    #[default]
+    Continues,
+    /// A connection begins with them.
+    Begins,
+    /// A datagram: nothing before them and nothing behind them belongs to them.
+    Whole,
 }
 
 /// Whether a link is open.
@@ -59,8 +74,16 @@ pub trait Link {
         let _ = peer;
     }
 
-    /// Ends the connection of a peer that has proved nothing, on links that serve one at a time.
-    fn dismiss(&mut self) {}
+    /// Says that a whole frame in the autopilot's name came from this peer, which is not pinned: of several connections those
+    /// without make room first.
+    fn vouch(&mut self, peer: SocketAddr) {
+        let _ = peer;
+    }
+
+    /// How many peers may be half through a frame at the same time.
+    fn senders(&self) -> usize {
+        1
+    }
 
     /// Whether it is open; links that do not reconnect are always up and report their end as an error.
     fn state(&self) -> LinkState {

@@ -306,14 +306,23 @@ where
 
     fn take_frames(&mut self) {
         let (now_ns, peer) = (self.now_ns(), self.channel.peer());
-        while let Some(frame) = self.channel.next_frame() {
-            match self.peers.judge(peer, &frame, now_ns) {
-                Verdict::Refuse => {
-                    self.counters.refused_peers += 1;
-                    continue;
+        loop {
+            let (mut verdict, mut claims) = (Verdict::Refuse, false);
+            let (peers, refused) = (&mut self.peers, &mut self.counters.refused_peers);
+            let frame = self.channel.next_frame_if(|frame| {
+                verdict = peers.judge(peer, frame, now_ns);
+                *refused += u64::from(verdict == Verdict::Refuse);
+                claims |= verdict == Verdict::Claims;
+                matches!(verdict, Verdict::Take | Verdict::TakeAfresh)
+            });
+            let Some(frame) = frame else {
+                if let Some(peer) = peer.filter(|_| claims) {
+                    self.channel.link_mut().vouch(peer);
                 }
-                Verdict::TakeAfresh => self.autopilot.start_afresh(),
-                Verdict::Take => {}
+                break;
+            };
+            if verdict == Verdict::TakeAfresh {
+                self.autopilot.start_afresh();
             }
             self.service.component.handle(&frame, self.autopilot.ids().system, now_ns);
             if self.autopilot.handle(&frame, now_ns) == Handled::Position {
@@ -321,10 +330,8 @@ where
                 self.counters.events_dropped += push(&mut self.events, report.map(Event::Pose));
             }
         }
-        match self.peers.address() {
-            Some(pinned) if peer == Some(pinned) => self.channel.link_mut().pin(pinned),
-            _ if peer.is_some() && self.peers.is_idle(peer, now_ns) => self.channel.link_mut().dismiss(),
-            _ => {}
+        if let Some(pinned) = self.peers.address().filter(|pinned| peer == Some(*pinned)) {
+            self.channel.link_mut().pin(pinned);
         }
     }
 

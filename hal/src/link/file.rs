@@ -127,7 +127,7 @@ impl Link for TlogLink {
                     self.last_us = Some(stamp);
                     self.records += 1;
                     self.searching = false;
-                    return Ok(Received { bytes: len - STAMP, time_ns: Some(stamp * 1000), peer: None });
+                    return Ok(Received { bytes: len - STAMP, time_ns: Some(stamp * 1000), ..super::NOTHING });
                 }
                 None => {
                     if !std::mem::replace(&mut self.searching, true) {

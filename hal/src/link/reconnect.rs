@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::{AnyLink, LinkAddress, NOTHING, open};
 use crate::error::{Error, ErrorKind, HalError};
-use crate::traits::{Link, LinkState, Received};
+use crate::traits::{Flow, Link, LinkState, Received};
 
 /// First wait after a loss.
 const FIRST_DELAY: Duration = Duration::from_millis(100);
@@ -18,6 +18,8 @@ pub struct Reconnecting {
     address: LinkAddress,
     link: Option<AnyLink>,
     ended: bool,
+    /// Nothing was read since it was opened again.
+    reopened: bool,
     delay: Duration,
     retry_at: Instant,
     losses: u64,
@@ -39,6 +41,7 @@ impl Reconnecting {
             address,
             link,
             ended: false,
+            reopened: false,
             delay: FIRST_DELAY,
             retry_at: Instant::now() + FIRST_DELAY,
             losses: 0,
@@ -83,7 +86,7 @@ impl Reconnecting {
     fn retry(&mut self) {
         match open(&self.address) {
             Ok(link) => {
-                self.link = Some(link);
+                (self.link, self.reopened) = (Some(link), true);
                 self.delay = FIRST_DELAY;
             }
             Err(e) => {
@@ -115,7 +118,12 @@ impl Link for Reconnecting {
             return Ok(NOTHING);
         }
         match link.read(into, timeout) {
-            Ok(received) => Ok(received),
+            Ok(mut received) => {
+                if received.bytes > 0 && std::mem::take(&mut self.reopened) && received.flow == Flow::Continues {
+                    received.flow = Flow::Begins;
+                }
+                Ok(received)
+            }
             Err(e) => {
                 self.lost(e);
                 Ok(NOTHING)
@@ -140,10 +148,14 @@ impl Link for Reconnecting {
         }
     }
 
-    fn dismiss(&mut self) {
+    fn vouch(&mut self, peer: SocketAddr) {
         if let Some(link) = &mut self.link {
-            link.dismiss();
+            link.vouch(peer);
         }
+    }
+
+    fn senders(&self) -> usize {
+        if matches!(self.address, LinkAddress::TcpIn(_)) { super::tcp::CONNECTIONS } else { 1 }
     }
 
     fn state(&self) -> LinkState {

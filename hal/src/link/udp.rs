@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::{NOTHING, is_timeout};
 use crate::error::HalError;
-use crate::traits::{Link, Received};
+use crate::traits::{Flow, Link, Received};
 
 /// A UDP socket and the peer it talks to.
 pub struct UdpLink {
@@ -75,10 +75,11 @@ impl Link for UdpLink {
             Ok((bytes, from)) => {
                 if self.follow {
                     self.peer = Some(from);
-                } else if !self.listens && self.peer.is_some_and(|p| p.port() != from.port()) {
+                } else if !self.listens && self.peer != Some(from) {
                     return Ok(NOTHING);
                 }
-                Ok(Received { bytes, peer: Some(from), ..NOTHING })
+                // `udpout` has one peer, whom the mission names: nobody has to be told apart.
+                Ok(Received { bytes, peer: self.listens.then_some(from), flow: Flow::Whole, ..NOTHING })
             }
             // Linux reports that an earlier datagram met a closed port: the peer is not up yet.
             Err(e) if is_timeout(&e) || e.kind() == std::io::ErrorKind::ConnectionRefused => Ok(NOTHING),

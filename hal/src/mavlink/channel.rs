@@ -1,11 +1,15 @@
 //! Frames over a link: what a simulator, a test or the vehicle driver needs to talk MAVLink, signing included.
 
 use std::net::SocketAddr;
+use std::ops::Range;
 use std::time::Duration;
 
 use super::{Encoder, Frame, FrameCounters, Framer, MessageData, Refusal, Signer};
 use crate::error::{Error, ErrorKind};
-use crate::traits::Link;
+use crate::traits::{Flow, Link};
+
+/// Read at once at most: a datagram, or what a serial driver's buffer holds.
+const STAGE: usize = 4096;
 
 /// What happened on a channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -24,10 +28,26 @@ pub struct ChannelCounters {
     pub replayed: u64,
 }
 
-/// MAVLink over one link.
+/// A peer and the frame it is half through.
+struct Sender {
+    peer: Option<SocketAddr>,
+    framer: Framer,
+    /// The larger, the later it was heard.
+    heard: u64,
+}
+
+/// MAVLink over one link. Every sender has its own framer, so that nobody completes a frame that somebody else began.
 pub struct Channel<L: Link> {
     link: L,
-    framer: Framer,
+    senders: Vec<Sender>,
+    /// Whose bytes were read last.
+    current: usize,
+    reads: u64,
+    stage: Box<[u8; STAGE]>,
+    /// What of it is not yet in the sender's framer.
+    staged: Range<usize>,
+    /// Nothing follows what is staged: it is a datagram.
+    whole: bool,
     encoder: Encoder,
     signer: Signer,
     received_ns: Option<u64>,
@@ -38,9 +58,15 @@ pub struct Channel<L: Link> {
 impl<L: Link> Channel<L> {
     /// A channel that sends as `system`, `component`.
     pub fn new(link: L, system: u8, component: u8, signer: Signer) -> Self {
+        let sender = || Sender { peer: None, framer: Framer::new(), heard: 0 };
         Self {
+            senders: (0..link.senders().max(1)).map(|_| sender()).collect(),
             link,
-            framer: Framer::new(),
+            current: 0,
+            reads: 0,
+            stage: Box::new([0; STAGE]),
+            staged: 0..0,
+            whole: false,
             encoder: Encoder::new(system, component),
             signer,
             received_ns: None,
@@ -68,12 +94,12 @@ impl<L: Link> Channel<L> {
 
     /// Says that no more bytes will come; a last call of [`Channel::next_frame`] finds what half a frame was hiding.
     pub fn end(&mut self) {
-        self.framer.end();
+        self.senders.iter_mut().for_each(|s| s.framer.end());
     }
 
     /// Forgets half a frame, for a link that was reopened.
     pub fn resynchronise(&mut self) {
-        self.framer.reset();
+        self.senders.iter_mut().for_each(|s| s.framer.reset());
     }
 
     /// The signing state.
@@ -83,7 +109,8 @@ impl<L: Link> Channel<L> {
 
     /// What happened so far.
     pub fn counters(&self) -> ChannelCounters {
-        ChannelCounters { frames: self.framer.counters(), ..self.counters }
+        let frames = self.senders.iter().map(|s| s.framer.counters()).fold(FrameCounters::default(), |a, b| a + b);
+        ChannelCounters { frames, ..self.counters }
     }
 
     /// When the frame returned last was received, for recordings; `None` on live links.
@@ -102,19 +129,70 @@ impl<L: Link> Channel<L> {
     /// # Errors
     /// The link's.
     pub fn fill(&mut self, timeout: Duration) -> Result<bool, L::Error> {
-        let received = self.link.read(self.framer.space(), timeout)?;
-        self.framer.filled(received.bytes);
+        if !self.staged.is_empty() {
+            return Ok(true);
+        }
+        let received = self.link.read(&mut self.stage[..], timeout)?;
         (self.received_ns, self.peer) = (received.time_ns, received.peer);
-        Ok(received.bytes > 0)
+        if received.bytes == 0 {
+            return Ok(false);
+        }
+        self.reads += 1;
+        self.current = self.sender_of(received.peer);
+        self.staged = 0..received.bytes.min(STAGE);
+        self.whole = received.flow == Flow::Whole;
+        if let Some(sender) = self.senders.get_mut(self.current) {
+            if received.flow != Flow::Continues || sender.peer != received.peer {
+                sender.framer.reset();
+            }
+            (sender.peer, sender.heard) = (received.peer, self.reads);
+        }
+        Ok(true)
+    }
+
+    /// The framer of `peer`; of a new one, the place of whom nothing was heard for the longest time.
+    fn sender_of(&self, peer: Option<SocketAddr>) -> usize {
+        let known = self.senders.iter().position(|s| s.peer == peer && s.heard > 0);
+        known.or_else(|| self.senders.iter().enumerate().min_by_key(|(_, s)| s.heard).map(|(i, _)| i)).unwrap_or(0)
+    }
+
+    /// Moves staged bytes into the sender's framer; false when there are none.
+    fn feed(&mut self) -> bool {
+        let Some(sender) = self.senders.get_mut(self.current) else { return false };
+        if !self.staged.is_empty() {
+            self.staged.start += sender.framer.push(&self.stage[self.staged.clone()]);
+            return true;
+        }
+        // Half a frame dies with its datagram, and what it hid is found.
+        let ends = std::mem::take(&mut self.whole);
+        if ends {
+            sender.framer.end();
+        }
+        ends
     }
 
     /// The next good frame of what was read; refused ones are counted and passed over.
     pub fn next_frame(&mut self) -> Option<Frame<'_>> {
+        self.next_frame_if(|_| true)
+    }
+
+    /// The same, of a sender whom `admit` believes. Nothing is remembered of other frames, of which a stranger may send copies.
+    pub fn next_frame_if(&mut self, mut admit: impl FnMut(&Frame<'_>) -> bool) -> Option<Frame<'_>> {
         // Two steps because a frame borrows the framer: first whether it is acceptable, then its bytes.
         loop {
-            let verdict = self.signer.check(&self.framer.next_frame()?);
-            match verdict {
-                Ok(()) => return self.framer.last_frame(),
+            let Some(frame) = self.senders.get_mut(self.current)?.framer.next_frame() else {
+                if self.feed() {
+                    continue;
+                }
+                return None;
+            };
+            match self.signer.verify(&frame) {
+                Ok(stamp) => {
+                    if admit(&frame) {
+                        self.signer.note(stamp);
+                        return self.senders.get(self.current)?.framer.last_frame();
+                    }
+                }
                 Err(Refusal::Unsigned) => self.counters.unsigned += 1,
                 Err(Refusal::WrongKey | Refusal::TooManyStreams) => self.counters.wrong_key += 1,
                 Err(Refusal::Replayed) => self.counters.replayed += 1,

@@ -98,6 +98,20 @@ pub struct FrameCounters {
     pub unsupported: u64,
 }
 
+impl core::ops::Add for FrameCounters {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            frames: self.frames + other.frames,
+            damaged: self.damaged + other.damaged,
+            skipped_bytes: self.skipped_bytes + other.skipped_bytes,
+            unknown: self.unknown + other.unknown,
+            unsupported: self.unsupported + other.unsupported,
+        }
+    }
+}
+
 /// Finds frames in a byte stream; fixed memory.
 pub struct Framer {
     buffer: [u8; CAPACITY],

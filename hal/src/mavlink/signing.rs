@@ -51,6 +51,9 @@ pub struct Signer {
     streams: LinearMap<(u8, u8, u8), u64, STREAMS>,
 }
 
+/// The stream and time stamp of a frame whose signature is right; nothing of an unsigned one.
+pub(super) struct Stamp(Option<((u8, u8, u8), u64)>);
+
 /// A Unix time in microseconds as a signing time stamp; 0 before 2015.
 pub fn timestamp_of_unix_us(unix_us: u64) -> u64 {
     (unix_us / 10).saturating_sub(EPOCH_UNIX_S * TICKS_PER_S)
@@ -97,12 +100,23 @@ impl Signer {
     /// # Errors
     /// Why the frame must not be used.
     pub fn check(&mut self, frame: &Frame<'_>) -> Result<(), Refusal> {
+        let stamp = self.verify(frame)?;
+        self.note(stamp);
+        Ok(())
+    }
+
+    /// Checks an incoming frame without remembering it: a copy that comes from a peer who is not believed must not make the
+    /// original a replayed one.
+    ///
+    /// # Errors
+    /// Why the frame must not be used.
+    pub(super) fn verify(&self, frame: &Frame<'_>) -> Result<Stamp, Refusal> {
         let Some(signature) = frame.signature() else {
             let exempt = self.mode != SigningMode::Require || frame.id() == RADIO_STATUS;
-            return if exempt { Ok(()) } else { Err(Refusal::Unsigned) };
+            return if exempt { Ok(Stamp(None)) } else { Err(Refusal::Unsigned) };
         };
         if self.mode == SigningMode::Off {
-            return Ok(());
+            return Ok(Stamp(None));
         }
         let bytes = frame.bytes();
         if self.hash(&bytes[..bytes.len() - 6]) != bytes[bytes.len() - 6..] {
@@ -112,16 +126,21 @@ impl Signer {
         stamp[..6].copy_from_slice(&signature[1..7]);
         let timestamp = u64::from_le_bytes(stamp);
         let stream = (signature[0], frame.system(), frame.component());
-        match self.streams.get_mut(&stream) {
-            Some(last) if timestamp <= *last => return Err(Refusal::Replayed),
-            Some(last) => *last = timestamp,
-            None if timestamp + NEW_STREAM_LAG < self.timestamp => return Err(Refusal::Replayed),
-            None => {
-                self.streams.insert(stream, timestamp).map_err(|_| Refusal::TooManyStreams)?;
-            }
+        match self.streams.get(&stream) {
+            Some(last) if timestamp <= *last => Err(Refusal::Replayed),
+            None if timestamp + NEW_STREAM_LAG < self.timestamp => Err(Refusal::Replayed),
+            None if self.streams.len() == STREAMS => Err(Refusal::TooManyStreams),
+            _ => Ok(Stamp(Some((stream, timestamp)))),
         }
-        self.advance_to(timestamp);
-        Ok(())
+    }
+
+    /// Remembers the time stamp of a frame that is used.
+    pub(super) fn note(&mut self, Stamp(stamp): Stamp) {
+        if let Some((stream, timestamp)) = stamp {
+            // `verify` has seen that there is room.
+            let _ = self.streams.insert(stream, timestamp);
+            self.advance_to(timestamp);
+        }
     }
 
     fn hash(&self, frame: &[u8]) -> [u8; 6] {

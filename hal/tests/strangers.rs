@@ -1,0 +1,268 @@
+//! Whatever strangers send to an open UDP port, a flight is what it is without them. One recorded flight is flown again beside
+//! random streams of theirs: noise, frames cut anywhere, frames in the autopilot's name. `DGTR_STREAMS` says how many (3,000).
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
+
+use std::collections::VecDeque;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use config::geodesy::Geodetic;
+use config::link::LinkSettings;
+use config::mission::{CameraSettings, MountAttitude, MountSettings};
+use hal::camera::Picture;
+use hal::counters::HalCounters;
+use hal::error::HalError;
+use hal::link::{LinkAddress, TlogLink};
+use hal::mavlink::dialect::{
+    CAMERA_FEEDBACK_DATA, EXTENDED_SYS_STATE_DATA, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot,
+    SYS_STATUS_DATA,
+};
+use hal::mavlink::{Encoder, Framer, MessageData};
+use hal::time::ManualClock;
+use hal::traits::{Camera, Flow, Link, PictureClues, Received};
+use hal::vehicle::{Vehicle, VehicleSettings};
+
+/// When, from whom, what.
+type Datagram = (u64, SocketAddr, Vec<u8>);
+
+/// Where the autopilot's come from.
+const AUTOPILOT: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 14_555);
+
+fn address(port: u16) -> SocketAddr {
+    SocketAddr::from(([127, 0, 0, 1], port))
+}
+
+/// What has arrived at a port.
+type Arrived = Arc<Mutex<VecDeque<(SocketAddr, Vec<u8>)>>>;
+
+/// A port at which datagrams arrive when the test says so.
+struct Port {
+    arrived: Arrived,
+}
+
+impl Link for Port {
+    type Error = HalError;
+
+    fn read(&mut self, into: &mut [u8], _timeout: Duration) -> Result<Received, HalError> {
+        let Some((peer, bytes)) = self.arrived.lock().expect("lock").pop_front() else {
+            return Ok(Received::default());
+        };
+        let count = bytes.len().min(into.len());
+        into[..count].copy_from_slice(&bytes[..count]);
+        Ok(Received { bytes: count, time_ns: None, peer: Some(peer), flow: Flow::Whole })
+    }
+
+    fn write(&mut self, _frame: &[u8]) -> Result<(), HalError> {
+        Ok(())
+    }
+}
+
+/// A picture 60 ms after each announcement.
+struct Shutter(VecDeque<u64>, u64);
+
+impl Camera for Shutter {
+    type Picture = Picture;
+    type Error = HalError;
+
+    fn next_picture(&mut self, now_ns: u64) -> Result<Option<(PictureClues, Picture)>, HalError> {
+        let Some(arrived_ns) = self.0.front().copied().filter(|at| *at <= now_ns) else { return Ok(None) };
+        self.0.pop_front();
+        self.1 += 1;
+        let clues = PictureClues { arrived_ns, number: Some(self.1), ..PictureClues::default() };
+        Ok(Some((clues, Picture::Path(format!("{}.jpg", self.1).into()))))
+    }
+}
+
+/// The autopilot's datagrams of a recorded survey's first seconds, fast ones together, and when its pictures
+/// were there. The clock starts with it.
+fn recorded() -> (Vec<Datagram>, VecDeque<u64>) {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/run8_trimmed.tlog");
+    let (mut link, mut framer, mut buffer) = (TlogLink::open(&path).expect("log"), Framer::new(), [0; 512]);
+    let (mut datagrams, mut pictures, mut start) = (Vec::<Datagram>::new(), VecDeque::new(), None);
+    while let Ok(received) = link.read(&mut buffer, Duration::ZERO) {
+        framer.push(&buffer[..received.bytes]);
+        let at = received.time_ns.expect("a log has times");
+        let at = at - *start.get_or_insert(at) + 1_000_000_000;
+        while let Some(frame) = framer.next_frame() {
+            let fast = [30, 31, 32, 33, 108, 285].contains(&frame.id());
+            if frame.message::<CAMERA_FEEDBACK_DATA>().is_some() {
+                pictures.push_back(at + 60_000_000);
+            }
+            match datagrams.last_mut() {
+                Some((_, _, bytes)) if fast && bytes.len() < 120 => bytes.extend(frame.bytes()),
+                _ => datagrams.push((at, AUTOPILOT, frame.bytes().to_vec())),
+            }
+        }
+        if at > 7_000_000_000 {
+            break;
+        }
+    }
+    (datagrams, pictures)
+}
+
+/// Numbers of splitmix64.
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self, sides: usize) -> usize {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) % sides.max(1) as u64) as usize
+    }
+
+    /// A frame in the autopilot's name that would end the flight, or spoil it.
+    fn frame(&mut self, at_ns: u64) -> Vec<u8> {
+        let mut encoder = Encoder::new(1, 1);
+        // Any sequence number.
+        for _ in 0..self.roll(256) {
+            encoder.encode(&EXTENDED_SYS_STATE_DATA::default(), None);
+        }
+        let mut encode = |kind: usize, n: usize| match kind {
+            0 => encoded(&mut encoder, &SYS_STATUS_DATA { battery_remaining: 3, load: n as u16, ..Default::default() }),
+            1 => {
+                let time_boot_ms = (at_ns / 1_000_000) as u32;
+                encoded(&mut encoder, &GLOBAL_POSITION_INT_DATA { time_boot_ms, lat: n as i32, ..Default::default() })
+            }
+            2 => {
+                let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+                encoded(&mut encoder, &HEARTBEAT_DATA { autopilot, custom_mode: n as u32, ..Default::default() })
+            }
+            _ => encoded(&mut encoder, &CAMERA_FEEDBACK_DATA { img_idx: n as u16, ..Default::default() }),
+        };
+        let kind = self.roll(4);
+        let mut n = self.roll(1 << 16);
+        // Often one whose last byte begins a frame, too.
+        let wanted = self.roll(2) == 0;
+        let mut frame = encode(kind, n);
+        for _ in 0..if wanted { 2000 } else { 0 } {
+            if matches!(frame.last(), Some(0xFD | 0xFE)) {
+                break;
+            }
+            n += 1;
+            frame = encode(kind, n);
+        }
+        frame
+    }
+
+    /// What a stranger sends at `at_ns`. Whole frames in the autopilot's name come once it has proven itself: before, without
+    /// signatures, nobody can tell who is who.
+    fn datagram(&mut self, at_ns: u64, flight: &[Datagram]) -> Vec<u8> {
+        let cut = |mut frame: Vec<u8>, dice: &mut Self| {
+            let most = if dice.roll(2) == 0 { 1 } else { frame.len() - 1 };
+            frame.truncate(frame.len() - 1 - dice.roll(most));
+            frame
+        };
+        match self.roll(6) {
+            0 => (0..1 + self.roll(300)).map(|_| self.roll(256) as u8).collect(),
+            1 => {
+                let frame = self.frame(at_ns);
+                cut(frame, self)
+            }
+            2 => {
+                let overheard = flight[self.roll(flight.len())].2.clone();
+                cut(overheard, self)
+            }
+            3 => [0xFD, 0xFE, 0xFD, 255][..1 + self.roll(4)].to_vec(),
+            _ if at_ns < 4_000_000_000 => vec![0xFD; 1 + self.roll(40)],
+            4 => self.frame(at_ns),
+            _ => flight[self.roll(flight.len())].2.clone(),
+        }
+    }
+}
+
+fn encoded<D: MessageData>(encoder: &mut Encoder, message: &D) -> Vec<u8> {
+    encoder.encode(message, None).to_vec()
+}
+
+fn settings() -> VehicleSettings {
+    let lens = CameraSettings {
+        width: 640,
+        height: 480,
+        fx: 400.0,
+        fy: 400.0,
+        cx: 320.0,
+        cy: 240.0,
+        distortion: [0.0; 4],
+        exposure_delay_ms: 0.0,
+    };
+    VehicleSettings {
+        address: LinkAddress::UdpIn("0.0.0.0:14550".into()),
+        patient: false,
+        system_id: 1,
+        link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
+        failsafe: config::failsafe::FailsafeSettings::default(),
+        camera: None,
+        pictures_since: None,
+        lens,
+        mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
+        origin: Geodetic { lat_deg: 46.84265, lon_deg: -91.99390, alt_m: 158.6 },
+    }
+}
+
+/// Flies: every event, what is known of the autopilot after each second, and the totals but those of what was refused.
+fn fly(datagrams: &[Datagram], pictures: &VecDeque<u64>) -> Vec<String> {
+    let (clock, arrived) = (Arc::new(ManualClock::default()), Arc::default());
+    let port = Port { arrived: Arc::clone(&arrived) };
+    let camera = Shutter(pictures.clone(), 0);
+    let mut vehicle = Vehicle::new(port, camera, clock.clone(), &settings()).expect("a vehicle");
+    let (mut told, mut second) = (Vec::new(), 0);
+    for (at, from, bytes) in datagrams {
+        clock.set(*at);
+        // What is due by now is done before anything arrives, whoever sends it.
+        while let Some(event) = vehicle.poll(Duration::ZERO).expect("a port does not fail") {
+            told.push(format!("{event:?}"));
+        }
+        arrived.lock().expect("lock").push_back((*from, bytes.clone()));
+        while let Some(event) = vehicle.poll(Duration::ZERO).expect("a port does not fail") {
+            told.push(format!("{event:?}"));
+        }
+        if *from == AUTOPILOT && at / 1_000_000_000 > second {
+            second = at / 1_000_000_000;
+            told.push(format!("{:?}", vehicle.autopilot()));
+        }
+    }
+    let counted = HalCounters {
+        frames: 0,
+        damaged: 0,
+        skipped_bytes: 0,
+        unknown: 0,
+        refused_peers: 0,
+        sent: 0,
+        send_failed: 0,
+        ..vehicle.counters()
+    };
+    told.push(format!("{counted:?}"));
+    told
+}
+
+#[test]
+fn whatever_strangers_send_a_flight_over_udp_is_the_flight_without_them() {
+    let (flight, pictures) = recorded();
+    let alone = fly(&flight, &pictures);
+    let posed = alone.iter().filter(|told| told.starts_with("Posed")).count();
+    assert!(posed >= 10, "{posed} pictures posed of a flight that has 15");
+    let streams = std::env::var("DGTR_STREAMS").ok().and_then(|n| n.parse().ok()).unwrap_or(3000);
+    for seed in 0..streams {
+        let mut dice = Dice(seed);
+        let mut all = Vec::with_capacity(2 * flight.len());
+        let often = 1 + dice.roll(12);
+        for datagram in &flight {
+            while dice.roll(12) < often {
+                let bytes = dice.datagram(datagram.0, &flight);
+                all.push((datagram.0, address(40_000 + dice.roll(3) as u16), bytes));
+                if dice.roll(2) == 0 {
+                    break;
+                }
+            }
+            all.push(datagram.clone());
+        }
+        let beside = fly(&all, &pictures);
+        if beside != alone {
+            let first = beside.iter().zip(&alone).find(|(a, b)| a != b);
+            panic!("stream {seed}: {first:#?}");
+        }
+    }
+}
