@@ -42,6 +42,8 @@ pub mod refine;
 #[cfg(feature = "std")]
 pub mod settings;
 #[cfg(feature = "std")]
+pub mod state;
+#[cfg(feature = "std")]
 pub mod training;
 #[cfg(feature = "std")]
 pub mod upload;

@@ -36,7 +36,8 @@ table! {
             from "longer than a change of batteries";
         /// Message signing.
         pub signing: Signing = Signing::Off;
-        /// File with the 32-byte key, raw or as 64 hexadecimal digits. The last time stamp is kept beside it.
+        /// File with the 32-byte key, raw or as 64 hexadecimal digits. The last time stamp is kept in the state
+        /// folder (`STATE_DIRECTORY`), without one beside it.
         pub signing_key: Option<PathBuf> = None;
         /// Expected time from exposure to complete picture; learnt from there on.
         pub picture_latency_ms: f32 = 200.0, in Limits::within(0.0, 600_000.0);

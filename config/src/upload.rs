@@ -38,8 +38,11 @@ table! {
         pub listen: Vec<String> = Vec::new();
         /// Certificates; required for `tls/` endpoints.
         pub tls: Option<TlsSettings> = None;
-        /// Folder of this end's private key, `ID.key` of an aircraft or `ground.key`, and of the number of its last flight.
+        /// Folder of this end's private key, `ID.key` of an aircraft or `ground.key`. What counts flights and models lies there, too,
+        /// where there is no state folder (`STATE_DIRECTORY`).
         pub keys: PathBuf = PathBuf::from("keys");
+        /// The ground takes models that an earlier session has received, too, as `dgtr serve --again` does.
+        pub again: bool = false;
         /// Endpoints beyond this machine are used although nothing is signed: anybody there can replace any model.
         pub insecure: bool = false;
         /// Bound on what an aircraft sends; absent = what the link carries.

@@ -1,4 +1,4 @@
-//! The signing key from its file, and the time stamp kept beside it: signing time stamps must never go back, also over a
+//! The signing key from its file, and the time stamp kept in the state folder: signing time stamps must never go back, also over a
 //! restart on a computer without a battery-backed clock.
 
 use std::fs::File;
@@ -40,10 +40,8 @@ pub fn open(settings: &LinkSettings) -> Result<(Signer, Option<SigningStore>), H
         return Err(HalError::Signing { path: "link.signing_key".into(), why });
     };
     let key = read_key(path)?;
-    let mut name = path.clone().into_os_string();
-    name.push(".timestamp");
-    let mut store = SigningStore { path: name.into(), stored: 0 };
-    store.stored = store.read()?;
+    let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut store = SigningStore::of(path, &config::state::folder(beside))?;
     let now_us = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_micros() as u64);
     let start = store.stored.max(timestamp_of_unix_us(now_us));
     let mut signer = Signer::new(mode, key, settings.own_component, start);
@@ -73,6 +71,22 @@ fn read_key(path: &Path) -> Result<[u8; 32], HalError> {
 }
 
 impl SigningStore {
+    /// The keeper of the time stamp of `key` in the folder `state`. One that was kept beside the key counts, too.
+    fn of(key: &Path, state: &Path) -> Result<Self, HalError> {
+        let mut name = key.file_name().unwrap_or_default().to_owned();
+        name.push(".timestamp");
+        let mut store = Self { path: state.join(&name), stored: 0 };
+        store.stored = store.read()?;
+        let beside = key.with_file_name(name);
+        if beside != store.path
+            && let Ok(Ok(text)) = read(&beside).map(String::from_utf8)
+        {
+            let stamp = text.trim().parse().ok().filter(|stamp: &u64| stamp >> 48 == 0);
+            store.stored = store.stored.max(stamp.unwrap_or(0).saturating_add(RESERVE));
+        }
+        Ok(store)
+    }
+
     /// The newest time stamp that can be read. Damage never keeps an aircraft on the ground: with what is lost the reserve of
     /// two writes is skipped, so that no time stamp is used again.
     fn read(&self) -> Result<u64, HalError> {
@@ -122,6 +136,23 @@ mod tests {
         let (first, _) = open(&settings(&key)).expect("opens");
         let (second, _) = open(&settings(&key)).expect("opens");
         assert!(second.timestamp() >= first.timestamp() + RESERVE);
+    }
+
+    #[test]
+    fn a_key_where_nothing_may_be_written_is_flown_with_its_time_stamp_in_the_state_folder() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (key, state) = (folder.path().join("etc/key"), folder.path().join("state"));
+        std::fs::create_dir(folder.path().join("etc")).expect("made");
+        std::fs::write(&key, [7; 32]).expect("written");
+        // As an earlier release left it.
+        std::fs::write(folder.path().join("etc/key.timestamp"), "700000000000").expect("written");
+        let mut store = SigningStore::of(&key, &state).expect("opens");
+        assert_eq!(store.stored, 700_000_000_000 + RESERVE);
+        let mut signer = Signer::new(SigningMode::Require, [7; 32], 1, store.stored);
+        store.keep(&mut signer).expect("written");
+        assert!(state.join("key.timestamp").is_file());
+        assert_eq!(std::fs::read(folder.path().join("etc/key.timestamp")).expect("read"), b"700000000000");
+        assert!(SigningStore::of(&key, &state).expect("opens").stored >= store.stored);
     }
 
     #[test]

@@ -32,6 +32,9 @@ pub struct Args {
     /// Seconds to wait for the aircraft; then what has arrived is merged. Without it: until all are in, or Ctrl-C.
     #[arg(long, value_name = "SECONDS")]
     pub timeout: Option<f64>,
+    /// Take models that an earlier session has received, too, as when the same stick is merged once more.
+    #[arg(long)]
+    pub again: bool,
     /// How to merge, over `[ground]` of the mission.
     #[command(flatten)]
     pub settings: Settings,
@@ -47,6 +50,7 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), CliError> {
     let mut mission = Mission::read(&args.mission)?;
     args.settings.merging.apply(&mut mission.ground)?;
+    mission.upload.again |= args.again;
     let timeout = match args.timeout {
         Some(s) => Some(Duration::try_from_secs_f64(s).map_err(|e| CliError::input(format!("--timeout {s}: {e}")))?),
         None => None,

@@ -8,6 +8,7 @@ use std::path::Path;
 use config::upload::UploadSettings;
 use serde::Serialize;
 
+use super::memory::Memory;
 use super::offer::{Offer, OfferError};
 use crate::keys::Identity;
 
@@ -38,6 +39,8 @@ pub struct Admission {
     pub identity: Identity,
     /// The gates behind the transfer.
     pub check: Box<ModelCheck>,
+    /// What earlier sessions have received.
+    pub memory: Memory,
 }
 
 impl Admission {

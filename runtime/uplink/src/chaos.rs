@@ -93,7 +93,13 @@ fn serve(dir: &Path, port: u16) {
     let settings = UploadSettings { listen: vec![format!("tls/localhost:{port}")], ..settings(dir, "ground", port) };
     let identity = identities(AIRCRAFT)[AIRCRAFT.len()].clone();
     let aircraft: Vec<String> = AIRCRAFT.iter().map(|id| (*id).to_owned()).collect();
-    let admission = Admission { mission: "m".into(), aircraft, identity, check: Box::new(|_, _| Ok(())) };
+    let admission = Admission {
+        mission: "m".into(),
+        aircraft,
+        identity,
+        check: Box::new(|_, _| Ok(())),
+        memory: Default::default(),
+    };
     let mut r = Receiver::open(&settings, admission, &dir.join("received")).expect("receiver");
     let mut finals = finished(&r);
     let counted = dir.join(format!("ground.{}.json", std::process::id()));

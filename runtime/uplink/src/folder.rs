@@ -30,7 +30,7 @@ pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
 /// Reads a file of at most `limit` bytes.
 pub(super) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, TransportError> {
     // A pipe without a writer would block for ever.
-    let flags = rustix::fs::OFlags::NONBLOCK.bits() as i32;
+    let flags = (rustix::fs::OFlags::NONBLOCK | rustix::fs::OFlags::NOFOLLOW).bits() as i32;
     let file = File::options().read(true).custom_flags(flags).open(path).map_err(TransportError::io(path))?;
     if !file.metadata().map_err(TransportError::io(path))?.is_file() {
         return Err(TransportError::io(path)(std::io::Error::other("not a regular file")));
@@ -41,6 +41,27 @@ pub(super) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, Transport
         return Err(TransportError::TooLong { what: path.display().to_string(), bytes: bytes.len() as u64, limit });
     }
     Ok(bytes)
+}
+
+/// Whether a name is that of a chunk: 64 hexadecimal digits.
+pub(crate) fn is_hash(name: &str) -> bool {
+    name.len() == 64 && name.bytes().all(|b| b.is_ascii_hexdigit())
+}
+
+/// Nothing between `root` and `path` is a link: whoever prepares a stick must not choose what is written or removed elsewhere.
+fn without_links(root: &Path, path: &Path) -> std::io::Result<()> {
+    let below = path.ancestors().take_while(|p| *p != root && p.starts_with(root));
+    for part in below {
+        match std::fs::symlink_metadata(part) {
+            Ok(m) if m.is_symlink() => {
+                let what = format!("{} is a link and is not followed; remove it", part.display());
+                return Err(std::io::Error::other(what));
+            }
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e),
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 /// The aircraft's end.
@@ -67,7 +88,9 @@ impl FolderOutlet {
         let Ok(entries) = std::fs::read_dir(self.dir.join("chunk")) else { return };
         let keep: std::collections::HashSet<String> = offer.chunks.iter().chain(&self.previous).map(hex).collect();
         for entry in entries.flatten() {
-            if !entry.file_name().to_str().is_some_and(|name| keep.contains(name)) {
+            let name = entry.file_name();
+            let is_ours = name.to_str().is_some_and(|name| is_hash(name) && !keep.contains(name));
+            if is_ours && entry.file_type().is_ok_and(|t| t.is_file()) {
                 // Left-overs cost room, nothing else; the next offer tries again.
                 let _ = std::fs::remove_file(entry.path());
             }
@@ -85,6 +108,7 @@ impl Outlet for FolderOutlet {
         let parent = self.root.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         std::fs::metadata(parent).map_err(TransportError::io(parent))?;
         self.medium.check().map_err(TransportError::io(&self.root))?;
+        without_links(&self.root, &self.dir.join("chunk")).map_err(TransportError::io(&self.dir))?;
         if self.current.is_none() {
             // The first of this start: what a kill left half written. Chunks are looked through below.
             Disk::default().sweep(&self.dir);
@@ -150,7 +174,8 @@ impl Inlet for FolderInlet {
             Err(e) => return Err(TransportError::io(&self.dir)(e)),
         };
         for entry in entries.flatten().take(MAX_ENTRIES) {
-            if entry.file_name().to_str().is_some_and(is_safe_name) {
+            let is_folder = entry.file_type().is_ok_and(|t| t.is_dir());
+            if is_folder && entry.file_name().to_str().is_some_and(is_safe_name) {
                 match read_bounded(&entry.path().join("offer"), self.max_offer) {
                     Ok(bytes) => see(&bytes),
                     Err(TransportError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
@@ -193,9 +218,61 @@ impl Inlet for FolderInlet {
         _: &mut dyn FnMut(&[u8]) -> bool,
     ) -> Result<(), TransportError> {
         let path = self.dir.join(aircraft).join("receipt");
+        without_links(&self.dir, &path).map_err(TransportError::io(&path))?;
         if let Err(e) = write_whole(&path, receipt) {
             tracing::debug!("serve: {}: {e}", path.display());
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+    use crate::offer::Order;
+    use crate::testing::noise;
+
+    fn offered(dir: &Path, source: &Source) -> Arc<OfferedModel> {
+        let path = dir.join("model");
+        std::fs::write(&path, noise(40_000, 1)).expect("written");
+        let order = Order { flight: 1, counter: 1 };
+        Arc::new(OfferedModel::open(&path, &Default::default(), source, order, true).expect("a model"))
+    }
+
+    #[test]
+    fn a_stick_with_links_in_the_place_of_folders_gets_nothing_written_or_removed_elsewhere() {
+        for linked in ["m", "m/a1", "m/a1/chunk"] {
+            let dir = tempfile::tempdir().expect("a folder");
+            let (stick, elsewhere) = (dir.path().join("stick"), dir.path().join("elsewhere"));
+            std::fs::create_dir_all(elsewhere.join("a1/chunk")).expect("made");
+            let keepsakes = [elsewhere.join("keepsake"), elsewhere.join("a1/chunk").join("a".repeat(64))];
+            keepsakes.iter().for_each(|k| std::fs::write(k, b"mine").expect("written"));
+            let link = stick.join(linked);
+            std::fs::create_dir_all(link.parent().expect("a folder")).expect("made");
+            symlink(&elsewhere, &link).expect("linked");
+            let source = Source::unsigned("m", "a1");
+            let mut outlet = FolderOutlet::new(&stick, source.clone());
+            let error = outlet.offer(&offered(dir.path(), &source)).expect_err(linked).to_string();
+            assert!(error.contains("is a link"), "{error}");
+            assert!(keepsakes.iter().all(|k| std::fs::read(k).is_ok_and(|b| b == b"mine")), "{linked}");
+            assert_eq!(std::fs::read_dir(&elsewhere).expect("there").count(), 2, "{linked}");
+        }
+    }
+
+    #[test]
+    fn in_the_folder_of_chunks_only_chunks_are_removed() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let source = Source::unsigned("m", "a1");
+        let mut outlet = FolderOutlet::new(&dir.path().join("stick"), source.clone());
+        let chunks = dir.path().join("stick/m/a1/chunk");
+        std::fs::create_dir_all(chunks.join("b".repeat(64))).expect("made");
+        for name in ["holiday.jpg", &"c".repeat(64)] {
+            std::fs::write(chunks.join(name), b"x").expect("written");
+        }
+        outlet.offer(&offered(dir.path(), &source)).expect("offered");
+        assert!(chunks.join("holiday.jpg").exists() && chunks.join("b".repeat(64)).exists());
+        assert!(!chunks.join("c".repeat(64)).exists(), "a chunk of nothing on offer");
     }
 }

@@ -86,18 +86,22 @@ pub fn make(folder: &Path, id: &str) -> Result<(PublicKey, bool), KeyError> {
     if path.exists() {
         return Ok((public(&read_private(&path)?), false));
     }
-    let mut seed = [0; 32];
-    let mut filled = 0;
-    while filled < seed.len() {
-        filled += rustix::rand::getrandom(&mut seed[filled..], rustix::rand::GetRandomFlags::empty())
-            .map_err(|e| io(e.into()))?;
-    }
+    let seed = random().map_err(io)?;
     // Temporary files are made with mode 0600.
     let mut file = tempfile::Builder::new().prefix(".tmp-").tempfile_in(folder).map_err(io)?;
     writeln!(file, "{PRIVATE} {}", to_hex(&seed)).and_then(|()| file.as_file().sync_all()).map_err(io)?;
     file.persist_noclobber(&path).map_err(|e| io(e.error))?;
     File::open(folder).and_then(|f| f.sync_all()).map_err(io)?;
     Ok((public(&SigningKey::from_bytes(&seed)), true))
+}
+
+/// 32 bytes that nobody can guess.
+pub(crate) fn random() -> std::io::Result<[u8; 32]> {
+    let (mut bytes, mut filled) = ([0; 32], 0);
+    while filled < bytes.len() {
+        filled += rustix::rand::getrandom(&mut bytes[filled..], rustix::rand::GetRandomFlags::empty())?;
+    }
+    Ok(bytes)
 }
 
 fn public(key: &SigningKey) -> PublicKey {
@@ -114,6 +118,8 @@ fn read_private(path: &Path) -> Result<SigningKey, KeyError> {
     let mut text = String::new();
     file.take(256).read_to_string(&mut text).map_err(io)?;
     let seed = text.trim().strip_prefix(PRIVATE).and_then(|rest| from_hex(rest.trim()));
+    // Zeros are what a disk gives that lost the key.
+    let seed = seed.filter(|s| *s != [0; 32]);
     seed.map(|s| SigningKey::from_bytes(&s)).ok_or_else(|| KeyError::Format(path.into()))
 }
 
@@ -126,6 +132,8 @@ pub enum Domain {
     Receipt,
     /// An aircraft has taken note of a receipt.
     Acknowledgement,
+    /// The ground asks an aircraft.
+    Request,
 }
 
 impl Domain {
@@ -134,6 +142,7 @@ impl Domain {
             Self::Offer => b"dgtr offer\0",
             Self::Receipt => b"dgtr receipt\0",
             Self::Acknowledgement => b"dgtr acknowledgement\0",
+            Self::Request => b"dgtr request\0",
         };
         [domain, bytes].concat()
     }
@@ -193,6 +202,11 @@ impl Identity {
     /// Whether messages are signed at all.
     pub fn is_signed(&self) -> bool {
         self.own.is_some()
+    }
+
+    /// The public key of `id` in hexadecimal; empty in a mission without keys.
+    pub fn key_of(&self, id: &str) -> String {
+        self.keys.get(id).map_or(String::new(), |key| to_hex(key.as_bytes()))
     }
 
     /// Signs in our own name; None in a mission without keys.

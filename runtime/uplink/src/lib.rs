@@ -19,6 +19,7 @@ pub mod flight_number;
 pub mod folder;
 pub mod keys;
 mod medium;
+pub mod memory;
 #[cfg(feature = "zenoh")]
 pub mod network;
 pub mod offer;
@@ -64,14 +65,19 @@ pub struct Source {
 }
 
 impl Source {
-    /// An aircraft of a mission; the number of its last flight lies beside its key, without keys in `out`.
+    /// An aircraft of a mission; the number of its last flight lies in the state folder, without one
+    /// beside its key, without keys in `out`.
     ///
     /// # Errors
     /// The mission may not be flown unsigned, or the private key is not usable.
     pub fn of(mission: &Mission, aircraft: &str, out: &Path) -> Result<Self, KeyError> {
         let identity = Identity::of(mission, aircraft)?;
-        let folder = if identity.is_signed() { &mission.upload.keys } else { out };
-        let flight_number = Some(folder.join(format!("{aircraft}.flight")));
+        let (keys, name) = (&mission.upload.keys, format!("{aircraft}.flight"));
+        let folder = if identity.is_signed() { config::state::folder(keys) } else { out.into() };
+        let flight_number = Some(folder.join(&name));
+        if let Some(now) = flight_number.as_deref().filter(|now| identity.is_signed() && !now.exists()) {
+            flight_number::go_on(&keys.join(&name), now);
+        }
         Ok(Self {
             mission: mission.name.clone(),
             aircraft: aircraft.into(),

@@ -3,8 +3,9 @@
 //! Keys: `dgtr/<mission>/<aircraft>/offer`, `…/chunk/<blake3>`, `…/receipt`; all three are queries that the aircraft
 //! answers, so nothing is kept in between and a restart of either end costs at most one chunk. A new offer is announced
 //! by a publication as well, which only wakes the ground early. No scouting, no gossip: both ends talk to the endpoints
-//! of the mission file and to nobody else. Over TLS the ground lets an aircraft speak only under the id that is its
-//! certificate's common name (zenoh's access control).
+//! of the mission file and to nobody else. The ground passes on nothing between those who connect to it, and
+//! over TLS an aircraft speaks only under the id that is its certificate's common name (zenoh's access control). What the
+//! ground asks is signed, so that an aircraft answers nobody else.
 
 mod inlet;
 mod outlet;
@@ -23,6 +24,9 @@ use super::transport::TransportError;
 
 /// Longest time for a connection to come about, milliseconds.
 const HANDSHAKE_MS: u64 = 60_000;
+/// A connection that has not said who it is by then is ended, milliseconds; so many may be about it at the same time.
+const ACCEPT_MS: u64 = 15_000;
+const PENDING: u64 = 4096;
 /// How often a waiting thread looks whether it should stop.
 const LOOK_UP: Duration = Duration::from_millis(100);
 /// What the aircraft answers for a chunk it does not have.
@@ -32,8 +36,7 @@ fn network(e: impl std::fmt::Display) -> TransportError {
     TransportError::Network(e.to_string().replace('\n', " "))
 }
 
-/// Opens a session of this end only: `listen` for the ground, `connect` for the aircraft. Over TLS `access` says who may
-/// say what.
+/// Opens a session of this end only: `listen` for the ground, `connect` for the aircraft. `access` says who may say what.
 fn open(
     settings: &UploadSettings,
     listen: &[String],
@@ -54,7 +57,9 @@ fn open(
         "scouting": { "multicast": { "enabled": false }, "gossip": { "enabled": false }, "delay": 0 },
         "transport": {
             // A handshake over a link with a delay of seconds.
-            "unicast": { "open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS },
+            "unicast": {
+                "open_timeout": HANDSHAKE_MS, "accept_timeout": ACCEPT_MS, "accept_pending": PENDING, "max_sessions": PENDING,
+            },
             "link": { "rx": { "max_message_size": largest } },
         },
     });
@@ -67,9 +72,9 @@ fn open(
             "connect_certificate": tls.certificate,
             "connect_private_key": tls.key,
         });
-        if let Some(access) = access {
-            json["access_control"] = access;
-        }
+    }
+    if let Some(access) = access {
+        json["access_control"] = access;
     }
     let config = zenoh::Config::from_json5(&json.to_string()).map_err(network)?;
     zenoh::open(config).wait().map_err(network)

@@ -135,8 +135,9 @@ pub struct Receiver {
     link: Arc<Link>,
     dir: PathBuf,
     seats: Vec<Seat>,
-    /// What the last look saw.
+    /// What the last look saw, and how long it took.
     sight: Sight,
+    looked: Duration,
     /// Whose turn it is when not all can be at work at once.
     turn: usize,
     wake: Wake<()>,
@@ -162,7 +163,8 @@ impl Receiver {
         #[cfg(feature = "zenoh")]
         if !settings.listen.is_empty() {
             let (mission, aircraft) = (&admission.mission, &admission.aircraft);
-            let inlet = super::network::NetworkInlet::open(settings, mission, aircraft, sender.clone())?;
+            let inlet =
+                super::network::NetworkInlet::open(settings, mission, aircraft, &admission.identity, sender.clone())?;
             inlets.push(Box::new(inlet));
         }
         #[cfg(not(feature = "zenoh"))]
@@ -190,6 +192,7 @@ impl Receiver {
             dir: dir.into(),
             seats,
             sight: Sight::default(),
+            looked: Duration::ZERO,
             turn: 0,
             wake,
             _waker: waker,
@@ -262,6 +265,8 @@ impl Receiver {
             let seat = &mut self.seats[i];
             let Place::Here(mut slot) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
             let link = self.link.clone();
+            // Where nobody waits for a turn it goes on beside the next look, which somebody who never answers makes long.
+            let until = if waiting.is_empty() { until + self.looked } else { until };
             let work = move || {
                 let advance = slot.advance(&link, until);
                 (slot, advance)
@@ -313,7 +318,7 @@ impl Receiver {
 
     /// Reads the offers of every inlet and chooses a target for each aircraft that is not at work.
     fn look(&mut self) {
-        let before = std::mem::take(&mut self.sight);
+        let (before, begun) = (std::mem::take(&mut self.sight), Instant::now());
         let Link { settings, admission, inlets, stop } = &*self.link;
         for (index, inlet) in inlets.iter().enumerate() {
             let outcome = inlet.offers(Patience { limit: ANSWER, stop }, &mut |bytes| {
@@ -328,9 +333,10 @@ impl Receiver {
                 tracing::debug!("serve: {}: {e}", inlet.name());
             }
         }
+        self.looked = begun.elapsed();
         for seat in &mut self.seats {
             if let Place::Here(slot) = &mut seat.place {
-                slot.choose(self.sight.of(&seat.id), &mut self.counters);
+                slot.choose(self.sight.of(&seat.id), admission, &mut self.counters, &mut self.refusals);
                 seat.progress = slot.progress();
                 (seat.is_over, seat.is_told) = (slot.is_over(), slot.is_told());
             }

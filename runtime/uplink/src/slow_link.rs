@@ -44,7 +44,8 @@ impl Flight {
     fn receiver(&self) -> Receiver {
         let check = Box::new(|_: &str, _: &Path| Ok(()));
         let (mission, aircraft) = ("m".into(), vec!["a1".into()]);
-        let admission = Admission { mission, aircraft, identity: Identity::unsigned(), check };
+        let admission =
+            Admission { mission, aircraft, identity: Identity::unsigned(), check, memory: Default::default() };
         Receiver::open(&self.ground, admission, &self.dir.path().join("g")).expect("receiver")
     }
 

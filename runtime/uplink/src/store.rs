@@ -16,7 +16,7 @@ use config::error::{Error, ErrorKind};
 use config::upload::UploadSettings;
 
 use super::admission::{Admission, ModelRefusal};
-use super::folder::read_bounded;
+use super::folder::{is_hash, read_bounded};
 use super::offer::{Hash, Offer, hex};
 
 /// The offer of the model that lies complete.
@@ -76,7 +76,7 @@ impl Error for StoreError {
     }
 }
 
-fn io(path: &Path) -> impl FnOnce(std::io::Error) -> StoreError + '_ {
+pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> StoreError + '_ {
     move |source| StoreError::Io { path: path.display().to_string(), source }
 }
 
@@ -276,7 +276,7 @@ impl Store {
         let keep: std::collections::HashSet<String> = offer.iter().flat_map(|o| &o.chunks).map(hex).collect();
         let Ok(entries) = std::fs::read_dir(self.dir.join("chunk")) else { return };
         for entry in entries.flatten() {
-            if !entry.file_name().to_str().is_some_and(|name| keep.contains(name)) {
+            if entry.file_name().to_str().is_some_and(|name| is_hash(name) && !keep.contains(name)) {
                 // Left-overs cost room, nothing else.
                 let _ = self.disk.remove(&entry.path());
             }

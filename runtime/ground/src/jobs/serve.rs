@@ -13,6 +13,7 @@ use config::mission::Mission;
 use uplink::UploadError;
 use uplink::admission::{Admission, ModelRefusal, Refusals};
 use uplink::keys::{GROUND, Identity};
+use uplink::memory::Memory;
 use uplink::receive::{ReceiveCounters, Received, Receiver};
 
 use crate::AggregateError;
@@ -96,7 +97,8 @@ pub fn receive(
 ) -> Result<Reception, UploadError> {
     let start = Instant::now();
     let ids: Vec<String> = mission.aircraft.iter().map(|a| a.id.clone()).collect();
-    let mut receiver = Receiver::open(&mission.upload, admission(mission)?, &out.join("received"))?;
+    let mut receiver =
+        Receiver::open(&mission.upload, admission(mission, &out.join("received"))?, &out.join("received"))?;
     let mut complete: Option<Instant> = None;
     let over = || stop.load(std::sync::atomic::Ordering::Relaxed) || timeout.is_some_and(|t| start.elapsed() >= t);
     loop {
@@ -134,8 +136,17 @@ pub fn receive(
 }
 
 /// What the ground of this mission lets in.
-fn admission(mission: &Mission) -> Result<Admission, UploadError> {
+fn admission(mission: &Mission, received: &Path) -> Result<Admission, UploadError> {
     let identity = Identity::of(mission, GROUND)?;
+    let (state, again) = (config::state::folder(&mission.upload.keys), mission.upload.again);
+    let memory = match Memory::open(&state, &mission.name, received, again) {
+        Ok(memory) => memory,
+        Err(e) if identity.is_signed() => return Err(e.into()),
+        Err(e) => {
+            tracing::warn!("serve: {e}; models that this session receives are not known to later ones");
+            Memory::default()
+        }
+    };
     let (name, aircraft) = (mission.name.clone(), mission.aircraft.iter().map(|a| a.id.clone()).collect());
     let mission = mission.clone();
     // One model is in memory at a time, however many arrive at once.
@@ -145,7 +156,7 @@ fn admission(mission: &Mission) -> Result<Admission, UploadError> {
         let _alone = alone.lock().unwrap_or_else(PoisonError::into_inner);
         admit::admit(&mission, id, path).map(drop)
     });
-    Ok(Admission { mission: name, aircraft, identity, check })
+    Ok(Admission { mission: name, aircraft, identity, check, memory })
 }
 
 /// Merges what has been received, around the mission's origin. A received model that does not count (any more) is left out

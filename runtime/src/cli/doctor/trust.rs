@@ -42,6 +42,22 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
             ("private key", finding)
         }));
     }
+    let state = config::state::folder(&upload.keys);
+    // Without it the folder that has to be made says the same.
+    let nearest = state.ancestors().find(|p| p.exists()).unwrap_or(&state);
+    let finding = match tempfile::tempfile_in(nearest) {
+        Ok(_) => {
+            Finding::Ok(format!("{} may be written: numbers of flights, models received, signing", state.display()))
+        }
+        Err(e) => {
+            let what = format!(
+                "{} may not be written ({e}): numbers of flights and signing would begin anew",
+                state.display()
+            );
+            Finding::missing(what, "give the service a StateDirectory, or let it write there")
+        }
+    };
+    all.push(("state folder", finding));
     all.extend(exposed.map(|endpoint| {
         let finding = match &upload.tls {
             Some(_) => {

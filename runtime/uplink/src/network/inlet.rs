@@ -13,15 +13,22 @@ use zenoh::{Session, Wait};
 use super::super::offer::{Offer, hex};
 use super::super::transport::{Inlet, Patience, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
+use crate::keys::{Domain, Identity};
 
 /// What zenoh lets pass on the ground: from each aircraft, known by its certificate's common name, what lies under its own
 /// key; to everybody, what the ground itself asks.
-fn access_control(mission: &str, aircraft: &[String]) -> serde_json::Value {
+fn access_control(mission: &str, aircraft: &[String], has_certificates: bool) -> serde_json::Value {
     let everything = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"];
     let rule = |id: &str, flow: &str, messages: &[&str], key: String| serde_json::json!({ "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": [key] });
     let mut rules = vec![rule("ask", "egress", &everything, format!("dgtr/{mission}/**"))];
     let (mut subjects, mut policies) = (Vec::new(), Vec::new());
-    for id in aircraft {
+    if !has_certificates {
+        // Who is who is not known; but nobody asks others by way of the ground, and nobody overhears.
+        rules.push(rule("answer", "ingress", &["put", "reply", "declare_queryable"], format!("dgtr/{mission}/**")));
+        subjects.push(serde_json::json!({ "id": "anybody" }));
+        policies.push(serde_json::json!({ "rules": ["ask", "answer"], "subjects": ["anybody"] }));
+    }
+    for id in aircraft.iter().filter(|_| has_certificates) {
         let own = format!("own {id}");
         let speak = ["put", "reply", "declare_queryable"];
         rules.push(rule(&own, "ingress", &speak, format!("dgtr/{mission}/{id}/**")));
@@ -38,6 +45,7 @@ pub struct NetworkInlet {
     session: Session,
     mission: String,
     endpoints: String,
+    identity: Identity,
     max_offer: u64,
 }
 
@@ -50,9 +58,11 @@ impl NetworkInlet {
         settings: &UploadSettings,
         mission: &str,
         aircraft: &[String],
+        identity: &Identity,
         wake: SyncSender<()>,
     ) -> Result<Self, TransportError> {
-        let session = open(settings, &settings.listen, &[], Some(access_control(mission, aircraft)))?;
+        let session =
+            open(settings, &settings.listen, &[], Some(access_control(mission, aircraft, settings.tls.is_some())))?;
         session
             .declare_subscriber(format!("dgtr/{mission}/*/offer"))
             .callback(move |_| {
@@ -63,7 +73,7 @@ impl NetworkInlet {
             .wait()
             .map_err(network)?;
         let (mission, endpoints) = (mission.into(), settings.listen.join(", "));
-        Ok(Self { session, mission, endpoints, max_offer: Offer::max_encoded(settings) })
+        Ok(Self { session, mission, endpoints, identity: identity.clone(), max_offer: Offer::max_encoded(settings) })
     }
 
     /// Shows every answer to one query until `take` is content; an answer above `limit` is shown as an empty one. Returns
@@ -85,9 +95,12 @@ impl NetworkInlet {
             .congestion_control(CongestionControl::Block)
             .consolidation(ConsolidationMode::None)
             .with(FifoChannel::new(4));
-        let replies = match payload {
-            Some(payload) => query.payload(payload).wait(),
-            None => query.wait(),
+        // A receipt is signed itself.
+        let signed = self.identity.sign(Domain::Request, key.as_bytes());
+        let replies = match (payload, signed) {
+            (Some(payload), _) => query.payload(payload).wait(),
+            (None, Some(signature)) => query.payload(signature.to_vec()).wait(),
+            (None, None) => query.wait(),
         };
         let replies = replies.map_err(network)?;
         let (until, mut not_held) = (Instant::now() + patience.limit, false);

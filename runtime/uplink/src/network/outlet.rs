@@ -17,7 +17,7 @@ use super::super::offer::{Offer, OfferedModel};
 use super::super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::super::transport::{Outlet, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
-use crate::keys::Domain;
+use crate::keys::{Domain, GROUND, SignatureBytes};
 
 /// A model under way is let go when nobody has asked for it for so long: longer than the ground ever waits for a chunk.
 const KEPT_FOR: Duration = Duration::from_secs(900);
@@ -127,6 +127,9 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
     let Some(rest) = asked.strip_prefix("dgtr/") else { return };
     let Some((_, rest)) = rest.split_once('/') else { return };
     let Some((_, what)) = rest.split_once('/') else { return };
+    if what != "receipt" && !is_asked_by_the_ground(shared, asked, query) {
+        return;
+    }
     let payload = match what.split_once('/') {
         None if what == "offer" => locked(&shared.models).front().map(|k| k.model.offer.encode()),
         None if what == "receipt" => acknowledge(shared, query),
@@ -158,6 +161,13 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
             Err(e) => tracing::debug!("upload: reply to {asked} not sent: {e}"),
         }
     }
+}
+
+/// Whether the ground signed the question, where anything is signed: others would take the link from it.
+fn is_asked_by_the_ground(shared: &Shared, asked: &str, query: &Query) -> bool {
+    let payload = query.payload().filter(|p| p.len() <= size_of::<SignatureBytes>()).map(|p| p.to_bytes());
+    let signature = payload.and_then(|p| SignatureBytes::try_from(&*p).ok());
+    shared.source.identity.verify(GROUND, Domain::Request, asked.as_bytes(), signature.as_ref()).is_ok()
 }
 
 /// Takes a receipt that is really the ground's, and signs for it.

@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use super::*;
 use crate::admission::Admission;
-use crate::keys::Identity;
 use crate::keys::testing::identities;
+use crate::keys::{Domain, Identity};
 use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::receive::Receiver;
@@ -35,7 +35,8 @@ fn source(aircraft: &str, identity: &Identity) -> Source {
 fn ground(settings: &UploadSettings, ids: &[&str], identity: &Identity, dir: &Path) -> Receiver {
     let aircraft = ids.iter().map(|id| (*id).to_owned()).collect();
     let check = Box::new(|_: &str, _: &Path| Ok(()));
-    let admission = Admission { mission: "m".into(), aircraft, identity: identity.clone(), check };
+    let admission =
+        Admission { mission: "m".into(), aircraft, identity: identity.clone(), check, memory: Default::default() };
     Receiver::open(settings, admission, dir).expect("receiver")
 }
 
@@ -70,7 +71,12 @@ fn a_false_receipt_over_the_network_is_not_believed() {
         asked.expect("asked").into_iter().count()
     };
     let until = Instant::now() + LIMIT;
-    while stranger.get("dgtr/m/a1/offer").wait().expect("asked").into_iter().count() == 0 {
+    let asks = |who: &Identity| {
+        let key = "dgtr/m/a1/offer";
+        let signature = who.sign(Domain::Request, key.as_bytes()).map_or(Vec::new(), |s| s.to_vec());
+        stranger.get(key).payload(signature).timeout(LOOK_UP * 5).wait().expect("asked").into_iter().count()
+    };
+    while asks(&ids[2]) == 0 {
         assert!(Instant::now() < until, "no connection");
         std::thread::sleep(LOOK_UP);
     }
@@ -78,6 +84,10 @@ fn a_false_receipt_over_the_network_is_not_believed() {
         assert_eq!(say(receipt.seal(&forger)), 0, "signed for");
     }
     assert!(!o.wait_delivered(Duration::from_secs(1), || true));
+    // Nor does anybody but the ground get a model, or as much as an offer.
+    for other in [Identity::unsigned(), ids[0].clone(), ids[1].clone()] {
+        assert_eq!(asks(&other), 0, "answered");
+    }
     // The ground's own is.
     assert_eq!(say(receipt.seal(&ids[2])), 1);
     assert!(o.wait_delivered(LIMIT, || true));
@@ -133,4 +143,45 @@ fn over_tls_an_aircrafts_certificate_speaks_under_its_own_name_only() {
     assert!(!receive(&mut r, Duration::from_secs(3), |r| r.received().len() > 1));
     assert_eq!(r.received()[0].aircraft, "a2");
     assert!(honest.wait_delivered(LIMIT, || true) && !rogue.status().delivered);
+}
+
+/// A client of the ground's own endpoint asked the aircraft by way of it, and took the link from the ground.
+#[test]
+fn the_ground_passes_on_nothing_between_those_who_connect_to_it() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = settings(&format!("tcp/127.0.0.1:{}", free_port()));
+    let mut r = ground(&settings, &["a1"], &Identity::unsigned(), &dir.path().join("g"));
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 3)).expect("write");
+    let a1 = Offerer::start(&settings, source("a1", &Identity::unsigned())).expect("offerer");
+    a1.offer(&path);
+    assert!(receive(&mut r, LIMIT, |r| r.counters.models == 1), "{:?}", r.counters);
+    let endpoint = serde_json::json!({
+        "mode": "client", "connect": { "endpoints": settings.connect }, "scouting": { "multicast": { "enabled": false } },
+    });
+    let client =
+        zenoh::open(zenoh::Config::from_json5(&endpoint.to_string()).expect("settings")).wait().expect("session");
+    let overheard = client.declare_subscriber("**").wait().expect("subscriber");
+    let asked = client.get("dgtr/m/a1/offer").timeout(Duration::from_secs(2)).wait().expect("asked");
+    assert_eq!(asked.into_iter().filter(|reply| reply.result().is_ok()).count(), 0, "the aircraft answered a stranger");
+    a1.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?}", r.counters);
+    assert_eq!(overheard.drain().count(), 0);
+}
+
+/// 130 connections that said nothing took every place of those who want in.
+#[test]
+fn connections_that_say_nothing_keep_no_aircraft_out() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let port = free_port();
+    let settings = settings(&format!("tcp/127.0.0.1:{port}"));
+    let mut r = ground(&settings, &["a1"], &Identity::unsigned(), &dir.path().join("g"));
+    let idle: Vec<_> =
+        (0..200).map(|_| std::net::TcpStream::connect(("127.0.0.1", port)).expect("listening")).collect();
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 4)).expect("write");
+    let a1 = Offerer::start(&settings, source("a1", &Identity::unsigned())).expect("offerer");
+    a1.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?}", r.counters);
+    drop(idle);
 }

@@ -40,7 +40,7 @@ fn anything(ids: &[&str]) -> Admission {
 
 fn admission(ids: &[&str], identity: Identity) -> Admission {
     let aircraft = ids.iter().map(|id| (*id).to_owned()).collect();
-    Admission { mission: "m".into(), aircraft, identity, check: Box::new(|_, _| Ok(())) }
+    Admission { mission: "m".into(), aircraft, identity, check: Box::new(|_, _| Ok(())), memory: Default::default() }
 }
 
 const LIMIT: Duration = Duration::from_secs(60);
@@ -271,4 +271,74 @@ fn over_tls_only_aircraft_of_the_same_authority_deliver() {
     assert!(friend.wait_delivered(LIMIT, || true));
     assert!(!receive(&mut r, Duration::from_secs(2), |r| r.received().len() > 1));
     assert!(r.received()[0].aircraft == "friend" && !stranger.status().delivered);
+}
+
+/// A stick that nobody cleared ended the next day's reception with yesterday's model.
+#[test]
+fn yesterdays_final_model_on_the_stick_is_named_and_not_taken_for_todays() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let ids = crate::keys::testing::identities(["a1"]);
+    let settings = UploadSettings {
+        folder: Some(dir.path().join("stick")),
+        retry_min_s: 0.05,
+        poll_s: 0.05,
+        ..Default::default()
+    };
+    let numbers = dir.path().join("a1.flight");
+    let fly = |seed: u8| {
+        let path = dir.path().join("m.dgtr");
+        std::fs::write(&path, noise(100_000, seed)).expect("write");
+        let source =
+            Source { identity: ids[0].clone(), flight_number: Some(numbers.clone()), ..Source::unsigned("m", "a1") };
+        let o = Offerer::start(&settings, source).expect("offerer");
+        o.offer_final(&path);
+        assert!(o.wait_delivered(LIMIT, || true));
+    };
+    let session = |name: &str, again: bool| {
+        let received = dir.path().join(name);
+        let memory = crate::memory::Memory::open(&dir.path().join("state"), "m", &received, again).expect("memory");
+        Receiver::open(&settings, Admission { memory, ..admission(&["a1"], ids[1].clone()) }, &received)
+            .expect("receiver")
+    };
+    fly(1);
+    let mut yesterday = session("yesterday", false);
+    assert!(receive(&mut yesterday, LIMIT, |r| r.all_finished()));
+    // The same session goes on after a restart.
+    drop(yesterday);
+    assert!(receive(&mut session("yesterday", false), LIMIT, |r| r.all_finished()));
+    let mut today = session("today", false);
+    assert!(!receive(&mut today, Duration::from_secs(1), |r| r.all_finished()), "yesterday's was taken");
+    assert!(today.received().is_empty() && today.counters.stale > 0, "{:?}", today.counters);
+    let why: Vec<String> = today.refusals.iter().map(|(why, _)| why.to_owned()).collect();
+    assert!(why.len() == 1 && why[0].contains("a1's final model of flight 1"), "{why:?}");
+    fly(2);
+    assert!(receive(&mut today, LIMIT, |r| r.all_finished()), "{:?}", today.counters);
+    assert!(std::fs::read(&today.received()[0].path).expect("read") == noise(100_000, 2));
+    assert!(receive(&mut session("once more", true), LIMIT, |r| r.all_finished()), "asked for");
+}
+
+/// An aircraft whose number file was lost begins with flight 1; the receipt tells it how far its ground has come.
+#[test]
+fn an_aircraft_whose_numbers_fell_behind_an_earlier_session_is_told_and_goes_on_beyond() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let ids = crate::keys::testing::identities(["a1"]);
+    let settings = UploadSettings {
+        folder: Some(dir.path().join("stick")),
+        retry_min_s: 0.05,
+        poll_s: 0.05,
+        ..Default::default()
+    };
+    for (day, seed) in [("first", 1), ("second", 2)] {
+        let received = dir.path().join(day);
+        let memory = crate::memory::Memory::open(&dir.path().join("state"), "m", &received, false).expect("memory");
+        let admission = Admission { memory, ..admission(&["a1"], ids[1].clone()) };
+        let mut r = Receiver::open(&settings, admission, &received).expect("receiver");
+        let path = dir.path().join("m.dgtr");
+        std::fs::write(&path, noise(100_000, seed)).expect("write");
+        let source = Source { identity: ids[0].clone(), ..Source::unsigned("m", "a1") };
+        let o = Offerer::start(&settings, source).expect("offerer");
+        o.offer_final(&path);
+        assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{day}: {:?}", r.counters);
+        assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(100_000, seed));
+    }
 }

@@ -56,6 +56,8 @@ pub(super) struct Slot {
     target: Option<Target>,
     /// The inlets that show an older offer than what is here: whoever made it should know.
     behind: Vec<usize>,
+    /// What it is told of, where an earlier session received it.
+    remembered: Option<Offer>,
     /// The order it was told about.
     told_behind: Option<Order>,
     /// Failures in a row.
@@ -82,6 +84,7 @@ impl Slot {
             store: Store::open(&Disk::default(), dir, settings, admission),
             target: None,
             behind: Vec::new(),
+            remembered: None,
             told_behind: None,
             failures: 0,
             source: 0,
@@ -124,8 +127,34 @@ impl Slot {
 
     /// Newest offer wins; but a transfer under way is finished first unless the newer one is the last of the flight or
     /// nobody holds the older one any more: over a slow link, chasing every checkpoint would never complete one.
-    pub(super) fn choose(&mut self, offers: &[Shown], counters: &mut ReceiveCounters) {
-        let offers = offers.iter();
+    pub(super) fn choose(
+        &mut self,
+        offers: &[Shown],
+        admission: &Admission,
+        counters: &mut ReceiveCounters,
+        refusals: &mut Refusals,
+    ) {
+        let key = admission.identity.key_of(&self.id);
+        let (stale, offers): (Vec<_>, Vec<_>) =
+            offers.iter().partition(|(o, _)| admission.memory.is_stale(o, &key).is_some());
+        counters.stale += stale.len() as u64;
+        for (offer, inlet) in &stale {
+            let Some(order) = admission.memory.is_stale(offer, &key) else { continue };
+            let kind = if offer.finished { "final model" } else { "checkpoint" };
+            refusals.count(format!(
+                "{}'s {kind} of flight {} is not of this session: an earlier one has received flight {} of it; clear the \
+                 stick, or give --again to take it once more",
+                self.id, offer.order.flight, order.flight
+            ));
+            if self.told_behind != Some(offer.order) {
+                // Its numbers may have fallen behind; then it should know.
+                let mut known = Offer::clone(offer);
+                known.order = order;
+                self.remembered = Some(known);
+                (self.behind, self.told_behind) = (vec![*inlet], Some(offer.order));
+            }
+        }
+        let offers = offers.into_iter();
         let usable = offers.clone().filter(|(o, _)| !self.refused_offers.contains(&o.digest()));
         let Some((best, _)) = usable.max_by_key(|(o, _)| o.order) else { return };
         if let Some(done) = self.store.complete() {
@@ -208,7 +237,7 @@ impl Slot {
     fn transfer(&mut self, done: &mut Advance, link: &Link, until: Instant) -> Result<(), Setback> {
         if !self.behind.is_empty() {
             let from = std::mem::take(&mut self.behind);
-            if let Some(newest) = self.store.complete().cloned() {
+            if let Some(newest) = self.store.complete().cloned().or_else(|| self.remembered.take()) {
                 self.deliver_receipt(&newest, Verdict::Received, &from, link)?;
             }
         }
@@ -309,6 +338,8 @@ impl Slot {
     fn finish(&mut self, offer: &Offer, from: &[usize], link: &Link) -> Result<(), Setback> {
         self.target = None;
         self.failures = 0;
+        let Admission { identity, memory, .. } = &link.admission;
+        memory.note(offer, &identity.key_of(&self.id))?;
         self.deliver_receipt(offer, Verdict::Received, from, link)?;
         self.confirmed = Some(offer.digest());
         Ok(())

@@ -258,7 +258,13 @@ fn a_vanished_aircraft_does_not_hold_up_the_others() {
     }
     stuck.quota.store(u32::MAX, Ordering::SeqCst);
     let (mission, aircraft) = ("m".into(), vec!["a1".into(), "a2".into()]);
-    let admission = Admission { mission, aircraft, identity: Identity::unsigned(), check: Box::new(|_, _| Ok(())) };
+    let admission = Admission {
+        mission,
+        aircraft,
+        identity: Identity::unsigned(),
+        check: Box::new(|_, _| Ok(())),
+        memory: Default::default(),
+    };
     let inlets: Vec<Box<dyn Inlet>> = vec![Box::new(Vanished(stuck))];
     let dir = b.dir.path().join("received");
     let mut r = Receiver::with_inlets(&settings, admission, &dir, inlets, sync_channel(1)).expect("receiver");
@@ -285,7 +291,13 @@ fn one_aircraft_that_cannot_be_written_costs_the_others_nothing_and_is_tried_aga
     std::fs::create_dir(&dir).expect("folder");
     std::fs::write(dir.join("a1"), b"").expect("in the way");
     let (mission, aircraft) = ("m".into(), vec!["a1".into(), "a2".into()]);
-    let admission = Admission { mission, aircraft, identity: Identity::unsigned(), check: Box::new(|_, _| Ok(())) };
+    let admission = Admission {
+        mission,
+        aircraft,
+        identity: Identity::unsigned(),
+        check: Box::new(|_, _| Ok(())),
+        memory: Default::default(),
+    };
     let inlets: Vec<Box<dyn Inlet>> = vec![Box::new(b.fake.clone())];
     let mut r = Receiver::with_inlets(&b.settings, admission, &dir, inlets, sync_channel(1)).expect("receiver");
     b.rounds(&mut r, 3);

@@ -11,7 +11,13 @@ fn settings() -> UploadSettings {
 
 fn admission() -> Admission {
     let (mission, aircraft) = ("m".into(), vec!["a1".into()]);
-    Admission { mission, aircraft, identity: Identity::unsigned(), check: Box::new(|_, _| Ok(())) }
+    Admission {
+        mission,
+        aircraft,
+        identity: Identity::unsigned(),
+        check: Box::new(|_, _| Ok(())),
+        memory: Default::default(),
+    }
 }
 
 /// A checkpoint and the final model of one aircraft, which have chunks in common.

@@ -134,7 +134,7 @@ impl Bench {
         let inlets: Vec<Box<dyn Inlet>> = vec![Box::new(self.fake.clone())];
         let dir = self.dir.path().join("received");
         let (mission, aircraft) = ("m".into(), vec!["a1".into()]);
-        let admission = Admission { mission, aircraft, identity, check: Box::new(check) };
+        let admission = Admission { mission, aircraft, identity, check: Box::new(check), memory: Default::default() };
         Receiver::with_inlets(&self.settings, admission, &dir, inlets, sync_channel(1)).expect("receiver")
     }
 

@@ -1,0 +1,134 @@
+//! What earlier sessions of the ground have received of each aircraft. A model of theirs that is shown again, by a stick that
+//! nobody cleared or by somebody who kept it, is not this session's.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use config::disk::Disk;
+use serde::{Deserialize, Serialize};
+
+use crate::folder::read_bounded;
+use crate::keys::random;
+use crate::offer::{Offer, Order, hex};
+use crate::store::{StoreError, io};
+
+/// Bound on the file: a few hundred bytes for each aircraft that a mission may have.
+const LIMIT: u64 = 4 << 20;
+/// Bound on the name of a session.
+const NAME: u64 = 64;
+
+/// The last model of one aircraft.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Last {
+    /// Whose key signed it; empty in missions without keys.
+    key: String,
+    flight: u64,
+    counter: u64,
+    /// The session that received it.
+    session: String,
+}
+
+/// The last models of a mission's aircraft, over all sessions.
+#[derive(Debug, Default)]
+pub struct Memory {
+    path: Option<PathBuf>,
+    session: String,
+    /// What earlier sessions have is taken, too.
+    again: bool,
+    last: Mutex<BTreeMap<String, Last>>,
+}
+
+impl Memory {
+    /// The memory of `mission` in the folder `state`, for the session whose folder is `received`. With `again` nothing counts
+    /// as an earlier session's.
+    ///
+    /// # Errors
+    /// It cannot be read back or written.
+    pub fn open(state: &Path, mission: &str, received: &Path, again: bool) -> Result<Self, StoreError> {
+        let path = state.join(format!("{mission}.received.json"));
+        let read = |p: &Path| {
+            let bytes = read_bounded(p, LIMIT).map_err(|e| e.to_string())?;
+            serde_json::from_slice::<BTreeMap<String, Last>>(&bytes).map_err(|e| format!("{}: {e}", p.display()))
+        };
+        let newest = Disk::default().newest(&path, read).map_err(io(&path))?;
+        newest.damaged.iter().for_each(|d| tracing::warn!("{d}; what earlier sessions received is not known"));
+        let session = session_of(received)?;
+        let memory = Self { path: Some(path), session, again, last: Mutex::new(newest.found.unwrap_or_default()) };
+        // Better now than after the first model.
+        memory.write()?;
+        Ok(memory)
+    }
+
+    /// The order that an earlier session has of this aircraft, if the offer is not newer.
+    pub fn is_stale(&self, offer: &Offer, key: &str) -> Option<Order> {
+        if self.again {
+            return None;
+        }
+        let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        let last = last.get(&offer.aircraft).filter(|l| l.key == key && l.session != self.session)?;
+        let order = Order { flight: last.flight, counter: last.counter };
+        (offer.order <= order).then_some(order)
+    }
+
+    /// Remembers a model that is here.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn note(&self, offer: &Offer, key: &str) -> Result<(), StoreError> {
+        let Order { flight, counter } = offer.order;
+        let now = Last { key: key.into(), flight, counter, session: self.session.clone() };
+        {
+            let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+            let before = last.insert(offer.aircraft.clone(), now.clone());
+            if before == Some(now) {
+                return Ok(());
+            }
+        }
+        self.write()
+    }
+
+    fn write(&self) -> Result<(), StoreError> {
+        let Some(path) = &self.path else { return Ok(()) };
+        let json = {
+            let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+            serde_json::to_vec(&*last).map_err(|e| io(path)(e.into()))?
+        };
+        Disk::default().replace_keeping(path, |out| out.write_all(&json)).map_err(|e| io(path)(e.into()))
+    }
+}
+
+/// The name of the session that has `received`: made with it, and the same after a restart.
+fn session_of(received: &Path) -> Result<String, StoreError> {
+    let path = received.join("session");
+    let there = read_bounded(&path, NAME).ok().and_then(|bytes| String::from_utf8(bytes).ok());
+    if let Some(name) = there.filter(|name| name.len() as u64 == NAME) {
+        return Ok(name);
+    }
+    let name = hex(&random().map_err(io(&path))?);
+    Disk::default().replace(&path, |out| out.write_all(name.as_bytes())).map_err(|e| io(&path)(e.into()))?;
+    Ok(name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::offer::testing::offer;
+
+    #[test]
+    fn what_an_earlier_session_received_is_stale_in_a_later_one_and_not_in_its_own() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let open =
+            |session: &str, again| Memory::open(dir.path(), "m", &dir.path().join(session), again).expect("opens");
+        let (second, third) = (offer("m", "a1", 2), offer("m", "a1", 3));
+        open("yesterday", false).note(&second, "k").expect("written");
+        assert_eq!(open("yesterday", false).is_stale(&second, "k"), None, "the same session, started again");
+        let today = open("today", false);
+        assert_eq!(today.is_stale(&second, "k"), Some(second.order));
+        assert_eq!(today.is_stale(&offer("m", "a1", 1), "k"), Some(second.order));
+        assert_eq!(today.is_stale(&third, "k"), None);
+        assert_eq!(today.is_stale(&second, "another key"), None, "numbers begin anew with a key");
+        assert_eq!(today.is_stale(&offer("m", "a2", 1), "k"), None);
+        assert_eq!(open("today", true).is_stale(&second, "k"), None, "asked for");
+    }
+}
