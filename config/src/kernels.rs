@@ -1,21 +1,26 @@
-//! Who decides the shape of the kernels: their workgroup sizes, and how many lanes share a tile. It belongs to a device and
-//! not to a mission, which many devices share, so it is given by the environment variable [`VARIABLE`]. The trained
+//! Who decides the kernel configuration: workgroup sizes, and how many lanes share a tile. It belongs to a device and
+//! not to a mission, which many devices share, so the environment variable [`VARIABLE`] names it. The trained
 //! model's bytes do not depend on it.
 
 use std::str::FromStr;
 
-/// `auto` (or not set), `default`, or `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART` such as `64x8x1x8x1x1x1x8`.
+/// `auto` (or not set), `default`, a profile of [`PROFILES`], or, to tune,
+/// `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART` such as `64x8x1x8x1x1x1x8`.
 pub const VARIABLE: &str = "DGTR_KERNELS";
+
+/// What the three kinds of devices begin with, by name: a processor (Mesa's llvmpipe), a board's GPU, a graphics card.
+pub const PROFILES: [(&str, &str); 3] =
+    [("processor", "64x8x1x8x1x1x1x8"), ("board", "64x32x1x8x8x1x1x2"), ("card", "64x32x32x8x8x1x8x8")];
 
 /// Who decides.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum KernelChoice {
     /// `auto`: measured once per device and driver, then remembered.
     #[default]
-    Calibrated,
+    Autotuned,
     /// `default`: the built-in sizes; nothing is measured, nothing is read or written.
     Standard,
-    /// `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART`: these.
+    /// A profile's numbers, or `WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART`.
     Fixed {
         /// Lanes of a workgroup of the plain loops over Gaussians or pixels.
         wide: u32,
@@ -37,10 +42,10 @@ pub enum KernelChoice {
     },
 }
 
-/// A value that is none of the three.
+/// A value that names no configuration.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{VARIABLE}: '{0}' is none of auto, default, WIDExNARROWxSHARExTILESxRUNSxFETCHEDxSUMMEDxPART (such as 64x8x1x8x1x1x1x8)"
+    "{VARIABLE}: '{0}' is none of auto, default, processor, board, card and no eight numbers such as 64x8x1x8x1x1x1x8"
 )]
 pub struct KernelChoiceError(String);
 
@@ -49,11 +54,16 @@ impl FromStr for KernelChoice {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         match text {
-            "" | "auto" => Ok(Self::Calibrated),
+            "" | "auto" => Ok(Self::Autotuned),
             "default" => Ok(Self::Standard),
-            other => fixed(other).ok_or_else(|| KernelChoiceError(other.chars().take(40).collect())),
+            other => fixed(profile(other)).ok_or_else(|| KernelChoiceError(other.chars().take(40).collect())),
         }
     }
+}
+
+/// The numbers of the profile of this name; what names none is taken for numbers.
+fn profile(text: &str) -> &str {
+    PROFILES.iter().find(|(name, _)| *name == text).map_or(text, |(_, numbers)| numbers)
 }
 
 fn fixed(text: &str) -> Option<KernelChoice> {
@@ -77,7 +87,7 @@ impl KernelChoice {
     /// What the environment says.
     ///
     /// # Errors
-    /// A value that is none of the three.
+    /// A value that names no configuration.
     pub fn from_environment() -> Result<Self, KernelChoiceError> {
         std::env::var_os(VARIABLE).unwrap_or_default().to_string_lossy().parse()
     }
@@ -88,9 +98,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_three_forms_are_read_and_everything_else_is_refused() {
-        assert_eq!("".parse(), Ok(KernelChoice::Calibrated));
-        assert_eq!("auto".parse(), Ok(KernelChoice::Calibrated));
+    fn names_profiles_and_numbers_are_read_and_everything_else_is_refused() {
+        assert_eq!("".parse(), Ok(KernelChoice::Autotuned));
+        assert_eq!("auto".parse(), Ok(KernelChoice::Autotuned));
         assert_eq!("default".parse(), Ok(KernelChoice::Standard));
         let fixed = KernelChoice::Fixed {
             wide: 128,
@@ -103,7 +113,13 @@ mod tests {
             part: 2,
         };
         assert_eq!("128x16x16x8x8x1x8x2".parse(), Ok(fixed));
-        let bad = "off 64 64x8 64x8x1x8x1x1x8 64x8x1x8x1x1x1x x8x1x8x1x1x1x8 64x-8x1x8x1x1x1x8 99999999999x8x1x8x1x1x1x8 \
+        for (name, numbers) in PROFILES {
+            assert!(
+                matches!(name.parse(), Ok(KernelChoice::Fixed { .. }))
+                    && name.parse::<KernelChoice>() == numbers.parse()
+            );
+        }
+        let bad = "off Board 64 64x8 64x8x1x8x1x1x8 64x8x1x8x1x1x1x x8x1x8x1x1x1x8 64x-8x1x8x1x1x1x8 99999999999x8x1x8x1x1x1x8 \
                    64x8x1x8x1x1x1x8x1";
         for bad in bad.split(' ') {
             let refused = bad.parse::<KernelChoice>().unwrap_err().to_string();

@@ -75,8 +75,8 @@ struct Cli {
 fn notes() -> String {
     let codes: Vec<String> = EXIT_CODES.iter().map(|(_, code, meaning)| format!("{code} {meaning}")).collect();
     format!(
-        "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|WIDExNARROWxSHARExTILESxRUNSxFETCHEDxPART: shape of the kernels; auto \
-         measures it once per hardware device and driver (dgtr doctor shows it), default measures nothing. Models do not \
+        "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|processor|board|card: kernel configuration. auto measures it once per \
+         hardware device and driver (dgtr doctor shows it); default and the three profiles measure nothing. Models do not \
          depend on it.",
         codes.join(", ")
     )

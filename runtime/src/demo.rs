@@ -117,7 +117,7 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
 
     // Once, and before anything else is at work; the jobs find the result. Without a device they say so themselves.
     if let Ok(gpu) = Gpu::open(None) {
-        kernels::shape_of(&gpu);
+        kernels::config_of(&gpu);
     }
     let spawn = |name: &str, arguments: &[&str]| Process::spawn(name, arguments, &out, options.limit_mib);
     let mission = mission.to_string_lossy().into_owned();

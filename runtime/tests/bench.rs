@@ -32,7 +32,7 @@ fn has_device() -> bool {
 }
 
 #[test]
-fn stages_have_time_work_and_a_ceiling() {
+fn stages_have_time_work_and_a_roofline() {
     if !has_device() {
         return;
     }
@@ -180,8 +180,8 @@ fn every_skip_is_a_row_with_a_verdict() {
 }
 
 #[test]
-fn the_twin_keeps_every_promise_without_a_device() {
-    let text = held(&bench(&["stress", "--twin-only"]));
+fn the_reference_keeps_every_promise_without_a_device() {
+    let text = held(&bench(&["stress", "--reference-only"]));
     assert!(text.contains("held") && !text.contains("BROKEN"), "{text}");
 }
 
@@ -212,20 +212,20 @@ fn detail_that_training_pictures_cannot_show_is_learnt_from_crops_and_the_same_s
 }
 
 #[test]
-fn a_device_s_report_says_who_it_is_and_that_it_computes_what_the_twin_does() {
+fn a_device_s_report_says_who_it_is_and_that_it_computes_what_the_reference_does() {
     if !has_device() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("device.json");
     let path = file.to_string_lossy().into_owned();
-    let small = ["--calibration-seconds", "0", "--sizes", "1", "--steps", "10"];
+    let small = ["--autotune-seconds", "0", "--sizes", "1", "--steps", "10"];
     let text = held(&bench(&[&["device", "--out", &path][..], &small].concat()));
     let report = json(&file);
     let name = report["device"]["name"].as_str().unwrap();
     assert!(!name.is_empty() && text.contains(name), "{text}");
-    let [device, twin] = ["loss", "twin_loss"].map(|loss| report["twin"][loss].as_f64().unwrap());
-    assert!((device - twin).abs() < 2e-4, "{device} against {twin}");
+    let [device, reference] = ["loss", "reference_loss"].map(|loss| report["reference"][loss].as_f64().unwrap());
+    assert!((device - reference).abs() < 2e-4, "{device} against {reference}");
     assert_eq!(report["sizes"].as_array().unwrap().len(), 1);
     assert_eq!(report["survey"]["steps"], 10);
     assert!(report["survey"]["psnr"].as_f64().unwrap() > 10.0);

@@ -2,7 +2,7 @@
 // The lazy Adam updates of SH that the visible Gaussians missed outside the view, before `shade` reads them; mode 1: those of all. Most
 // missed none, and a branch costs llvmpipe what is behind it whether it is taken or not: each lane looks for its next one in a loop.
 // In the order in which Gaussians lie, where `project` has just left their keys. 683 Gaussians a lane at the most (`config::plan`), 14 turns
-// each: fewer than the 65,535 after which llvmpipe ends an invocation's loops. Twin: the lazy updates of src/twin/adam.rs.
+// each: fewer than the 65,535 after which llvmpipe ends an invocation's loops. Reference: the lazy updates of src/reference/adam.rs.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "harmonics.glsl"

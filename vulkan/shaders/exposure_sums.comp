@@ -1,6 +1,6 @@
 #version 450
 // The exposure's gradient, one partial sum per strip of a column, from the loss's at every pixel as `loss_gradient` left it: by the
-// rendered colour, before gain and offset. Only where a view's exposure is trained. Twin: the exposure of src/twin/loss.rs.
+// rendered colour, before gain and offset. Only where a view's exposure is trained. Reference: the exposure of src/reference/loss.rs.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 

@@ -1,7 +1,7 @@
 // Adam's moments of the SH coefficients: as they are, or in 16 bits each where the plan says so. The 16 bits hold the
 // first moment and the square root of the second, both times `frame.moment_scale`, which brings gradients of a mean over pixels
 // to the size of a pixel's. The root is rounded by chance: to the nearest, the thousandth by which a step changes a second
-// moment would be lost or doubled. src/twin/adam.rs has the twin.
+// moment would be lost or doubled. src/reference/adam.rs has the reference.
 
 TEXELS(vec4, 12, sh_first_texels)
 TEXELS(vec4, 13, sh_second_texels)

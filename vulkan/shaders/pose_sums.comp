@@ -1,6 +1,6 @@
 #version 450
 // The gradient of the camera's pose, one partial sum per lane, from those of the Gaussians as `project_backward` left them. Only where
-// a view's pose is trained; before `optimise`, which moves the Gaussians. Twin: the pose of src/twin/project_backward.rs.
+// a view's pose is trained; before `optimise`, which moves the Gaussians. Reference: the pose of src/reference/project_backward.rs.
 #extension GL_GOOGLE_include_directive : require
 #include "frame.glsl"
 #include "camera.glsl"

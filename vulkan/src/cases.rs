@@ -1,5 +1,5 @@
 //! Numbers that broke other renderers: for each case what is promised, and a function that tries it — on the device, on
-//! the CPU twin, or both. The tests run them one by one (`tests/numerical_gpu.rs`, `tests/numerical_twin.rs`), and
+//! the CPU reference, or both. The tests run them one by one (`tests/numerical_gpu.rs`, `tests/numerical_reference.rs`), and
 //! `dgtr bench stress` runs them all on whatever device is there.
 
 /// Ends the case as broken unless the condition holds.
@@ -36,8 +36,8 @@ pub mod extremes;
 pub mod half;
 pub mod instances;
 mod list;
+pub mod reference;
 pub mod scenes;
-pub mod twin;
 
 pub use list::{CASES, ELSEWHERE};
 
@@ -83,8 +83,8 @@ pub struct Case {
     pub promise: &'static str,
     /// Through training steps on the device.
     pub device: Option<fn(&Gpu) -> Outcome>,
-    /// Through the twin.
-    pub twin: Option<fn() -> Outcome>,
+    /// Through the reference.
+    pub reference: Option<fn() -> Outcome>,
 }
 
 /// What a case went through.
@@ -105,7 +105,7 @@ impl Tally {
         self.instances += instances;
     }
 
-    /// The twin's answer, counted.
+    /// The reference's answer, counted.
     pub fn ask(
         &mut self,
         cloud: &GaussianCloud,

@@ -1,4 +1,4 @@
-//! Numbers that the shaders and their CPU twins must share; `shaders/constants.glsl` holds the same values and a
+//! Numbers that the shaders and their CPU references must share; `shaders/constants.glsl` holds the same values and a
 //! test compares the two files, so that neither can drift alone.
 
 /// Variance in px² added to both diagonal entries of the projected covariance (3DGS, `computeCov2D`).

@@ -3,18 +3,18 @@
 //! [`gpu::Gpu`] opens a device, [`config::plan::Plan`] says what is allocated, [`trainer::Trainer`] trains and renders.
 
 mod arena;
-pub mod calibration;
+pub mod autotune;
 #[cfg(feature = "lab")]
 pub mod cases;
-pub mod ceiling;
 mod commands;
 pub mod constants;
 pub mod gpu;
+pub mod kernel_config;
 mod kernels;
 mod layout;
 mod pipelines;
-pub mod shape;
+pub mod reference;
+pub mod roofline;
 pub mod stages;
 pub mod synthetic;
 pub mod trainer;
-pub mod twin;

@@ -6,11 +6,11 @@ mod listed;
 use crate::arena::{Arena, Section};
 use crate::constants::STRIP;
 use crate::gpu::{DeviceLimits, Gpu, GpuError};
+use crate::kernel_config::KernelConfig;
 use crate::kernels::{
     DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
 };
 use crate::kernels::{texel_bytes, texel_format};
-use crate::shape::KernelShape;
 use ash::vk;
 use config::plan::{Plan, sh_columns};
 
@@ -29,7 +29,7 @@ pub(crate) struct Pipelines {
     sets: Vec<vk::DescriptorSet>,
     view_sets: Vec<vk::DescriptorSet>,
     texel_views: Vec<vk::BufferView>,
-    shape: KernelShape,
+    config: KernelConfig,
     /// Kernels read storage buffers where they would fetch texels.
     storage_reads: bool,
 }
@@ -72,17 +72,17 @@ fn bound(arena: &Arena, plan: &Plan, name: &str) -> Section {
 }
 
 /// Whether kernels of this kind run as their variant: more than one lane per tile or share, strips in parts.
-fn takes_variant(group: Group, shape: KernelShape) -> bool {
+fn takes_variant(group: Group, config: KernelConfig) -> bool {
     match group {
-        Group::Sort | Group::Walk => shape.share_lanes > 1,
-        Group::Strips => shape.part < STRIP,
-        _ => shape.tile_lanes > 1,
+        Group::Sort | Group::Walk => config.share_lanes > 1,
+        Group::Strips => config.part < STRIP,
+        _ => config.tile_lanes > 1,
     }
 }
 
 /// Lanes of a workgroup of this kind.
-fn local_size(group: Group, shape: KernelShape) -> u32 {
-    let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, .. } = shape;
+fn local_size(group: Group, config: KernelConfig) -> u32 {
+    let KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, .. } = config;
     match group {
         Group::Wide | Group::Strips => wide,
         Group::Sort if share_lanes > 1 => SCAN_LANES,
@@ -106,13 +106,13 @@ impl Pipelines {
         gpu: &Gpu,
         plan: &Plan,
         arena: &Arena,
-        shape: KernelShape,
+        config: KernelConfig,
         own_degrees: bool,
         kernels: &[Kernel],
     ) -> Result<Self, GpuError> {
         // Compiling may take minutes: what the device refuses is found out first.
         let limits = &gpu.info().limits;
-        limits.check_workgroup(shape.largest_workgroup().max(SCAN_LANES))?;
+        limits.check_workgroup(config.largest_workgroup().max(SCAN_LANES))?;
         let storage_reads = Self::needs_storage_reads(limits, plan)?;
         let device = gpu.device();
         let read = match storage_reads {
@@ -157,7 +157,7 @@ impl Pipelines {
                 sets: Vec::new(),
                 view_sets: Vec::new(),
                 texel_views: Vec::new(),
-                shape,
+                config,
                 storage_reads,
             };
             let layouts = [set_layout];
@@ -271,7 +271,7 @@ impl Pipelines {
     unsafe fn pipeline(&self, index: usize, plan: &Plan, own_degrees: bool) -> Result<vk::Pipeline, GpuError> {
         let kernel = &KERNELS[index];
         let constants = Specialisation {
-            local_size: local_size(kernel.group, self.shape),
+            local_size: local_size(kernel.group, self.config),
             sh_columns: sh_columns(plan.sh_degree) as u32,
             sh_degree: plan.sh_degree.into(),
             sort_lanes: plan.lanes.sort,
@@ -281,8 +281,8 @@ impl Pipelines {
             },
             own_degrees: own_degrees.into(),
             half_moments: plan.half_moments.into(),
-            staged: (self.shape.fetched > 1).into(),
-            rolled: (self.shape.summed < self.shape.tile_lanes).into(),
+            staged: (self.config.fetched > 1).into(),
+            rolled: (self.config.summed < self.config.tile_lanes).into(),
         };
         let entries: [_; 9] = std::array::from_fn(|i| vk::SpecializationMapEntry {
             constant_id: i as u32,
@@ -290,8 +290,8 @@ impl Pipelines {
             size: 4,
         });
         let special = vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(&constants));
-        let shared = kernel.shared.filter(|_| self.shape.meets(self.gpu.info()));
-        let variant = shared.or(kernel.variant).filter(|_| takes_variant(kernel.group, self.shape));
+        let shared = kernel.shared.filter(|_| self.config.meets(self.gpu.info()));
+        let variant = shared.or(kernel.variant).filter(|_| takes_variant(kernel.group, self.config));
         // SAFETY: by this function's contract; the constants are those that `frame.glsl` and `tile.glsl` declare.
         unsafe {
             self.gpu.compute_pipeline(
@@ -306,9 +306,9 @@ impl Pipelines {
     /// Workgroups that give `kernel` at least `count` lanes, tiles or shares, whichever it is dispatched over.
     pub fn groups(&self, kernel: Kernel, count: usize) -> u32 {
         let each = match KERNELS[kernel as usize].group {
-            Group::Tiles => self.shape.tiles,
-            Group::Sort | Group::Walk if self.shape.share_lanes > 1 => 1,
-            group => local_size(group, self.shape),
+            Group::Tiles => self.config.tiles,
+            Group::Sort | Group::Walk if self.config.share_lanes > 1 => 1,
+            group => local_size(group, self.config),
         };
         (count as u32).div_ceil(each).max(1)
     }

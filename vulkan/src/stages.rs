@@ -1,4 +1,4 @@
-//! Names of the pipeline's stages, in order: timings, counters and the CPU twins all use them.
+//! Names of the pipeline's stages, in order: timings, counters and the CPU references all use them.
 
 pub mod work;
 

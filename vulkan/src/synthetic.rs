@@ -1,4 +1,4 @@
-//! Small made-up scenes: what calibration measures with, what `check` compares with the twin, what the stress cases start from.
+//! Small made-up scenes: what autotuning measures with, what `check` compares with the reference, what the stress cases start from.
 
 use config::training::{DensitySettings, RegulariseSettings, ResolutionSettings, ShSettings, Strategy, TrainSettings};
 use glam::{DQuat, DVec3};

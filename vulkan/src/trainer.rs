@@ -43,10 +43,10 @@ pub use validation::Validated;
 use crate::arena::Arena;
 use crate::commands::{Commands, Recording};
 use crate::gpu::Gpu;
+use crate::kernel_config::KernelConfig;
 use crate::kernels::{ALL, GROUPS, Kernel};
 use crate::layout::{Frame, Push, Status};
 use crate::pipelines::Pipelines;
-use crate::shape::KernelShape;
 use crate::stages::STAGE_NAMES;
 use bytemuck::Zeroable;
 use config::plan::Plan;
@@ -126,26 +126,26 @@ impl std::fmt::Debug for Trainer {
 }
 
 impl Trainer {
-    /// As [`Trainer::with_shape`], with the device's standard shape.
+    /// As [`Trainer::with_config`], with the device's standard configuration.
     ///
     /// # Errors
     /// As there.
     pub fn new(gpu: &Gpu, plan: &Plan, settings: &TrainSettings) -> Result<Self, TrainError> {
-        Self::with_shape(gpu, plan, settings, KernelShape::standard(gpu.info()))
+        Self::with_config(gpu, plan, settings, KernelConfig::standard(gpu.info()))
     }
 
     /// Allocates everything training will ever need: one device allocation of `plan.total_bytes`, all pipelines, and the
-    /// host's own lists. The shape decides how fast the kernels run and changes no bit of what they compute.
+    /// host's own lists. The configuration decides how fast the kernels run and changes no bit of what they compute.
     ///
     /// # Errors
     /// [`TrainError::Gpu`] (device, driver, memory, limits); [`TrainError::Settings`].
-    pub fn with_shape(
+    pub fn with_config(
         gpu: &Gpu,
         plan: &Plan,
         settings: &TrainSettings,
-        shape: KernelShape,
+        config: KernelConfig,
     ) -> Result<Self, TrainError> {
-        Self::with_kernels(gpu, plan, settings, shape, ALL)
+        Self::with_kernels(gpu, plan, settings, config, ALL)
     }
 
     /// The same with some of the kernels only.
@@ -153,7 +153,7 @@ impl Trainer {
         gpu: &Gpu,
         plan: &Plan,
         settings: &TrainSettings,
-        shape: KernelShape,
+        config: KernelConfig,
         kernels: &[Kernel],
     ) -> Result<Self, TrainError> {
         settings.check()?;
@@ -162,7 +162,7 @@ impl Trainer {
             return Err(SettingError::new("sh.raise_share", &settings.sh.raise_share, wanted).into());
         }
         let arena = Arena::new(gpu, plan)?;
-        let pipelines = Pipelines::new(gpu, plan, &arena, shape, settings.sh.raise_share < 1.0, kernels)?;
+        let pipelines = Pipelines::new(gpu, plan, &arena, config, settings.sh.raise_share < 1.0, kernels)?;
         let commands = Commands::new(gpu)?;
         let parameters = parameters::Parameters::new(&arena, plan);
         Ok(Self {

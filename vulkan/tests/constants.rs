@@ -16,7 +16,7 @@ fn glsl(name: &str) -> Vec<f32> {
 }
 
 #[test]
-fn shaders_and_twins_share_every_constant() {
+fn shaders_and_references_share_every_constant() {
     let scalars = [
         ("LOW_PASS", c::LOW_PASS),
         ("ALPHA_MAX", c::ALPHA_MAX),

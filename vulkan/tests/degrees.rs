@@ -9,12 +9,12 @@ use models::cloud::{GaussianCloud, sh_coefficients};
 use scenes::device::{empty_trainer, plain, posed, trainer};
 use scenes::{cloud, photo, view};
 use std::ops::ControlFlow;
+use vulkan::reference::camera::Camera;
+use vulkan::reference::gaussian::Gaussian;
+use vulkan::reference::loss::{Exposure, Target};
+use vulkan::reference::project::Limits;
+use vulkan::reference::step::{backward, forward};
 use vulkan::trainer::{Rendering, RunBudget};
-use vulkan::twin::camera::Camera;
-use vulkan::twin::gaussian::Gaussian;
-use vulkan::twin::loss::{Exposure, Target};
-use vulkan::twin::project::Limits;
-use vulkan::twin::step::{backward, forward};
 
 /// Rows of degree 0, 1, 2, 3, 0, 1, …: what is above is zero.
 fn mixed(n: usize) -> GaussianCloud {
@@ -36,7 +36,7 @@ fn by_residual(share: f32) -> TrainSettings {
 }
 
 #[test]
-fn gaussians_of_mixed_degrees_are_drawn_and_differentiated_as_their_twins() {
+fn gaussians_of_mixed_degrees_are_drawn_and_differentiated_as_their_references() {
     let (c, v) = (mixed(200), view(48, 36));
     let Some(mut t) = trainer(&c, &v, &by_residual(0.25)) else { return };
     let photo = photo(3, &v);
@@ -48,11 +48,11 @@ fn gaussians_of_mixed_degrees_are_drawn_and_differentiated_as_their_twins() {
 
     let (gaussians, camera, limits) = (Gaussian::<f32>::of_cloud(&c), Camera::<f32>::of(&v), Limits::default());
     let all = |_: usize| 1.0;
-    let twin = forward(&gaussians, &camera, own, all, &limits);
+    let reference = forward(&gaussians, &camera, own, all, &limits);
     let target = Target { width: 48, rgb: &photo, depth: None, kept: None, background: [0.0; 3] };
     let settings = plain().loss;
-    let slopes = backward(&gaussians, &camera, own, all, &limits, &twin, &target, &Exposure::default(), &settings);
-    for (at, p) in twin.picture.iter().enumerate() {
+    let slopes = backward(&gaussians, &camera, own, all, &limits, &reference, &target, &Exposure::default(), &settings);
+    for (at, p) in reference.picture.iter().enumerate() {
         for k in 0..3 {
             assert!((shown.rgb[3 * at + k] - p.rgb[k]).abs() < 1e-4, "pixel {at}");
         }

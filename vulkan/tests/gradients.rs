@@ -7,13 +7,13 @@
 use config::training::LossSettings;
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use vulkan::twin::camera::{Camera, Rays};
-use vulkan::twin::entropy::entropy;
-use vulkan::twin::gaussian::{Gaussian, PARAMETERS};
-use vulkan::twin::loss::{Exposure, Target, loss};
-use vulkan::twin::project::Limits;
-use vulkan::twin::step::{Forward, ViewGradient, backward, forward};
-use vulkan::twin::view_dependence::magnitude;
+use vulkan::reference::camera::{Camera, Rays};
+use vulkan::reference::entropy::entropy;
+use vulkan::reference::gaussian::{Gaussian, PARAMETERS};
+use vulkan::reference::loss::{Exposure, Target, loss};
+use vulkan::reference::project::Limits;
+use vulkan::reference::step::{Forward, ViewGradient, backward, forward};
+use vulkan::reference::view_dependence::magnitude;
 
 const SIZE: [u32; 2] = [29, 21];
 

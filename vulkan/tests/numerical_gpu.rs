@@ -1,5 +1,5 @@
 //! Numbers that broke other renderers, through the trainer on the device: one test per case of `vulkan::cases`. The same
-//! promises hold for the twin (`numerical_twin.rs`).
+//! promises hold for the reference (`numerical_reference.rs`).
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 use vulkan::cases::{ELSEWHERE, Outcome, device, extremes, half, instances};
@@ -28,7 +28,7 @@ held! { device:
     needles_have_a_positive_determinant_and_never_more_than_their_peak_opacity
     at_the_camera_centre_or_behind_nothing_is_drawn_and_the_step_still_ends
     opaque_gaussians_in_front_of_each_other_divide_by_no_zero
-    pictures_of_one_row_one_column_or_one_pixel_are_the_twins
+    pictures_of_one_row_one_column_or_one_pixel_are_those_of_the_reference
     colours_up_to_the_largest_float_are_clamped
     the_same_scene_at_any_scale_gives_the_same_picture
     a_depth_prior_that_says_nothing_has_no_correlation
@@ -80,7 +80,7 @@ fn eight_hundred_steps_stay_sound() {
 #[test]
 fn every_case_of_the_list_has_a_test_of_its_name() {
     let list = include_str!("../src/cases/list.rs");
-    let tests = concat!(include_str!("numerical_gpu.rs"), include_str!("numerical_twin.rs"));
+    let tests = concat!(include_str!("numerical_gpu.rs"), include_str!("numerical_reference.rs"));
     let mut named = 0;
     for piece in list.split("Some(").skip(1) {
         let name = piece.split(')').next().unwrap().rsplit("::").next().unwrap();

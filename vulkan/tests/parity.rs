@@ -1,5 +1,5 @@
 //! Parity with the published formulas: an f64 evaluation of 3DGS/gsplat, written from the papers without tiles, sorting
-//! stages or culling, against the twin in f32 with everything the renderer does.
+//! stages or culling, against the reference in f32 with everything the renderer does.
 //!
 //! Documented band: a contribution whose α lies within 2e-6 of the cut-off 1/255 may be taken by one and skipped by the
 //! other, likewise a pixel whose transmittance passes within 2e-9 of the stop; such pixels are counted and exempt.
@@ -7,10 +7,10 @@
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use vulkan::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
-use vulkan::twin::camera::{Camera, Rays};
-use vulkan::twin::gaussian::Gaussian;
-use vulkan::twin::project::Limits;
-use vulkan::twin::step::forward;
+use vulkan::reference::camera::{Camera, Rays};
+use vulkan::reference::gaussian::Gaussian;
+use vulkan::reference::project::Limits;
+use vulkan::reference::step::forward;
 
 const SIZE: [u32; 2] = [96, 70];
 

@@ -1,4 +1,4 @@
-//! The shaders against their twins: the picture of a scene, and what whole training steps make of it.
+//! The shaders against their references: the picture of a scene, and what whole training steps make of it.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod scenes;
@@ -9,17 +9,17 @@ use models::cloud::GaussianCloud;
 use models::picture::mask::Mask;
 use scenes::device::{plain, posed, trainer};
 use scenes::{answer, cloud, photo, view};
+use vulkan::reference::camera::Camera;
+use vulkan::reference::gaussian::{Gaussian, PARAMETERS};
+use vulkan::reference::loss::Target;
+use vulkan::reference::project::Limits;
+use vulkan::reference::rasterise::Pixel;
+use vulkan::reference::step::forward;
+use vulkan::reference::trainer::ReferenceTrainer;
 use vulkan::trainer::{Rendering, TrainError};
-use vulkan::twin::camera::Camera;
-use vulkan::twin::gaussian::{Gaussian, PARAMETERS};
-use vulkan::twin::loss::Target;
-use vulkan::twin::project::Limits;
-use vulkan::twin::rasterise::Pixel;
-use vulkan::twin::step::forward;
-use vulkan::twin::trainer::TwinTrainer;
 
 #[test]
-fn the_picture_is_the_twins() {
+fn the_picture_is_that_of_the_reference() {
     for (seed, n, w, h) in [(1, 1, 16, 16), (2, 30, 37, 29), (3, 300, 96, 70), (4, 60, 5, 3)] {
         let v = view(w, h);
         let c = cloud(seed, n, 3);
@@ -32,7 +32,7 @@ fn the_picture_is_the_twins() {
 }
 
 #[test]
-fn the_orthographic_picture_is_the_twins() {
+fn the_orthographic_picture_is_that_of_the_reference() {
     for (seed, n, w, h) in [(2, 30, 37, 29), (3, 300, 96, 70)] {
         let v = view(w, h);
         let c = cloud(seed, n, 3);
@@ -90,33 +90,33 @@ fn assert_same(what: &str, drawn: &Rendering, expected: &[Pixel<f32>]) {
 }
 
 #[test]
-fn whole_steps_move_every_parameter_as_the_twin_does() {
-    steps_follow_the_twin(None, plain());
+fn whole_steps_move_every_parameter_as_the_reference_does() {
+    steps_follow_the_reference(None, plain());
 }
 
 #[test]
-fn steps_that_weigh_the_entropy_of_opacities_move_every_parameter_as_the_twin_does() {
+fn steps_that_weigh_the_entropy_of_opacities_move_every_parameter_as_the_reference_does() {
     let mut settings = plain();
     settings.loss.entropy = 2.0;
-    steps_follow_the_twin(None, settings);
+    steps_follow_the_reference(None, settings);
 }
 
 #[test]
-fn steps_that_hold_colours_back_from_varying_move_every_parameter_as_the_twin_does() {
+fn steps_that_hold_colours_back_from_varying_move_every_parameter_as_the_reference_does() {
     let mut settings = plain();
     (settings.loss.view_dependence, settings.loss.view_dependence_visits) = (1e-3, 0);
-    steps_follow_the_twin(None, settings.clone());
+    steps_follow_the_reference(None, settings.clone());
     // Of the degrees that are evaluated so far alone.
     settings.sh.raise_at = [0.0, 0.0, 1.0];
-    steps_follow_the_twin(None, settings);
+    steps_follow_the_reference(None, settings);
 }
 
 #[test]
-fn whole_steps_on_a_masked_picture_move_every_parameter_as_the_twin_does() {
-    steps_follow_the_twin(Some(Mask::from_fn(37, 29, |x, y| !(x > 9 && x < 24 && y > 4))), plain());
+fn whole_steps_on_a_masked_picture_move_every_parameter_as_the_reference_does() {
+    steps_follow_the_reference(Some(Mask::from_fn(37, 29, |x, y| !(x > 9 && x < 24 && y > 4))), plain());
 }
 
-fn steps_follow_the_twin(mask: Option<Mask>, settings: TrainSettings) {
+fn steps_follow_the_reference(mask: Option<Mask>, settings: TrainSettings) {
     let v = view(37, 29);
     let c = cloud(5, 40, 3);
     let photo = photo(5, &v);
@@ -125,20 +125,21 @@ fn steps_follow_the_twin(mask: Option<Mask>, settings: TrainSettings) {
     let kept = mask.map(|m| (0..37 * 29).map(|i| m.keeps(i % 37, i / 37)).collect::<Vec<_>>());
     let camera = Camera::<f64>::of(&v);
     let extent = config::training::scene_extent(&c.means, &[[0.0; 3]]);
-    let mut twin = TwinTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
+    let mut reference =
+        ReferenceTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
     let rgb: Vec<[f64; 3]> = photo.iter().map(|p| p.map(f64::from)).collect();
     let mut got = GaussianCloud::default();
     for step in 0..8u32 {
         let target = Target { width: 37, rgb: &rgb, depth: None, kept: kept.as_deref(), background: [0.0; 3] };
         let report = gpu.step().unwrap();
-        let gradient = twin.step(&camera, &target, settings.progress(step, 0.0));
+        let gradient = reference.step(&camera, &target, settings.progress(step, 0.0));
         let total = gradient.loss.total as f32;
         assert!((report.loss - total).abs() < 2e-4, "step {step}: loss {} against {total}", report.loss);
         gpu.snapshot(&mut got).unwrap();
         let mut far = vec![];
         for i in 0..c.len() {
             let mut g = Gaussian::<f64>::of_row(&got, i);
-            let mut t = twin.cloud[i];
+            let mut t = reference.cloud[i];
             let mut before = Gaussian::<f64>::of_row(&c, i);
             for k in 0..PARAMETERS {
                 let (a, b, start) = (*g.parameter(k), *t.parameter(k), *before.parameter(k));

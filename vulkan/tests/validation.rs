@@ -12,7 +12,7 @@ use scenes::{cloud, photo, view};
 use std::process::Command;
 use vulkan::constants::{RUNS, SHORT_PART};
 use vulkan::gpu::Gpu;
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
 use vulkan::trainer::{Rendering, Trainer};
 
 const CHILD: &str = "DGTR_VALIDATION_CHILD";
@@ -55,9 +55,9 @@ fn work() {
         scene_gaussians: None,
         ..Default::default()
     };
-    let standard = KernelShape::standard(gpu.info());
+    let standard = KernelConfig::standard(gpu.info());
     // Every kernel with several lanes that the device can run, those that fetch for each other and those that meet.
-    let several = |(tiles, tile_lanes, fetched, summed)| KernelShape {
+    let several = |(tiles, tile_lanes, fetched, summed)| KernelConfig {
         narrow: 32,
         share_lanes: 32,
         tiles,
@@ -67,15 +67,15 @@ fn work() {
         part: SHORT_PART,
         ..standard
     };
-    let staged = KernelShape::tile_candidates(gpu.info()).into_iter().max_by_key(|t| (t.2, t.0)).map(several).unwrap();
-    for (instances, shape) in
+    let staged = KernelConfig::tile_candidates(gpu.info()).into_iter().max_by_key(|t| (t.2, t.0)).map(several).unwrap();
+    for (instances, config) in
         [standard, staged, several((2, RUNS, 1, 1))].into_iter().flat_map(|s| [(1 << 16, s), (400, s)])
     {
         let plan = Plan::with_capacities(&request, 300, instances);
         let mut settings = plain();
         settings.refine_poses = true;
         settings.refine_exposure = true;
-        let mut t = Trainer::with_shape(&gpu, &plan, &settings, shape).unwrap();
+        let mut t = Trainer::with_config(&gpu, &plan, &settings, config).unwrap();
         t.load(&cloud(3, 200, 3)).unwrap();
         let depth: Vec<f32> = (0..64 * 48).map(|i| (i % 64) as f32).collect();
         let prior = DepthPrior { width: 64, height: 48, confidence: vec![1.0; depth.len()], depth };

@@ -1,11 +1,11 @@
-//! What a training step costs on this device: measured once in a few seconds, kept beside the kernels' shapes, and asked by whoever must
+//! What a training step costs on this device: measured once in a few seconds, kept beside the kernels' configurations, and asked by whoever must
 //! know beforehand how long a training will take.
 
 use std::path::PathBuf;
 
 use config::kernels::KernelChoice;
 use vulkan::gpu::{Gpu, GpuInfo};
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
 
 use crate::kernels::{cache, choice};
 use model::CostModel;
@@ -28,41 +28,41 @@ pub fn threads(info: &GpuInfo) -> u32 {
     std::env::var(LAVAPIPE_THREADS).ok().and_then(|n| n.trim().parse().ok()).unwrap_or_else(cores)
 }
 
-/// What steps cost on this device with kernels of `shape`, as far as it was measured.
-pub fn known(info: &GpuInfo, shape: KernelShape) -> Option<CostModel> {
-    kept(cache::path()?, info, shape)
+/// What steps cost on this device with kernels of `config`, as far as it was measured.
+pub fn known(info: &GpuInfo, config: KernelConfig) -> Option<CostModel> {
+    kept(cache::path()?, info, config)
 }
 
 /// The same, measured now and kept where it was not; `None` (and a warning) where it cannot be measured, and where
 /// [`config::kernels::VARIABLE`] says that nothing is. Call it before anything that must not wait: it takes seconds.
-pub fn of(gpu: &Gpu, shape: KernelShape) -> Option<CostModel> {
+pub fn of(gpu: &Gpu, config: KernelConfig) -> Option<CostModel> {
     if choice() == KernelChoice::Standard {
         return None;
     }
-    measured(gpu, shape, cache::path())
+    measured(gpu, config, cache::path())
 }
 
-fn kept(path: PathBuf, info: &GpuInfo, shape: KernelShape) -> Option<CostModel> {
-    cache::read_cost(&path, info, threads(info), shape).unwrap_or_else(|e| {
+fn kept(path: PathBuf, info: &GpuInfo, config: KernelConfig) -> Option<CostModel> {
+    cache::read_cost(&path, info, threads(info), config).unwrap_or_else(|e| {
         tracing::warn!("what steps cost is measured anew: {e}");
         None
     })
 }
 
 /// Measures it, whatever is kept, and keeps the result; `None` (and a warning) when it cannot be measured.
-pub fn anew(gpu: &Gpu, shape: KernelShape) -> Option<CostModel> {
-    now(gpu, shape, cache::path())
+pub fn anew(gpu: &Gpu, config: KernelConfig) -> Option<CostModel> {
+    now(gpu, config, cache::path())
 }
 
-fn measured(gpu: &Gpu, shape: KernelShape, path: Option<PathBuf>) -> Option<CostModel> {
-    let before = path.clone().and_then(|path| kept(path, gpu.info(), shape));
-    before.or_else(|| now(gpu, shape, path))
+fn measured(gpu: &Gpu, config: KernelConfig, path: Option<PathBuf>) -> Option<CostModel> {
+    let before = path.clone().and_then(|path| kept(path, gpu.info(), config));
+    before.or_else(|| now(gpu, config, path))
 }
 
-fn now(gpu: &Gpu, shape: KernelShape, path: Option<PathBuf>) -> Option<CostModel> {
+fn now(gpu: &Gpu, config: KernelConfig, path: Option<PathBuf>) -> Option<CostModel> {
     let info = gpu.info();
     tracing::info!("{}: measuring what a step costs (once)", info.name);
-    let model = match measure::measure(gpu, shape) {
+    let model = match measure::measure(gpu, config) {
         Ok(model) if model.is_sound() => model,
         Ok(_) => {
             tracing::warn!("{}: its clock says nothing; what steps cost is not known", info.name);
@@ -73,7 +73,7 @@ fn now(gpu: &Gpu, shape: KernelShape, path: Option<PathBuf>) -> Option<CostModel
             return None;
         }
     };
-    let keep = |path: PathBuf| cache::write_cost(&path, info, threads(info), shape, model);
+    let keep = |path: PathBuf| cache::write_cost(&path, info, threads(info), config, model);
     if let Some(Err(e)) = path.map(keep) {
         tracing::warn!("{e}; what steps cost is measured anew next time");
     }
@@ -92,13 +92,13 @@ mod tests {
         };
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("kernels.toml");
-        let shape = KernelShape::standard(gpu.info());
-        assert_eq!(kept(path.clone(), gpu.info(), shape), None);
-        let model = measured(&gpu, shape, Some(path.clone())).unwrap();
-        assert_eq!(kept(path.clone(), gpu.info(), shape), Some(model));
-        assert_eq!(measured(&gpu, shape, Some(path)), Some(model), "nothing is measured twice");
+        let config = KernelConfig::standard(gpu.info());
+        assert_eq!(kept(path.clone(), gpu.info(), config), None);
+        let model = measured(&gpu, config, Some(path.clone())).unwrap();
+        assert_eq!(kept(path.clone(), gpu.info(), config), Some(model));
+        assert_eq!(measured(&gpu, config, Some(path)), Some(model), "nothing is measured twice");
         // A folder that cannot be: the model is used, and nothing fails.
         std::fs::write(dir.path().join("file"), b"").unwrap();
-        assert!(measured(&gpu, shape, Some(dir.path().join("file/kernels.toml"))).unwrap().is_sound());
+        assert!(measured(&gpu, config, Some(dir.path().join("file/kernels.toml"))).unwrap().is_sound());
     }
 }

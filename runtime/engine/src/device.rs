@@ -106,7 +106,7 @@ impl DeviceRequest {
     pub fn open<E: From<PlanError> + From<TrainError>>(&self, training: &TrainSettings) -> Result<Trainer, E> {
         let gpu = devices::open(self.device.as_deref()).map_err(TrainError::from)?;
         let request = self.plan_request(&training.sh, gpu.info().lanes());
-        let mut trainer = Trainer::with_shape(&gpu, &Plan::new(&request)?, training, kernels::shape_of(&gpu))?;
+        let mut trainer = Trainer::with_config(&gpu, &Plan::new(&request)?, training, kernels::config_of(&gpu))?;
         if request.view_file_bytes() > 0 {
             trainer.keep_views_in(scratch_file(&self.scratch_folder(), request.view_file_bytes())?);
         }
@@ -246,5 +246,5 @@ fn empty_renderer(
     let request = request.plan_request(&settings.sh, gpu.info().lanes());
     let pixels = width as usize * height as usize;
     let plan = Plan::with_capacities(&request, gaussians, gaussians + instances_per_pixel * pixels);
-    Ok(Trainer::with_shape(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?)
+    Ok(Trainer::with_config(&gpu, &plan, &settings, kernels::known(gpu.info()).0)?)
 }

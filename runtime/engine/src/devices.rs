@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use config::kernels::KernelChoice;
-use vulkan::calibration::step_ms;
+use vulkan::autotune::step_ms;
 use vulkan::gpu::{Gpu, GpuError, GpuInfo};
 
 use crate::kernels::{cache, choice};

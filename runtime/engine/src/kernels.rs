@@ -1,21 +1,21 @@
-//! Which shape of the kernels this process trains with: the one the user fixed, the one measured earlier on this device with this
+//! Which kernel configuration this process trains with: the one the user fixed, the one measured earlier on this device with this
 //! driver and these kernels, or the one measured now. Whatever goes wrong on the way costs a warning and some speed, never
-//! the run; and since the shape changes no bit of the model, it needs no place in it.
+//! the run; and since the configuration changes no bit of the model, it needs no place in it.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use config::kernels::{KernelChoice, VARIABLE};
-use vulkan::calibration::calibrate;
+use vulkan::autotune::autotune;
 use vulkan::gpu::{Gpu, GpuInfo};
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
 
 pub mod cache;
 
-/// No further shape is tried after this when nobody asked for it.
+/// No further configuration is tried after this when nobody asked for it.
 const PATIENCE: Duration = Duration::from_millis(1500);
 
-/// Where a shape comes from.
+/// Where a configuration comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// [`VARIABLE`] says so.
@@ -28,41 +28,41 @@ pub enum Source {
     Standard,
 }
 
-/// The shape that commands use on `gpu`, measured first if it never was. Call it before anything that must not wait: it
-/// may take a second or two. A software renderer compiles for seconds per shape, so it is measured on request only
+/// The configuration that commands use on `gpu`, measured first if it never was. Call it before anything that must not wait: it
+/// may take a second or two. A software renderer compiles for seconds per configuration, so it is measured on request only
 /// ([`measure`]).
-pub fn shape_of(gpu: &Gpu) -> KernelShape {
+pub fn config_of(gpu: &Gpu) -> KernelConfig {
     let choice = choice();
-    let (shape, source) = found(gpu.info(), choice);
-    if source == Source::Standard && choice == KernelChoice::Calibrated && !gpu.info().is_cpu {
-        return measured(gpu, cache::path(), Some(PATIENCE)).map_or(shape, |m| m.0);
+    let (config, source) = found(gpu.info(), choice);
+    if source == Source::Standard && choice == KernelChoice::Autotuned && !gpu.info().is_cpu {
+        return measured(gpu, cache::path(), Some(PATIENCE)).map_or(config, |m| m.0);
     }
-    shape
+    config
 }
 
-/// The shape on the device and where it comes from, without measuring.
-pub fn known(info: &GpuInfo) -> (KernelShape, Source) {
+/// The configuration on the device and where it comes from, without measuring.
+pub fn known(info: &GpuInfo) -> (KernelConfig, Source) {
     found(info, choice())
 }
 
-fn found(info: &GpuInfo, choice: KernelChoice) -> (KernelShape, Source) {
-    let standard = (KernelShape::standard(info), Source::Standard);
+fn found(info: &GpuInfo, choice: KernelChoice) -> (KernelConfig, Source) {
+    let standard = (KernelConfig::standard(info), Source::Standard);
     match choice {
         KernelChoice::Standard => standard,
         KernelChoice::Fixed { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } => {
-            let fixed = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part };
+            let fixed = KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part };
             if fixed.fits(info) {
                 return (fixed, Source::Fixed);
             }
             tracing::warn!("{VARIABLE}: {} cannot run {fixed}; the default is used", info.name);
             standard
         }
-        KernelChoice::Calibrated => kept(info, cache::path()).unwrap_or(standard),
+        KernelChoice::Autotuned => kept(info, cache::path()).unwrap_or(standard),
     }
 }
 
-/// Measures the device with every shape, whatever is kept, and keeps the result; `None` (and a warning) when it cannot be measured.
-pub fn measure(gpu: &Gpu) -> Option<(KernelShape, Source)> {
+/// Measures the device with every configuration, whatever is kept, and keeps the result; `None` (and a warning) when it cannot be measured.
+pub fn measure(gpu: &Gpu) -> Option<(KernelConfig, Source)> {
     measured(gpu, cache::path(), None)
 }
 
@@ -74,40 +74,40 @@ pub fn choice() -> KernelChoice {
     })
 }
 
-fn kept(info: &GpuInfo, path: Option<PathBuf>) -> Option<(KernelShape, Source)> {
+fn kept(info: &GpuInfo, path: Option<PathBuf>) -> Option<(KernelConfig, Source)> {
     let path = path?;
     match cache::read(&path, info) {
-        Ok(shape) => shape.map(|shape| (shape, Source::Kept(path))),
+        Ok(config) => config.map(|config| (config, Source::Kept(path))),
         Err(e) => {
-            tracing::warn!("kernel shapes of earlier runs are not used: {e}");
+            tracing::warn!("kernel configurations of earlier runs are not used: {e}");
             None
         }
     }
 }
 
-fn measured(gpu: &Gpu, path: Option<PathBuf>, limit: Option<Duration>) -> Option<(KernelShape, Source)> {
+fn measured(gpu: &Gpu, path: Option<PathBuf>, limit: Option<Duration>) -> Option<(KernelConfig, Source)> {
     let name = &gpu.info().name;
-    tracing::info!("{name}: measuring which shape of the kernels is the fastest (once)");
-    let found = match calibrate(gpu, limit) {
+    tracing::info!("{name}: measuring which kernel configuration is the fastest (once)");
+    let found = match autotune(gpu, limit) {
         Ok(found) => found,
         Err(e) => {
-            tracing::warn!("{name}: kernels could not be measured, the default shape is used: {e}");
+            tracing::warn!("{name}: kernels could not be measured, the default configuration is used: {e}");
             return None;
         }
     };
-    for shape in &found.refused {
-        tracing::warn!("{name}: kernels of shape {shape} compute something else here and are never used");
+    for config in &found.refused {
+        tracing::warn!("{name}: kernels of configuration {config} compute something else here and are never used");
     }
-    tracing::info!("{name}: kernels of shape {}, measured in {:.1} s", found.shape, found.seconds);
+    tracing::info!("{name}: kernels of configuration {}, measured in {:.1} s", found.config, found.seconds);
     let Some(path) = path else {
         tracing::warn!("neither XDG_CACHE_HOME nor HOME is set: kernels are measured anew next time");
-        return Some((found.shape, Source::Measured));
+        return Some((found.config, Source::Measured));
     };
-    match cache::write(&path, gpu.info(), found.shape) {
-        Ok(()) => Some((found.shape, Source::Kept(path))),
+    match cache::write(&path, gpu.info(), found.config) {
+        Ok(()) => Some((found.config, Source::Kept(path))),
         Err(e) => {
-            tracing::warn!("the kernels' shape is not kept and will be measured anew next time: {e}");
-            Some((found.shape, Source::Measured))
+            tracing::warn!("the kernels' configuration is not kept and will be measured anew next time: {e}");
+            Some((found.config, Source::Measured))
         }
     }
 }
@@ -115,6 +115,20 @@ fn measured(gpu: &Gpu, path: Option<PathBuf>, limit: Option<Duration>) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
+    use config::kernels::PROFILES;
+
+    #[test]
+    fn a_profile_is_what_the_devices_of_its_name_begin_with() {
+        let board = cache::tests::device("Mali-G610");
+        let board = GpuInfo { ids: (0x13b5, 1), ..board };
+        let card = GpuInfo { is_integrated: false, subgroup_size: 32, ..board.clone() };
+        let processor = GpuInfo { is_cpu: true, subgroup_size: 8, ..board.clone() };
+        for ((name, numbers), info) in PROFILES.into_iter().zip([processor, board, card]) {
+            let standard = KernelConfig::standard(&info);
+            assert_eq!(standard.to_string(), numbers, "{name}");
+            assert_eq!(found(&info, name.parse().unwrap()), (standard, Source::Fixed));
+        }
+    }
 
     #[test]
     fn what_is_measured_is_kept_and_found_again() {
@@ -125,13 +139,13 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("dgtr/kernels.toml");
         assert_eq!(kept(gpu.info(), Some(path.clone())), None);
-        let (shape, source) = measured(&gpu, Some(path.clone()), Some(Duration::ZERO)).unwrap();
+        let (config, source) = measured(&gpu, Some(path.clone()), Some(Duration::ZERO)).unwrap();
         assert_eq!(source, Source::Kept(path.clone()));
-        assert_eq!(kept(gpu.info(), Some(path)), Some((shape, source)));
-        // A folder that cannot be: the shape is used, and nothing fails.
+        assert_eq!(kept(gpu.info(), Some(path)), Some((config, source)));
+        // A folder that cannot be: the configuration is used, and nothing fails.
         std::fs::write(dir.path().join("file"), b"").unwrap();
         let nowhere = Some(dir.path().join("file/kernels.toml"));
-        let (shape, source) = measured(&gpu, nowhere, Some(Duration::ZERO)).unwrap();
-        assert!(shape.fits(gpu.info()) && source == Source::Measured);
+        let (config, source) = measured(&gpu, nowhere, Some(Duration::ZERO)).unwrap();
+        assert!(config.fits(gpu.info()) && source == Source::Measured);
     }
 }

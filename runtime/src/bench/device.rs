@@ -1,4 +1,4 @@
-//! All that a board or a card can tell in ten minutes: who it is, whether it computes what the twin does, which shape of the kernels is
+//! All that a board or a card can tell in ten minutes: who it is, whether it computes what the reference does, which kernel configuration is
 //! the fastest, the time of each stage at three sizes, a small survey trained, and how warm it became.
 
 use std::path::Path;
@@ -8,10 +8,10 @@ use job::health::board::Board;
 use job::health::power::pmic_watts;
 use serde::Serialize;
 use serde_json::{Value, json};
-use vulkan::calibration::calibrate;
-use vulkan::ceiling;
+use vulkan::autotune::autotune;
 use vulkan::gpu::{Gpu, GpuInfo};
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
+use vulkan::roofline;
 use vulkan::trainer::{TrainError, check_device, check_training};
 
 use super::stages::{Scene, SizeFigures, measure as measure_stages};
@@ -24,7 +24,7 @@ pub use machine::Machine;
 
 /// Form of the report.
 const VERSION: u32 = 1;
-/// Steps beside the twin, and steps whose stages are timed.
+/// Steps beside the reference, and steps whose stages are timed.
 const CHECKED_STEPS: u32 = 20;
 const TIMED_STEPS: u32 = 10;
 /// Gaussians and picture sizes of the stages' table: three of the nine of `dgtr bench stages`.
@@ -37,8 +37,8 @@ const SURVEY: [(&str, u32); 2] = [("--max-gaussians", 20_000), ("--budget-mib", 
 pub struct Extent {
     /// Part of the Vulkan device's name.
     pub device: Option<String>,
-    /// No further shape of the kernels is tried after this.
-    pub calibration: Duration,
+    /// No further kernel configuration is tried after this.
+    pub autotuning: Duration,
     /// How many of [`SIZES`].
     pub sizes: usize,
     /// Steps of the survey.
@@ -90,12 +90,12 @@ pub struct DeviceReport {
     pub machine: Machine,
     /// The Vulkan device.
     pub device: Value,
-    /// Gaussians whose projection is the twin's, and the loss after whole steps, the device's and the twin's.
-    pub twin: Value,
-    /// Shapes of the kernels: the fastest, all trials in ms, those that compute something else.
-    pub calibration: Value,
+    /// Gaussians whose projection is the reference's, and the loss after whole steps, the device's and the reference's.
+    pub reference: Value,
+    /// Kernel configurations: the fastest, all trials in ms, those that compute something else.
+    pub autotuning: Value,
     /// Measured rates.
-    pub ceiling: Value,
+    pub roofline: Value,
     /// Milliseconds, bytes and operations per stage.
     pub sizes: Vec<SizeFigures>,
     /// Sizes that this device has no memory for, and why.
@@ -119,7 +119,7 @@ impl DeviceReport {
         vec![
             self.machine.model.clone().unwrap_or_else(|| self.machine.processor.clone().unwrap_or_default()),
             self.device["name"].as_str().unwrap_or_default().to_owned(),
-            self.calibration["shape"].as_str().unwrap_or_default().to_owned(),
+            self.autotuning["configuration"].as_str().unwrap_or_default().to_owned(),
             ms(0),
             ms(1),
             ms(2),
@@ -153,15 +153,15 @@ pub fn measure(extent: &Extent, folder: &Path) -> Result<DeviceReport, JobError>
     look("nothing");
     let gpu = Gpu::open(extent.device.as_deref())?;
     let agreed = check_device(&gpu)?;
-    let standard = check_training(&gpu, KernelShape::standard(gpu.info()), CHECKED_STEPS)?;
-    let found = calibrate(&gpu, Some(extent.calibration))?;
-    let fastest = check_training(&gpu, found.shape, CHECKED_STEPS)?;
-    look("calibration");
-    let rates = ceiling::measure(&gpu)?;
+    let standard = check_training(&gpu, KernelConfig::standard(gpu.info()), CHECKED_STEPS)?;
+    let found = autotune(&gpu, Some(extent.autotuning))?;
+    let fastest = check_training(&gpu, found.config, CHECKED_STEPS)?;
+    look("autotuning");
+    let rates = roofline::measure(&gpu)?;
     let (mut sizes, mut left_out) = (Vec::new(), Vec::new());
     for (gaussians, (width, height)) in SIZES.into_iter().take(extent.sizes) {
         let scene = Scene::synthetic(gaussians, width, height, 1);
-        match measure_stages(&gpu, found.shape, &rates, &scene, TIMED_STEPS) {
+        match measure_stages(&gpu, found.config, &rates, &scene, TIMED_STEPS) {
             Ok(figures) => sizes.push(figures),
             // What a small board has no memory for says something, too.
             Err(JobError::Train(TrainError::Gpu(e))) => {
@@ -178,17 +178,17 @@ pub fn measure(extent: &Extent, folder: &Path) -> Result<DeviceReport, JobError>
         dgtr: env!("CARGO_PKG_VERSION"),
         machine: Machine::here(),
         device: device(gpu.info()),
-        twin: json!({
+        reference: json!({
             "projected": agreed, "steps": CHECKED_STEPS,
-            "loss": fastest.loss, "standard_loss": standard.loss, "twin_loss": fastest.twin_loss,
+            "loss": fastest.loss, "standard_loss": standard.loss, "reference_loss": fastest.reference_loss,
         }),
-        calibration: json!({
-            "shape": found.shape.to_string(),
+        autotuning: json!({
+            "configuration": found.config.to_string(),
             "seconds": found.seconds,
-            "trials": found.trials.iter().map(|t| json!({ "shape": t.shape.to_string(), "ms": t.ms })).collect::<Vec<_>>(),
+            "trials": found.trials.iter().map(|t| json!({ "configuration": t.config.to_string(), "ms": t.ms })).collect::<Vec<_>>(),
             "refused": found.refused.iter().map(ToString::to_string).collect::<Vec<_>>(),
         }),
-        ceiling: json!({
+        roofline: json!({
             "kernel_bytes_per_s": rates.kernel_bytes_per_s,
             "command_bytes_per_s": rates.command_bytes_per_s,
             "operations_per_s": rates.operations_per_s,

@@ -6,9 +6,9 @@ use engine::cost::synthetic::IN_VIEW;
 use engine::cost::{measure, threads};
 use pages::report::Table;
 use serde::Serialize;
-use vulkan::ceiling::Ceiling;
 use vulkan::gpu::Gpu;
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
+use vulkan::roofline::Roofline;
 
 use super::device::SIZES;
 use super::figures::short;
@@ -46,20 +46,20 @@ impl Forecast {
 /// The device, or its memory.
 pub fn measured(
     gpu: &Gpu,
-    shape: KernelShape,
+    config: KernelConfig,
     sizes: usize,
     steps: u32,
 ) -> Result<(CostModel, Vec<Forecast>), JobError> {
-    let mut model = measure::measure(gpu, shape)?;
+    let mut model = measure::measure(gpu, config)?;
     // Nothing is held against what the device could do.
-    let none = Ceiling { kernel_bytes_per_s: 1.0, command_bytes_per_s: 1.0, operations_per_s: 1.0 };
+    let none = Roofline { kernel_bytes_per_s: 1.0, command_bytes_per_s: 1.0, operations_per_s: 1.0 };
     let mut all = Vec::new();
     for (gaussians, size) in SIZES.into_iter().take(sizes) {
         let pixels = u64::from(size.0) * u64::from(size.1);
         let before = Sight { gaussians: gaussians as u64, share: IN_VIEW, pixels }.load(Footprint::SYNTHETIC);
-        let taken = measure_stages(gpu, shape, &none, &Scene::synthetic(gaussians, size.0, size.1, 1), steps)?;
+        let taken = measure_stages(gpu, config, &none, &Scene::synthetic(gaussians, size.0, size.1, 1), steps)?;
         let counted = load(taken.gaussians, taken.visible, taken.instances, taken.evaluations, pixels);
-        let after = measure::measure(gpu, shape)?;
+        let after = measure::measure(gpu, config)?;
         let meanwhile = model.between(&after);
         model = after;
         all.push(Forecast {

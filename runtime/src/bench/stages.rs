@@ -14,9 +14,9 @@ use models::cloud::GaussianCloud;
 use models::dataset::Dataset;
 use pages::report::Table;
 use serde::Serialize;
-use vulkan::ceiling::Ceiling;
 use vulkan::gpu::Gpu;
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
+use vulkan::roofline::Roofline;
 use vulkan::stages::work::{Load, work};
 use vulkan::stages::{STAGE_NAMES, STAGES};
 
@@ -41,7 +41,7 @@ pub struct StageFigures {
     pub bytes: u64,
     /// Operations it must do.
     pub operations: u64,
-    /// Time the device needs at least for both, by its measured ceilings, ms.
+    /// Time the device needs at least for both, by its measured rooflines, ms.
     pub least_ms: f64,
 }
 
@@ -124,8 +124,8 @@ impl Scene {
 /// The device, or its memory.
 pub fn measure(
     gpu: &Gpu,
-    shape: KernelShape,
-    ceiling: &Ceiling,
+    config: KernelConfig,
+    roofline: &Roofline,
     scene: &Scene,
     steps: u32,
 ) -> Result<SizeFigures, JobError> {
@@ -145,7 +145,7 @@ pub fn measure(
         scene_gaussians: None,
     };
     let plan = Plan::new(&request.plan_request(&settings().sh, gpu.info().lanes()))?;
-    let mut watch = Stopwatch::new(gpu, shape, &plan, &scene.pictures)?;
+    let mut watch = Stopwatch::new(gpu, config, &plan, &scene.pictures)?;
     watch.load(&scene.cloud)?;
     for _ in 0..WARM_UP {
         watch.step()?;
@@ -169,7 +169,7 @@ pub fn measure(
             ms: mean(&|s| s.stage_ms[i]),
             bytes: w.bytes,
             operations: w.operations,
-            least_ms: 1e3 * ceiling.least_seconds(w.bytes, w.operations),
+            least_ms: 1e3 * roofline.least_seconds(w.bytes, w.operations),
         }
     });
     Ok(SizeFigures {
@@ -226,7 +226,7 @@ pub fn size_table(size: &SizeFigures) -> Table {
             },
             size.steps
         ),
-        head: ["stage", "ms", "MB moved", "M operations", "least ms", "of the ceiling"].map(String::from).to_vec(),
+        head: ["stage", "ms", "MB moved", "M operations", "least ms", "of the roofline"].map(String::from).to_vec(),
         rows,
     }
 }
@@ -248,7 +248,7 @@ pub fn overview_table(sizes: &[SizeFigures]) -> Table {
         ]
     };
     let head =
-        ["scene", "Gaussians", "visible", "instances", "M evaluations", "ms per step", "device ms", "of the ceiling"];
+        ["scene", "Gaussians", "visible", "instances", "M evaluations", "ms per step", "device ms", "of the roofline"];
     Table {
         title: "Whole steps".into(),
         note: String::new(),

@@ -1,4 +1,4 @@
-//! The numerical promises of `vulkan::cases`, tried on the device that is there and on the CPU twin.
+//! The numerical promises of `vulkan::cases`, tried on the device that is there and on the CPU reference.
 
 use serde::Serialize;
 use vulkan::cases::{CASES, ELSEWHERE, Outcome, extremes};
@@ -13,7 +13,7 @@ pub struct Tried {
     pub input: &'static str,
     /// What was promised.
     pub promise: &'static str,
-    /// `device` or `twin`.
+    /// `device` or `reference`.
     pub path: &'static str,
     /// Whether the promise held.
     pub held: bool,
@@ -26,7 +26,7 @@ fn tried(input: &'static str, promise: &'static str, path: &'static str, outcome
     Tried { input, promise, path, held, outcome: outcome.unwrap_or_else(|e| e.to_string()) }
 }
 
-/// Tries every case, `each` after every one; without a device only the twin's. `long_steps` above 0 adds a long run.
+/// Tries every case, `each` after every one; without a device only the reference's. `long_steps` above 0 adds a long run.
 pub fn run(gpu: Option<&Gpu>, long_steps: u32, each: &mut dyn FnMut(&Tried)) -> Vec<Tried> {
     let mut all = Vec::new();
     let mut add = |one: Tried| {
@@ -37,8 +37,8 @@ pub fn run(gpu: Option<&Gpu>, long_steps: u32, each: &mut dyn FnMut(&Tried)) -> 
         if let (Some(gpu), Some(f)) = (gpu, case.device) {
             add(tried(case.input, case.promise, "device", f(gpu)));
         }
-        if let Some(f) = case.twin {
-            add(tried(case.input, case.promise, "twin", f()));
+        if let Some(f) = case.reference {
+            add(tried(case.input, case.promise, "reference", f()));
         }
     }
     if let (Some(gpu), true) = (gpu, long_steps > 0) {
@@ -77,9 +77,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_a_device_the_twin_keeps_every_promise() {
+    fn without_a_device_the_reference_keeps_every_promise() {
         let all = run(None, 0, &mut |_| {});
-        assert!(all.len() > 10 && all.iter().all(|t| t.path == "twin"));
+        assert!(all.len() > 10 && all.iter().all(|t| t.path == "reference"));
         let broken: Vec<_> = all.iter().filter(|t| !t.held).collect();
         assert!(broken.is_empty(), "{broken:?}");
     }

@@ -31,10 +31,10 @@ pub struct Args {
     /// Also say what protects the deliveries of this mission, and what does not.
     #[arg(long, value_name = "FILE")]
     pub mission: Option<PathBuf>,
-    /// Measure anew which shape of the kernels is the fastest on each Vulkan device, and remember it. Hardware is measured
+    /// Measure anew which kernel configuration is the fastest on each Vulkan device, and remember it. Hardware is measured
     /// at its first training anyway, software renderers only here.
     #[arg(long)]
-    pub calibrate: bool,
+    pub autotune: bool,
 }
 
 /// How a check came out. What is not well says how to mend it.
@@ -89,7 +89,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         Err(e) => tell("vulkan", Finding::missing(e, DRIVER)),
         Ok(found) => {
             if found.len() > 1 {
-                tell("training", trains(&found, args.calibrate));
+                tell("training", trains(&found, args.autotune));
             }
             for d in found {
                 let kind = if d.is_cpu { "software" } else { "hardware" };
@@ -98,8 +98,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 let text =
                     format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
                 tell("vulkan", Finding::Ok(text));
-                tell("kernels", kernel_shape(&d, args.calibrate));
-                tell("a step", step_cost(&d, args.calibrate));
+                tell("kernels", kernel_config(&d, args.autotune));
+                tell("a step", step_cost(&d, args.autotune));
                 tell("device", computes(&d));
                 tell("memory plan", takes_a_plan(&d));
             }
@@ -175,10 +175,10 @@ fn checked(manifest: &Path) -> Result<String, OnnxError> {
     Ok(format!("{name} follows contract `{contract}` and runs ({} bytes)", network.file_bytes()))
 }
 
-/// Whether a kernel computes on the device what its twin says.
+/// Whether a kernel computes on the device what its reference says.
 fn computes(info: &GpuInfo) -> Finding {
     match Gpu::open(Some(&info.name)).map_err(TrainError::from).and_then(|gpu| check_device(&gpu)) {
-        Ok(agreed) => Finding::Ok(format!("{}: a kernel and its twin agree on {agreed} Gaussians", info.name)),
+        Ok(agreed) => Finding::Ok(format!("{}: a kernel and its reference agree on {agreed} Gaussians", info.name)),
         Err(e) => Finding::missing(format!("{}: {e}", info.name), DRIVER),
     }
 }
@@ -202,53 +202,55 @@ fn takes_a_plan(info: &GpuInfo) -> Finding {
 }
 
 /// Which of several devices trains, and why.
-fn trains(found: &[GpuInfo], calibrate: bool) -> Finding {
-    let steps: Vec<Option<f64>> =
-        found.iter().map(if calibrate { devices::measured } else { devices::known }).collect();
+fn trains(found: &[GpuInfo], autotune: bool) -> Finding {
+    let steps: Vec<Option<f64>> = found.iter().map(if autotune { devices::measured } else { devices::known }).collect();
     let chosen = &found[devices::fastest(found, &steps)].name;
     if steps.contains(&None) {
         let what = format!("on {chosen} until the first job measures a step of each");
-        return Finding::note(what, "dgtr doctor --calibrate measures it now");
+        return Finding::note(what, "dgtr doctor --autotune measures it now");
     }
     let each = found.iter().zip(&steps).map(|(d, ms)| format!("{} {:.1} ms", d.name, ms.unwrap_or(f64::INFINITY)));
     Finding::Ok(format!("on {chosen} (a step: {}; --device names another)", each.collect::<Vec<_>>().join(", ")))
 }
 
-/// Which shape of the kernels is in use on a device, and why.
-fn kernel_shape(info: &GpuInfo, calibrate: bool) -> Finding {
-    let measured = match calibrate {
+/// Which kernel configuration is in use on a device, and why.
+fn kernel_config(info: &GpuInfo, autotune: bool) -> Finding {
+    let measured = match autotune {
         true => Gpu::open(Some(&info.name)).ok().and_then(|gpu| kernels::measure(&gpu)),
         false => None,
     };
-    if calibrate && measured.is_none() {
-        return Finding::note("not measured, the default shape is used", "try again with nothing else on the device");
+    if autotune && measured.is_none() {
+        return Finding::note(
+            "not measured, the default configuration is used",
+            "try again with nothing else on the device",
+        );
     }
-    let (shape, source) = measured.unwrap_or_else(|| kernels::known(info));
+    let (config, source) = measured.unwrap_or_else(|| kernels::known(info));
     let why = match source {
         Source::Fixed => format!("{VARIABLE} says so"),
         Source::Kept(path) => format!("measured, kept in {}", path.display()),
         Source::Measured => "measured, not kept".to_owned(),
-        Source::Standard if KernelChoice::from_environment() == Ok(KernelChoice::Calibrated) => match info.is_cpu {
-            true => "default; dgtr doctor --calibrate measures it, in minutes".to_owned(),
-            false => "default until the first training or dgtr doctor --calibrate measures it".to_owned(),
+        Source::Standard if KernelChoice::from_environment() == Ok(KernelChoice::Autotuned) => match info.is_cpu {
+            true => "default; dgtr doctor --autotune measures it, in minutes".to_owned(),
+            false => "default until the first training or dgtr doctor --autotune measures it".to_owned(),
         },
         Source::Standard => format!("default, by {VARIABLE}"),
     };
     let lanes = |n: u32| if n == 1 { "one lane" } else { "several" };
-    let (share, tile) = (lanes(shape.share_lanes), lanes(shape.tile_lanes));
-    let staged = if shape.fetched > 1 { ", which fetch for each other" } else { "" };
-    Finding::Ok(format!("shape {shape}: {share} per share of the Gaussians, {tile} per tile{staged} ({why})"))
+    let (share, tile) = (lanes(config.share_lanes), lanes(config.tile_lanes));
+    let staged = if config.fetched > 1 { ", which fetch for each other" } else { "" };
+    Finding::Ok(format!("configuration {config}: {share} per share of the Gaussians, {tile} per tile{staged} ({why})"))
 }
 
 /// What `auto` forecasts with.
-fn step_cost(info: &GpuInfo, calibrate: bool) -> Finding {
-    let shape = kernels::known(info).0;
-    let cost = match calibrate {
-        true => Gpu::open(Some(&info.name)).ok().and_then(|gpu| cost::anew(&gpu, shape)),
-        false => cost::known(info, shape),
+fn step_cost(info: &GpuInfo, autotune: bool) -> Finding {
+    let config = kernels::known(info).0;
+    let cost = match autotune {
+        true => Gpu::open(Some(&info.name)).ok().and_then(|gpu| cost::anew(&gpu, config)),
+        false => cost::known(info, config),
     };
     let Some(cost) = cost else {
-        let how = "the first job with preset auto, or dgtr doctor --calibrate, measures it in seconds";
+        let how = "the first job with preset auto, or dgtr doctor --autotune, measures it in seconds";
         return Finding::note("what it costs is not measured yet", how);
     };
     // The point of the presets of whole pictures.

@@ -50,7 +50,7 @@ impl TrainJob {
             return Ok(None);
         }
         let gpu = devices::open(self.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
-        let Some(cost) = cost::of(&gpu, kernels::shape_of(&gpu)) else { return Ok(None) };
+        let Some(cost) = cost::of(&gpu, kernels::config_of(&gpu)) else { return Ok(None) };
         let by_energy = Meter::of(&self.training)?.map(|meter| meter.seconds());
         let seconds = shorter(self.seconds.or(self.training.seconds), by_energy);
         let device = DeviceRequest {

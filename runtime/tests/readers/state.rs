@@ -186,7 +186,7 @@ fn measured_kernels() {
         let path = folder.path().join("kernels.toml");
         for name in names {
             let info = GpuInfo { name: (*name).into(), ..info.clone() };
-            cache::write(&path, &info, vulkan::shape::KernelShape::standard(&info)).expect("written");
+            cache::write(&path, &info, vulkan::kernel_config::KernelConfig::standard(&info)).expect("written");
         }
         std::fs::read(path).expect("there")
     };
@@ -197,7 +197,7 @@ fn measured_kernels() {
         shell: None,
         memory: (64 << 10, 256),
         read: Read::File("kernels.toml", &|path| {
-            line(cache::read(path, &info), |shape| shape.is_none_or(|shape| shape.fits(&info)))
+            line(cache::read(path, &info), |config| config.is_none_or(|config| config.fits(&info)))
         }),
     });
 }

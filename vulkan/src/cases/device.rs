@@ -144,7 +144,7 @@ pub fn opaque_gaussians_in_front_of_each_other_divide_by_no_zero(gpu: &Gpu) -> O
     Ok(counted.said())
 }
 
-pub fn pictures_of_one_row_one_column_or_one_pixel_are_the_twins(gpu: &Gpu) -> Outcome {
+pub fn pictures_of_one_row_one_column_or_one_pixel_are_those_of_the_reference(gpu: &Gpu) -> Outcome {
     let mut counted = Tally::default();
     for (w, h) in [(1, 1), (1, 17), (17, 1)] {
         let v = view(w, h);

@@ -4,12 +4,12 @@ use super::device::{ready, survive};
 use super::scenes::{Answer, cloud, empty_trainer, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
 use crate::gpu::Gpu;
+use crate::reference::camera::Camera;
+use crate::reference::gaussian::{Gaussian, PARAMETERS};
+use crate::reference::loss::Target;
+use crate::reference::project::Limits;
+use crate::reference::trainer::ReferenceTrainer;
 use crate::trainer::{Rendering, RunBudget, TrainError};
-use crate::twin::camera::Camera;
-use crate::twin::gaussian::{Gaussian, PARAMETERS};
-use crate::twin::loss::Target;
-use crate::twin::project::Limits;
-use crate::twin::trainer::TwinTrainer;
 use config::training::{RateSettings, Strategy, TrainSettings};
 use glam::DVec3;
 use models::camera::View;
@@ -55,14 +55,14 @@ fn wild(factor: f32) -> RateSettings {
     }
 }
 
-/// Largest difference of transmittance between two pictures of the twin.
+/// Largest difference of transmittance between two pictures of the reference.
 fn apart(a: &Answer, b: &Answer) -> f32 {
     let pairs = a.picture.iter().zip(&b.picture);
     pairs.map(|(a, b)| (a.transmittance - b.transmittance).abs()).fold(0.0, f32::max)
 }
 
-/// Steps of the twin: their losses.
-fn twin_losses(t: &mut TwinTrainer<f32>, v: &View, photo: &[[f32; 3]], steps: usize) -> Vec<f32> {
+/// Steps of the reference: their losses.
+fn reference_losses(t: &mut ReferenceTrainer<f32>, v: &View, photo: &[[f32; 3]], steps: usize) -> Vec<f32> {
     let target =
         Target { width: v.intrinsics.width as usize, rgb: photo, depth: None, kept: None, background: [0.0; 3] };
     (0..steps).map(|_| t.step(&Camera::of(v), &target, 0.0).loss.total).collect()
@@ -85,14 +85,14 @@ pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike(gpu: &Gpu
     Ok(counted.said())
 }
 
-/// The same on the twin, three steps each.
-pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_twin() -> Outcome {
+/// The same on the reference, three steps each.
+pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_reference() -> Outcome {
     let mut counted = Tally::default();
     let v = view(21, 17);
     let (base, photo) = (cloud(13, 20, 0), photo(1, &v));
     let train = |c: &GaussianCloud, extent: f32| {
-        let mut t = TwinTrainer::new(Gaussian::of_cloud(c), plain(), extent, Limits::default());
-        twin_losses(&mut t, &v, &photo, 3)[2]
+        let mut t = ReferenceTrainer::new(Gaussian::of_cloud(c), plain(), extent, Limits::default());
+        reference_losses(&mut t, &v, &photo, 3)[2]
     };
     let (expected, loss) = (counted.ask(&base, &v, &photo, &Default::default()), train(&base, 5.0));
     for (case, scale) in SIZES {
@@ -124,8 +124,8 @@ pub fn cameras_far_from_the_origin_see_the_same_picture(gpu: &Gpu) -> Outcome {
     Ok(counted.said())
 }
 
-/// The same on the twin.
-pub fn cameras_far_from_the_origin_see_the_same_picture_in_the_twin() -> Outcome {
+/// The same on the reference.
+pub fn cameras_far_from_the_origin_see_the_same_picture_in_the_reference() -> Outcome {
     let mut counted = Tally::default();
     let at_origin = view(21, 17);
     let (base, photo) = (cloud(14, 20, 0), photo(1, &at_origin));
@@ -177,19 +177,20 @@ pub fn extreme_learning_rates_are_recovered_from_or_refused(gpu: &Gpu) -> Outcom
     Ok(counted.said())
 }
 
-/// The twin's optimiser is thrown as far, stays finite, and finds back.
-pub fn extreme_learning_rates_are_recovered_from_by_the_twin() -> Outcome {
+/// The reference's optimiser is thrown as far, stays finite, and finds back.
+pub fn extreme_learning_rates_are_recovered_from_by_the_reference() -> Outcome {
     let v = view(21, 17);
     let photo = photo(1, &v);
     let mut said = String::new();
     for factor in [1e3f32, 1e6] {
         let mut settings = plain();
         settings.rates = wild(factor);
-        let mut t = TwinTrainer::new(Gaussian::<f32>::of_cloud(&cloud(15, 30, 1)), settings, 5.0, Limits::default());
-        let losses = twin_losses(&mut t, &v, &photo, 10);
+        let mut t =
+            ReferenceTrainer::new(Gaussian::<f32>::of_cloud(&cloud(15, 30, 1)), settings, 5.0, Limits::default());
+        let losses = reference_losses(&mut t, &v, &photo, 10);
         promise!(losses.iter().all(|l| l.is_finite()), "rates × {factor}: losses {losses:?}");
         t.settings.rates = RateSettings::default();
-        let losses = twin_losses(&mut t, &v, &photo, 30);
+        let losses = reference_losses(&mut t, &v, &photo, 30);
         promise!(losses[29] <= losses[0], "rates × {factor}: the loss rose from {} to {}", losses[0], losses[29]);
         let finite = t.cloud.iter_mut().all(|g| (0..PARAMETERS).all(|k| g.parameter(k).is_finite()));
         promise!(finite, "rates × {factor}: a row went bad");

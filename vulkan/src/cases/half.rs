@@ -1,4 +1,4 @@
-//! Moments in 16 bits against moments in 32: the device's training, and the twin's arithmetic.
+//! Moments in 16 bits against moments in 32: the device's training, and the reference's arithmetic.
 #![allow(missing_docs, reason = "their names say what they promise")]
 
 use std::ops::ControlFlow;
@@ -6,8 +6,8 @@ use std::ops::ControlFlow;
 use super::scenes::{cloud, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
 use crate::gpu::Gpu;
+use crate::reference::adam::{Moments, adam, half_moments};
 use crate::trainer::{RunBudget, Trainer};
-use crate::twin::adam::{Moments, adam, half_moments};
 use config::plan::{Plan, PlanRequest};
 use config::training::TrainSettings;
 use models::cloud::GaussianCloud;

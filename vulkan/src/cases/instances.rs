@@ -5,11 +5,11 @@ use super::device::{ready, survive};
 use super::scenes::{answer, answer_in, cloud, grey, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
 use crate::gpu::Gpu;
+use crate::reference::camera::Camera;
+use crate::reference::gaussian::{Gaussian, PARAMETERS};
+use crate::reference::project::Limits;
+use crate::reference::step::forward;
 use crate::trainer::{Rendering, StepReport, Trainer};
-use crate::twin::camera::Camera;
-use crate::twin::gaussian::{Gaussian, PARAMETERS};
-use crate::twin::project::Limits;
-use crate::twin::step::forward;
 use config::plan::{Plan, PlanRequest};
 use models::camera::View;
 use models::cloud::GaussianCloud;
@@ -36,7 +36,7 @@ pub fn more_tiles_than_instances_leave_the_other_tiles_empty(gpu: &Gpu) -> Outco
     Ok(counted.said())
 }
 
-pub fn more_tiles_than_instances_leave_the_other_tiles_empty_in_the_twin() -> Outcome {
+pub fn more_tiles_than_instances_leave_the_other_tiles_empty_in_the_reference() -> Outcome {
     let mut counted = Tally::default();
     let v = view(64, 48);
     let got = counted.ask(&specks(), &v, &photo(1, &v), &Default::default());
@@ -151,7 +151,7 @@ pub fn light_and_contributions_below_sixteen_bits_are_still_summed(gpu: &Gpu) ->
     faint_holds(drawn.transmittance[middle], drawn.depth[middle], faint_truth(&c, &v))
 }
 
-pub fn light_and_contributions_below_sixteen_bits_are_still_summed_in_the_twin() -> Outcome {
+pub fn light_and_contributions_below_sixteen_bits_are_still_summed_in_the_reference() -> Outcome {
     let (c, v) = (faint_layers(), view(9, 9));
     let got = answer(&c, &v, &photo(1, &v), &Default::default());
     got.check_finite("faint layers")?;
@@ -188,7 +188,7 @@ pub fn a_tile_with_more_gaussians_than_a_loop_may_turn_leaves_those_behind_alone
     Ok(counted.said())
 }
 
-pub fn a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin() -> Outcome {
+pub fn a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_reference() -> Outcome {
     let mut counted = Tally::default();
     let (v, n) = (view(256, 256), 70_000);
     let got = counted.ask(&crowded_tile(&v, n), &v, &photo(1, &v), &Default::default());
@@ -222,7 +222,7 @@ fn wide_holds(sh: &[f32], opacity: f32) -> Outcome {
     Ok(format!("off by {worst:.1e} of itself"))
 }
 
-pub fn a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_twin() -> Outcome {
+pub fn a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_reference() -> Outcome {
     let (c, v, photo) = wide_scene();
     let got = answer(&c, &v, &photo, &plain().loss);
     got.check_finite("one Gaussian")?;

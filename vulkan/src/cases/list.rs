@@ -1,123 +1,123 @@
 //! The table of contents: every case with its promise, and where the cases live that are not the renderer's.
 
-use super::{Case, device, extremes, half, instances, twin};
+use super::{Case, device, extremes, half, instances, reference};
 
 macro_rules! case {
-    ($input:literal, $promise:literal, $device:expr, $twin:expr) => {
-        Case { input: $input, promise: $promise, device: $device, twin: $twin }
+    ($input:literal, $promise:literal, $device:expr, $reference:expr) => {
+        Case { input: $input, promise: $promise, device: $device, reference: $reference }
     };
 }
 
-/// Every case of the renderer and the trainer. There is no twin where the host does the work for both (it refuses poses,
-/// moves and adds rows), nor of counting and emitting, which the twin does in one function.
+/// Every case of the renderer and the trainer. There is no reference where the host does the work for both (it refuses poses,
+/// moves and adds rows), nor of counting and emitting, which the reference does in one function.
 pub const CASES: &[Case] = &[
     case!(
         "NaN or infinity in any parameter",
         "the row is left out and counted, the others are unchanged",
         Some(device::a_row_with_nan_or_infinity_in_any_slot_is_dropped_and_counted_at_load),
-        Some(twin::a_row_with_nan_or_infinity_in_any_slot_is_counted_and_changes_nothing_else)
+        Some(reference::a_row_with_nan_or_infinity_in_any_slot_is_counted_and_changes_nothing_else)
     ),
     case!(
         "denormals and f32::MAX in any parameter",
         "picture, loss and parameters stay finite",
         Some(device::denormal_and_largest_numbers_in_any_slot_leave_everything_finite),
-        Some(twin::denormal_and_largest_numbers_in_any_slot_leave_everything_finite)
+        Some(reference::denormal_and_largest_numbers_in_any_slot_leave_everything_finite)
     ),
     case!(
         "quaternions of any length, zero too",
         "zero is left out, the rest normalised",
         Some(extremes::a_quaternion_of_length_zero_is_dropped_and_any_other_length_is_normalised),
-        Some(twin::a_quaternion_of_length_zero_is_not_drawn_and_any_other_length_is_normalised)
+        Some(reference::a_quaternion_of_length_zero_is_not_drawn_and_any_other_length_is_normalised)
     ),
     case!(
         "log scales up to 40 and beyond",
         "visible, flat, inside the tiles",
         Some(device::log_scales_up_to_forty_stay_visible),
-        Some(twin::log_scales_up_to_forty_stay_visible_and_finite)
+        Some(reference::log_scales_up_to_forty_stay_visible_and_finite)
     ),
     case!(
         "needles: det Σ₂ near 0, σ < 0",
         "positive determinant, never more than the peak opacity",
         Some(device::needles_have_a_positive_determinant_and_never_more_than_their_peak_opacity),
-        Some(twin::needles_thinner_than_f32_can_square_have_a_positive_determinant_and_no_negative_exponent)
+        Some(reference::needles_thinner_than_f32_can_square_have_a_positive_determinant_and_no_negative_exponent)
     ),
     case!(
         "Gaussians at the camera centre or behind it",
         "not drawn, not moved, the step ends",
         Some(device::at_the_camera_centre_or_behind_nothing_is_drawn_and_the_step_still_ends),
-        Some(twin::a_gaussian_at_the_camera_centre_or_behind_it_is_counted_and_not_drawn)
+        Some(reference::a_gaussian_at_the_camera_centre_or_behind_it_is_counted_and_not_drawn)
     ),
     case!(
         "nothing visible, no instance",
         "black picture, gradient zero",
         Some(device::at_the_camera_centre_or_behind_nothing_is_drawn_and_the_step_still_ends),
-        Some(twin::nothing_to_draw_is_a_black_picture_with_a_gradient_of_zero)
+        Some(reference::nothing_to_draw_is_a_black_picture_with_a_gradient_of_zero)
     ),
     case!(
         "α → 1, one behind the other",
         "no division by zero in 1/(1−α)",
         Some(device::opaque_gaussians_in_front_of_each_other_divide_by_no_zero),
-        Some(twin::opaque_gaussians_in_front_of_each_other_divide_by_no_zero)
+        Some(reference::opaque_gaussians_in_front_of_each_other_divide_by_no_zero)
     ),
     case!(
         "pictures of 1×1, 1×17, 17×1",
-        "drawn as the twin draws them",
-        Some(device::pictures_of_one_row_one_column_or_one_pixel_are_the_twins),
-        Some(twin::pictures_of_one_row_one_column_or_one_pixel_are_drawn)
+        "drawn as the reference draws them",
+        Some(device::pictures_of_one_row_one_column_or_one_pixel_are_those_of_the_reference),
+        Some(reference::pictures_of_one_row_one_column_or_one_pixel_are_drawn)
     ),
     case!(
         "colours up to f32::MAX",
         "clamped, with gradient zero",
         Some(device::colours_up_to_the_largest_float_are_clamped),
-        Some(twin::colours_up_to_the_largest_float_are_clamped_and_their_gradient_is_zero)
+        Some(reference::colours_up_to_the_largest_float_are_clamped_and_their_gradient_is_zero)
     ),
     case!(
         "duplicated Gaussians",
         "drawn in the order of their rows",
         Some(extremes::duplicated_gaussians_are_drawn_in_the_order_of_their_rows),
-        Some(twin::duplicated_gaussians_are_drawn_in_the_order_of_their_rows)
+        Some(reference::duplicated_gaussians_are_drawn_in_the_order_of_their_rows)
     ),
     case!(
         "the scene × 0.1 … 10⁶",
         "the same picture",
         Some(device::the_same_scene_at_any_scale_gives_the_same_picture),
-        Some(twin::the_same_scene_at_any_scale_gives_the_same_picture)
+        Some(reference::the_same_scene_at_any_scale_gives_the_same_picture)
     ),
     case!(
         "scenes of 1 cm and of 100 km",
         "train alike",
         Some(extremes::scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike),
-        Some(extremes::scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_twin)
+        Some(extremes::scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_reference)
     ),
     case!(
         "10 km and 6,378 km from the origin",
         "the same picture at 10 km, finite beyond",
         Some(extremes::cameras_far_from_the_origin_see_the_same_picture),
-        Some(extremes::cameras_far_from_the_origin_see_the_same_picture_in_the_twin)
+        Some(extremes::cameras_far_from_the_origin_see_the_same_picture_in_the_reference)
     ),
     case!(
         "rates × 10³ and × 10⁶, NaN, negative",
         "recovered from, or refused by name",
         Some(extremes::extreme_learning_rates_are_recovered_from_or_refused),
-        Some(extremes::extreme_learning_rates_are_recovered_from_by_the_twin)
+        Some(extremes::extreme_learning_rates_are_recovered_from_by_the_reference)
     ),
     case!(
         "pictures of one colour",
         "SSIM has no negative variance",
         Some(extremes::constant_photographs_have_no_negative_variance),
-        Some(twin::ssim_of_constant_pictures_has_no_negative_variance)
+        Some(reference::ssim_of_constant_pictures_has_no_negative_variance)
     ),
     case!(
         "depth priors that say nothing",
         "no correlation, no gradient",
         Some(device::a_depth_prior_that_says_nothing_has_no_correlation),
-        Some(twin::pearson_of_constant_depth_or_an_empty_mask_has_value_and_gradient_zero)
+        Some(reference::pearson_of_constant_depth_or_an_empty_mask_has_value_and_gradient_zero)
     ),
     case!(
         "exposure against a black photograph",
         "loss zero of nothing, gain and offset finite",
         Some(device::a_black_photograph_of_nothing_has_loss_zero_and_exposure_stays_finite),
-        Some(twin::exposure_against_a_black_photograph_stays_finite)
+        Some(reference::exposure_against_a_black_photograph_stays_finite)
     ),
     case!(
         "poses with NaN, zero quaternions, flips",
@@ -141,7 +141,7 @@ pub const CASES: &[Case] = &[
         "more tiles than instances",
         "the other tiles stay empty",
         Some(instances::more_tiles_than_instances_leave_the_other_tiles_empty),
-        Some(instances::more_tiles_than_instances_leave_the_other_tiles_empty_in_the_twin)
+        Some(instances::more_tiles_than_instances_leave_the_other_tiles_empty_in_the_reference)
     ),
     case!(
         "count pass ≠ emit pass",
@@ -153,19 +153,19 @@ pub const CASES: &[Case] = &[
         "70,000 Gaussians in one tile",
         "those behind the opaque ones stay as they are",
         Some(instances::a_tile_with_more_gaussians_than_a_loop_may_turn_leaves_those_behind_alone),
-        Some(instances::a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin)
+        Some(instances::a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_reference)
     ),
     case!(
         "one Gaussian over 70,400 tiles",
         "its gradient is the sum over all",
         Some(instances::a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient),
-        Some(instances::a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_twin)
+        Some(instances::a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_reference)
     ),
     case!(
         "T·α below f16",
         "summed: transmittance is kept in 32 bits",
         Some(instances::light_and_contributions_below_sixteen_bits_are_still_summed),
-        Some(instances::light_and_contributions_below_sixteen_bits_are_still_summed_in_the_twin)
+        Some(instances::light_and_contributions_below_sixteen_bits_are_still_summed_in_the_reference)
     ),
     case!(
         "f16 storage of moments against f32",

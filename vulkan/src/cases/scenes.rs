@@ -1,24 +1,24 @@
-//! What the twin and the device make of the made-up scenes.
+//! What the reference and the device make of the made-up scenes.
 
 use models::camera::View;
 use models::cloud::GaussianCloud;
 
 use super::Broken;
 use crate::gpu::Gpu;
+use crate::reference::camera::Camera;
+use crate::reference::gaussian::Gaussian;
+use crate::reference::loss::{Exposure, Target};
+use crate::reference::project::{Culled, Limits};
+use crate::reference::rasterise::Pixel;
+use crate::reference::real::Real;
+use crate::reference::step::{ViewGradient, backward, forward};
 use crate::trainer::Trainer;
-use crate::twin::camera::Camera;
-use crate::twin::gaussian::Gaussian;
-use crate::twin::loss::{Exposure, Target};
-use crate::twin::project::{Culled, Limits};
-use crate::twin::rasterise::Pixel;
-use crate::twin::real::Real;
-use crate::twin::step::{ViewGradient, backward, forward};
 use config::plan::{Plan, PlanRequest};
 use config::training::{LossSettings, TrainSettings};
 
 pub use crate::synthetic::{cloud, grey, photo, plain, posed, view};
 
-/// What the twin makes of a scene.
+/// What the reference makes of a scene.
 pub struct Answer<R = f32> {
     /// The picture, row by row.
     pub picture: Vec<Pixel<R>>,
@@ -54,7 +54,7 @@ impl<R: Real> Answer<R> {
     }
 }
 
-/// The twin's full step before the optimiser, in f32, with the shaders' limits.
+/// The reference's full step before the optimiser, in f32, with the shaders' limits.
 pub fn answer(cloud: &GaussianCloud, view: &View, photo: &[[f32; 3]], settings: &LossSettings) -> Answer {
     answer_in(cloud, view, photo, settings)
 }

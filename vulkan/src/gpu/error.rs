@@ -72,7 +72,7 @@ pub enum GpuError {
         "this device computes nothing: kernels end without an effect; update its driver, or choose another with --device"
     )]
     ComputesNothing,
-    /// A kernel computes something else than its twin.
+    /// A kernel computes something else than its reference.
     #[error(
         "this device computes something else than it should: kernel '{kernel}' is wrong about {differ} of {of} Gaussians; \
          update its driver, or choose another with --device"

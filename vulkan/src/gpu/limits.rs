@@ -1,4 +1,4 @@
-//! The limits of a device that a plan or a shape can run into.
+//! The limits of a device that a plan or a kernel configuration can run into.
 
 use super::GpuError;
 use ash::vk;

@@ -1,4 +1,4 @@
-//! The kernels and the shapes in which `tests/boards.sh` has the boards' drivers compile them: `tests/boards/kernels.txt`,
+//! The kernels and the configurations in which `tests/boards.sh` has the boards' drivers compile them: `tests/boards/kernels.txt`,
 //! made from the list of kernels. `DGTR_BLESS=1` remakes it.
 
 use super::*;
@@ -7,28 +7,28 @@ use config::plan::Lanes;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// A line per kernel and shape: a name for the table, the SPIR-V, the specialisation constants in order.
+/// A line per kernel and configuration: a name for the table, the SPIR-V, the specialisation constants in order.
 fn lines() -> BTreeSet<String> {
-    // What a GPU gets where nothing was measured, and what calibration may choose instead (`KernelShape`).
+    // What a GPU gets where nothing was measured, and what autotuning may choose instead (`KernelConfig`).
     let (wide, narrow, tiles) = (64, 32, 32);
-    let one = KernelShape { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1, summed: 1, part: STRIP };
-    let other = KernelShape { share_lanes: 32, tiles: 8, tile_lanes: 8, summed: 8, part: SHORT_PART, ..one };
-    let (fetching, meeting) = (KernelShape { fetched: 8, ..other }, KernelShape { tiles: 2, ..other });
+    let one = KernelConfig { wide, narrow, share_lanes: 1, tiles, tile_lanes: 1, fetched: 1, summed: 1, part: STRIP };
+    let other = KernelConfig { share_lanes: 32, tiles: 8, tile_lanes: 8, summed: 8, part: SHORT_PART, ..one };
+    let (fetching, meeting) = (KernelConfig { fetched: 8, ..other }, KernelConfig { tiles: 2, ..other });
     let mut lines = BTreeSet::new();
     for kernel in KERNELS {
-        for shape in [one, other, fetching, meeting] {
+        for config in [one, other, fetching, meeting] {
             let of_tiles = kernel.group == Group::Tiles;
-            if shape != one && kernel.variant.is_none() || [fetching, meeting].contains(&shape) && !of_tiles {
+            if config != one && kernel.variant.is_none() || [fetching, meeting].contains(&config) && !of_tiles {
                 continue;
             }
-            let suffix = match (takes_variant(kernel.group, shape), kernel.group) {
+            let suffix = match (takes_variant(kernel.group, config), kernel.group) {
                 (false, _) => "",
-                (true, Group::Tiles) if shape == meeting => "_runs_shared",
+                (true, Group::Tiles) if config == meeting => "_runs_shared",
                 (true, Group::Tiles) => "_runs",
                 (true, Group::Strips) => "_short",
                 (true, _) => "_group",
             };
-            let (lanes, staged) = (local_size(kernel.group, shape), u32::from(shape.fetched > 1));
+            let (lanes, staged) = (local_size(kernel.group, config), u32::from(config.fetched > 1));
             let halves = u32::from(kernel.bindings.contains(&"sh_first_moment"));
             // Nothing else is summed over a tile.
             let sums = u32::from(suffix.starts_with("_runs") && kernel.file.starts_with("rasterise_backward"));
@@ -39,8 +39,8 @@ fn lines() -> BTreeSet<String> {
                 let Lanes { sort, loops } = Lanes::BOARD;
                 let constants = format!("{lanes} {} 3 {sort} {loops} 0 {half} {staged} {rolled}", sh_columns(3));
                 lines.insert(format!("{name}:{lanes}{label} {name}.spv {constants}"));
-                let strips = shape == other && kernel.group == Group::Strips;
-                if kernel.spirv.storage.is_some() && half == 0 && (shape == one || strips) {
+                let strips = config == other && kernel.group == Group::Strips;
+                if kernel.spirv.storage.is_some() && half == 0 && (config == one || strips) {
                     lines.insert(format!("{name}:{lanes}+storage {name}.storage.spv {constants}"));
                 }
             }
@@ -50,7 +50,7 @@ fn lines() -> BTreeSet<String> {
 }
 
 #[test]
-fn the_boards_compile_every_kernel_in_every_kind_of_shape() {
+fn the_boards_compile_every_kernel_in_every_kind_of_config() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/boards/kernels.txt");
     let text: String = lines().into_iter().map(|line| line + "\n").collect();
     if std::env::var_os("DGTR_BLESS").is_some() {

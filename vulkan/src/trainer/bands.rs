@@ -149,7 +149,8 @@ mod tests {
         let request = PlanRequest { width: 32, height: 24, views: 1, sh_degree: 0, ..Default::default() };
         let plan = Plan::with_capacities(&request, 256, 4096);
         let mut trainer =
-            Trainer::with_kernels(&gpu, &plan, &plain(), crate::shape::KernelShape::standard(gpu.info()), &[]).unwrap();
+            Trainer::with_kernels(&gpu, &plan, &plain(), crate::kernel_config::KernelConfig::standard(gpu.info()), &[])
+                .unwrap();
         trainer.load(&cloud(1, 64, 0)).unwrap();
         trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
         assert_eq!(trainer.step().err(), Some(TrainError::Gpu(GpuError::ComputesNothing)));

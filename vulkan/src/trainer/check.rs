@@ -1,26 +1,26 @@
-//! Whether a device can be relied on, found out without training: one kernel against its twin, and a plan against what the
+//! Whether a device can be relied on, found out without training: one kernel against its reference, and a plan against what the
 //! device refuses.
 
 use super::{TrainError, Trainer};
 use crate::arena::Arena;
 use crate::gpu::{Gpu, GpuError};
+use crate::kernel_config::KernelConfig;
 use crate::kernels::{Kernel, SCAN_LANES};
 use crate::layout::Push;
 use crate::pipelines::Pipelines;
-use crate::shape::KernelShape;
+use crate::reference::camera::Camera;
+use crate::reference::gaussian::Gaussian;
+use crate::reference::loss::Target;
+use crate::reference::project::{Culled, Limits, project};
+use crate::reference::trainer::ReferenceTrainer;
 use crate::synthetic::{cloud, photo, plain, posed, view};
-use crate::twin::camera::Camera;
-use crate::twin::gaussian::Gaussian;
-use crate::twin::loss::Target;
-use crate::twin::project::{Culled, Limits, project};
-use crate::twin::trainer::TwinTrainer;
 use config::plan::{Plan, PlanRequest};
 use config::training::scene_extent;
 
 /// Gaussians that the kernel is tried on.
 const TRIED: usize = 200;
 
-/// Runs the projection on the device and compares it with its twin; returns on how many Gaussians.
+/// Runs the projection on the device and compares it with its reference; returns on how many Gaussians.
 ///
 /// # Errors
 /// [`GpuError::ComputesNothing`], [`GpuError::ComputesWrong`], or what the driver says, as [`TrainError::Gpu`].
@@ -29,8 +29,8 @@ pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
     let lanes = gpu.info().lanes();
     let request = PlanRequest { width: 64, height: 48, views: 0, sh_degree: 0, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, TRIED, TRIED);
-    let shape = KernelShape::standard(gpu.info());
-    let mut trainer = Trainer::with_kernels(gpu, &plan, &plain(), shape, &[Kernel::Project])?;
+    let config = KernelConfig::standard(gpu.info());
+    let mut trainer = Trainer::with_kernels(gpu, &plan, &plain(), config, &[Kernel::Project])?;
     trainer.load(&c)?;
     trainer.frame.plain();
     (trainer.frame.gaussians, trainer.frame.step) = (TRIED as u32, 1);
@@ -46,20 +46,23 @@ pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
     }
     let camera = Camera::<f32>::of(&v);
     let agrees = |i: usize| {
-        let twin = project(&Gaussian::of_row(&c, i), &camera, 0, 1.0, &Limits::default());
-        let twin = match twin {
-            Ok(twin) => twin,
+        let reference = project(&Gaussian::of_row(&c, i), &camera, 0, 1.0, &Limits::default());
+        let reference = match reference {
+            Ok(reference) => reference,
             // The two cull differently by a fraction of a pixel at the picture's edge.
             Err(Culled::Outside) => return true,
             Err(_) => return keys[i] == u32::MAX,
         };
-        let inside = (0..2).all(|k| twin.mean2d[k] >= 0.0 && twin.mean2d[k] <= camera.size[k] as f32);
+        let inside = (0..2).all(|k| reference.mean2d[k] >= 0.0 && reference.mean2d[k] <= camera.size[k] as f32);
         if keys[i] == u32::MAX && !inside {
             return true;
         }
         let [x, y, z, _] = projected[3 * i];
         let near = |a: f32, b: f32| (a - b).abs() <= 1e-3 * (1.0 + b.abs());
-        keys[i] == z.to_bits() && near(x, twin.mean2d[0]) && near(y, twin.mean2d[1]) && near(z, twin.depth)
+        keys[i] == z.to_bits()
+            && near(x, reference.mean2d[0])
+            && near(y, reference.mean2d[1])
+            && near(z, reference.depth)
     };
     let differ = (0..TRIED).filter(|i| !agrees(*i)).count();
     match differ {
@@ -68,38 +71,39 @@ pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
     }
 }
 
-/// Whole training steps on the device beside those of the twin.
+/// Whole training steps on the device beside those of the reference.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingCheck {
     /// Steps.
     pub steps: u32,
     /// Loss of the last one on the device.
     pub loss: f32,
-    /// The twin's, in f64.
-    pub twin_loss: f64,
+    /// The reference's, in f64.
+    pub reference_loss: f64,
 }
 
-/// Trains a small scene for so many steps with kernels of `shape`, and the same on the processor in f64.
+/// Trains a small scene for so many steps with kernels of `config`, and the same on the processor in f64.
 ///
 /// # Errors
 /// What the driver says, as [`TrainError::Gpu`].
-pub fn check_training(gpu: &Gpu, shape: KernelShape, steps: u32) -> Result<TrainingCheck, TrainError> {
+pub fn check_training(gpu: &Gpu, config: KernelConfig, steps: u32) -> Result<TrainingCheck, TrainError> {
     let (v, c, settings) = (view(64, 48), cloud(5, TRIED, 3), plain());
     let photo = photo(5, &v);
     let lanes = gpu.info().lanes();
     let request = PlanRequest { width: 64, height: 48, views: 1, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, TRIED, 64 * TRIED);
-    let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape)?;
+    let mut trainer = Trainer::with_config(gpu, &plan, &settings, config)?;
     trainer.load(&c)?;
     trainer.add_view(&posed(&v, &photo), None)?;
     let extent = scene_extent(&c.means, &[v.pose.center.to_array()]);
-    let mut twin = TwinTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
+    let mut reference =
+        ReferenceTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
     let (camera, rgb) = (Camera::<f64>::of(&v), photo.iter().map(|p| p.map(f64::from)).collect::<Vec<_>>());
-    let mut check = TrainingCheck { steps, loss: f32::NAN, twin_loss: f64::NAN };
+    let mut check = TrainingCheck { steps, loss: f32::NAN, reference_loss: f64::NAN };
     for step in 0..steps {
         let target = Target { width: 64, rgb: &rgb, depth: None, kept: None, background: [0.0; 3] };
         check.loss = trainer.step()?.loss;
-        check.twin_loss = twin.step(&camera, &target, settings.progress(step, 0.0)).loss.total;
+        check.reference_loss = reference.step(&camera, &target, settings.progress(step, 0.0)).loss.total;
     }
     Ok(check)
 }
@@ -120,7 +124,7 @@ pub enum PlanFit {
 /// The first thing the device refuses, and how to mend it.
 pub fn check_plan(gpu: &Gpu, plan: &Plan) -> Result<PlanFit, GpuError> {
     let limits = &gpu.info().limits;
-    limits.check_workgroup(KernelShape::standard(gpu.info()).largest_workgroup().max(SCAN_LANES))?;
+    limits.check_workgroup(KernelConfig::standard(gpu.info()).largest_workgroup().max(SCAN_LANES))?;
     let storage = Pipelines::needs_storage_reads(limits, plan)?;
     Arena::check(gpu, plan)?;
     Ok(if storage { PlanFit::StorageReads } else { PlanFit::Whole })
@@ -132,7 +136,7 @@ mod tests {
     use crate::gpu::{DeviceLimits, Forced};
 
     #[test]
-    fn a_device_is_compared_with_its_twin_and_one_without_effect_is_named() {
+    fn a_device_is_compared_with_its_reference_and_one_without_effect_is_named() {
         let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
         let agreed = check_device(&gpu).unwrap();
         println!("{agreed} of {TRIED} agree");

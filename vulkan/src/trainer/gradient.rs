@@ -1,5 +1,5 @@
 //! Gradients for inspection: what a step would follow, for every parameter, the camera and the exposure. The gradient
-//! checks compare them with the CPU twins and with central differences.
+//! checks compare them with the CPU references and with central differences.
 
 use super::scene::Blocks;
 use super::slots::Picture;

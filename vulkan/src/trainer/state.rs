@@ -63,7 +63,7 @@ mod tests {
     #[test]
     fn what_is_away_keeps_what_it_missed_and_misses_no_more() {
         let word = with_degree(up_to(state(0), 0), 2);
-        // Moved in step 8,190 and, its SH, in 8,187; taken off after 8,200, put on after 20,000.
+        // Moved in step 8,190 and, its SH, in 8,187; paged out after 8,200, paged in after 20,000.
         let word = f32::from_bits(word.to_bits() | 8190 | 8187 << 13);
         let away = turned(word, 8200);
         assert!(away.is_normal());

@@ -6,7 +6,7 @@ use config::plan::{Plan, PlanRequest};
 use config::training::{Strategy, TrainSettings};
 use models::camera::PosedImage;
 use vulkan::gpu::Gpu;
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
 use vulkan::stages::STAGES;
 use vulkan::trainer::{Counters, RunBudget, TrainError, Trainer};
 
@@ -59,8 +59,8 @@ impl Stopwatch {
     ///
     /// # Errors
     /// The device, or its memory.
-    pub fn new(gpu: &Gpu, shape: KernelShape, plan: &Plan, pictures: &[PosedImage]) -> Result<Self, TrainError> {
-        let mut trainer = Trainer::with_shape(gpu, plan, &settings(), shape)?;
+    pub fn new(gpu: &Gpu, config: KernelConfig, plan: &Plan, pictures: &[PosedImage]) -> Result<Self, TrainError> {
+        let mut trainer = Trainer::with_config(gpu, plan, &settings(), config)?;
         trainer.time_every_step();
         for picture in pictures {
             trainer.add_view(picture, None)?;
@@ -107,11 +107,11 @@ impl Stopwatch {
     }
 }
 
-/// What steps cost on `gpu` with kernels of `shape`.
+/// What steps cost on `gpu` with kernels of `config`.
 ///
 /// # Errors
 /// The device, or its memory.
-pub fn measure(gpu: &Gpu, shape: KernelShape) -> Result<CostModel, TrainError> {
+pub fn measure(gpu: &Gpu, config: KernelConfig) -> Result<CostModel, TrainError> {
     let views = PICTURES.map(|(w, h)| synthetic::view(w, h, 0.0));
     let pictures: Vec<PosedImage> = views.iter().map(|v| synthetic::picture(v, 1)).collect();
     let ((width, height), gaussians) = (PICTURES[PICTURES.len() - 1], CLOUDS[CLOUDS.len() - 1]);
@@ -127,7 +127,7 @@ pub fn measure(gpu: &Gpu, shape: KernelShape) -> Result<CostModel, TrainError> {
     };
     let pixels = width as usize * height as usize;
     let plan = Plan::with_capacities(&request, gaussians, INSTANCES_PER_PIXEL * pixels);
-    let mut watch = Stopwatch::new(gpu, shape, &plan, &pictures)?;
+    let mut watch = Stopwatch::new(gpu, config, &plan, &pictures)?;
     let mut samples = Vec::with_capacity(CLOUDS.len() * PICTURES.len());
     for gaussians in CLOUDS {
         watch.load(&synthetic::cloud(gaussians, width, height, 1))?;

@@ -1,4 +1,4 @@
-//! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the shape that was
+//! `dgtr/kernels.toml` in the user's cache folder: per device, driver version and set of kernels the configuration that was
 //! measured, the small step that devices are compared by, and what steps cost by how many threads. It is only a cache: it may be
 //! deleted, be damaged or be somebody's handiwork at any time.
 
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use models::formats::{FormatError, read_bounded, write_atomic};
 use serde::{Deserialize, Serialize};
 use vulkan::gpu::GpuInfo;
-use vulkan::shape::{KernelShape, kernels_fingerprint};
+use vulkan::kernel_config::{KernelConfig, kernels_fingerprint};
 
 use crate::cost::model::CostModel;
 
@@ -66,18 +66,18 @@ struct Step {
     ms: f64,
 }
 
-/// What steps cost on a device with so many threads and kernels of this shape.
+/// What steps cost on a device with so many threads and kernels of this configuration.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 struct Cost {
     #[serde(flatten)]
     id: Id,
     threads: u32,
-    shape: String,
+    config: String,
     #[serde(flatten)]
     model: CostModel,
 }
 
-/// A device's shape.
+/// A device's configuration.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 struct Entry {
     #[serde(flatten)]
@@ -88,21 +88,19 @@ struct Entry {
     tiles: u32,
     tile_lanes: u32,
     fetched: u32,
-    /// Not in files of before there was a choice; what those say is of other kernels.
-    #[serde(default)]
     summed: u32,
     part: u32,
 }
 
 impl Entry {
-    fn of(info: &GpuInfo, shape: KernelShape) -> Self {
-        let KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } = shape;
+    fn of(info: &GpuInfo, config: KernelConfig) -> Self {
+        let KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } = config;
         Self { id: Id::of(info), wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
     }
 
-    fn shape(&self) -> KernelShape {
+    fn config(&self) -> KernelConfig {
         let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part, .. } = *self;
-        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
+        KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
     }
 }
 
@@ -125,27 +123,27 @@ pub fn path() -> Option<PathBuf> {
 ///
 /// # Errors
 /// A file that is there and cannot be used.
-pub fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelShape>, FormatError> {
+pub fn read(path: &Path, info: &GpuInfo) -> Result<Option<KernelConfig>, FormatError> {
     let kept = load(path)?;
     // Another driver's, or other kernels', says nothing.
     let id = Id::of(info);
     let found = kept.device.iter().rev().find(|e| e.id == id);
-    match found.map(Entry::shape) {
-        Some(shape) if !shape.fits(info) => {
-            let what = format!("{}: {shape} is no shape this device can run", info.name);
+    match found.map(Entry::config) {
+        Some(config) if !config.fits(info) => {
+            let what = format!("{}: {config} is no configuration this device can run", info.name);
             Err(FormatError::Invalid { path: path.into(), what })
         }
-        shape => Ok(shape),
+        config => Ok(config),
     }
 }
 
-/// Remembers `shape`, in place of whatever was remembered of the device. A damaged file is begun anew.
+/// Remembers `config`, in place of whatever was remembered of the device. A damaged file is begun anew.
 ///
 /// # Errors
 /// A file or folder that cannot be written.
-pub fn write(path: &Path, info: &GpuInfo, shape: KernelShape) -> Result<(), FormatError> {
+pub fn write(path: &Path, info: &GpuInfo, config: KernelConfig) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
-    remember(&mut kept.device, Entry::of(info, shape), |a, b| a.id.is_device(&b.id));
+    remember(&mut kept.device, Entry::of(info, config), |a, b| a.id.is_device(&b.id));
     save(path, &kept)
 }
 
@@ -169,7 +167,7 @@ pub fn write_step(path: &Path, info: &GpuInfo, ms: f64) -> Result<(), FormatErro
     save(path, &kept)
 }
 
-/// What steps cost on this very device, with this driver, so many threads and kernels of this shape; `None` when it was not measured.
+/// What steps cost on this very device, with this driver, so many threads and kernels of this configuration; `None` when it was not measured.
 ///
 /// # Errors
 /// A file that is there and cannot be used.
@@ -177,10 +175,10 @@ pub fn read_cost(
     path: &Path,
     info: &GpuInfo,
     threads: u32,
-    shape: KernelShape,
+    config: KernelConfig,
 ) -> Result<Option<CostModel>, FormatError> {
-    let (kept, id, shape) = (load(path)?, Id::of(info), shape.to_string());
-    let found = kept.cost.iter().rev().find(|c| c.id == id && c.threads == threads && c.shape == shape);
+    let (kept, id, config) = (load(path)?, Id::of(info), config.to_string());
+    let found = kept.cost.iter().rev().find(|c| c.id == id && c.threads == threads && c.config == config);
     Ok(found.map(|c| c.model).filter(CostModel::is_sound))
 }
 
@@ -192,11 +190,11 @@ pub fn write_cost(
     path: &Path,
     info: &GpuInfo,
     threads: u32,
-    shape: KernelShape,
+    config: KernelConfig,
     model: CostModel,
 ) -> Result<(), FormatError> {
     let mut kept = load(path).unwrap_or_default();
-    let new = Cost { id: Id::of(info), threads, shape: shape.to_string(), model };
+    let new = Cost { id: Id::of(info), threads, config: config.to_string(), model };
     remember(&mut kept.cost, new, |a, b| a.id.is_device(&b.id) && a.threads == b.threads);
     save(path, &kept)
 }
@@ -206,7 +204,7 @@ fn save(path: &Path, kept: &Kept) -> Result<(), FormatError> {
     write_atomic(path, |out| {
         writeln!(
             out,
-            "# Shapes of kernels, steps and their costs, measured by dgtr (`dgtr doctor --calibrate`); may be deleted."
+            "# Kernel configurations, steps and their costs, measured by dgtr (`dgtr doctor --autotune`); may be deleted."
         )?;
         out.write_all(text.as_bytes())
     })
@@ -227,10 +225,18 @@ pub(crate) mod tests {
     use super::*;
     use vulkan::gpu::DeviceLimits;
 
-    const SHAPE: KernelShape =
-        KernelShape { wide: 128, narrow: 16, share_lanes: 16, tiles: 8, tile_lanes: 8, fetched: 8, summed: 1, part: 2 };
-    const OTHER: KernelShape =
-        KernelShape { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, summed: 1, part: 8 };
+    const CONFIG: KernelConfig = KernelConfig {
+        wide: 128,
+        narrow: 16,
+        share_lanes: 16,
+        tiles: 8,
+        tile_lanes: 8,
+        fetched: 8,
+        summed: 1,
+        part: 2,
+    };
+    const OTHER: KernelConfig =
+        KernelConfig { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, summed: 1, part: 8 };
 
     /// A board's GPU.
     pub(crate) fn device(name: &str) -> GpuInfo {
@@ -254,9 +260,9 @@ pub(crate) mod tests {
         let path = dir.path().join("deep/dgtr/kernels.toml");
         let (a, b) = (device("V3D \"7.1\""), device("llvmpipe"));
         assert_eq!(read(&path, &a).unwrap(), None);
-        write(&path, &a, SHAPE).unwrap();
+        write(&path, &a, CONFIG).unwrap();
         write(&path, &b, OTHER).unwrap();
-        assert_eq!(read(&path, &a).unwrap(), Some(SHAPE));
+        assert_eq!(read(&path, &a).unwrap(), Some(CONFIG));
         assert_eq!(read(&path, &b).unwrap(), Some(OTHER));
     }
 
@@ -265,12 +271,12 @@ pub(crate) mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("kernels.toml");
         let (a, b) = (device("V3D"), device("llvmpipe"));
-        write(&path, &a, SHAPE).unwrap();
+        write(&path, &a, CONFIG).unwrap();
         write_step(&path, &a, 12.5).unwrap();
         write_step(&path, &b, 3.25).unwrap();
         write_step(&path, &b, 3.5).unwrap();
         assert_eq!([&a, &b].map(|info| read_step(&path, info).unwrap()), [Some(12.5), Some(3.5)]);
-        assert_eq!(read(&path, &a).unwrap(), Some(SHAPE));
+        assert_eq!(read(&path, &a).unwrap(), Some(CONFIG));
         assert_eq!(read_step(&path, &GpuInfo { driver_version: 8, ..a.clone() }).unwrap(), None);
         // What nobody could have measured is not believed.
         for ms in [0.0, -1.0, f64::NAN, f64::INFINITY] {
@@ -283,27 +289,27 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_steps_cost_is_kept_by_driver_threads_and_shape() {
+    fn what_steps_cost_is_kept_by_driver_threads_and_config() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("kernels.toml");
         let (info, of) = (device("llvmpipe"), |pixel_ns: f64| CostModel { pixel_ns, ..CostModel::default() });
-        write(&path, &info, SHAPE).unwrap();
-        write_cost(&path, &info, 1, SHAPE, of(3.0)).unwrap();
-        write_cost(&path, &info, 2, SHAPE, of(2.0)).unwrap();
-        let read = |info: &GpuInfo, threads, shape| read_cost(&path, info, threads, shape).unwrap();
-        assert_eq!([1, 2, 4].map(|n| read(&info, n, SHAPE)), [Some(of(3.0)), Some(of(2.0)), None]);
+        write(&path, &info, CONFIG).unwrap();
+        write_cost(&path, &info, 1, CONFIG, of(3.0)).unwrap();
+        write_cost(&path, &info, 2, CONFIG, of(2.0)).unwrap();
+        let read = |info: &GpuInfo, threads, config| read_cost(&path, info, threads, config).unwrap();
+        assert_eq!([1, 2, 4].map(|n| read(&info, n, CONFIG)), [Some(of(3.0)), Some(of(2.0)), None]);
         assert_eq!(read(&info, 2, OTHER), None, "other kernels take other times");
-        assert_eq!(read(&GpuInfo { driver_version: 8, ..info.clone() }, 2, SHAPE), None);
+        assert_eq!(read(&GpuInfo { driver_version: 8, ..info.clone() }, 2, CONFIG), None);
         write_cost(&path, &info, 2, OTHER, of(1.0)).unwrap();
-        assert_eq!((read(&info, 2, SHAPE), read(&info, 2, OTHER)), (None, Some(of(1.0))));
-        assert_eq!(super::read(&path, &info).unwrap(), Some(SHAPE));
+        assert_eq!((read(&info, 2, CONFIG), read(&info, 2, OTHER)), (None, Some(of(1.0))));
+        assert_eq!(super::read(&path, &info).unwrap(), Some(CONFIG));
         // What nobody could have measured is not believed.
         for ns in [f64::NAN, -1.0, f64::INFINITY, 0.0] {
-            write_cost(&path, &info, 1, SHAPE, of(ns)).unwrap();
-            assert_eq!(read_cost(&path, &info, 1, SHAPE).unwrap_or(None), None, "{ns}");
+            write_cost(&path, &info, 1, CONFIG, of(ns)).unwrap();
+            assert_eq!(read_cost(&path, &info, 1, CONFIG).unwrap_or(None), None, "{ns}");
         }
-        (0..2 * MOST_DEVICES as u32).for_each(|n| write_cost(&path, &info, n, SHAPE, of(1.0)).unwrap());
-        (0..2 * MOST_DEVICES).for_each(|i| write(&path, &device(&format!("device {i}")), SHAPE).unwrap());
+        (0..2 * MOST_DEVICES as u32).for_each(|n| write_cost(&path, &info, n, CONFIG, of(1.0)).unwrap());
+        (0..2 * MOST_DEVICES).for_each(|i| write(&path, &device(&format!("device {i}")), CONFIG).unwrap());
         assert!(std::fs::metadata(&path).unwrap().len() < LIMIT);
     }
 
@@ -313,7 +319,7 @@ pub(crate) mod tests {
         let path = dir.path().join("kernels.toml");
         let old = device("V3D");
         let new = GpuInfo { driver_version: 8, ..old.clone() };
-        write(&path, &old, SHAPE).unwrap();
+        write(&path, &old, CONFIG).unwrap();
         assert_eq!(read(&path, &new).unwrap(), None);
         write(&path, &new, OTHER).unwrap();
         assert_eq!(read(&path, &new).unwrap(), Some(OTHER));
@@ -330,7 +336,7 @@ pub(crate) mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("kernels.toml");
         let info = device("V3D");
-        write(&path, &info, SHAPE).unwrap();
+        write(&path, &info, CONFIG).unwrap();
         let sound = std::fs::read_to_string(&path).unwrap();
         let unusable = sound.replace("wide = 128", "wide = 48");
         let endless = "#".repeat(LIMIT as usize + 1);
@@ -339,8 +345,8 @@ pub(crate) mod tests {
             std::fs::write(&path, damaged).unwrap();
             let said = read(&path, &info).unwrap_err().to_string();
             assert!(said.contains("kernels.toml") && said.lines().count() == 1, "{said}");
-            write(&path, &info, SHAPE).unwrap();
-            assert_eq!(read(&path, &info).unwrap(), Some(SHAPE));
+            write(&path, &info, CONFIG).unwrap();
+            assert_eq!(read(&path, &info).unwrap(), Some(CONFIG));
         }
     }
 
@@ -349,11 +355,11 @@ pub(crate) mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("kernels.toml");
         for i in 0..MOST_DEVICES + 5 {
-            write(&path, &device(&format!("device {i}")), SHAPE).unwrap();
+            write(&path, &device(&format!("device {i}")), CONFIG).unwrap();
         }
         assert_eq!(load(&path).unwrap().device.len(), MOST_DEVICES);
         assert_eq!(read(&path, &device("device 0")).unwrap(), None);
-        assert_eq!(read(&path, &device("device 68")).unwrap(), Some(SHAPE));
+        assert_eq!(read(&path, &device("device 68")).unwrap(), Some(CONFIG));
         assert!(std::fs::metadata(&path).unwrap().len() < LIMIT);
     }
 
@@ -361,6 +367,6 @@ pub(crate) mod tests {
     fn a_folder_that_cannot_be_written_is_an_error_and_no_panic() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("file"), b"").unwrap();
-        assert!(write(&dir.path().join("file/kernels.toml"), &device("V3D"), SHAPE).is_err());
+        assert!(write(&dir.path().join("file/kernels.toml"), &device("V3D"), CONFIG).is_err());
     }
 }

@@ -56,7 +56,7 @@ fn measured(mission: &Mission, aircraft: &Aircraft) -> Option<Choice> {
     }
     // Whoever opens it for the flight says what is wrong with it.
     let gpu = devices::open(aircraft.device.as_deref()).ok()?;
-    let cost = cost::of(&gpu, kernels::shape_of(&gpu))?;
+    let cost = cost::of(&gpu, kernels::config_of(&gpu))?;
     choose(mission, &mission.region(aircraft), gpu.info(), &cost)
 }
 
@@ -65,11 +65,11 @@ pub fn foresee(mission: &mut Mission, gpu: &Gpu) -> Option<Choice> {
     if !mission.memory.is_auto() || kernels::choice() == KernelChoice::Standard {
         return None;
     }
-    let (info, shape) = (gpu.info(), kernels::known(gpu.info()).0);
+    let (info, config) = (gpu.info(), kernels::known(gpu.info()).0);
     let regions = mission.aircraft.iter().map(|a| mission.region(a));
     // All aircraft share the plan: the one with the most ground decides.
     let region = regions.max_by(|a, b| area_m2(a).total_cmp(&area_m2(b))).unwrap_or_default();
-    let choice = choose(mission, &region, info, &cost::known(info, shape)?)?;
+    let choice = choose(mission, &region, info, &cost::known(info, config)?)?;
     fill(mission, &choice);
     Some(choice)
 }

@@ -19,9 +19,9 @@ pub struct Args {
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
-    /// No further shape of the kernels is tried after so many seconds.
+    /// No further kernel configuration is tried after so many seconds.
     #[arg(long, default_value_t = 120)]
-    pub calibration_seconds: u64,
+    pub autotune_seconds: u64,
     /// How many of the three sizes are measured, the smallest first.
     #[arg(long, default_value_t = SIZES.len(), value_name = "N")]
     pub sizes: usize,
@@ -36,16 +36,16 @@ pub struct Args {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let folder = tempfile::tempdir().map_err(CliError::failed)?;
-    let calibration = Duration::from_secs(args.calibration_seconds);
-    let extent = Extent { device: args.device, calibration, sizes: args.sizes, steps: args.steps };
+    let autotuning = Duration::from_secs(args.autotune_seconds);
+    let extent = Extent { device: args.device, autotuning, sizes: args.sizes, steps: args.steps };
     let report = measure(&extent, folder.path())?;
     write_json(&args.out, &report)?;
     let head = ["board", "device", "kernels", "10 k, ms", "100 k, ms", "500 k, ms", "survey, s", "PSNR, dB", "W", "°C"];
     let table = Table {
         title: format!("{}: the row for tests/DEVICES.md, which says where to send the report", args.out.display()),
         note: format!(
-            "{:.0} s; the device's loss {}, the twin's {}.",
-            report.seconds, report.twin["loss"], report.twin["twin_loss"]
+            "{:.0} s; the device's loss {}, the reference's {}.",
+            report.seconds, report.reference["loss"], report.reference["reference_loss"]
         ),
         head: head.map(str::to_owned).to_vec(),
         rows: vec![report.row()],

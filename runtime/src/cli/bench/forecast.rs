@@ -34,7 +34,7 @@ pub struct Args {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
-    let (model, all) = measured(&gpu, kernels::shape_of(&gpu), args.sizes, args.steps)?;
+    let (model, all) = measured(&gpu, kernels::config_of(&gpu), args.sizes, args.steps)?;
     outln!("{}", markdown(&table(&gpu, &model, &all)));
     if let Some(path) = &args.json {
         write_json(path, &serde_json::json!({ "device": gpu.info().name, "cost": model, "sizes": all }))?;

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use engine::kernels;
 use pages::report::Table;
-use vulkan::ceiling;
 use vulkan::gpu::Gpu;
+use vulkan::roofline;
 
 use crate::bench::figures::{csv, markdown, short, write_json, write_text};
 use crate::bench::stages::{Scene, SizeFigures, growth, growth_table, measure, overview_table, size_table};
@@ -61,20 +61,20 @@ fn size(text: &str) -> Result<(u32, u32), String> {
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
     let gpu = Gpu::open(args.device.as_deref())?;
-    let shape = kernels::shape_of(&gpu);
-    let ceiling = ceiling::measure(&gpu)?;
+    let config = kernels::config_of(&gpu);
+    let roofline = roofline::measure(&gpu)?;
     outln!(
         "{}: copies {} GB/s by a kernel and {} GB/s by command (read + written), computes {} G operations/s; kernels {}x{}\n",
         gpu.info().name,
-        short(ceiling.kernel_bytes_per_s * 1e-9),
-        short(ceiling.command_bytes_per_s * 1e-9),
-        short(ceiling.operations_per_s * 1e-9),
-        shape.wide,
-        shape.narrow
+        short(roofline.kernel_bytes_per_s * 1e-9),
+        short(roofline.command_bytes_per_s * 1e-9),
+        short(roofline.operations_per_s * 1e-9),
+        config.wide,
+        config.narrow
     );
     let mut sizes = Vec::new();
     let mut add = |scene: &Scene| -> Result<(), CliError> {
-        let figures = measure(&gpu, shape, &ceiling, scene, args.steps)?;
+        let figures = measure(&gpu, config, &roofline, scene, args.steps)?;
         outln!("{}", markdown(&size_table(&figures)));
         sizes.push(figures);
         Ok(())
@@ -101,10 +101,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if let Some(path) = &args.json {
         let all = serde_json::json!({
             "device": gpu.info().name,
-            "kernels": { "wide": shape.wide, "narrow": shape.narrow },
-            "kernel_bytes_per_s": ceiling.kernel_bytes_per_s,
-            "command_bytes_per_s": ceiling.command_bytes_per_s,
-            "operations_per_s": ceiling.operations_per_s,
+            "kernels": { "wide": config.wide, "narrow": config.narrow },
+            "kernel_bytes_per_s": roofline.kernel_bytes_per_s,
+            "command_bytes_per_s": roofline.command_bytes_per_s,
+            "operations_per_s": roofline.operations_per_s,
             "sizes": sizes,
             "growth": if sizes.len() > 1 { grown } else { Vec::new() },
         });

@@ -15,9 +15,9 @@ pub struct Args {
     /// Also train this many steps on a tiny scene (100,000 take minutes).
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     pub long: u32,
-    /// Only the CPU twin, without a device.
+    /// Only the CPU reference, without a device.
     #[arg(long, conflicts_with_all = ["long", "device"])]
-    pub twin_only: bool,
+    pub reference_only: bool,
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
@@ -34,7 +34,7 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let gpu = match args.twin_only {
+    let gpu = match args.reference_only {
         true => None,
         false => Some(Gpu::open(args.device.as_deref())?),
     };
@@ -44,7 +44,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         }
     });
     let table = table(&all);
-    outln!("{}\n\n{}", gpu.as_ref().map_or("CPU twin", |g| &g.info().name), markdown(&table));
+    outln!("{}\n\n{}", gpu.as_ref().map_or("CPU reference", |g| &g.info().name), markdown(&table));
     outln!("{}", markdown(&elsewhere()));
     if let Some(path) = &args.csv {
         write_text(path, &csv(&table))?;

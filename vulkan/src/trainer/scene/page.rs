@@ -1,7 +1,7 @@
 //! Cells onto the device and back, with their moments.
 //!
 //! Where Gaussians lie on the device decides bits of what follows, so it depends on steps alone: those that leave make room, in order,
-//! for those that come, and what a drawing takes off comes back to where it was.
+//! for those that come, and what a drawing pages out comes back to where it was.
 
 use super::cell::{self, Bounds};
 use super::{Cell, Scene};
@@ -21,14 +21,14 @@ pub(super) struct Device<'a> {
 
 impl Device<'_> {
     /// Copies Gaussian `index` to a record. Its state says there how many steps it missed: while it is away it misses none.
-    fn take_off(&self, index: usize, record: &mut [u8]) {
+    fn page_out(&self, index: usize, record: &mut [u8]) {
         self.parameters.read_record(self.arena, index, record);
         let missed = state::turned(self.parameters.geometry(self.arena)[index].state, self.updates);
         Parameters::write_state(record, missed);
     }
 
     /// Copies a record to place `index`.
-    fn put_on(&mut self, index: usize, record: &[u8]) {
+    fn page_in(&mut self, index: usize, record: &[u8]) {
         self.parameters.write_record(self.arena, index, record);
         let g = &mut self.parameters.geometry_mut(self.arena)[index];
         g.state = state::turned(g.state, self.updates);
@@ -136,7 +136,7 @@ impl Scene {
             let run = run_of(&order[from..], tags, index);
             let cell = &mut cells[index as usize];
             if !stays(cell) {
-                store.append(&mut cell.chain, run.len(), |i, record| device.take_off(run[i] as usize, record))?;
+                store.append(&mut cell.chain, run.len(), |i, record| device.page_out(run[i] as usize, record))?;
                 holes.extend_from_slice(run);
             }
             from += run.len();
@@ -148,7 +148,7 @@ impl Scene {
         Ok(())
     }
 
-    /// Puts the cells at work that are away onto the device: into the holes, then behind the others. Whoever is last comes to the holes
+    /// Pages the cells at work in: into the holes, then behind the others. Whoever is last comes to the holes
     /// that are left.
     fn come(&mut self, device: &mut Device<'_>) -> Result<(), TrainError> {
         self.check_whole()?;
@@ -158,7 +158,7 @@ impl Scene {
         for (index, cell) in cells.iter_mut().enumerate().filter(|(_, cell)| cell.at_work && !cell.on_device) {
             store.read(&cell.chain, |_, record| {
                 let place = holes.get(filled).map_or(tags.len(), |hole| *hole as usize);
-                device.put_on(place, record);
+                device.page_in(place, record);
                 match tags.get_mut(place) {
                     Some(tag) => *tag = index as u32,
                     None => tags.push(index as u32),
@@ -189,7 +189,7 @@ impl Scene {
         self.holes.clear();
     }
 
-    /// Takes the window off the device, remembers where each of it was, and puts copies of the cells `drawn`, by index and in order,
+    /// Pages the window out, remembers where each of it was, and pages copies of the cells `drawn`, by index and in order,
     /// there instead.
     fn draw_instead(&mut self, device: &mut Device<'_>, drawn: &[u32]) -> Result<(), TrainError> {
         if !self.drawing {
@@ -202,7 +202,7 @@ impl Scene {
         for &index in drawn {
             let (n, cell) = (tags.len(), &mut cells[index as usize]);
             store.read(&cell.chain, |i, record| {
-                device.put_on(n + i, record);
+                device.page_in(n + i, record);
                 // What it missed it still has to do: here it is drawn as it is.
                 device.up_to_date(n + i);
                 Ok::<(), TrainError>(())
@@ -235,7 +235,7 @@ impl Scene {
             let run = run_of(&order[from..], tags, index);
             let cell = &mut cells[index as usize];
             store.read(&cell.chain, |i, record| {
-                device.put_on(run[i] as usize, record);
+                device.page_in(run[i] as usize, record);
                 Ok::<(), TrainError>(())
             })?;
             store.forget(&mut cell.chain);
@@ -272,7 +272,7 @@ impl Trainer {
         done
     }
 
-    /// Takes all off the device; no window is at work.
+    /// Pages all out; no window is at work.
     pub(super) fn page_out(&mut self) -> Result<(), TrainError> {
         self.page(|scene, device| {
             scene.leave(&device, |_| false)?;

@@ -4,7 +4,7 @@
 //! Rounding may make a variance negative on constant pictures: it is then 0. C₂ > 0 keeps B₂ positive.
 
 use crate::constants::{SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW};
-use crate::twin::real::Real;
+use crate::reference::real::Real;
 
 /// Separable convolution with the window; the window is symmetric, so this is its own adjoint.
 fn blur<R: Real>(image: &[R], width: usize) -> Vec<R> {

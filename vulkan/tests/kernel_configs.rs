@@ -1,4 +1,4 @@
-//! The shape of the kernels changes no bit of the trained model, and calibration ends in time with one the device can run.
+//! The kernel configuration changes no bit of the trained model, and autotuning ends in time with one the device can run.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod scenes;
@@ -9,10 +9,10 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::time::Duration;
-use vulkan::calibration::calibrate;
+use vulkan::autotune::autotune;
 use vulkan::constants::{RUNS, SHORT_PART, STRIP};
 use vulkan::gpu::Gpu;
-use vulkan::shape::KernelShape;
+use vulkan::kernel_config::KernelConfig;
 use vulkan::trainer::{Rendering, Trainer};
 
 fn gpu() -> Option<Gpu> {
@@ -25,14 +25,14 @@ fn gpu() -> Option<Gpu> {
 
 /// Everything that draws random numbers or sums over many lanes: growth, relocation, noise, depth, pose and exposure,
 /// two views, and a picture that is no multiple of any workgroup. Few `instances` are done in bands.
-fn trained(gpu: &Gpu, shape: KernelShape, instances: usize, steps: u32) -> (GaussianCloud, Rendering, u64) {
-    trained_with(gpu, shape, (Lanes::SOFTWARE, true), instances, steps)
+fn trained(gpu: &Gpu, config: KernelConfig, instances: usize, steps: u32) -> (GaussianCloud, Rendering, u64) {
+    trained_with(gpu, config, (Lanes::SOFTWARE, true), instances, steps)
 }
 
 /// Where `refine` says so, poses are refined: their gradient is summed in as many parts as lanes loop.
 fn trained_with(
     gpu: &Gpu,
-    shape: KernelShape,
+    config: KernelConfig,
     (lanes, refine): (Lanes, bool),
     instances: usize,
     steps: u32,
@@ -47,7 +47,7 @@ fn trained_with(
     (settings.refine_poses, settings.refine_exposure) = (refine, true);
     let request = PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, 3000, instances);
-    let mut trainer = Trainer::with_shape(gpu, &plan, &settings, shape).unwrap();
+    let mut trainer = Trainer::with_config(gpu, &plan, &settings, config).unwrap();
     trainer.load(&cloud(8, 1500, 3)).unwrap();
     let depth: Vec<f32> = (0..77 * 53).map(|i| 2.0 + (i % 77) as f32 * 0.05).collect();
     let confidence = depth.iter().map(|d| d / 8.0).collect();
@@ -72,17 +72,17 @@ fn bits(model: &GaussianCloud) -> Vec<u32> {
     all.map(|v| v.to_bits()).collect()
 }
 
-/// Together with the standard shape: the smallest and the largest of each size, with one lane per tile and share and with
-/// several, fetching for themselves and for each other, summed in a loop and at once, where the device can, with strips in parts and at once (each shape costs a
+/// Together with the standard configuration: the smallest and the largest of each size, with one lane per tile and share and with
+/// several, fetching for themselves and for each other, summed in a loop and at once, where the device can, with strips in parts and at once (each configuration costs a
 /// compilation).
-fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
+fn configs(gpu: &Gpu) -> Vec<KernelConfig> {
     let info = gpu.info();
-    let wide = KernelShape::wide_candidates(info);
-    let tiles = KernelShape::tile_candidates(info);
+    let wide = KernelConfig::wide_candidates(info);
+    let tiles = KernelConfig::tile_candidates(info);
     if !info.shuffles {
         println!("skipped: four lanes per tile ({} has no shuffles)", info.name);
     }
-    let of = |wide, narrow, share_lanes, (tiles, tile_lanes, fetched, summed)| KernelShape {
+    let of = |wide, narrow, share_lanes, (tiles, tile_lanes, fetched, summed)| KernelConfig {
         wide,
         narrow,
         share_lanes,
@@ -101,14 +101,14 @@ fn shapes(gpu: &Gpu) -> Vec<KernelShape> {
 }
 
 #[test]
-fn the_trained_model_and_its_pictures_are_the_same_to_the_bit_with_every_shape() {
+fn the_trained_model_and_its_pictures_are_the_same_to_the_bit_with_every_config() {
     let Some(gpu) = gpu() else { return };
-    let (model, drawn, _) = trained(&gpu, KernelShape::standard(gpu.info()), 200_000, 110);
+    let (model, drawn, _) = trained(&gpu, KernelConfig::standard(gpu.info()), 200_000, 110);
     assert!(model.len() > 1500, "density control did not run");
-    for shape in shapes(&gpu) {
-        let (other, other_drawn, _) = trained(&gpu, shape, 200_000, 110);
-        assert!(bits(&other) == bits(&model), "{shape:?}: another model");
-        assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{shape:?}: another picture");
+    for config in configs(&gpu) {
+        let (other, other_drawn, _) = trained(&gpu, config, 200_000, 110);
+        assert!(bits(&other) == bits(&model), "{config:?}: another model");
+        assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{config:?}: another picture");
     }
 }
 
@@ -116,50 +116,50 @@ fn the_trained_model_and_its_pictures_are_the_same_to_the_bit_with_every_shape()
 #[test]
 fn lanes_that_meet_in_shared_memory_leave_the_same_bits_at_once_and_in_bands() {
     let Some(gpu) = gpu() else { return };
-    let standard = KernelShape::standard(gpu.info());
+    let standard = KernelConfig::standard(gpu.info());
     let meeting = Gpu::open_without_shuffles(Some(&gpu.info().name)).unwrap();
     for (instances, steps) in [(200_000, 110), (3000, 6)] {
         let (model, drawn, _) = trained(&gpu, standard, instances, steps);
         for (gpu, tiles, summed) in [(&gpu, 2, 1), (&meeting, 2, RUNS), (&meeting, 8, 1)] {
-            let shape = KernelShape { tiles, tile_lanes: RUNS, fetched: 1, summed, ..standard };
-            let (other, other_drawn, _) = trained(gpu, shape, instances, steps);
-            assert!(bits(&other) == bits(&model), "{shape:?}, {instances} instances: another model");
-            assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{shape:?}: another picture");
+            let config = KernelConfig { tiles, tile_lanes: RUNS, fetched: 1, summed, ..standard };
+            let (other, other_drawn, _) = trained(gpu, config, instances, steps);
+            assert!(bits(&other) == bits(&model), "{config:?}, {instances} instances: another model");
+            assert!(other_drawn.rgb == drawn.rgb && other_drawn.depth == drawn.depth, "{config:?}: another picture");
         }
     }
 }
 
 #[test]
-fn in_bands_the_model_is_the_same_to_the_bit_with_every_shape() {
+fn in_bands_the_model_is_the_same_to_the_bit_with_every_config() {
     let Some(gpu) = gpu() else { return };
-    let (model, _, banded) = trained(&gpu, KernelShape::standard(gpu.info()), 3000, 6);
+    let (model, _, banded) = trained(&gpu, KernelConfig::standard(gpu.info()), 3000, 6);
     assert_eq!(banded, 6, "the plan holds every instance at once");
-    for shape in shapes(&gpu) {
-        let (other, _, _) = trained(&gpu, shape, 3000, 6);
-        assert!(bits(&other) == bits(&model), "{shape:?}: another model");
+    for config in configs(&gpu) {
+        let (other, _, _) = trained(&gpu, config, 3000, 6);
+        assert!(bits(&other) == bits(&model), "{config:?}: another model");
     }
 }
 
 #[test]
 fn a_board_s_and_a_card_s_number_of_lanes_leave_the_same_bits_at_once_and_in_bands() {
     let Some(gpu) = gpu() else { return };
-    let shape = KernelShape::standard(gpu.info());
+    let config = KernelConfig::standard(gpu.info());
     for (instances, steps) in [(200_000, 20), (3000, 4)] {
         for (lanes, refine) in [(Lanes::BOARD, true), (Lanes::CARD, false)] {
-            let (few, drawn, _) = trained_with(&gpu, shape, (Lanes::SOFTWARE, refine), instances, steps);
-            let (many, other, _) = trained_with(&gpu, shape, (lanes, refine), instances, steps);
+            let (few, drawn, _) = trained_with(&gpu, config, (Lanes::SOFTWARE, refine), instances, steps);
+            let (many, other, _) = trained_with(&gpu, config, (lanes, refine), instances, steps);
             assert!(bits(&few) == bits(&many) && drawn.rgb == other.rgb, "{instances} instances, {lanes:?}");
         }
     }
 }
 
 #[test]
-fn calibration_without_time_for_more_measures_the_standard_shape_and_keeps_it() {
+fn autotuning_without_time_for_more_measures_the_standard_configuration_and_keeps_it() {
     let Some(gpu) = gpu() else { return };
-    let found = calibrate(&gpu, Some(Duration::ZERO)).unwrap();
+    let found = autotune(&gpu, Some(Duration::ZERO)).unwrap();
     println!("{found:?}");
-    let standard = KernelShape::standard(gpu.info());
-    assert_eq!((found.shape, found.trials.len(), found.trials[0].shape), (standard, 1, standard));
+    let standard = KernelConfig::standard(gpu.info());
+    assert_eq!((found.config, found.trials.len(), found.trials[0].config), (standard, 1, standard));
     let t = found.trials[0];
     assert!(t.ms.iter().all(|ms| *ms > 0.0 && *ms < 1e6), "{t:?}");
 }

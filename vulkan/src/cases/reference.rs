@@ -1,14 +1,14 @@
-//! The cases through the CPU twin's whole step before the optimiser.
+//! The cases through the CPU reference's whole step before the optimiser.
 #![allow(missing_docs, reason = "their names say what they promise")]
 
 use super::scenes::{cloud, grey, parameter, photo, view};
 use super::{Outcome, Tally};
 use crate::constants::COLOUR_MAX;
-use crate::twin::gaussian::Gaussian;
-use crate::twin::loss::pearson::pearson;
-use crate::twin::loss::{Exposure, Target, loss};
-use crate::twin::project::Culled;
-use crate::twin::rasterise::Pixel;
+use crate::reference::gaussian::Gaussian;
+use crate::reference::loss::pearson::pearson;
+use crate::reference::loss::{Exposure, Target, loss};
+use crate::reference::project::Culled;
+use crate::reference::rasterise::Pixel;
 use config::training::LossSettings;
 use models::cloud::GaussianCloud;
 

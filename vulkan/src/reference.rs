@@ -1,5 +1,5 @@
-//! CPU twins of the stages, in plain Rust, over f32 or f64: `project`, `sort`, `emit` (counting included), `shade`,
-//! `rasterise`, `loss`, `rasterise_backward` (with `reduce`: a twin sums at once), and of `optimise` the parts
+//! CPU references of the stages, in plain Rust, over f32 or f64: `project`, `sort`, `emit` (counting included), `shade`,
+//! `rasterise`, `loss`, `rasterise_backward` (with `reduce`: a reference sums at once), and of `optimise` the parts
 //! `project_backward`, `entropy`, `view_dependence` and `adam`. The stage `target` has none, and neither has density control, which runs on the host.
 //!
 //! In f32 they say what the shaders should have computed; in f64 they are the judge of both: the gradient checks

@@ -1,5 +1,5 @@
-//! The shape of the kernels: what about them is chosen per device. Every kernel works with any of the shapes here and leaves
-//! the same bits with each (`tests/shapes.rs`); only the time differs, and [`calibration`](crate::calibration) measures
+//! The kernel configuration: what is chosen per device. Every kernel works with any of the configurations here and leaves
+//! the same bits with each (`tests/kernel_configs.rs`); only the time differs, and [`autotune`](crate::autotune) measures
 //! which is the fastest.
 
 use crate::constants::{RUNS, SHORT_PART, STRIP};
@@ -9,7 +9,7 @@ use std::fmt;
 /// Sizes of workgroups, by kind of kernel, and who blends a tile. No kernel knows two of the kinds, so that each is chosen
 /// by itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct KernelShape {
+pub struct KernelConfig {
     /// Lanes of a workgroup: plain loops over Gaussians or pixels.
     pub wide: u32,
     /// Lanes of a workgroup: the kernels that sort, count and emit, each lane or workgroup its share of the Gaussians.
@@ -41,7 +41,7 @@ const MEETING_TILES: [u32; 2] = [2, 8];
 /// PCI vendor of VideoCore GPUs (a Raspberry Pi's).
 const BROADCOM: u32 = 0x14e4;
 
-impl KernelShape {
+impl KernelConfig {
     /// What is used where nothing was measured.
     pub fn standard(info: &GpuInfo) -> Self {
         // Software renderers run a workgroup on one core: small groups of tiles balance better there.
@@ -113,7 +113,7 @@ impl KernelShape {
         all
     }
 
-    /// Whether the kernels are written for this shape and the device can run it.
+    /// Whether the kernels are written for this configuration and the device can run it.
     pub fn fits(&self, info: &GpuInfo) -> bool {
         let sizes = WIDE.contains(&self.wide) && NARROW.contains(&self.narrow);
         let runs = match self.tile_lanes {
@@ -140,14 +140,14 @@ impl KernelShape {
 }
 
 /// As `config::kernels::VARIABLE` takes it.
-impl fmt::Display for KernelShape {
+impl fmt::Display for KernelConfig {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part } = self;
         write!(f, "{wide}x{narrow}x{share_lanes}x{tiles}x{tile_lanes}x{fetched}x{summed}x{part}")
     }
 }
 
-/// A number that changes whenever any kernel does: a shape measured with other kernels says nothing about these.
+/// A number that changes whenever any kernel does: a configuration measured with other kernels says nothing about these.
 pub fn kernels_fingerprint() -> u64 {
     crate::kernels::fingerprint()
 }
@@ -182,51 +182,52 @@ mod tests {
     #[test]
     fn candidates_respect_the_limits_and_fill_subgroups() {
         let lavapipe = device(true, 8, 1024);
-        assert_eq!(KernelShape::wide_candidates(&lavapipe), WIDE);
-        assert_eq!(KernelShape::narrow_candidates(&lavapipe), NARROW.map(|n| (n, 1)));
+        assert_eq!(KernelConfig::wide_candidates(&lavapipe), WIDE);
+        assert_eq!(KernelConfig::narrow_candidates(&lavapipe), NARROW.map(|n| (n, 1)));
         let pi5 = device(false, 16, 256);
-        assert_eq!(KernelShape::narrow_candidates(&pi5), [(16, 1), (32, 1), (16, 16), (32, 32)]);
+        assert_eq!(KernelConfig::narrow_candidates(&pi5), [(16, 1), (32, 1), (16, 16), (32, 32)]);
         let turnip = device(false, 128, 1024);
-        assert_eq!(KernelShape::wide_candidates(&turnip), [64, 128, 256]);
-        assert_eq!(KernelShape::narrow_candidates(&turnip), [(32, 1), (32, 32)], "the standard one remains");
-        assert_eq!(KernelShape::wide_candidates(&device(false, 32, 128)), [32, 64, 128]);
+        assert_eq!(KernelConfig::wide_candidates(&turnip), [64, 128, 256]);
+        assert_eq!(KernelConfig::narrow_candidates(&turnip), [(32, 1), (32, 32)], "the standard one remains");
+        assert_eq!(KernelConfig::wide_candidates(&device(false, 32, 128)), [32, 64, 128]);
     }
 
     #[test]
     fn several_lanes_per_tile_fetch_for_each_other_only_where_they_can_read_each_other() {
-        assert_eq!(KernelShape::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1, 1), (16, 1, 1, 1), (32, 1, 1, 1)]);
+        assert_eq!(KernelConfig::tile_candidates(&device(true, 8, 1024)), [(8, 1, 1, 1), (16, 1, 1, 1), (32, 1, 1, 1)]);
         let pi5 = device(false, 16, 256);
         let at_once = [(1, 1), (1, 8), (8, 1), (8, 8)];
         let runs: Vec<_> = [8, 16, 32].into_iter().flat_map(|n| at_once.map(|(f, s)| (n, 8, f, s))).collect();
         let met = [(2, 8, 1, 1), (2, 8, 1, 8)];
-        assert_eq!(KernelShape::tile_candidates(&pi5), [&[(16, 1, 1, 1), (32, 1, 1, 1)], &runs[..], &met].concat());
-        assert_eq!(KernelShape::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1, 1)], &runs[..]].concat());
+        assert_eq!(KernelConfig::tile_candidates(&pi5), [&[(16, 1, 1, 1), (32, 1, 1, 1)], &runs[..], &met].concat());
+        assert_eq!(KernelConfig::tile_candidates(&device(false, 64, 1024)), [&[(32, 1, 1, 1)], &runs[..]].concat());
         // A Raspberry Pi 4: they meet in shared memory.
         let pi4 = GpuInfo { shuffles: false, ..pi5.clone() };
         let meeting = [2, 8].into_iter().flat_map(|n| [1, 8].map(|s| (n, 8, 1, s)));
         let meeting: Vec<_> = [(16, 1, 1, 1), (32, 1, 1, 1)].into_iter().chain(meeting).collect();
-        assert_eq!(KernelShape::tile_candidates(&pi4), meeting);
+        assert_eq!(KernelConfig::tile_candidates(&pi4), meeting);
         let (wide, narrow, share_lanes, tiles, tile_lanes) = (64, 32, 32, 8, 8);
-        let runs = KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched: 8, summed: 1, part: 2 };
+        let runs = KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched: 8, summed: 1, part: 2 };
         assert!(runs.fits(&pi5) && !runs.fits(&pi4));
         assert!(
-            KernelShape { fetched: 1, ..runs }.fits(&pi4) && !KernelShape { fetched: 1, tiles: 16, ..runs }.fits(&pi4)
+            KernelConfig { fetched: 1, ..runs }.fits(&pi4)
+                && !KernelConfig { fetched: 1, tiles: 16, ..runs }.fits(&pi4)
         );
-        let two = KernelShape { fetched: 1, tiles: 2, ..runs };
+        let two = KernelConfig { fetched: 1, tiles: 2, ..runs };
         assert!(two.fits(&pi5) && two.meets(&pi5) && !runs.meets(&pi5));
-        assert!(!KernelShape { tile_lanes: 1, summed: 1, ..two }.fits(&pi5), "too few lanes");
-        assert!(!KernelShape { tile_lanes: 2, ..runs }.fits(&pi5));
-        assert!(!KernelShape { fetched: 2, ..runs }.fits(&pi5));
-        assert!(!KernelShape { summed: 2, ..runs }.fits(&pi5));
-        assert!(!KernelShape { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
-        assert!(!KernelShape { share_lanes: 16, ..runs }.fits(&pi5));
-        assert!(!KernelShape { part: 4, ..runs }.fits(&pi5));
+        assert!(!KernelConfig { tile_lanes: 1, summed: 1, ..two }.fits(&pi5), "too few lanes");
+        assert!(!KernelConfig { tile_lanes: 2, ..runs }.fits(&pi5));
+        assert!(!KernelConfig { fetched: 2, ..runs }.fits(&pi5));
+        assert!(!KernelConfig { summed: 2, ..runs }.fits(&pi5));
+        assert!(!KernelConfig { tile_lanes: 1, ..runs }.fits(&pi5), "nobody to fetch for");
+        assert!(!KernelConfig { share_lanes: 16, ..runs }.fits(&pi5));
+        assert!(!KernelConfig { part: 4, ..runs }.fits(&pi5));
         assert_eq!(runs.to_string(), "64x32x32x8x8x8x1x2");
     }
 
     #[test]
     fn a_gpu_begins_with_a_lane_per_run_and_a_processor_with_one_per_tile() {
-        let lanes = |info: &GpuInfo| (KernelShape::standard(info).tiles, KernelShape::standard(info).tile_lanes);
+        let lanes = |info: &GpuInfo| (KernelConfig::standard(info).tiles, KernelConfig::standard(info).tile_lanes);
         assert_eq!(lanes(&device(false, 16, 256)), (8, RUNS));
         assert_eq!(lanes(&device(false, 4, 256)), (2, RUNS), "no shuffles");
         assert_eq!(lanes(&GpuInfo { shuffles: false, ..device(false, 128, 256) }), (8, RUNS));
@@ -234,9 +235,9 @@ mod tests {
         let no_shuffles = [4, 16, 128].map(|n| GpuInfo { shuffles: false, ..device(false, n, 256) });
         let others = [device(false, 16, 64), device(false, 16, 256), device(true, 8, 1024), device(false, 64, 128)];
         for info in no_shuffles.into_iter().chain(others) {
-            assert!(KernelShape::standard(&info).fits(&info));
-            let listed = KernelShape::tile_candidates(&info);
-            let KernelShape { tiles, tile_lanes, fetched, summed, .. } = KernelShape::standard(&info);
+            assert!(KernelConfig::standard(&info).fits(&info));
+            let listed = KernelConfig::tile_candidates(&info);
+            let KernelConfig { tiles, tile_lanes, fetched, summed, .. } = KernelConfig::standard(&info);
             assert!(listed.contains(&(tiles, tile_lanes, fetched, summed)), "{info:?}");
         }
     }
@@ -245,23 +246,23 @@ mod tests {
     fn sums_over_a_tile_begin_as_the_compiler_of_the_device_spills_least() {
         let of = |vendor: u32, is_integrated: bool| {
             let info = GpuInfo { ids: (vendor, 2), is_integrated, ..device(false, 16, 256) };
-            KernelShape::standard(&info).summed
+            KernelConfig::standard(&info).summed
         };
         let (mali, adreno, nvidia) = (0x13b5, 0x5143, 0x10de);
         assert_eq!([of(mali, true), of(adreno, true), of(BROADCOM, true), of(nvidia, false)], [1, 1, RUNS, RUNS]);
         let pi4 = GpuInfo { ids: (BROADCOM, 2), shuffles: false, ..device(false, 16, 256) };
-        assert_eq!(KernelShape::standard(&pi4).summed, RUNS);
+        assert_eq!(KernelConfig::standard(&pi4).summed, RUNS);
     }
 
     #[test]
     fn every_candidate_fits_and_divides_the_lanes_of_the_loops() {
         for info in [device(true, 8, 1024), device(false, 64, 256), device(false, 4, 128)] {
-            let (wide, narrow) = (KernelShape::wide_candidates(&info), KernelShape::narrow_candidates(&info));
-            let tiles = KernelShape::tile_candidates(&info);
+            let (wide, narrow) = (KernelConfig::wide_candidates(&info), KernelConfig::narrow_candidates(&info));
+            let tiles = KernelConfig::tile_candidates(&info);
             for (wide, (narrow, share_lanes)) in wide.iter().flat_map(|w| narrow.iter().map(|n| (*w, *n))) {
                 assert!(tiles.iter().copied().all(|(tiles, tile_lanes, fetched, summed)| {
                     [2, STRIP].into_iter().all(|part| {
-                        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }.fits(&info)
+                        KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }.fits(&info)
                     })
                 }));
                 for Lanes { sort, loops } in [Lanes::SOFTWARE, Lanes::BOARD, Lanes::CARD] {
@@ -273,9 +274,9 @@ mod tests {
         for (wide, narrow, tiles) in
             [(256, 32, 8), (64, 0, 8), (48, 32, 8), (64, 64, 8), (0, 8, 8), (64, 8, 9), (64, 8, 0), (64, 8, u32::MAX)]
         {
-            let one = KernelShape::standard(&device(true, 8, 128));
-            let shape = KernelShape { wide, narrow, tiles, ..one };
-            assert!(!shape.fits(&info), "{shape}");
+            let one = KernelConfig::standard(&device(true, 8, 128));
+            let config = KernelConfig { wide, narrow, tiles, ..one };
+            assert!(!config.fits(&info), "{config}");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Adam (Kingma & Ba 2015) and lazy Adam updates of Gaussians outside the view: such a one has gradient zero,
 //! its moments decay and its parameters still drift along the first moment. The shaders take k such steps at
-//! once when the Gaussian is next needed; this twin takes them one by one and is the judge of the shortcut.
+//! once when the Gaussian is next needed; this reference takes them one by one and is the judge of the shortcut.
 
 use half::f16;
 

@@ -14,7 +14,7 @@ use super::step::{ViewGradient, backward, forward};
 
 /// A cloud in training.
 #[derive(Clone, Debug)]
-pub struct TwinTrainer<R> {
+pub struct ReferenceTrainer<R> {
     /// The parameters.
     pub cloud: Vec<Gaussian<R>>,
     moments: Vec<[Moments<R>; PARAMETERS]>,
@@ -25,7 +25,7 @@ pub struct TwinTrainer<R> {
     limits: Limits,
 }
 
-impl<R: Real> TwinTrainer<R> {
+impl<R: Real> ReferenceTrainer<R> {
     /// Starts with `cloud`; `extent` is the scene's, metres.
     pub fn new(cloud: Vec<Gaussian<R>>, settings: TrainSettings, extent: f32, limits: Limits) -> Self {
         let moments = vec![[Moments::default(); PARAMETERS]; cloud.len()];

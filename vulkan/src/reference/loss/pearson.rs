@@ -4,7 +4,7 @@
 //! affine change of either map, which is why an uncalibrated prior may be used (paper, L_reg).
 
 use crate::constants::PEARSON_EPSILON;
-use crate::twin::real::Real;
+use crate::reference::real::Real;
 
 /// ρ and its gradient to `depth`; `prior` is scaled to 0…1. With fewer than three usable pixels or a constant map
 /// (variance below 1e-6 of the mean's square, or of 1 for the prior) ρ is 0 and so is the gradient.

@@ -15,13 +15,13 @@ const COPY_GROUPS: u32 = 1 << 10;
 /// What is run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
-    /// `ceiling_copy.comp` over the whole buffer.
+    /// `roofline_copy.comp` over the whole buffer.
     CopyKernel,
     /// `vkCmdCopyBuffer` over the whole buffer.
     CopyCommand,
     /// `vkCmdFillBuffer` over the whole buffer with something else than zeros, which some devices do not move.
     Fill,
-    /// `ceiling_fma.comp`.
+    /// `roofline_fma.comp`.
     Fma { lanes: u32, turns: u32 },
 }
 
@@ -139,8 +139,9 @@ impl Probe {
             made.set = device.allocate_descriptor_sets(&set_allocate).map_err(vulkan("vkAllocateDescriptorSets"))?[0];
             made.texels = gpu.texel_view("source", made.arena.buffer, source, vk::Format::R32G32B32A32_SFLOAT)?;
             made.pipelines[0] =
-                made.pipeline("ceiling_copy", include_bytes!("../../shaders/spirv/ceiling_copy.spv"))?;
-            made.pipelines[1] = made.pipeline("ceiling_fma", include_bytes!("../../shaders/spirv/ceiling_fma.spv"))?;
+                made.pipeline("roofline_copy", include_bytes!("../../shaders/spirv/roofline_copy.spv"))?;
+            made.pipelines[1] =
+                made.pipeline("roofline_fma", include_bytes!("../../shaders/spirv/roofline_fma.spv"))?;
         }
         made.bind();
         made.run(Kind::Fill, 1)?;

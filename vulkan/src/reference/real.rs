@@ -1,4 +1,4 @@
-//! The two number types the twins run in: f32, as the shaders do, and f64, which judges both.
+//! The two number types the references run in: f32, as the shaders do, and f64, which judges both.
 
 use std::fmt::Debug;
 use std::iter::Sum;

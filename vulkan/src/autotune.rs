@@ -1,18 +1,18 @@
-//! Which shape is the fastest on a device: a few training steps of one small scene with each.
+//! Which configuration is the fastest on a device: a few training steps of one small scene with each.
 //!
 //! Timestamps tell the time of one kind of kernel from another's, so that one trial judges one size of each kind at once;
 //! without timestamps each size is tried by itself on the wall clock. The trials take turns, so that whatever else the
 //! machine does meanwhile slows all alike, and each keeps its best time.
 //!
-//! A shape must also compute what the standard one does, to the bit: one whose gradients are others on this device (a
+//! A configuration must also compute what the standard one does, to the bit: one whose gradients are others on this device (a
 //! compiler that contracts or a subgroup that runs otherwise than it says) is left out, however fast it is.
 //!
-//! Every shape's kernels are compiled first, which can take longer than all steps together (lavapipe: seconds per shape),
-//! so the standard shape comes first and no further one is begun once the given time is over.
+//! Every configuration's kernels are compiled first, which can take longer than all steps together (lavapipe: seconds per configuration),
+//! so the standard configuration comes first and no further one is begun once the given time is over.
 
 use crate::gpu::{Gpu, GpuInfo};
+use crate::kernel_config::KernelConfig;
 use crate::kernels::Group;
-use crate::shape::KernelShape;
 use crate::synthetic::{cloud, photo, plain, posed, view};
 use crate::trainer::{TrainError, Trainer};
 use config::plan::{Plan, PlanRequest};
@@ -29,11 +29,11 @@ const REPEATS: usize = 3;
 /// The standard size stays unless another is faster by this share: less is noise.
 const MARGIN: f64 = 0.03;
 
-/// One shape's best times.
+/// One configuration's best times.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trial {
-    /// The shape.
-    pub shape: KernelShape,
+    /// The configuration.
+    pub config: KernelConfig,
     /// Milliseconds per step of its wide, its narrow and its blending kernels (of the whole step, three times, where the
     /// device has no timestamps).
     pub ms: [f64; 3],
@@ -41,42 +41,42 @@ pub struct Trial {
 
 /// What was measured, and what follows from it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Calibration {
-    /// The fastest shape.
-    pub shape: KernelShape,
+pub struct Autotuned {
+    /// The fastest configuration.
+    pub config: KernelConfig,
     /// Every trial.
     pub trials: Vec<Trial>,
-    /// Shapes that compute something else than the standard one here.
-    pub refused: Vec<KernelShape>,
+    /// Configurations that compute something else than the standard one here.
+    pub refused: Vec<KernelConfig>,
     /// Seconds it took.
     pub seconds: f64,
 }
 
-/// Measures `gpu`: the standard shape, and then others for as long as `limit` is not over (all without a limit).
+/// Measures `gpu`: the standard configuration, and then others for as long as `limit` is not over (all without a limit).
 ///
 /// # Errors
 /// [`TrainError::Gpu`]: the device, its driver or its memory.
-pub fn calibrate(gpu: &Gpu, limit: Option<Duration>) -> Result<Calibration, TrainError> {
+pub fn autotune(gpu: &Gpu, limit: Option<Duration>) -> Result<Autotuned, TrainError> {
     let start = Instant::now();
     let timed = gpu.timestamp_ns() > 0.0;
-    let standard = KernelShape::standard(gpu.info());
+    let standard = KernelConfig::standard(gpu.info());
     let (mut trials, mut trainers, mut refused) = (Vec::new(), Vec::new(), Vec::new());
     let mut expected = None;
-    for shape in shapes(&Candidates::of(gpu.info()), standard, timed) {
+    for config in configs(&Candidates::of(gpu.info()), standard, timed) {
         if !trials.is_empty() && limit.is_some_and(|limit| start.elapsed() >= limit) {
             break;
         }
-        let mut trainer = trainer(gpu, shape)?;
+        let mut trainer = trainer(gpu, config)?;
         // The first pass compiles; its time says nothing.
         let mut gradient = GaussianCloud::default();
         trainer.gradient(0, &mut gradient)?;
         if *expected.get_or_insert_with(|| gradient.clone()) != gradient {
-            refused.push(shape);
+            refused.push(config);
             continue;
         }
         step(&mut trainer, timed)?;
         trainers.push(trainer);
-        trials.push(Trial { shape, ms: [f64::MAX; 3] });
+        trials.push(Trial { config, ms: [f64::MAX; 3] });
     }
     for _ in 0..REPEATS {
         for (trainer, trial) in trainers.iter_mut().zip(&mut trials) {
@@ -84,17 +84,17 @@ pub fn calibrate(gpu: &Gpu, limit: Option<Duration>) -> Result<Calibration, Trai
             trial.ms = std::array::from_fn(|k| trial.ms[k].min(ms[k]));
         }
     }
-    let shape = fastest(&trials, standard, timed);
-    Ok(Calibration { shape, trials, refused, seconds: start.elapsed().as_secs_f64() })
+    let config = fastest(&trials, standard, timed);
+    Ok(Autotuned { config, trials, refused, seconds: start.elapsed().as_secs_f64() })
 }
 
-/// Milliseconds of wall clock that the device takes for one small training step with its standard shape: what devices of one
+/// Milliseconds of wall clock that the device takes for one small training step with its standard configuration: what devices of one
 /// computer are compared by.
 ///
 /// # Errors
 /// [`TrainError::Gpu`]: the device, its driver or its memory.
 pub fn step_ms(gpu: &Gpu) -> Result<f64, TrainError> {
-    let mut trainer = trainer(gpu, KernelShape::standard(gpu.info()))?;
+    let mut trainer = trainer(gpu, KernelConfig::standard(gpu.info()))?;
     // The first one compiles.
     trainer.step()?;
     let mut least = f64::INFINITY;
@@ -115,43 +115,43 @@ struct Candidates {
 impl Candidates {
     fn of(info: &GpuInfo) -> Self {
         Self {
-            wide: KernelShape::part_candidates(info)
+            wide: KernelConfig::part_candidates(info)
                 .into_iter()
-                .flat_map(|part| KernelShape::wide_candidates(info).into_iter().map(move |n| (n, part)))
+                .flat_map(|part| KernelConfig::wide_candidates(info).into_iter().map(move |n| (n, part)))
                 .collect(),
-            narrow: KernelShape::narrow_candidates(info),
-            tiles: KernelShape::tile_candidates(info),
+            narrow: KernelConfig::narrow_candidates(info),
+            tiles: KernelConfig::tile_candidates(info),
         }
     }
 }
 
-/// What a shape says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched or pixels held at once, lanes summed
+/// What a configuration says about each kind of kernel: its size, lanes per share or tile, Gaussians fetched or pixels held at once, lanes summed
 /// at once.
 type Sizes = (u32, u32, u32, u32);
 
-fn wide(shape: KernelShape) -> Sizes {
-    (shape.wide, 1, shape.part, 1)
+fn wide(config: KernelConfig) -> Sizes {
+    (config.wide, 1, config.part, 1)
 }
 
-fn narrow(shape: KernelShape) -> Sizes {
-    (shape.narrow, shape.share_lanes, 1, 1)
+fn narrow(config: KernelConfig) -> Sizes {
+    (config.narrow, config.share_lanes, 1, 1)
 }
 
-fn tiles(shape: KernelShape) -> Sizes {
-    (shape.tiles, shape.tile_lanes, shape.fetched, shape.summed)
+fn tiles(config: KernelConfig) -> Sizes {
+    (config.tiles, config.tile_lanes, config.fetched, config.summed)
 }
 
-const KINDS: [fn(KernelShape) -> Sizes; 3] = [wide, narrow, tiles];
+const KINDS: [fn(KernelConfig) -> Sizes; 3] = [wide, narrow, tiles];
 
-/// The shape with these sizes, by kind.
-fn with_sizes([of_wide, of_narrow, of_tiles]: [Sizes; 3]) -> KernelShape {
+/// The configuration with these sizes, by kind.
+fn with_sizes([of_wide, of_narrow, of_tiles]: [Sizes; 3]) -> KernelConfig {
     let ((wide, _, part, _), (narrow, share_lanes, ..), (tiles, tile_lanes, fetched, summed)) =
         (of_wide, of_narrow, of_tiles);
-    KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
+    KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part }
 }
 
-/// The shapes to try, the standard one first.
-fn shapes(all: &Candidates, standard: KernelShape, timed: bool) -> Vec<KernelShape> {
+/// The configurations to try, the standard one first.
+fn configs(all: &Candidates, standard: KernelConfig, timed: bool) -> Vec<KernelConfig> {
     let own = KINDS.map(|kind| kind(standard));
     let listed = [
         all.wide.iter().map(|(n, part)| (*n, 1, *part, 1)).collect::<Vec<_>>(),
@@ -164,26 +164,26 @@ fn shapes(all: &Candidates, standard: KernelShape, timed: bool) -> Vec<KernelSha
         others.sort_by_key(|sizes| std::cmp::Reverse(sizes.1));
         others
     });
-    let mut shapes = vec![standard];
+    let mut configs = vec![standard];
     if timed {
         for i in 0..others.iter().map(Vec::len).max().unwrap_or(0) {
-            shapes.push(with_sizes(std::array::from_fn(|k| others[k].get(i).copied().unwrap_or(own[k]))));
+            configs.push(with_sizes(std::array::from_fn(|k| others[k].get(i).copied().unwrap_or(own[k]))));
         }
     } else {
         for k in (0..3).rev() {
             let but_one = |sizes: &Sizes| with_sizes(std::array::from_fn(|o| if o == k { *sizes } else { own[o] }));
-            shapes.extend(others[k].iter().map(but_one));
+            configs.extend(others[k].iter().map(but_one));
         }
     }
-    shapes
+    configs
 }
 
 /// Each kind's best size. Without timestamps only trials that are standard otherwise judge a kind.
-fn fastest(trials: &[Trial], standard: KernelShape, timed: bool) -> KernelShape {
+fn fastest(trials: &[Trial], standard: KernelConfig, timed: bool) -> KernelConfig {
     with_sizes(std::array::from_fn(|k| {
-        let standard_otherwise = |t: &&Trial| (0..3).all(|o| o == k || KINDS[o](t.shape) == KINDS[o](standard));
+        let standard_otherwise = |t: &&Trial| (0..3).all(|o| o == k || KINDS[o](t.config) == KINDS[o](standard));
         let judges = trials.iter().filter(|t| timed || standard_otherwise(t));
-        least(judges.map(|t| (KINDS[k](t.shape), t.ms[k])), KINDS[k](standard))
+        least(judges.map(|t| (KINDS[k](t.config), t.ms[k])), KINDS[k](standard))
     }))
 }
 
@@ -194,7 +194,7 @@ fn least(times: impl Iterator<Item = (Sizes, f64)>, standard: Sizes) -> Sizes {
 }
 
 /// The scene, loaded.
-fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
+fn trainer(gpu: &Gpu, config: KernelConfig) -> Result<Trainer, TrainError> {
     let v = view(SIDE.0, SIDE.1);
     let mut gaussians = cloud(1, GAUSSIANS, 3);
     // As small against the picture as trained ones are.
@@ -211,7 +211,7 @@ fn trainer(gpu: &Gpu, shape: KernelShape) -> Result<Trainer, TrainError> {
         ..Default::default()
     };
     let plan = Plan::with_capacities(&request, GAUSSIANS, INSTANCES * GAUSSIANS);
-    let mut trainer = Trainer::with_shape(gpu, &plan, &plain(), shape)?;
+    let mut trainer = Trainer::with_config(gpu, &plan, &plain(), config)?;
     trainer.time_every_step();
     trainer.load(&gaussians)?;
     trainer.add_view(&posed(&v, &photo(1, &v)), None)?;
@@ -234,16 +234,16 @@ fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 3], TrainError> {
 mod tests {
     use super::*;
 
-    const STANDARD: KernelShape = with_sizes_of(64, (32, 1), (32, 1, 1, 1));
+    const STANDARD: KernelConfig = with_sizes_of(64, (32, 1), (32, 1, 1, 1));
 
-    const fn with_sizes_of(wide: u32, narrow: (u32, u32), of_tiles: Sizes) -> KernelShape {
+    const fn with_sizes_of(wide: u32, narrow: (u32, u32), of_tiles: Sizes) -> KernelConfig {
         let (tiles, tile_lanes, fetched, summed) = of_tiles;
         let (narrow, share_lanes) = narrow;
-        KernelShape { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part: 8 }
+        KernelConfig { wide, narrow, share_lanes, tiles, tile_lanes, fetched, summed, part: 8 }
     }
 
     fn trial(wide: u32, narrow: (u32, u32), tiles: Sizes, ms: [f64; 3]) -> Trial {
-        Trial { shape: with_sizes_of(wide, narrow, tiles), ms }
+        Trial { config: with_sizes_of(wide, narrow, tiles), ms }
     }
 
     #[test]
@@ -254,7 +254,7 @@ mod tests {
             tiles: vec![(16, 1, 1, 1), (32, 1, 1, 1), (8, 4, 1, 1), (8, 4, 4, 1), (16, 4, 1, 4), (16, 4, 4, 4)],
         };
         for (timed, count) in [(true, 6), (false, 12)] {
-            let tried = shapes(&all, STANDARD, timed);
+            let tried = configs(&all, STANDARD, timed);
             assert_eq!((tried.len(), tried[0]), (count, STANDARD));
             assert!(all.wide.iter().all(|w| tried.iter().any(|s| (s.wide, s.part) == *w)));
             assert!(all.narrow.iter().all(|n| tried.iter().any(|s| (s.narrow, s.share_lanes) == *n)));

@@ -1,7 +1,7 @@
-//! Numbers that broke other renderers, through the twin's whole step: one test per case of `vulkan::cases`.
+//! Numbers that broke other renderers, through the reference's whole step: one test per case of `vulkan::cases`.
 #![allow(clippy::panic, reason = "a test fails by panicking")]
 
-use vulkan::cases::{extremes, half, instances, twin};
+use vulkan::cases::{extremes, half, instances, reference};
 
 macro_rules! held {
     ($module:ident: $($name:ident)*) => {$(
@@ -12,7 +12,7 @@ macro_rules! held {
     )*};
 }
 
-held! { twin:
+held! { reference:
     a_row_with_nan_or_infinity_in_any_slot_is_counted_and_changes_nothing_else
     denormal_and_largest_numbers_in_any_slot_leave_everything_finite
     a_quaternion_of_length_zero_is_not_drawn_and_any_other_length_is_normalised
@@ -31,9 +31,9 @@ held! { twin:
 }
 
 held! { extremes:
-    scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_twin
-    cameras_far_from_the_origin_see_the_same_picture_in_the_twin
-    extreme_learning_rates_are_recovered_from_by_the_twin
+    scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_reference
+    cameras_far_from_the_origin_see_the_same_picture_in_the_reference
+    extreme_learning_rates_are_recovered_from_by_the_reference
 }
 
 held! { half:
@@ -42,8 +42,8 @@ held! { half:
 }
 
 held! { instances:
-    more_tiles_than_instances_leave_the_other_tiles_empty_in_the_twin
-    light_and_contributions_below_sixteen_bits_are_still_summed_in_the_twin
-    a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_twin
-    a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_twin
+    more_tiles_than_instances_leave_the_other_tiles_empty_in_the_reference
+    light_and_contributions_below_sixteen_bits_are_still_summed_in_the_reference
+    a_crowded_tile_leaves_those_behind_opaque_ones_alone_in_the_reference
+    a_gaussian_over_more_tiles_than_sixteen_bits_count_has_its_whole_gradient_in_the_reference
 }

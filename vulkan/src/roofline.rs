@@ -17,12 +17,12 @@ const MEASUREMENTS: usize = 5;
 const FMA_LANES: u32 = 1 << 18;
 /// Turns of its loop; llvmpipe ends an invocation's loops after 65,535.
 const FMA_TURNS: u32 = 64;
-/// Operations per turn and lane: 16 chains × 8 unrolled, a multiply and an addition each (`ceiling_fma.comp`).
+/// Operations per turn and lane: 16 chains × 8 unrolled, a multiply and an addition each (`roofline_fma.comp`).
 const FMA_PER_TURN: u64 = 16 * 8 * 2;
 
 /// Measured rates of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Ceiling {
+pub struct Roofline {
     /// Bytes read plus bytes written per second by a compute kernel that copies.
     pub kernel_bytes_per_s: f64,
     /// The same by the device's own copy command.
@@ -31,7 +31,7 @@ pub struct Ceiling {
     pub operations_per_s: f64,
 }
 
-impl Ceiling {
+impl Roofline {
     /// The larger of the two copying rates.
     pub fn bytes_per_s(&self) -> f64 {
         self.kernel_bytes_per_s.max(self.command_bytes_per_s)
@@ -47,10 +47,10 @@ impl Ceiling {
 ///
 /// # Errors
 /// [`GpuError`], in particular when 128 MiB of device memory cannot be had.
-pub fn measure(gpu: &Gpu) -> Result<Ceiling, GpuError> {
+pub fn measure(gpu: &Gpu) -> Result<Roofline, GpuError> {
     let probe = Probe::new(gpu, BUFFER_BYTES)?;
     let moved = 2 * BUFFER_BYTES;
-    Ok(Ceiling {
+    Ok(Roofline {
         kernel_bytes_per_s: rate(&probe, Kind::CopyKernel, moved)?,
         command_bytes_per_s: rate(&probe, Kind::CopyCommand, moved)?,
         operations_per_s: rate(
@@ -87,7 +87,7 @@ mod tests {
 
     #[test]
     fn the_slower_of_moving_and_computing_decides() {
-        let c = Ceiling { kernel_bytes_per_s: 10.0, command_bytes_per_s: 5.0, operations_per_s: 100.0 };
+        let c = Roofline { kernel_bytes_per_s: 10.0, command_bytes_per_s: 5.0, operations_per_s: 100.0 };
         assert_eq!(c.least_seconds(100, 100), 10.0);
         assert_eq!(c.least_seconds(10, 1000), 10.0);
     }

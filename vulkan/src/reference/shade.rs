@@ -125,8 +125,8 @@ mod tests {
     #[test]
     fn the_basis_is_the_one_that_models_are_stored_in() {
         for at in [[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [-0.48, 0.64, 0.6], [0.36, -0.48, -0.8]] {
-            let (twin, stored) = (super::basis::<f64>(3, at), models::cloud::sh_basis(at));
-            assert!(twin[1..].iter().zip(stored).all(|(a, b)| (a - b).abs() < 1e-12), "{twin:?} {stored:?}");
+            let (reference, stored) = (super::basis::<f64>(3, at), models::cloud::sh_basis(at));
+            assert!(reference[1..].iter().zip(stored).all(|(a, b)| (a - b).abs() < 1e-12), "{reference:?} {stored:?}");
         }
     }
 }
