@@ -255,7 +255,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn every_device_gets_its_own_shape_back() {
+    fn every_device_gets_its_own_configuration_back() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("deep/dgtr/kernels.toml");
         let (a, b) = (device("V3D \"7.1\""), device("llvmpipe"));
@@ -267,7 +267,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn the_step_of_a_device_is_kept_beside_its_shape_until_its_driver_changes() {
+    fn the_step_of_a_device_is_kept_beside_its_configuration_until_its_driver_changes() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("kernels.toml");
         let (a, b) = (device("V3D"), device("llvmpipe"));
