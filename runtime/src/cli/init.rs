@@ -86,7 +86,7 @@ fn asked(args: &Args) -> std::io::Result<Given> {
     let mut terminal = Terminal::new(stdin().lock(), stderr());
     let list = |numbers: &[f64]| numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(",");
     let links: Vec<String> = args.aircraft.iter().map(|(id, link)| format!("{id}={link}")).collect();
-    // Somewhere for a simulator to fly; picture and angle are the README's example.
+    // Somewhere for a simulator to fly; picture and angle are the help's example.
     let origin = args.origin.map_or("47.4,8.5,430".to_owned(), |o| list(&o));
     let picture = args.picture.map_or("4056x3040".to_owned(), |[w, h]| format!("{w}x{h}"));
     let fov = args.fov_deg.unwrap_or(62.0).to_string();

@@ -16,7 +16,7 @@ pub fn text(options: &DemoOptions, [ground, west, east]: [PublicKey; 3]) -> Stri
     let port = free_port();
     let DemoOptions { seconds, seed, .. } = options;
     format!(
-        r#"# Two aircraft side by side over a simulated town; see README.md, "The mission file".
+        r#"# Two aircraft side by side over a simulated town; `dgtr init --reference` explains every setting.
 name = "demo"
 seed = {seed}
 origin = {{ lat_deg = 47.3977, lon_deg = 8.5456, alt_m = 488.0 }}
