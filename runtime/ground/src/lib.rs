@@ -14,7 +14,8 @@ use vulkan::trainer::TrainError;
 
 use store::StoreError;
 
-#[cfg(all(test, feature = "zenoh"))]
+#[cfg(test)]
+#[cfg(feature = "zenoh")]
 #[path = "../../../tests/bad_link.rs"]
 #[allow(dead_code, reason = "all of it is used where links are tested")]
 mod bad_link;
