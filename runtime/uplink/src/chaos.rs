@@ -127,7 +127,7 @@ fn finished(r: &Receiver) -> Vec<String> {
 /// Holds a2's certificate, but not its key: offers rubbish as a2 and as a1, and answers every question about a2 with rubbish.
 fn lie(dir: &Path, port: u16) {
     let settings = settings(dir, "a2", port);
-    let identity = Identity::stranger();
+    let identity = Identity::stranger(&identities(AIRCRAFT)[0]);
     let model = dir.join("rogue.dgtr");
     write_whole(&model, b"x").expect("write");
     let offerers = ["a1", "a2"].map(|id| {

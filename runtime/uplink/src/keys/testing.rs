@@ -12,8 +12,8 @@ pub(crate) fn identities<const N: usize>(ids: [&str; N]) -> Vec<Identity> {
 
 #[cfg(feature = "zenoh")]
 impl Identity {
-    /// Somebody with a key that nobody knows.
-    pub(crate) fn stranger() -> Self {
-        Self { own: Some(SigningKey::from_bytes(&[0xfe; 32])), keys: HashMap::new() }
+    /// Somebody with a key that nobody knows, who knows the mission file and so answers its ground.
+    pub(crate) fn stranger(one: &Self) -> Self {
+        Self { own: Some(SigningKey::from_bytes(&[0xfe; 32])), keys: one.keys.clone() }
     }
 }
