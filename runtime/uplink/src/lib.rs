@@ -15,6 +15,7 @@ pub mod admission;
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
 mod chaos;
+pub mod disk_error;
 pub mod flight_number;
 pub mod folder;
 pub mod keys;

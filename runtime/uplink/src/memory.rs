@@ -8,10 +8,10 @@ use std::sync::{Mutex, PoisonError};
 use config::disk::Disk;
 use serde::{Deserialize, Serialize};
 
+use crate::disk_error::{DiskError, io};
 use crate::folder::read_bounded;
 use crate::keys::random;
 use crate::offer::{Offer, Order, hex};
-use crate::store::{StoreError, io};
 
 /// Bound on the file: a few hundred bytes for each aircraft that a mission may have.
 const LIMIT: u64 = 4 << 20;
@@ -45,7 +45,7 @@ impl Memory {
     ///
     /// # Errors
     /// It cannot be read back or written.
-    pub fn open(state: &Path, mission: &str, received: &Path, again: bool) -> Result<Self, StoreError> {
+    pub fn open(state: &Path, mission: &str, received: &Path, again: bool) -> Result<Self, DiskError> {
         let path = state.join(format!("{mission}.received.json"));
         let read = |p: &Path| {
             let bytes = read_bounded(p, LIMIT).map_err(|e| e.to_string())?;
@@ -75,7 +75,7 @@ impl Memory {
     ///
     /// # Errors
     /// It cannot be written.
-    pub fn note(&self, offer: &Offer, key: &str) -> Result<(), StoreError> {
+    pub fn note(&self, offer: &Offer, key: &str) -> Result<(), DiskError> {
         let Order { flight, counter } = offer.order;
         let now = Last { key: key.into(), flight, counter, session: self.session.clone() };
         {
@@ -88,7 +88,7 @@ impl Memory {
         self.write()
     }
 
-    fn write(&self) -> Result<(), StoreError> {
+    fn write(&self) -> Result<(), DiskError> {
         let Some(path) = &self.path else { return Ok(()) };
         let json = {
             let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
@@ -99,7 +99,7 @@ impl Memory {
 }
 
 /// The name of the session that has `received`: made with it, and the same after a restart.
-fn session_of(received: &Path) -> Result<String, StoreError> {
+fn session_of(received: &Path) -> Result<String, DiskError> {
     let path = received.join("session");
     let there = read_bounded(&path, NAME).ok().and_then(|bytes| String::from_utf8(bytes).ok());
     if let Some(name) = there.filter(|name| name.len() as u64 == NAME) {

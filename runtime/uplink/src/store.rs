@@ -16,6 +16,7 @@ use config::error::{Error, ErrorKind};
 use config::upload::UploadSettings;
 
 use super::admission::{Admission, ModelRefusal};
+use super::disk_error::{DiskError, io};
 use super::folder::{is_hash, read_bounded};
 use super::offer::{Hash, Offer, hex};
 
@@ -39,13 +40,8 @@ pub struct Store {
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// Disk trouble on the ground.
-    #[error("{path}: {source}; is the disk full or read-only?")]
-    Io {
-        /// Where.
-        path: String,
-        /// The system's word on it.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Disk(#[from] DiskError),
     /// A chunk does not have the bytes its name promises.
     #[error("chunk {index} of {aircraft}'s model is corrupt and will be fetched again")]
     Corrupt {
@@ -70,14 +66,10 @@ pub enum StoreError {
 impl Error for StoreError {
     fn kind(&self) -> ErrorKind {
         match self {
-            Self::Io { source, .. } => Error::kind(source),
+            Self::Disk(e) => e.kind(),
             Self::Corrupt { .. } | Self::Refused { .. } | Self::WrongWhole(_) => ErrorKind::Failed,
         }
     }
-}
-
-pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> StoreError + '_ {
-    move |source| StoreError::Io { path: path.display().to_string(), source }
 }
 
 /// The chunks of a model and their places in it: start and length.
@@ -176,7 +168,7 @@ impl Store {
     /// The disk.
     pub fn put(&self, offer: &Offer, index: usize, bytes: &[u8]) -> Result<(), StoreError> {
         let path = self.chunk_path(&offer.chunks[index]);
-        self.disk.replace(&path, |out| out.write_all(bytes)).map_err(|e| io(&path)(e.into()))
+        self.disk.replace(&path, |out| out.write_all(bytes)).map_err(|e| io(&path)(e.into()).into())
     }
 
     /// Writes what has come of a model in cells, up to the first chunk that is missing, as [`Self::preview_path`]: something to look at
@@ -266,7 +258,7 @@ impl Store {
 
     fn write_note(&self, name: &str, offer: &Offer) -> Result<(), StoreError> {
         let note = self.dir.join(name);
-        self.disk.replace(&note, |out| out.write_all(&offer.encode())).map_err(|e| io(&note)(e.into()))
+        self.disk.replace(&note, |out| out.write_all(&offer.encode())).map_err(|e| io(&note)(e.into()).into())
     }
 
     /// Removes chunks that belong to no model being fetched, and the preview of the one that was.

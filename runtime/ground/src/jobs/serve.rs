@@ -141,7 +141,7 @@ fn admission(mission: &Mission, received: &Path) -> Result<Admission, UploadErro
     let (state, again) = (config::state::folder(&mission.upload.keys), mission.upload.again);
     let memory = match Memory::open(&state, &mission.name, received, again) {
         Ok(memory) => memory,
-        Err(e) if identity.is_signed() => return Err(e.into()),
+        Err(e) if identity.is_signed() => return Err(uplink::store::StoreError::from(e).into()),
         Err(e) => {
             tracing::warn!("serve: {e}; models that this session receives are not known to later ones");
             Memory::default()

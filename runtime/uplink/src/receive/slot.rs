@@ -277,7 +277,7 @@ impl Slot {
                 return self.refuse(&offer, why.to_string(), &from, link);
             }
             Err(e) => {
-                done.counters.corrupt += u64::from(!matches!(e, StoreError::Io { .. }));
+                done.counters.corrupt += u64::from(!matches!(e, StoreError::Disk(_)));
                 if matches!(e, StoreError::WrongWhole(_)) {
                     done.refusals.count(e.to_string());
                     remember(&mut self.refused_offers, offer.digest());
@@ -339,7 +339,7 @@ impl Slot {
         self.target = None;
         self.failures = 0;
         let Admission { identity, memory, .. } = &link.admission;
-        memory.note(offer, &identity.key_of(&self.id))?;
+        memory.note(offer, &identity.key_of(&self.id)).map_err(StoreError::from)?;
         self.deliver_receipt(offer, Verdict::Received, from, link)?;
         self.confirmed = Some(offer.digest());
         Ok(())
@@ -383,7 +383,7 @@ impl From<TransportError> for Setback {
 impl From<StoreError> for Setback {
     fn from(e: StoreError) -> Self {
         match e {
-            StoreError::Io { .. } => Self::Disk(e),
+            StoreError::Disk(_) => Self::Disk(e),
             other => Self::Again(other.to_string()),
         }
     }
