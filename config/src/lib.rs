@@ -1,20 +1,15 @@
-//! What every part of `dgtr` must agree on before the first frame: the mission file, presets, geodesy and
-//! the fixed memory plan. Depends on nothing else of the project.
+//! What every part of `dgtr` must agree on before the first frame: the mission file, presets and the fixed memory plan.
 //!
-//! Without the `std` feature only [`error`] and [`geodesy`] remain; the `no_std` core of `hal` uses it.
+//! Without the `std` feature only [`error`] remains; the `no_std` core of `hal` uses it.
 #![cfg_attr(not(feature = "std"), no_std)]
 
 #[cfg(feature = "std")]
 pub mod coverage;
-#[cfg(feature = "std")]
-pub mod disk;
 pub mod error;
 #[cfg(feature = "std")]
 pub mod failsafe;
 #[cfg(feature = "std")]
 pub mod faults;
-pub mod geodesy;
-
 #[cfg(feature = "std")]
 pub mod ground;
 #[cfg(feature = "std")]
@@ -25,8 +20,6 @@ pub mod init;
 pub mod kernels;
 #[cfg(feature = "std")]
 pub mod keys;
-#[cfg(feature = "std")]
-pub mod lens;
 #[cfg(feature = "std")]
 pub mod link;
 #[cfg(feature = "std")]

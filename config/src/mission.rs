@@ -11,7 +11,6 @@ use std::path::{Path, PathBuf};
 use crate::coverage::CoverageSettings;
 use crate::failsafe::FailsafeSettings;
 use crate::faults::FaultSettings;
-use crate::geodesy::{EnuFrame, Geodetic};
 use crate::ground::GroundSettings;
 use crate::http::HttpSettings;
 use crate::init::InitSettings;
@@ -23,6 +22,7 @@ use crate::refine::RefineSettings;
 use crate::settings::{Limits, SettingError, record, table};
 use crate::training::TrainSettings;
 use crate::upload::UploadSettings;
+use geometry::geodesy::{EnuFrame, Geodetic};
 
 mod camera;
 mod draft;

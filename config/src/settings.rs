@@ -227,7 +227,13 @@ macro_rules! described {
                 }),+]
             }
         }
+    };
+}
+pub(crate) use described;
 
+/// A check that callers need no trait for.
+macro_rules! checked {
+    ($name:ident) => {
         impl $name {
             /// Checks every setting.
             ///
@@ -239,7 +245,7 @@ macro_rules! described {
         }
     };
 }
-pub(crate) use described;
+pub(crate) use checked;
 
 /// A table of the mission file, every setting of which has a default:
 /// `pub name: type = default, in limits, unit "unit", from "source";` with its documentation, of which only the default must be
@@ -266,6 +272,7 @@ macro_rules! table {
         $crate::settings::described!($name {
             $([concat!($($doc),+)] $field: $type = $default $(, in $limits)? $(, unit $unit)? $(, from $source)?;)+
         } $($also)?);
+        $crate::settings::checked!($name);
     };
 }
 pub(crate) use table;
@@ -288,6 +295,7 @@ macro_rules! record {
         $crate::settings::described!($name {
             $([concat!($($doc),+)] $field: $type $(= $default)? $(, in $limits)? $(, unit $unit)? $(, from $source)?;)+
         } $($also)?);
+        $crate::settings::checked!($name);
     };
 }
 pub(crate) use record;

@@ -3,13 +3,13 @@
 
 use std::path::Path;
 
-use config::disk::plan::{DiskPlan, DiskRequest};
 use config::init::InitSettings;
 use config::mission::{KeyframeSettings, Mission, NetworkSettings};
 use config::plan::{Plan, PlanRequest};
 use config::refine::RefineSettings;
 use config::settings::SettingError;
 use config::training::TrainSettings;
+use disk::plan::{DiskPlan, DiskRequest};
 use serde::Deserialize;
 
 #[path = "../../tests/readers/driver.rs"]
@@ -148,7 +148,7 @@ fn files_of_settings() {
 #[test]
 fn files_of_lines() {
     let folder = memory_folder();
-    let disk = config::disk::Disk::default();
+    let disk = disk::Disk::default();
     let path = folder.path().join("lines.csv");
     survive(&Reader {
         name: "lines",

@@ -3,7 +3,7 @@
 pub mod ring;
 pub mod track;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::{DQuat, DVec3};
 
 /// A pose of the body at one instant.

@@ -21,7 +21,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::DVec2;
 
 pub use error::SimError;

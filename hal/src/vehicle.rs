@@ -11,7 +11,7 @@ mod settings;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use config::geodesy::EnuFrame;
+use geometry::geodesy::EnuFrame;
 
 pub use event::{CameraPose, Event, PoseReport, PosedPicture, Unmatched, UnmatchedReason};
 pub use settings::VehicleSettings;

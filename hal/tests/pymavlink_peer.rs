@@ -7,9 +7,9 @@ use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use config::geodesy::Geodetic;
 use config::link::{LinkSettings, Signing};
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
+use geometry::geodesy::Geodetic;
 use hal::link::LinkAddress;
 use hal::mavlink::dialect::MavSeverity;
 use hal::vehicle::{Event, Vehicle, VehicleSettings};

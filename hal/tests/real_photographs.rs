@@ -7,9 +7,9 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use config::geodesy::{EnuFrame, Geodetic};
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, CameraSource, MountAttitude, MountSettings};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use hal::link::{LinkAddress, PtyLink};
 use hal::mavlink::Signer;
 use hal::mavlink::channel::Channel;

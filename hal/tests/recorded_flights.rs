@@ -6,9 +6,9 @@ use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use config::geodesy::{EnuFrame, Geodetic};
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 use hal::camera::Picture;
 use hal::counters::HalCounters;

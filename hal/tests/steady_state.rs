@@ -6,9 +6,9 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
+use geometry::geodesy::Geodetic;
 use hal::link::{LinkAddress, SerialLink, TlogLink};
 use hal::mavlink::Encoder;
 use hal::mavlink::dialect::{

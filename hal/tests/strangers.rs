@@ -8,9 +8,9 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
+use geometry::geodesy::Geodetic;
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::error::HalError;

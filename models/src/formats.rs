@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
-use config::disk::{Disk, DiskError};
 use config::error::{Error, ErrorKind};
+use disk::{Disk, DiskError};
 
 pub mod colmap;
 pub mod delivery;
@@ -86,11 +86,13 @@ impl Error for FormatError {
 }
 
 impl FormatError {
-    pub(crate) fn invalid(path: &Path, what: impl Into<String>) -> Self {
+    /// Content of `path` that makes no sense: what, where and how to mend.
+    pub fn invalid(path: &Path, what: impl Into<String>) -> Self {
         Self::Invalid { path: path.to_owned(), what: what.into() }
     }
 
-    pub(crate) fn io(path: &Path, action: &'static str, source: std::io::Error) -> Self {
+    /// What the operating system said to `action` on `path`.
+    pub fn io(path: &Path, action: &'static str, source: std::io::Error) -> Self {
         Self::Io { path: path.to_owned(), action, source }
     }
 
@@ -101,7 +103,7 @@ impl FormatError {
 
     /// Whether it is the disk's fault and room or a medium that comes back may mend it.
     pub fn may_pass(&self) -> bool {
-        matches!(self, Self::Io { source, .. } if config::disk::may_pass(source))
+        matches!(self, Self::Io { source, .. } if disk::may_pass(source))
     }
 
     /// The file the error is about.
@@ -137,7 +139,7 @@ pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
 }
 
 /// What another library says, on one line: decoders' and ONNX Runtime's messages span several.
-pub(crate) fn one_line(error: impl std::fmt::Display) -> String {
+pub fn one_line(error: impl std::fmt::Display) -> String {
     error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
 }
 

@@ -7,10 +7,7 @@
 pub mod align;
 pub mod baselines;
 pub mod camera;
-pub mod card;
 pub mod cloud;
-pub mod coverage;
-pub mod dataset;
 pub mod formats;
 mod frame_file;
 pub mod ground_cell;
@@ -20,7 +17,6 @@ pub mod light;
 pub mod metrics;
 mod morton;
 pub mod onnx;
-pub mod ortho;
 pub mod picture;
 pub mod refine;
 pub mod undistort;

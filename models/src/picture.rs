@@ -7,13 +7,13 @@
 
 pub mod crops;
 pub mod mask;
-pub(crate) mod tiff;
+pub mod tiff;
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use config::lens::Distortion;
+use geometry::lens::Distortion;
 use glam::DQuat;
 use image::{DynamicImage, ImageReader, Limits, RgbImage, imageops};
 use jpeg_decoder::{Decoder, PixelFormat};

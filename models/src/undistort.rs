@@ -1,6 +1,6 @@
 //! Lens distortion is taken out of a data set's pictures once, when they are read.
 
-use config::lens::{Distortion, Lens, Pixels};
+use geometry::lens::{Distortion, Lens, Pixels};
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 

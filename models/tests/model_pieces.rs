@@ -10,7 +10,7 @@ mod peak_allocator;
 use std::io;
 use std::path::Path;
 
-use config::disk::{Disk, previous};
+use disk::{Disk, previous};
 use models::cloud::GaussianCloud;
 use models::formats::FormatError;
 use models::formats::model::{

@@ -1,8 +1,6 @@
 //! Every reader of `models` against broken files.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
-#[path = "readers/cards.rs"]
-mod cards;
 #[path = "readers/clouds.rs"]
 mod clouds;
 #[path = "readers/colmap.rs"]

@@ -3,13 +3,13 @@
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
-use config::lens::Distortion;
+use geometry::geodesy::Geodetic;
+use geometry::lens::Distortion;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose};
-use models::dataset::Dataset;
 use models::formats::reconstruction::{CAMERA_MODELS, CameraModel, LensDescription, Reconstruction, Shot};
 use models::formats::{colmap, mega_nerf, opensfm, transforms};
+use survey::dataset::Dataset;
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 158.5 };
 

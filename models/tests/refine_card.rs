@@ -9,10 +9,10 @@ use std::ops::ControlFlow;
 use config::refine::RefineSettings;
 use glam::DQuat;
 use models::camera::Pose;
-use models::card::CardOptions;
-use models::dataset::{Dataset, PoseSource};
 use models::refine::{RefineReport, Refiner};
 use pose_errors::pose_errors;
+use survey::card::CardOptions;
+use survey::dataset::{Dataset, PoseSource};
 
 #[path = "support/pose_errors.rs"]
 mod pose_errors;

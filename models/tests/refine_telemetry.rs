@@ -5,10 +5,10 @@
 
 use config::refine::RefineSettings;
 use models::camera::Pose;
-use models::dataset::{Dataset, PoseSource};
 use models::refine::{RefineReport, Refiner};
 use pose_errors::{PoseErrors, pose_errors};
 use std::time::Instant;
+use survey::dataset::{Dataset, PoseSource};
 
 #[path = "support/pose_errors.rs"]
 mod pose_errors;

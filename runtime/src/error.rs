@@ -7,12 +7,12 @@ use config::mission::MissionError;
 use config::plan::PlanError;
 use hal::error::HalError;
 use job::interrupt::InterruptError;
-use models::dataset::DatasetError;
 use models::formats::FormatError;
 use models::init::InitError;
 use models::onnx::OnnxError;
-use models::ortho::OrthoError;
 use models::refine::RefineError;
+use survey::dataset::DatasetError;
+use survey::ortho::OrthoError;
 use vulkan::gpu::GpuError;
 use vulkan::trainer::TrainError;
 

@@ -6,12 +6,12 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use config::coverage::CoverageSettings;
-use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
 use config::mission::{DEVICE_MIB, KeyframeSettings, NetworkSettings};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use disk::Disk;
 use engine::device::DeviceRequest;
 use engine::evaluate::{self, IntoModel};
 use engine::failsafe::Failsafe;
@@ -24,11 +24,11 @@ use job::console::Progress;
 use job::health::Health;
 use job::interrupt::Interrupt;
 use job::run_json::RunReport;
-use models::card::CardOptions;
-use models::dataset::{Dataset, PoseSource};
 use models::formats::delivery::Rounding;
 use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
+use survey::card::CardOptions;
+use survey::dataset::{Dataset, PoseSource};
 use vulkan::trainer::RunBudget;
 
 use crate::error::JobError;

@@ -132,13 +132,13 @@ fn the_reference_of_settings_needs_no_other_argument() {
 fn a_plan_is_flown_by_the_simulator_with_a_picture_at_each_waypoint() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
-    let origin = config::geodesy::Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
+    let origin = geometry::geodesy::Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
     let mission = "name = \"m\"\norigin = { lat_deg = 46.0, lon_deg = 7.0, alt_m = 500.0 }\n\
                    camera = { width = 32, height = 24, fx = 30.0, fy = 30.0, cx = 16.0, cy = 12.0 }\n\
                    [[aircraft]]\nid = \"one\"\nlink = \"tcpin:1\"\ncamera = { folder = \"c\" }\n\
                    region_enu = [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]\n";
     std::fs::write(path("m.toml"), mission).unwrap();
-    let frame = config::geodesy::EnuFrame::new(origin);
+    let frame = geometry::geodesy::EnuFrame::new(origin);
     let places = [DVec3::new(0.0, 0.0, 35.0), DVec3::new(30.0, 0.0, 35.0), DVec3::new(30.0, 25.0, 45.0)];
     let waypoint = |p: &DVec3| Waypoint { position: frame.to_geodetic(*p), yaw_deg: None, picture: true };
     let waypoints = places.iter().map(waypoint).collect();
@@ -199,7 +199,7 @@ fn export_and_import_give_the_model_back() {
     let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
     let mut cloud = GaussianCloud::with_capacity(1, 1);
     cloud.push([1.0, 2.0, 3.0], [-1.0; 3], [1.0, 0.0, 0.0, 0.0], 0.5, &[0.1; 12]);
-    let origin = Some(config::geodesy::Geodetic { lat_deg: 46.5, lon_deg: 7.25, alt_m: 500.125 });
+    let origin = Some(geometry::geodesy::Geodetic { lat_deg: 46.5, lon_deg: 7.25, alt_m: 500.125 });
     model::write(&dir.path().join("m.dgtr"), &ModelHeader { origin, ..Default::default() }, &cloud).unwrap();
     assert!(dgtr(&["export", &path("m.dgtr"), "--to", "ply"]).status.success());
     assert!(dgtr(&["import", &path("m.ply"), "--out", &path("back.dgtr")]).status.success());

@@ -7,7 +7,7 @@ mod peak_allocator;
 
 use std::sync::PoisonError;
 
-use config::disk::Disk;
+use disk::Disk;
 use engine::device::{file_renderer, renderer};
 use engine::ortho::{Map, MapRequest};
 use glam::{DQuat, DVec3};
@@ -15,8 +15,8 @@ use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::delivery::Rounding;
 use models::formats::model::{self, Chunks, ModelHeader, piece_bytes};
-use models::ortho::extent::SAMPLE;
 use peak_allocator::peak_of;
+use survey::ortho::extent::SAMPLE;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{Rendering, Trainer};
 

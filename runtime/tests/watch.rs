@@ -6,7 +6,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use pages::report::{Craft, ReportData};
 use pages::watch::{Server, Token, Watch, parse};
 

@@ -10,7 +10,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use config::disk::{Operations, Output, System};
+use disk::{Operations, Output, System};
 
 pub mod states;
 

@@ -9,9 +9,9 @@ mod support;
 use std::path::Path;
 
 use image::imageops::{FilterType, resize};
-use models::dataset::Dataset;
 use models::formats::model;
 use support::run;
+use survey::dataset::Dataset;
 
 /// Half of the pictures' size: enough to see light by, and quick.
 const SIZE: (u32, u32) = (320, 240);

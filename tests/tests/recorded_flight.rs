@@ -9,7 +9,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 use hal::mavlink::MessageData;
 use hal::mavlink::dialect::SIM_STATE_DATA;
@@ -17,10 +17,10 @@ use hal::replay::Recording;
 use hal::sim::axes::camera_to_enu;
 use hal::sim::reference::Lens;
 use hal::sim::world::{World, WorldSettings};
-use models::dataset::Dataset;
 use models::metrics::psnr;
 use support::hub::Hub;
 use support::{Running, run, wait_until};
+use survey::dataset::Dataset;
 
 #[path = "../shared_data.rs"]
 mod shared_data;

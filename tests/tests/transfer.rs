@@ -4,8 +4,8 @@
 
 use engine::transfer::PoseTransfer;
 use models::camera::View;
-use models::dataset::{Dataset, PoseSource};
 use models::refine::Refiner;
+use survey::dataset::{Dataset, PoseSource};
 
 #[path = "../shared_data.rs"]
 mod shared_data;

@@ -54,7 +54,7 @@ fn model(path: &Path) {
         let rotation = DQuat::from_mat3(&DMat3::from_cols(x, y, z));
         (name.to_owned(), View { intrinsics, pose: Pose { rotation, center: DVec3::from_array(center) } })
     });
-    let origin = Some(config::geodesy::Geodetic { lat_deg: 53.38, lon_deg: -1.47, alt_m: 80.0 });
+    let origin = Some(geometry::geodesy::Geodetic { lat_deg: 53.38, lon_deg: -1.47, alt_m: 80.0 });
     let header = ModelHeader { mission: "<lawn> & tower".into(), origin, views: views.into(), ..Default::default() };
     model::write(path, &header, &cloud).expect("a model");
 }

@@ -2,9 +2,9 @@
 //! `cargo run --release -p vulkan --example fit -- DATASET [steps] [max_gaussians] [growth]`
 use config::plan::{Plan, PlanRequest};
 use config::training::{Strategy, TrainSettings};
-use models::dataset::Dataset;
 use std::ops::ControlFlow;
 use std::path::Path;
+use survey::dataset::Dataset;
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{Rendering, RunBudget, Trainer};
 

@@ -3,10 +3,10 @@
 
 use super::Mission;
 use super::reference::{comment, explain};
-use crate::geodesy::Geodetic;
 use crate::plan::WORKING_SIDE;
 use crate::preset::Preset;
 use crate::settings::{Setting, Value};
+use geometry::geodesy::Geodetic;
 
 /// What a mission needs to know from its author.
 #[derive(Clone, Debug)]

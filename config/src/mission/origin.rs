@@ -1,7 +1,7 @@
 //! `origin`: where the local East-North-Up frame lies. The type is shared with the `no_std` core, hence described here.
 
-use crate::geodesy::Geodetic;
 use crate::settings::{Limits, described};
+use geometry::geodesy::Geodetic;
 
 described!(Geodetic {
     ["Latitude, north positive."] lat_deg: f64, in Limits::within(-90.0, 90.0);

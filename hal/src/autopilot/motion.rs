@@ -1,7 +1,7 @@
 //! Position and attitude messages into the track: units, frames, which of several sources is believed, and what is too
 //! wild to be true.
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::{Autopilot, Handled};

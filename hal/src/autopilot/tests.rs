@@ -1,6 +1,6 @@
 //! What autopilots really send, message by message.
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::*;

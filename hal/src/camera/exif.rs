@@ -4,8 +4,8 @@
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use config::geodesy::Geodetic;
 use exif::{DateTime, Exif, In, Reader, Tag, Value};
+use geometry::geodesy::Geodetic;
 use glam::DQuat;
 
 use super::regular;

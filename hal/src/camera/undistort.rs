@@ -1,8 +1,8 @@
 //! Undistortion on ingest: everything behind the HAL sees a pinhole camera, with the mission's own focal lengths and
 //! principal point.
 
-use config::lens::{Distortion, Lens, Pixels};
 use config::mission::CameraSettings;
+use geometry::lens::{Distortion, Lens, Pixels};
 use image::RgbImage;
 use rayon::prelude::*;
 

@@ -6,8 +6,8 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use config::disk::Disk;
 use config::link::{LinkSettings, Signing};
+use disk::Disk;
 
 use super::signing::{Signer, SigningMode, timestamp_of_unix_us};
 use crate::error::HalError;

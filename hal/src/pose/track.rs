@@ -1,7 +1,7 @@
 //! The recent track of the aircraft: positions, attitudes and gimbal angles as they were sent, each in its own ring, and
 //! the pose at any instant between them. It never extrapolates silently.
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::{DQuat, DVec3};
 
 use super::ring::{Around, Ring, Stamped};
@@ -195,7 +195,7 @@ impl Track {
 
 /// A geodetic position moved by a few metres.
 pub(crate) fn moved(position: Geodetic, enu: DVec3) -> Geodetic {
-    config::geodesy::EnuFrame::new(position).to_geodetic(enu)
+    geometry::geodesy::EnuFrame::new(position).to_geodetic(enu)
 }
 
 impl PoseSource for Track {
@@ -239,7 +239,7 @@ mod tests {
         let track = track();
         let start = track.pose_at(S).expect("a sample");
         let pose = track.pose_at(S + S / 2 + S / 20).expect("between samples");
-        let way = config::geodesy::EnuFrame::new(start.position).to_enu(pose.position);
+        let way = geometry::geodesy::EnuFrame::new(start.position).to_enu(pose.position);
         assert!((way - DVec3::new(8.0 * 0.55, 0.0, 0.0)).length() < 1e-3, "{way}");
         // Yaw 0.025 rad east of north: the nose leans east.
         assert!((pose.attitude * DVec3::X - DVec3::new(0.025, 1.0, 0.0)).length() < 1e-3);
@@ -252,7 +252,7 @@ mod tests {
         assert_eq!(track.pose_at(2 * S + 1), Err(PoseError::NotYet));
         let near = track.pose_near(2 * S + S / 10).expect("100 ms beyond");
         let newest = track.pose_at(2 * S).expect("newest");
-        let way = config::geodesy::EnuFrame::new(newest.position).to_enu(near.position);
+        let way = geometry::geodesy::EnuFrame::new(newest.position).to_enu(near.position);
         assert!((way.x - 0.8).abs() < 1e-6 && near.position_sigma_m.x > newest.position_sigma_m.x);
         assert_eq!(track.pose_near(2 * S + S / 2), Err(PoseError::NotYet));
         assert_eq!(track.pose_at(S - 1), Err(PoseError::TooOld));

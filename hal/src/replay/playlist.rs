@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::ReplaySettings;

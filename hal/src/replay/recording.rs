@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DQuat;
 
 use crate::frames::{euler_to_ned, yaw_of_ned};

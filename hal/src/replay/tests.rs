@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use config::geodesy::{EnuFrame, Geodetic};
 use config::link::LinkSettings;
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::*;

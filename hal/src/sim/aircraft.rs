@@ -1,7 +1,7 @@
 //! A multirotor flying a survey, computed before take-off: what really happened (truth) and what its sensors make
 //! of it (reported). Wind, gimbal, GPS and shutter are wrong in the ways real ones are; all of it follows from the seed.
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::{DQuat, DVec2, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;

@@ -9,9 +9,9 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
 use config::faults::FaultSettings;
-use config::geodesy::{EnuFrame, Geodetic};
 use config::link::LinkSettings;
 use config::mission::MountSettings;
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DQuat;
 
 use super::SimError;

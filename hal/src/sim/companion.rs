@@ -4,9 +4,9 @@ use std::path::Path;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, CameraSource, MountSettings};
+use geometry::geodesy::Geodetic;
 
 use crate::counters::HalCounters;
 use crate::link::LinkAddress;

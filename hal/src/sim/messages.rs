@@ -1,6 +1,6 @@
 //! What an ArduPilot says about its state, message by message, in its units.
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::track::Sample;

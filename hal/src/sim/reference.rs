@@ -5,7 +5,7 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 

@@ -6,7 +6,7 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use config::faults::FaultSettings;
-use config::geodesy::EnuFrame;
+use geometry::geodesy::EnuFrame;
 use glam::DVec3;
 
 use super::*;

@@ -1,7 +1,7 @@
 //! From the body's pose to the camera's: gimbal or fixed mount, lever arm, and the uncertainty turned into the camera's axes.
 
-use config::geodesy::EnuFrame;
 use config::mission::{MountAttitude, MountSettings};
+use geometry::geodesy::EnuFrame;
 use glam::{DMat3, DQuat, DVec3};
 
 use super::{CameraPose, PoseReport};
@@ -112,7 +112,7 @@ impl Mount {
 mod tests {
     use super::*;
     use crate::frames::{attitude_to_enu, euler_to_ned};
-    use config::geodesy::Geodetic;
+    use geometry::geodesy::Geodetic;
 
     #[test]
     fn lever_arm_and_uncertainty_turn_with_the_airframe() {

@@ -1,7 +1,7 @@
 //! What a vehicle does besides listening: heartbeats, TIMESYNC, STATUSTEXT, the MAVLink camera's answers, and the signing
 //! time stamp.
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 
 use super::{CameraPose, Event, Vehicle, VehicleSettings};
 use crate::camera::Picture;

@@ -3,9 +3,9 @@
 use std::time::SystemTime;
 
 use config::failsafe::FailsafeSettings;
-use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission, MountSettings};
+use geometry::geodesy::Geodetic;
 
 use crate::error::HalError;
 use crate::link::LinkAddress;

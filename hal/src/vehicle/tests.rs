@@ -4,11 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountSettings};
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value};
+use geometry::geodesy::Geodetic;
 
 use super::*;
 use crate::camera::FolderCamera;

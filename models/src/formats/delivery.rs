@@ -217,7 +217,7 @@ fn code(
     let opacities = shape::opacities(coder, &shape, &neighbours, &scales, opacities.as_deref())?;
 
     let mut importance: Vec<f64> = (0..n).map(|i| shape.importance(scales[i], opacities[i])).collect();
-    let middle = predict::median(importance.clone());
+    let middle = geometry::median(&mut importance.clone()).unwrap_or(0.0);
     importance.iter_mut().for_each(|v| *v -= middle);
     let coefficients = crate::cloud::sh_coefficients(sh_degree) - 1;
     let weights: Vec<f64> = given.map_or_else(Vec::new, |_| importance.iter().map(|v| v.exp2()).collect());

@@ -5,7 +5,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use serde::Deserialize;
 use serde_json::{Value, json};
 

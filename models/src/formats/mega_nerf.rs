@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use config::lens::Distortion;
+use geometry::lens::Distortion;
 use glam::{DMat3, DQuat, DVec3};
 
 use super::FormatError;

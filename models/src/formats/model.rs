@@ -21,8 +21,8 @@
 use std::io::Write;
 use std::path::Path;
 
-use config::disk::Disk;
-use config::geodesy::Geodetic;
+use disk::Disk;
+use geometry::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
 use super::delivery::{self, Form, Rounding};

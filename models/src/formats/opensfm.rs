@@ -7,8 +7,8 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use config::geodesy::Geodetic;
-use config::lens::Distortion;
+use geometry::geodesy::Geodetic;
+use geometry::lens::Distortion;
 use glam::{DQuat, DVec3};
 use serde::Deserialize;
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 
 use super::{FormatError, write_atomic};
 use crate::cloud::{GaussianCloud, sh_coefficients};

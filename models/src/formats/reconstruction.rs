@@ -3,8 +3,8 @@
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
-use config::lens::{Distortion, Lens};
+use geometry::geodesy::Geodetic;
+use geometry::lens::{Distortion, Lens};
 
 use super::FormatError;
 use crate::camera::{Intrinsics, Pose};
@@ -88,7 +88,7 @@ impl LensDescription {
     }
 
     /// What is impossible about it, in a few words.
-    pub(crate) fn fault(&self) -> Option<&'static str> {
+    pub fn fault(&self) -> Option<&'static str> {
         let d = &self.distortion;
         let terms = [d.k1, d.k2, d.k3, d.k4, d.p1, d.p2, d.q1, d.q2, d.q3, d.sx1, d.sy1];
         match self.focal {

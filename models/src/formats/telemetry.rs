@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::{FormatError, read_bounded};

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use config::lens::Distortion;
+use geometry::lens::Distortion;
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 use serde_json::{Value, json};

@@ -1,6 +1,7 @@
 //! The ground as a plane through the sparse points of the whole flight: what bounds the depths of a picture that few
 //! points happen to lie in. Only from above and only where a plane describes the scene; elsewhere it has no opinion.
 
+use geometry::median;
 use glam::{DVec3, Vec3};
 use nalgebra::{Matrix3, Vector3};
 
@@ -39,14 +40,14 @@ impl Ground {
         let mut plane = Vector3::new(0.0, 0.0, 0.0);
         // The first scale is the spread of the heights themselves: the median deviation from their median.
         let mut heights: Vec<f64> = points.iter().map(|p| f64::from(p.z) - middle.z).collect();
-        plane[0] = median(&mut heights);
+        plane[0] = median(&mut heights)?;
         for _ in 0..ROUNDS {
             let residual = |p: &Vec3| {
                 let d = p.as_dvec3() - middle;
                 (Vector3::new(1.0, d.x, d.y), d.z - plane.dot(&Vector3::new(1.0, d.x, d.y)))
             };
             let mut sizes: Vec<f64> = points.iter().map(|p| residual(p).1.abs()).collect();
-            let scale = median(&mut sizes).max(1e-3);
+            let scale = median(&mut sizes)?.max(1e-3);
             let (mut a, mut b) = (Matrix3::zeros(), Vector3::zeros());
             for p in points {
                 let (x, r) = residual(p);
@@ -95,11 +96,6 @@ impl Ground {
         }
         (near > 0.0).then_some([near as f32, far as f32])
     }
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 #[cfg(test)]

@@ -103,7 +103,7 @@ impl Mask {
 }
 
 /// Places within a pixel at which a mask of another size is asked.
-pub(crate) const CORNERS: [[f64; 2]; 4] = [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]];
+pub const CORNERS: [[f64; 2]; 4] = [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]];
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a test may

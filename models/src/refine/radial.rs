@@ -3,7 +3,7 @@
 //! 1.2° from one end of a line to the other.
 
 use crate::camera::Pinhole;
-use config::lens::Distortion;
+use geometry::lens::Distortion;
 use glam::{DVec2, DVec3};
 
 /// `k1`, `k2` of [`Distortion`], in normalised coordinates: of any picture size.

@@ -1,6 +1,9 @@
 //! How many Gaussians a piece of ground gets while the flight goes on: its share of the plan, so that what is flown last finds the
 //! room that what was flown first found.
 
+use geometry::polygon::{perimeter, signed_area};
+use glam::DVec2;
+
 use super::Reconstruction;
 
 /// Pictures of a survey show each place so often at least; where no region says how much ground there is, as many as were planned
@@ -13,21 +16,13 @@ const MOST: f64 = 1.5;
 /// Fewer Gaussians than this are no ground.
 const FEWEST: usize = 256;
 
-/// Area and circumference of a polygon.
-fn polygon(corners: &[[f64; 2]]) -> (f64, f64) {
-    let next = corners.iter().cycle().skip(1);
-    let sides = corners.iter().zip(next);
-    sides.fold((0.0, 0.0), |(area, around), (a, b)| {
-        (area + 0.5 * (a[0] * b[1] - a[1] * b[0]), around + (b[0] - a[0]).hypot(b[1] - a[1]))
-    })
-}
-
 /// Gaussians for one square metre: `capacity` over the region and what pictures of `width` × `height` metres show beyond its edge.
 fn per_m2(capacity: usize, region: &[[f64; 2]], [width, height]: [f64; 2], views: usize) -> f64 {
     let beyond = 0.25 * (width + height);
-    let (area, around) = polygon(region);
-    let ground = match area.abs() > 0.0 {
-        true => area.abs() + around * beyond + std::f64::consts::PI * beyond * beyond,
+    let corners: Vec<DVec2> = region.iter().map(|c| DVec2::from(*c)).collect();
+    let area = signed_area(&corners).abs();
+    let ground = match area > 0.0 {
+        true => area + perimeter(&corners) * beyond + std::f64::consts::PI * beyond * beyond,
         false => views as f64 * width * height / OVERLAP,
     };
     capacity as f64 / ground.max(1e-6)

@@ -11,9 +11,9 @@ use models::camera::Intrinsics;
 use models::cloud::GaussianCloud;
 use models::formats::FormatError;
 use models::formats::model::{self, Chunks, ModelHeader};
-use models::ortho::grid::BLOCK;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
+use survey::ortho::grid::BLOCK;
 use vulkan::trainer::{TrainError, Trainer};
 
 use super::pieces;

@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 
 use config::error::{Error, ErrorKind};
 use config::plan::PlanError;
-use models::dataset::DatasetError;
 use models::formats::FormatError;
 use models::init::InitError;
 use models::onnx::OnnxError;
-use models::ortho::OrthoError;
 use models::refine::RefineError;
+use survey::dataset::DatasetError;
+use survey::ortho::OrthoError;
 use vulkan::gpu::GpuError;
 use vulkan::trainer::TrainError;
 

@@ -7,13 +7,13 @@ pub mod surveyed;
 
 use models::baselines::{MeanColor, nearest_view, warp_over_ground};
 use models::camera::{PosedImage, View};
-use models::dataset::Dataset;
 use models::formats::model::ModelHeader;
 use models::formats::write_atomic;
 use models::light::PictureLight;
 use models::metrics::{colors_fitted, psnr, ssim_where, to_f32, to_rgb8};
 use models::onnx::metric::PerceptualMetric;
 use serde::Serialize;
+use survey::dataset::Dataset;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::error::EngineError;

@@ -8,12 +8,12 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use config::disk::Disk;
 use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::NetworkSettings;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
+use disk::Disk;
 use job::run_json::RunReport;
 use models::camera::{DepthPrior, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;

@@ -2,16 +2,16 @@
 
 use std::path::Path;
 
-use config::disk::Disk;
+use disk::Disk;
 use glam::{DVec2, DVec3};
 use models::camera::View;
 use models::cloud::GaussianCloud;
 use models::formats::model::{Chunks, ModelHeader};
-use models::ortho::OrthoError;
-use models::ortho::crs::Crs;
-use models::ortho::extent::{Extent, SAMPLE, ViewsAround};
-use models::ortho::files::{MapFiles, NO_HEIGHT, Written};
-use models::ortho::grid::{BLOCK, Block, BlockView, Grid};
+use survey::ortho::OrthoError;
+use survey::ortho::crs::Crs;
+use survey::ortho::extent::{Extent, SAMPLE, ViewsAround};
+use survey::ortho::files::{MapFiles, NO_HEIGHT, Written};
+use survey::ortho::grid::{BLOCK, Block, BlockView, Grid};
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::device::map_renderer;

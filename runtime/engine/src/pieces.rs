@@ -5,7 +5,7 @@ use std::cell::Cell;
 use std::io;
 use std::path::Path;
 
-use config::disk::Disk;
+use disk::Disk;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, Chunks, ModelHeader};
 use vulkan::trainer::{LoadReport, TrainError, Trainer};

@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use image::imageops::{FilterType, resize};
 use models::camera::{Pose, PosedImage};
-use models::dataset::scaled;
 use models::formats::model;
+use survey::dataset::scaled;
 use vulkan::trainer::{RunBudget, StepReport, StopReason, Validated};
 
 use super::energy::EVERY_S;

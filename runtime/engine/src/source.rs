@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use image::RgbImage;
 use models::camera::PosedImage;
-use models::dataset::{Dataset, PoseSource};
 use models::picture::mask::Mask;
+use survey::dataset::{Dataset, PoseSource};
 
 use crate::error::EngineError;
 

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3};
 use models::camera::{Pose, View};
-use models::dataset::Dataset;
+use survey::dataset::Dataset;
 
 /// Neighbours that vote: enough to average their noise, few enough to stay local.
 const NEIGHBOURS: usize = 4;

@@ -2,14 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
-use config::geodesy::{EnuFrame, Geodetic};
+use disk::Disk;
+use geometry::geodesy::{EnuFrame, Geodetic};
 use models::camera::View;
-use models::coverage::gaps::{self, Gap, GapKind};
-use models::coverage::reflight::{self, Reflight};
-use models::coverage::{CoverageMap, geojson, raster};
 use models::formats::FormatError;
 use models::formats::flight_plan::{FlightPlan, Waypoint};
+use survey::coverage::gaps::{self, Gap, GapKind};
+use survey::coverage::reflight::{self, Reflight};
+use survey::coverage::{CoverageMap, geojson, raster};
 
 use job::run_json::RunReport;
 use pages::watch::GAPS;

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, SystemTime};
 
-use config::disk::bounded::{Bounded, bytes_below};
-use config::disk::plan::{DiskPlan, DiskRequest};
-use config::disk::{Disk, System};
 use config::mission::{Aircraft, CameraSettings, CameraSource, Mission};
 use config::plan::Lanes;
+use disk::bounded::{Bounded, bytes_below};
+use disk::plan::{DiskPlan, DiskRequest};
+use disk::{Disk, System};
 use hal::mavlink_camera::Activity;
 use hal::time::MonotonicClock;
 use hal::vehicle::VehicleSettings;

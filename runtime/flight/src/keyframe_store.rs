@@ -6,11 +6,11 @@
 
 use std::path::{Path, PathBuf};
 
-use config::disk::plan::picture_bytes;
-use config::disk::{Damaged, Disk, previous};
 use config::error::{Error, ErrorKind};
-use config::geodesy::Geodetic;
 use config::mission::CameraSettings;
+use disk::plan::picture_bytes;
+use disk::{Damaged, Disk, previous};
+use geometry::geodesy::Geodetic;
 use hal::camera::Picture;
 use hal::error::HalError;
 use image::RgbImage;

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 use models::camera::View;
-use models::dataset::Dataset;
 use models::formats::model;
 use models::metrics::to_rgb8;
+use survey::dataset::Dataset;
 use vulkan::trainer::{Rendering, Trainer};
 
 use super::region::Region;

@@ -5,7 +5,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use models::align::similarity::Similarity;
 use models::cloud::{GaussianCloud, ShTurn};
 use models::formats::model::ModelHeader;

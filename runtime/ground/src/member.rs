@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::{DVec2, DVec3};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};

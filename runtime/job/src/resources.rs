@@ -136,9 +136,9 @@ mod tests {
             survive_file_size_limit().expect("a handler");
         }
         setrlimit(Resource::Fsize, Rlimit { current: Some(4096), maximum: None }).expect("a limit");
-        let disk = config::disk::Disk::default();
+        let disk = disk::Disk::default();
         let e = disk.replace(&path, |out| out.write_all(&[7; 1 << 20])).expect_err("over the limit");
-        assert!(config::disk::is_full(&e.source), "{e}");
+        assert!(disk::is_full(&e.source), "{e}");
         assert!(!path.exists());
     }
 

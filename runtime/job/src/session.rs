@@ -7,8 +7,8 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use config::disk::{Disk, DiskError};
 use config::error::{Error, ErrorKind};
+use disk::{Disk, DiskError};
 use models::formats::{FormatError, read_bounded};
 use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use config::error::{Error, ErrorKind};
-use config::geodesy::Geodetic;
 use config::mission::Mission;
+use geometry::geodesy::Geodetic;
 use job::console;
 use serde_json::Value;
 

@@ -5,9 +5,9 @@ use std::path::Path;
 
 use engine::device::renderer;
 use engine::evaluate::{IntoModel, Scores, evaluate};
-use models::dataset::Dataset;
 use models::formats::{model, write_atomic};
 use serde::Serialize;
+use survey::dataset::Dataset;
 
 use super::child;
 use crate::error::JobError;

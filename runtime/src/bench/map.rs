@@ -12,9 +12,9 @@ use glam::{DMat4, DVec2, DVec3, DVec4};
 use hal::sim::world::{FromAbove, MapKind, World};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, Chunks, ModelHeader};
-use models::ortho::files::NO_HEIGHT;
-use models::ortho::grid::{Block, Grid};
 use serde::Serialize;
+use survey::ortho::files::NO_HEIGHT;
+use survey::ortho::grid::{Block, Grid};
 
 use super::{child, world};
 use crate::error::JobError;

@@ -15,6 +15,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use ::survey::dataset::{Dataset, SparsePoint, scaled};
 use config::error::{Error, ErrorKind};
 use config::ground::GroundSettings;
 use engine::device::renderer;
@@ -22,7 +23,6 @@ use engine::evaluate::{IntoModel, evaluate, open_metric};
 use ground::jobs::aggregate;
 use ground::member::Member;
 use ground::{AggregateError, LocalModel};
-use models::dataset::{Dataset, SparsePoint, scaled};
 use models::formats::{model, read_bounded};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};

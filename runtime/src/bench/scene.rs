@@ -4,9 +4,9 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use config::disk::Disk;
 use config::plan::{Lanes, Plan};
 use config::training::TrainSettings;
+use disk::Disk;
 use engine::cost::synthetic::picture;
 use engine::device::DeviceRequest;
 use engine::error::EngineError;

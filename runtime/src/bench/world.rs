@@ -65,7 +65,7 @@ mod tests {
     fn the_data_set_opens_and_its_pictures_overlap() {
         let dir = tempfile::tempdir().unwrap();
         write_data_set(dir.path(), 3, 1.0).unwrap();
-        let set = models::dataset::Dataset::open(dir.path()).unwrap();
+        let set = survey::dataset::Dataset::open(dir.path()).unwrap();
         assert_eq!(set.frames.len(), 24);
         assert_eq!((set.select("test", None).unwrap().len(), set.select("train", None).unwrap().len()), (3, 21));
         let footprint = HEIGHT_M * f64::from(SIZE[1]) / FOCAL;

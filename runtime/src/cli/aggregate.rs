@@ -12,8 +12,8 @@ use ground::jobs::summary;
 use ground::member::Member;
 use job::interrupt::Interrupt;
 use job::run_json::RunReport;
-use models::dataset::Dataset;
 use pages::report::{REPORT, ReportData};
+use survey::dataset::Dataset;
 
 use crate::cli::output::outln;
 

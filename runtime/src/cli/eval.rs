@@ -8,9 +8,9 @@ use engine::device::{file_renderer, map_renderer};
 use engine::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
 use engine::ortho::{Map, MapRequest};
 use engine::transfer::stem;
-use models::dataset::Dataset;
 use models::formats::model::{Chunks, ModelHeader};
 use serde::Serialize;
+use survey::dataset::Dataset;
 
 use super::CliError;
 use super::plan::largest;

@@ -3,19 +3,19 @@
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use config::disk::Disk;
-use config::lens::Distortion;
+use disk::Disk;
+use geometry::lens::Distortion;
 use glam::DVec3;
 use models::cloud::{GaussianCloud, SH_C0};
-use models::dataset::Dataset;
 use models::formats::colmap::Point;
 use models::formats::delivery::Rounding;
 use models::formats::model::{Chunks, ModelHeader};
 use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use models::formats::{colmap, gltf, model, opensfm, ply, sog, spz, transforms};
 use models::levels;
-use models::ortho::georef::{FROM_Y_UP, Georef, shifted};
 use pages::viewer::{self, ViewerRequest};
+use survey::dataset::Dataset;
+use survey::ortho::georef::{FROM_Y_UP, Georef, shifted};
 
 use super::CliError;
 use crate::cli::output::outln;

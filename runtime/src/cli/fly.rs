@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use config::disk::Disk;
 use config::mission::Mission;
+use disk::Disk;
 use engine::device::training_lens;
 use engine::ortho::keep_scratch_in;
 use engine::preset;

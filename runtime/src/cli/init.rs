@@ -3,9 +3,9 @@
 use std::io::{IsTerminal, stderr, stdin};
 use std::path::{Path, PathBuf};
 
-use config::geodesy::Geodetic;
 use config::mission::{Draft, Mission, reference};
 use config::preset::Preset;
+use geometry::geodesy::Geodetic;
 
 use super::{CliError, train::presets};
 use crate::cli::output::{out, outln};

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use config::disk::Disk;
+use disk::Disk;
 use engine::device::map_renderer;
 use engine::ortho::{Map, MapRequest, keep_scratch_in};
 use job::console;

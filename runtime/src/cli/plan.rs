@@ -2,20 +2,20 @@
 
 use std::path::PathBuf;
 
-use config::disk::plan::{DiskPlan, DiskRequest};
 use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::{MemorySettings, Mission, NetworkSettings};
 use config::plan::{Lanes, Plan};
 use config::refine::RefineSettings;
 use config::training::{CropSettings, ShSettings};
+use disk::plan::{DiskPlan, DiskRequest};
 use engine::device::DeviceRequest;
 use engine::devices;
 use engine::preset;
 use engine::scratch_bytes;
 use flight::fly::delivered_bytes;
 use job::service::limits::{DeviceMemory, ServiceLimits};
-use models::dataset::{Dataset, scaled};
+use survey::dataset::{Dataset, scaled};
 use vulkan::gpu::GpuInfo;
 
 use super::CliError;

@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use hal::replay::{Playlist, PlaylistItem, ReplaySettings, TlogSettings, play, play_tlog};
 use hal::sim::SessionSettings;
 use hal::sim::autopilot::AutopilotSettings;
 use hal::sim::reference::Lens;
 use hal::sim::world::WorldSettings;
-use models::dataset::{Dataset, DatasetFrame, PoseSource};
+use survey::dataset::{Dataset, DatasetFrame, PoseSource};
 
 use super::CliError;
 use super::sim::stop_flag;

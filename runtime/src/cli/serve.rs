@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use config::disk::Disk;
 use config::mission::Mission;
+use disk::Disk;
 
 use engine::ortho::{draw_file, keep_scratch_in};
 use ground::jobs::serve::{self, Board, Joining, Reception, ServeError};

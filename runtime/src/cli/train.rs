@@ -12,11 +12,11 @@ use config::preset::Preset;
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use engine::InitKind;
-use models::card::CardOptions;
-use models::dataset::PoseSource;
 use models::formats::delivery::Rounding;
 use models::formats::{FormatError, read_bounded};
 use serde::Deserialize;
+use survey::card::CardOptions;
+use survey::dataset::PoseSource;
 
 use super::CliError;
 use crate::cli::output::outln;

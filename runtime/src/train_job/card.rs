@@ -5,17 +5,17 @@ use std::collections::HashMap;
 use std::ops::ControlFlow;
 use std::path::Path;
 
-use config::geodesy::Geodetic;
 use config::refine::RefineSettings;
 use engine::evaluate::surveyed;
 use engine::host::settling_bytes;
 use engine::{matching_file_bytes, waiting_file};
+use geometry::geodesy::Geodetic;
 use job::console::Progress;
 use models::camera::View;
-use models::card::name_list;
-use models::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled};
 use models::formats::transforms;
 use models::refine::Refiner;
+use survey::card::name_list;
+use survey::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled};
 
 use crate::error::JobError;
 

@@ -8,7 +8,7 @@ use engine::energy::{Meter, shorter};
 use engine::kernels;
 use engine::preset::{Choice, Room, Wanted, most_side, shown};
 use models::camera::Pinhole;
-use models::dataset::Dataset;
+use survey::dataset::Dataset;
 
 use super::TrainJob;
 use super::scale::largest;

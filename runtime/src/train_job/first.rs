@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use engine::model_path;
-use models::dataset::Dataset;
 use models::formats::model::Chunks;
+use survey::dataset::Dataset;
 
 use crate::error::JobError;
 

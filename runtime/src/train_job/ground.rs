@@ -2,10 +2,11 @@
 //! reconstructed.
 
 use config::coverage::CoverageSettings;
+use geometry::polygon::hull;
 use glam::{DVec2, Vec3};
 use models::camera::View;
-use models::coverage::{CoverageMap, Heights, Region, hull};
 use models::formats::model::ModelHeader;
+use survey::coverage::{CoverageMap, Heights, Region};
 
 use flight::coverage::Coverage;
 

@@ -4,11 +4,11 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use hal::mavlink::dialect::CAMERA_FEEDBACK_DATA;
 use hal::mavlink::{Frame, Framer};
-use models::card::{Attitude, AttitudeSource, Exposure, Fix, dataflash, nadir_rotation};
 use models::formats::FormatError;
+use survey::card::{Attitude, AttitudeSource, Exposure, Fix, dataflash, nadir_rotation};
 
 use crate::error::JobError;
 

@@ -3,7 +3,7 @@
 use config::plan::{Lanes, Plan, WORKING_SIDE};
 use engine::device::DeviceRequest;
 use engine::preset::SCALES;
-use models::dataset::{Dataset, scaled};
+use survey::dataset::{Dataset, scaled};
 
 use super::TrainJob;
 use crate::error::JobError;

@@ -3,7 +3,7 @@
 use engine::Reconstruction;
 use engine::evaluate::surveyed;
 use models::camera::View;
-use models::dataset::{Dataset, scaled};
+use survey::dataset::{Dataset, scaled};
 
 use crate::error::JobError;
 

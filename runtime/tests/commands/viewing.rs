@@ -1,6 +1,6 @@
 //! Promises of `dgtr export` to viewers: each format with its georeference, and one line where something is missing.
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::{ply, spz};

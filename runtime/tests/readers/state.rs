@@ -3,11 +3,11 @@
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use config::disk::Disk;
-use config::geodesy::Geodetic;
 use config::mission::CameraSettings;
+use disk::Disk;
 use engine::kernels::cache;
 use flight::keyframe_store::{KeyFrame, KeyframeStore};
+use geometry::geodesy::Geodetic;
 use ground::register::edge::{Edges, Fitted};
 use hal::camera::Picture;
 use job::run_json::RunReport;

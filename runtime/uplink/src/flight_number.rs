@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
+use disk::Disk;
 
 use super::folder::{read_bounded, write_whole};
 

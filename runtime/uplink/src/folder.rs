@@ -10,8 +10,8 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use config::disk::Disk;
 use config::mission::MAX_AIRCRAFT;
+use disk::Disk;
 
 use super::Source;
 use super::medium::Medium;

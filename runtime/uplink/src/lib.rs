@@ -6,8 +6,8 @@
 
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
 use config::mission::Mission;
+use disk::Disk;
 
 use crate::keys::{Identity, KeyError};
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use config::disk::Disk;
+use disk::Disk;
 use serde::{Deserialize, Serialize};
 
 use crate::disk_error::{DiskError, io};

@@ -11,9 +11,9 @@ use std::io::{Read, Write};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
 use config::error::{Error, ErrorKind};
 use config::upload::UploadSettings;
+use disk::Disk;
 
 use super::admission::{Admission, ModelRefusal};
 use super::disk_error::{DiskError, io};

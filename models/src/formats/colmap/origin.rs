@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
 use crate::formats::reconstruction::origin;

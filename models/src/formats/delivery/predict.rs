@@ -97,12 +97,6 @@ pub fn half_power(half: i32) -> f64 {
     if half.rem_euclid(2) == 1 { whole * std::f64::consts::SQRT_2 } else { whole }
 }
 
-/// The middle value; 0 of none.
-pub fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -153,7 +153,7 @@ pub fn opacities(
 ) -> Result<Vec<u32>, Garbled> {
     let levels = 1usize << steps.opacity_bits;
     let size = |own: &Scales| f64::from(own.iter().sum::<i32>()) * steps.log_scale / 3.0;
-    let middle = super::predict::median(scales.iter().map(size).collect());
+    let middle = geometry::median(&mut scales.iter().map(size).collect::<Vec<_>>()).unwrap_or(0.0);
     let mut counts = vec![Counts::even(levels); BY_OPACITY * (2 * BY_SIZE as usize + 1)];
     let mut out: Vec<u32> = Vec::with_capacity(scales.len());
     for (i, own) in scales.iter().enumerate() {

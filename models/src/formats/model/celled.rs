@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Write};
 use std::path::Path;
 
-use config::disk::Disk;
+use disk::Disk;
 
 use super::hashing::Hashing;
 use super::{Body, FIXED, FormatError, HASH, LAYERED, ModelHeader, begin, check_columns, encode_header, finish, open};

@@ -5,7 +5,7 @@ use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
+use disk::Disk;
 
 use super::celled::Cells;
 use super::columns::{self, read_words, triples, write_floats};

@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
+use disk::Disk;
 use glam::{DMat3, DQuat, DVec3};
 use serde::Serialize;
 

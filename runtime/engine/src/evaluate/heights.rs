@@ -5,13 +5,13 @@ use std::path::Path;
 
 use glam::{DQuat, DVec2, DVec3};
 use models::camera::Pose;
-use models::dataset::Dataset;
 use models::formats::model::ModelHeader;
-use models::ortho::check_points;
-use models::ortho::files::NO_HEIGHT;
-use models::ortho::grid::{BLOCK, Block};
-use models::ortho::height_raster;
 use serde::Serialize;
+use survey::dataset::Dataset;
+use survey::ortho::check_points;
+use survey::ortho::files::NO_HEIGHT;
+use survey::ortho::grid::{BLOCK, Block};
+use survey::ortho::height_raster;
 use vulkan::trainer::Trainer;
 
 use crate::error::EngineError;

@@ -1,13 +1,13 @@
 //! Surveyed points through the renderings: the pixel at which a point is marked in a picture, at the depth that the model shows there,
 //! is a place on the ground, and so is the survey's. Their difference is what a measurement in the model is off by.
 
-use config::geodesy::EnuFrame;
+use geometry::geodesy::EnuFrame;
 use glam::DVec3;
 use models::camera::{Pinhole, View};
-use models::card::control::SurveyedPoint;
-use models::dataset::{Dataset, scaled};
 use models::refine::ControlPoint;
 use serde::Serialize;
+use survey::card::control::SurveyedPoint;
+use survey::dataset::{Dataset, scaled};
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::error::EngineError;

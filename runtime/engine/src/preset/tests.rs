@@ -281,7 +281,7 @@ region_enu = [[0.0, 0.0], [60.0, 0.0], [60.0, 40.0], [0.0, 40.0]]
             origin: [0.0; 3],
             picture: [64, 48],
         };
-        drop(session::Session::begin(&config::disk::Disk::default(), dir.path(), &owner).unwrap());
+        drop(session::Session::begin(&disk::Disk::default(), dir.path(), &owner).unwrap());
         assert_ne!(of_flight(&mut mission(""), &aircraft, dir.path()), Some(choice));
         // One that began before there was a choice.
         let older = tempfile::tempdir().unwrap();

@@ -1,6 +1,6 @@
 //! A plan as the simulated aircraft flies it.
 
-use config::geodesy::{EnuFrame, Geodetic};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use hal::sim::survey::{Route, Waypoint};
 use models::formats::flight_plan::FlightPlan;
 

@@ -11,8 +11,8 @@ use hal::sim::reference::{Lens, flown_views};
 use hal::sim::survey::SurveySettings;
 use hal::sim::world::{World, WorldSettings};
 use models::camera::{Intrinsics, Pose};
-use models::coverage::Region;
 use models::formats::flight_plan;
+use survey::coverage::Region;
 
 use super::*;
 

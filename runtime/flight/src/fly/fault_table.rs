@@ -7,11 +7,11 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::Duration;
 
-use config::disk::Disk;
 use config::faults::FaultSettings;
-use config::geodesy::Geodetic;
 use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountSettings};
+use disk::Disk;
+use geometry::geodesy::Geodetic;
 use hal::link::LinkAddress;
 use hal::sim::SessionSettings;
 use hal::sim::SimSettings;

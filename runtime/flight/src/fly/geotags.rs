@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::path::Path;
 
-use config::disk::{Disk, Output};
-use config::geodesy::{EnuFrame, Geodetic};
+use disk::{Disk, Output};
+use geometry::geodesy::{EnuFrame, Geodetic};
 use hal::vehicle::PosedPicture;
 
 use crate::capture::Decision;

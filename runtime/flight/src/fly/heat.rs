@@ -2,9 +2,9 @@
 
 use std::cell::Cell;
 
-use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::upload::UploadSettings;
+use disk::Disk;
 use engine::Reconstruct;
 use engine::failsafe::Failsafe;
 use glam::{DQuat, DVec3};

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-use config::disk::Disk;
 use config::mission::CameraSettings;
+use disk::Disk;
 use engine::{Reconstruct, model_path};
 use glam::{DQuat, DVec3};
 use hal::camera::Picture;

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::mission::KeyframeSettings;
 use config::upload::UploadSettings;
+use disk::Disk;
 use engine::PictureSource;
 use engine::failsafe::Failsafe;
 use glam::{DQuat, DVec3};

@@ -4,10 +4,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
 use config::mission::CameraSettings;
 use config::upload::UploadSettings;
+use disk::Disk;
 use engine::failsafe::Failsafe;
 use engine::model_path;
 use hal::camera::Picture;

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use config::disk::Disk;
+use disk::Disk;
 use hal::sim::world::World;
 use models::formats::flight_plan;
 

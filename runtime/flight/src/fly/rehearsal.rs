@@ -8,14 +8,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use config::coverage::CoverageSettings;
-use config::disk::Disk;
 use config::failsafe::FailsafeSettings;
-use config::geodesy::Geodetic;
 use config::mission::{CameraSettings, KeyframeSettings};
 use config::upload::UploadSettings;
+use disk::Disk;
 use engine::error::EngineError;
 use engine::failsafe::Failsafe;
 use engine::{Reconstruct, model_path};
+use geometry::geodesy::Geodetic;
 use hal::camera::FolderCamera;
 use hal::failsafe::{Action, Cause};
 use hal::sim::rehearsal::Rehearsal;

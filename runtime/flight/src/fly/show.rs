@@ -5,9 +5,9 @@ use hal::autopilot::AutopilotState;
 use hal::failsafe::State;
 use image::RgbImage;
 use models::camera::{Intrinsics, Pose, View};
-use models::coverage::CoverageMap;
 use pages::report::ground::Shot;
 use pages::watch::Watch;
+use survey::coverage::CoverageMap;
 use vulkan::trainer::StepReport;
 
 use crate::coverage::Coverage;

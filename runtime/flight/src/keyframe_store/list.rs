@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
 use config::mission::CameraSettings;
+use geometry::geodesy::Geodetic;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use models::formats::{FormatError, read_bounded};
 use serde::{Deserialize, Serialize};

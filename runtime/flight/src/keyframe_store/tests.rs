@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use config::disk::System;
-use config::disk::bounded::{Bounded, bytes_below};
+use disk::System;
+use disk::bounded::{Bounded, bytes_below};
 use glam::{DQuat, DVec3};
 
 use models::camera::PoseSigma;
@@ -152,7 +152,7 @@ fn the_store_is_a_data_set() {
     assert_eq!(again.len(), 9);
     let loaded = again.load(3).expect("load");
     assert_eq!((loaded.name.as_str(), loaded.view.pose.center.x, loaded.time_ns), ("3.png", 3.0, 7));
-    let set = models::dataset::Dataset::open(dir.path()).expect("a data set");
+    let set = survey::dataset::Dataset::open(dir.path()).expect("a data set");
     assert_eq!(set.frames.len(), 9);
     assert!((set.frames[3].view.pose.center - loaded.view.pose.center).length() < 1e-9);
     assert_eq!(set.origin, Some(ORIGIN));
@@ -190,7 +190,7 @@ fn the_cameras_own_file_is_kept_and_read_again_as_it_is_trained_on() {
     let again = store.load(0).expect("loads");
     assert_eq!((again.name.as_str(), again.view, again.image), ("DSC_7.JPG", posed.view, posed.image));
     // Other programs learn of the camera with its distortion.
-    let set = models::dataset::Dataset::open(&out).expect("a data set");
+    let set = survey::dataset::Dataset::open(&out).expect("a data set");
     assert_eq!((set.frames[0].view.intrinsics.width, set.frames[0].view.intrinsics.fx), (64, 50.0));
     // A file that vanished before it was kept costs only itself.
     std::fs::remove_file(&own).expect("gone");

@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use config::geodesy::Geodetic;
 use config::ground::GroundSettings;
+use geometry::geodesy::Geodetic;
 use models::formats::model::ModelHeader;
 
 use super::join::{self, Joined};

@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
-use config::disk::Disk;
-use config::geodesy::Geodetic;
 use config::ground::GroundSettings;
+use disk::Disk;
+use geometry::geodesy::Geodetic;
 use glam::DVec2;
 use models::cloud::GaussianCloud;
 use models::formats::model::columns::{self, write_floats};

@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
+use disk::Disk;
 use glam::{DQuat, DVec3};
 use models::align::similarity::Similarity;
 use serde::{Deserialize, Serialize};

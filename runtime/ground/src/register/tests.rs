@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use config::disk::Disk;
+use disk::Disk;
 use glam::DVec3;
 
 use super::*;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, SystemTime};
 
-use config::disk::Disk;
+use disk::Disk;
 use rustix::rand::{GetRandomFlags, getrandom};
 
 use super::{Fill, StoreError};

@@ -4,14 +4,14 @@
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::DVec3;
 use models::camera::View;
-use models::coverage::{CoverageMap, State};
 use models::formats::read_bounded;
-use models::ortho::crs::Crs;
-use models::ortho::files::preview_step;
 use serde::{Serialize, Serializer};
+use survey::coverage::{CoverageMap, State};
+use survey::ortho::crs::Crs;
+use survey::ortho::files::preview_step;
 
 /// Pictures shown of one aircraft: `keyframes.max` is at most this.
 pub const MAX_SHOTS: usize = 4096;
@@ -189,7 +189,7 @@ impl Ortho {
 mod tests {
     use glam::{DQuat, DVec2};
     use models::camera::{Intrinsics, Pose};
-    use models::coverage::Region;
+    use survey::coverage::Region;
 
     use super::*;
 

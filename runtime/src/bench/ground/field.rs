@@ -1,6 +1,6 @@
 //! The field that [`super`] hands to a ground station: square regions, flown there and back, of made-up ground that all aircraft see alike.
 
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use glam::{DQuat, DVec2, DVec3};
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;

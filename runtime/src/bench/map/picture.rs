@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use config::disk::Disk;
+use disk::Disk;
 use image::{Rgb, RgbImage};
 
 use super::Compared;

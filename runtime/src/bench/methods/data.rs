@@ -4,9 +4,9 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use models::dataset::{Dataset, SparsePoint};
 use models::formats::transforms;
 use serde_json::{Map, Value, json};
+use survey::dataset::{Dataset, SparsePoint};
 
 use super::super::figures::{write_json, write_text};
 use super::territory::Territory;

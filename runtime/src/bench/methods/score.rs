@@ -4,8 +4,8 @@ use engine::evaluate::{Scores, ViewScore};
 use glam::DVec2;
 use ground::region::Region;
 use models::camera::View;
-use models::dataset::Dataset;
 use serde::{Deserialize, Serialize};
+use survey::dataset::Dataset;
 
 use super::territory::Territory;
 

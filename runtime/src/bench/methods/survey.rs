@@ -7,9 +7,9 @@ use engine::evaluate::save_png;
 use glam::{DQuat, DVec2, DVec3};
 use hal::sim::world::{PinholeView, World, WorldSettings};
 use models::camera::{Pinhole, Pose};
-use models::dataset::{Dataset, SparsePoint};
 use models::formats::transforms::pose_to_opengl;
 use serde_json::{Value, json};
+use survey::dataset::{Dataset, SparsePoint};
 
 use super::super::figures::write_json;
 use super::data::write_points;

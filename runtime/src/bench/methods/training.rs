@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use config::disk::Disk;
+use disk::Disk;
 use job::run_json::RunReport;
 use models::formats::delivery::Rounding;
 use models::formats::model;

@@ -4,7 +4,7 @@
 
 use glam::DVec3;
 use models::camera::{Pinhole, View};
-use models::dataset::{Dataset, SparsePoint};
+use survey::dataset::{Dataset, SparsePoint};
 
 use super::territory::Territory;
 
@@ -82,7 +82,7 @@ pub fn seen(set: &Dataset, territories: &[Territory], points: &[SparsePoint]) ->
 mod tests {
     use glam::{DQuat, DVec2};
     use models::camera::{Intrinsics, Pose};
-    use models::dataset::{DatasetFrame, Split};
+    use survey::dataset::{DatasetFrame, Split};
 
     use super::*;
 
@@ -98,7 +98,7 @@ mod tests {
             name: format!("{i}.png"),
             path: format!("{i}.png").into(),
             view: nadir(c[0], c[1]),
-            distortion: config::lens::Distortion::default(),
+            distortion: geometry::lens::Distortion::default(),
             orientation: models::picture::Orientation::default(),
             mask: None,
             prior: None,

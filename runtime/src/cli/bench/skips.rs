@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use models::dataset::Dataset;
 use models::formats::read_bounded;
+use survey::dataset::Dataset;
 
 use super::Init;
 use crate::bench::figures::{csv, markdown, write_json, write_text};

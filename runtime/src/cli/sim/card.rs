@@ -5,15 +5,15 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use config::geodesy::EnuFrame;
+use geometry::geodesy::EnuFrame;
 use glam::{DQuat, DVec3};
 use hal::sim::SimSettings;
 use hal::sim::photographer::{to_jpeg, write_whole};
 use hal::sim::reference::flown_views;
 use hal::sim::world::World;
-use models::card::write::Tags;
 use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use models::formats::transforms;
+use survey::card::write::Tags;
 
 use crate::error::JobError;
 
@@ -67,7 +67,7 @@ pub fn write(settings: &SimSettings, folder: &Path, stop: &AtomicBool) -> Result
             cx: lens.cx as f32,
             cy: lens.cy as f32,
         };
-        let lens = LensDescription::new(&intrinsics, config::lens::Distortion::default());
+        let lens = LensDescription::new(&intrinsics, geometry::lens::Distortion::default());
         let pose = models::camera::Pose { rotation: view.rotation, center: view.position };
         let path = path.strip_prefix(folder).unwrap_or(&path).to_string_lossy().into_owned();
         shots.push(Shot { path, lens, pose, mask: None });

@@ -4,8 +4,8 @@ use std::collections::HashSet;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use config::disk::Disk;
 use config::upload::UploadSettings;
+use disk::Disk;
 
 use super::sight::Shown;
 use super::{ANSWER, ReceiveCounters, Received};

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::time::Duration;
 
-use config::disk::bounded::Bounded;
-use config::disk::{Disk, Operations, Output, System};
 use config::link::Signing;
+use disk::bounded::Bounded;
+use disk::{Disk, Operations, Output, System};
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::failsafe::Action;

@@ -5,7 +5,7 @@ use hal::camera::Picture;
 use hal::error::HalError;
 use hal::mavlink::dialect::MavSeverity;
 use hal::traits::{Camera, Clock, Link};
-use models::coverage::{CoverageMap, Region};
+use survey::coverage::{CoverageMap, Region};
 
 use super::Intake;
 use crate::coverage::Coverage;

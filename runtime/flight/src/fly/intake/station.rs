@@ -9,7 +9,7 @@ use hal::error::HalError;
 use hal::mavlink::dialect::MavSeverity;
 use hal::mavlink_camera::ParameterId;
 use hal::traits::{Camera, Clock, Link};
-use models::coverage::CoverageMap;
+use survey::coverage::CoverageMap;
 
 use super::{Intake, Phase};
 use crate::fly::record::{Entry, Seen};

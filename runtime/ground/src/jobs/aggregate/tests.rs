@@ -1,7 +1,7 @@
 //! Promises of the whole aggregation, distillation included (skipped, with a word, where there is no Vulkan device).
 
 use config::error::{Error, ErrorKind};
-use config::geodesy::Geodetic;
+use geometry::geodesy::Geodetic;
 use models::cloud::GaussianCloud;
 use models::formats::model;
 
@@ -144,7 +144,7 @@ fn a_single_model_becomes_the_global_one_unchanged() {
 fn models_around_different_origins_meet_in_one_frame() {
     let dir = tempfile::tempdir().expect("temp dir");
     let home = Geodetic { lat_deg: 47.0, lon_deg: 8.0, alt_m: 400.0 };
-    let away = config::geodesy::EnuFrame::new(home).to_geodetic(glam::DVec3::new(500.0, 300.0, 5.0));
+    let away = geometry::geodesy::EnuFrame::new(home).to_geodetic(glam::DVec3::new(500.0, 300.0, 5.0));
     let mut models = pair();
     models[0].header.origin = Some(home);
     models[1].header.origin = Some(home);

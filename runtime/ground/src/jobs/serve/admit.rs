@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use config::geodesy::Geodetic;
 use config::mission::Mission;
+use geometry::geodesy::Geodetic;
 use glam::{DVec2, DVec3, Vec3};
 use models::camera::View;
 use uplink::admission::ModelRefusal;

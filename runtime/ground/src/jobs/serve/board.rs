@@ -5,11 +5,11 @@ use std::path::Path;
 use std::time::{Instant, SystemTime};
 
 use config::mission::Mission;
-use models::coverage::{CoverageMap, Region};
 use models::formats::model::{self, ModelHeader};
 use pages::report::Thumbnail;
 use pages::report::ground::Shot;
 use pages::watch::Watch;
+use survey::coverage::{CoverageMap, Region};
 
 use super::{Progress, Received};
 

@@ -3,8 +3,8 @@
 
 use std::fmt::Write;
 
-use config::disk::Disk;
 use config::keys::PublicKey;
+use disk::Disk;
 use job::session::{Owner, Session};
 use uplink::keys;
 use uplink::{Offerer, Source};

@@ -1,0 +1,130 @@
+//! A card of pictures as it comes out of an aircraft: JPEG, PNG and TIFF files in nested folders, and what they say about
+//! where they were taken. What leaves this module are *priors with covariances*; where they came from is its business
+//! alone. Contradictions are found by vote, corrected or down-weighted, and named, never fatal.
+//!
+//! | source | position | height | attitude | lens |
+//! |---|---|---|---|---|
+//! | EXIF | `GPSLatitude`, `GPSLongitude` (±`GPSHPositioningError`, else 1.5 m × `GPSDOP`, else 3 m) | `GPSAltitude` with `GPSAltitudeRef` | heading from `GPSImgDirection` (10°), else `GPSTrack` (30°), else course over ground (30°); nadir assumed (10°) | `FocalLengthIn35mmFilm`, else `FocalLength` with `FocalPlaneXResolution` (10 %) |
+//! | DJI maker note (Phantom) | – | – | `CameraYaw/Pitch/Roll`, −90° = nadir | – |
+//! | DJI `drone-dji:` | `GpsLatitude`/`Latitude`, ±`RtkStdLat/Lon`, else by `RtkFlag` (50 fixed, 34 float, 16 single) | `AbsoluteAltitude` ±`RtkStdHgt`; `RelativeAltitude` above take-off | `GimbalYaw/Pitch/RollDegree`, −90° = nadir; without a gimbal's `FlightYaw/Pitch/RollDegree` (10°) | `DewarpData` `date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, centre relative to the middle (0.5 %; only the focal length where `DewarpFlag` says that the picture is already undistorted); `CalibratedFocalLength` (1 %) |
+//! | Parrot `drone-parrot:` | – | `RelativeAltitude`… as DJI | `CameraYaw/Pitch/RollDegree`, −90° = nadir; else `DroneYaw/Pitch/RollDegree` (10°) | – |
+//! | Skydio `drone-skydio:` | `Latitude`, `Longitude` | `AbsoluteAltitude`, `RelativeAltitude` | `CameraOrientationNEDYaw/Pitch/Roll`, −90° = nadir | `CalibratedFocalLength` |
+//! | Pix4D `Camera:` (senseFly, Sequoia, MicaSense, Autel, Yuneec, Sentera) | ±`GPSXYAccuracy` | ±`GPSZAccuracy` | `Yaw/Pitch/Roll`, 0° = nadir with the heading at the top of the picture; a pitch below −45° (Autel) is taken as −90° = nadir; senseFly's roll has the other sign | `PerspectiveFocalLength` (mm), `PerspectiveDistortion` r1 r2 r3 t1 t2, `PrincipalPoint` (mm) |
+//! | `geo.txt` (OpenDroneMap), Mission Planner's and our own CSV | as stated, with its accuracies | as stated | yaw, pitch, roll: 0° = nadir in `geo.txt` | – |
+//! | `gcp_list.txt` | surveyed points marked in pictures: they hold the poses, and give a card without GPS its place, north and scale | as stated | – | – |
+//! | flight log | at the exposure, 1.5 m | as logged | the airframe's (10°), the gimbal's where logged (3°) | – |
+
+use std::path::{Path, PathBuf};
+
+use geometry::geodesy::{EnuFrame, Geodetic};
+
+mod container;
+pub mod control;
+pub mod dataflash;
+mod error;
+mod exif;
+pub mod exposures;
+pub mod geotags;
+mod lens;
+mod maker_note;
+mod notes;
+mod priors;
+mod record;
+mod scan;
+mod vote;
+pub mod write;
+mod xmp;
+
+pub use error::CardError;
+pub use exposures::Exposure;
+pub use notes::name_list;
+pub use priors::CardPicture;
+pub use record::{Attitude, AttitudeSource, Fix, Record, nadir_rotation};
+
+/// An opened card.
+#[derive(Clone, Debug)]
+pub struct Card {
+    /// In order of capture: by time where known, else by name.
+    pub pictures: Vec<CardPicture>,
+    /// Origin of the priors' east-north-up frame; its height is that of the ground as far as anything tells it. `None` where no
+    /// picture says where it was taken: then the priors have no positions, and the pictures tell the scene up to a similarity.
+    pub origin: Option<Geodetic>,
+    /// Surveyed points that were marked in pictures.
+    pub control: Vec<control::SurveyedPoint>,
+    /// Others, that the result is measured against and that are not used for it.
+    pub check: Vec<control::SurveyedPoint>,
+    /// One line per thing a user should know: what was left out and why, what contradicts the rest.
+    pub notes: Vec<String>,
+    /// Names with the extension of a picture that were found.
+    pub found: usize,
+}
+
+/// What a card is read with besides its own files.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CardOptions {
+    /// A file of positions (`geo.txt`, Mission Planner's or our own CSV); files of these names on the card are found
+    /// without it.
+    pub geotags: Option<PathBuf>,
+    /// A file of surveyed points (`gcp_list.txt`); one of this name on the card is found without it.
+    pub control: Option<PathBuf>,
+    /// A file of the same form, of points that the result is measured against.
+    pub check: Option<PathBuf>,
+    /// Exposures out of a flight log, in order.
+    pub exposures: Vec<Exposure>,
+}
+
+impl Card {
+    /// True when there is a file with the extension of a picture below `folder`.
+    pub fn has_pictures(folder: &Path) -> bool {
+        scan::pictures(&[folder.to_owned()]).is_ok_and(|found| !found.files.is_empty())
+    }
+
+    /// Reads what the pictures below `folders` say of themselves; of no picture more than its head is read.
+    ///
+    /// # Errors
+    /// A folder cannot be read, nothing in it is a picture, or a file of positions is bad.
+    pub fn open(folders: &[PathBuf], options: &CardOptions) -> Result<Self, CardError> {
+        let scan::Scanned { files, notes: mut lines, geotags, control: marked, .. } = scan::pictures(folders)?;
+        let first = folders.first().cloned().unwrap_or_default();
+        let found = files.len();
+        let mut notes = notes::Notes::default();
+        let mut records = record::read_all(files, &mut notes);
+        if records.is_empty() {
+            let why = notes.summary().unwrap_or_else(|| "there is none".to_owned());
+            return Err(CardError::NoPictures { path: first, why });
+        }
+        for file in options.geotags.iter().chain(&geotags) {
+            let tags = geotags::read(file)?;
+            lines.push(geotags::apply(file, &tags, &mut records));
+        }
+        if !options.exposures.is_empty() {
+            lines.push(exposures::apply(&options.exposures, &mut records));
+        }
+        let mut control = Vec::new();
+        for file in options.control.iter().chain(&marked) {
+            let points = control::read(file)?;
+            lines.push(control::summary(file, &points, &records));
+            control.extend(points);
+        }
+        let mut check = Vec::new();
+        if let Some(file) = &options.check {
+            check = control::read(file)?;
+            lines.push(control::summary(file, &check, &records));
+        }
+        record::in_order(&mut records);
+        if !records.iter().any(|r| r.fix.is_some()) {
+            lines.push(format!(
+                "none of {} pictures says where it was taken (no GPS in EXIF or XMP, no geotags): the scene has no place, no north and no scale (neighbours are 1 apart); --geotags or --log would give them",
+                records.len()
+            ));
+            let pictures = priors::without_positions(&records);
+            lines.extend(notes.lines());
+            return Ok(Self { pictures, origin: None, control, check, notes: lines, found });
+        }
+        vote::settle(&mut records, &mut notes);
+        let origin = priors::origin(&records);
+        let pictures = priors::of(&records, &EnuFrame::new(origin), &mut notes);
+        lines.extend(notes.lines());
+        Ok(Self { pictures, origin: Some(origin), control, check, notes: lines, found })
+    }
+}

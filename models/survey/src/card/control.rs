@@ -1,0 +1,145 @@
+//! Surveyed points marked in pictures: OpenDroneMap's `gcp_list.txt`. Its first line is the reference system; every other line is
+//! `x y z pixel-x pixel-y picture [name [sigma-horizontal sigma-vertical]]`, the standard deviations in metres being ours.
+
+use std::collections::HashSet;
+use std::path::Path;
+
+use geometry::geodesy::Geodetic;
+use glam::DVec3;
+
+use super::record::Record;
+use crate::ortho::crs::SurveyCrs;
+use models::formats::{FormatError, read_bounded};
+
+/// A hundred thousand marks at 160 bytes each.
+const LIMIT: u64 = 16 << 20;
+/// No survey marks more points: each row is compared with all points before it.
+const MOST_POINTS: usize = 4096;
+/// What a point measured with RTK is worth where the file does not say, horizontally and vertically, metres.
+const SIGMA_M: [f64; 2] = [0.03, 0.05];
+/// No survey is better than this or of use beyond that, metres.
+const SIGMAS_M: [f64; 2] = [0.001, 100.0];
+/// Two rows nearer than this are one point, in the reference system's own unit: a millimetre, or its like in degrees.
+const SAME: [f64; 2] = [1e-3, 1e-8];
+
+/// A surveyed point.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SurveyedPoint {
+    /// Its name in the file, else its number there.
+    pub name: String,
+    /// Where it is, height on the scale of the pictures' heights.
+    pub position: Geodetic,
+    /// Standard deviation, horizontal and vertical, metres.
+    pub sigma_m: [f64; 2],
+    /// Pictures that show it (lower-case file names), and where: pixels of the picture as it is stored, the top left corner being
+    /// (0, 0).
+    pub marks: Vec<(String, [f64; 2])>,
+}
+
+/// Reads a `gcp_list.txt`; rows of one place are one point.
+///
+/// # Errors
+/// The file cannot be read, its first line names no known reference system, or a line is no mark of a point.
+pub fn read(path: &Path) -> Result<Vec<SurveyedPoint>, FormatError> {
+    let bytes = read_bounded(path, LIMIT)?;
+    let text = std::str::from_utf8(&bytes).map_err(|_| FormatError::invalid(path, "not UTF-8 text"))?;
+    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#'));
+    let first = lines.next().map(|(_, l)| l.trim().trim_start_matches('\u{feff}')).unwrap_or_default();
+    let crs = SurveyCrs::named(first).ok_or_else(|| {
+        FormatError::invalid(
+            path,
+            format!("line 1: {first:?} names no known reference system (EPSG:CODE, WGS84 UTM 32N, +proj=…)"),
+        )
+    })?;
+    let same = SAME[usize::from(crs.is_in_degrees())];
+    let mut points: Vec<(DVec3, SurveyedPoint)> = Vec::new();
+    for (i, line) in lines {
+        let bad = |what: &str| FormatError::invalid(path, format!("line {}: {what}", i + 1));
+        let cells: Vec<&str> = line.split([' ', '\t', ',']).filter(|c| !c.is_empty()).collect();
+        let number = |k: usize| cells.get(k)?.parse::<f64>().ok().filter(|v| v.is_finite());
+        let five = (|| Some([number(0)?, number(1)?, number(2)?, number(3)?, number(4)?]))();
+        let (Some([x, y, z, u, v]), Some(picture)) = (five, cells.get(5)) else {
+            return Err(bad("x, y, z, the pixel's x and y and a picture's name are needed"));
+        };
+        let mark = (picture.to_lowercase(), [u, v]);
+        let place = DVec3::new(x, y, z);
+        let known = points.iter_mut().find(|(at, _)| (*at - place).abs().max_element() < same);
+        if let Some((_, point)) = known {
+            point.marks.push(mark);
+            continue;
+        }
+        if points.len() == MOST_POINTS {
+            return Err(bad(&format!(
+                "more than {MOST_POINTS} points; leave out those that these pictures do not show"
+            )));
+        }
+        let position = crs.geodetic(place).ok_or_else(|| bad("is outside of its reference system"))?;
+        let name = cells.get(6).map_or_else(|| (points.len() + 1).to_string(), |name| (*name).to_owned());
+        let sigma_m = [7, 8].map(|k| number(k).filter(|s| *s > 0.0));
+        let sigma_m = [0, 1].map(|k| sigma_m[k].unwrap_or(SIGMA_M[k]).clamp(SIGMAS_M[0], SIGMAS_M[1]));
+        points.push((place, SurveyedPoint { name, position, sigma_m, marks: vec![mark] }));
+    }
+    Ok(points.into_iter().map(|(_, point)| point).collect())
+}
+
+/// One line: how many points are marked in how many of the card's pictures.
+pub(super) fn summary(path: &Path, points: &[SurveyedPoint], records: &[Record]) -> String {
+    let names: HashSet<String> = records.iter().map(|r| r.name.to_lowercase()).collect();
+    let marks = points.iter().flat_map(|p| &p.marks);
+    let (here, elsewhere): (Vec<_>, Vec<_>) = marks.partition(|(picture, _)| names.contains(picture));
+    let others = match elsewhere.first() {
+        Some((picture, _)) => format!("; {} marks are in pictures that are not here ({picture}, …)", elsewhere.len()),
+        None => String::new(),
+    };
+    format!("{}: {} surveyed points with {} marks{others}", path.display(), points.len(), here.len())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use super::*;
+
+    fn read_text(text: &str) -> Result<Vec<SurveyedPoint>, FormatError> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("gcp_list.txt");
+        std::fs::write(&path, text).unwrap();
+        read(&path)
+    }
+
+    #[test]
+    fn rows_of_one_place_are_one_point_with_its_name_and_standard_deviations() {
+        let text = "WGS84 UTM 17N\n\n333158.20\t3102916.18\t3\t2699.43\t1668.72\tDJI_0065.JPG\n\
+            333158.20 3102916.18 3 2706.86 1960.27 DJI_0066.JPG\n# a note\n\
+            333187.62 3102954.46 4.5 1434.68 704.34 DJI_0065.JPG church 0.01 0.02\n";
+        let points = read_text(text).unwrap();
+        assert_eq!(points.len(), 2);
+        assert_eq!((points[0].name.as_str(), points[0].marks.len()), ("1", 2));
+        assert_eq!(points[0].marks[1], ("dji_0066.jpg".to_owned(), [2706.86, 1960.27]));
+        assert_eq!((points[1].name.as_str(), points[1].sigma_m, points[0].sigma_m), ("church", [0.01, 0.02], SIGMA_M));
+        assert!((points[1].position.lat_deg - 28.04).abs() < 0.01 && points[1].position.alt_m == 4.5);
+        // In degrees a millimetre is not a thousandth.
+        let degrees = "EPSG:4326\n7.00001 46.0 400 1 2 a.jpg\n7.00002 46.0 400 3 4 a.jpg\n";
+        assert_eq!(read_text(degrees).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn bad_lines_are_named_by_number() {
+        for (text, expected) in [
+            ("hello\n1 2 3 4 5 a.jpg\n", "line 1"),
+            ("EPSG:4326\n7 46 400 1 2\n", "line 2"),
+            ("EPSG:4326\n7 46 400 1 2 a.jpg\n7 46 nan 1 2 a.jpg\n", "line 3"),
+            ("EPSG:4326\n7 146 400 1 2 a.jpg\n", "line 2: is outside"),
+        ] {
+            let error = read_text(text).unwrap_err().to_string();
+            assert!(error.contains(expected) && !error.contains('\n'), "{text:?}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_list_of_more_points_than_any_survey_has_is_refused_in_one_line() {
+        let rows = |n: usize| (0..n).map(|i| format!("{} 46.0 400 1 2 a.jpg\n", i as f64 * 1e-3)).collect::<String>();
+        assert_eq!(read_text(&format!("EPSG:4326\n{}", rows(MOST_POINTS))).unwrap().len(), MOST_POINTS);
+        let error = read_text(&format!("EPSG:4326\n{}", rows(MOST_POINTS + 1))).unwrap_err().to_string();
+        assert!(error.contains("line 4098: more than 4096 points") && !error.contains('\n'), "{error}");
+    }
+}

@@ -1,0 +1,6 @@
+//! Surveys: a card of pictures or another program's data set as posed pictures, what they cover, and maps of the result.
+
+pub mod card;
+pub mod coverage;
+pub mod dataset;
+pub mod ortho;
