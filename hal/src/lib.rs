@@ -3,8 +3,8 @@
 //!
 //! The core (traits, MAVLink framing and decoding, rings, time filters, matcher, camera component, failsafe ladder)
 //! is `no_std` without `alloc`: every capacity is in a type, nothing is allocated per message. Links and cameras
-//! need the `std` feature; [`vehicle::Vehicle`] drives them all. Simulators, replay and fault injection are the feature
-//! `lab`, which an aircraft flies without.
+//! need the `std` feature; [`vehicle::Vehicle`] drives them all. Simulators, replay and fault injection are the crate
+//! `sim`, which an aircraft flies without.
 //!
 //! MAVLink's NED/FRD never leaves this crate: poses are East-North-Up metres, body axes forward-left-up, camera
 //! axes OpenCV (x right, y down, z forward). See [`frames`].
@@ -33,9 +33,5 @@ pub mod blank;
 pub mod camera;
 #[cfg(feature = "std")]
 pub mod link;
-#[cfg(feature = "lab")]
-pub mod replay;
-#[cfg(feature = "lab")]
-pub mod sim;
 #[cfg(feature = "std")]
 pub mod vehicle;

@@ -8,7 +8,6 @@ mod reconnect;
 mod serial;
 mod tcp;
 mod udp;
-#[cfg(any(test, feature = "lab"))]
 mod wire;
 
 use std::net::SocketAddr;
@@ -22,7 +21,6 @@ pub use reconnect::Reconnecting;
 pub use serial::SerialLink;
 pub use tcp::TcpLink;
 pub use udp::UdpLink;
-#[cfg(any(test, feature = "lab"))]
 pub use wire::WireLink;
 
 use crate::error::HalError;

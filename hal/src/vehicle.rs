@@ -4,7 +4,7 @@
 
 mod event;
 mod exposures;
-pub(crate) mod mount;
+pub mod mount;
 mod service;
 mod settings;
 

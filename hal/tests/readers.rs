@@ -132,30 +132,6 @@ fn telemetry_logs() {
 }
 
 /// A log that is played back: everything it says of the flight is needed at once.
-#[cfg(feature = "lab")]
-#[test]
-fn recordings() {
-    use hal::replay::Recording;
-    let folder = memory_folder();
-    let path = folder.path().join("whole.tlog");
-    let mut seeds = stretches(6000);
-    seeds.retain(|bytes| {
-        std::fs::write(&path, bytes).expect("written");
-        Recording::read(&path).is_ok()
-    });
-    seeds.truncate(32);
-    survive(&Reader {
-        name: "recording",
-        seeds,
-        text: false,
-        shell: None,
-        memory: (256 << 10, 32),
-        read: Read::File("a.tlog", &|path| {
-            line(Recording::read(path), |r| r.home.is_valid() && r.length_s().is_finite() && r.boot_s(1.0).is_finite())
-        }),
-    });
-}
-
 #[test]
 fn addresses_of_links() {
     let seeds =

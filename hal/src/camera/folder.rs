@@ -123,7 +123,6 @@ impl FolderCamera {
     }
 
     /// For a clock that is not the wall's: the age of a file says nothing then.
-    #[cfg(any(test, feature = "lab"))]
     pub fn on_simulated_clock(self) -> Self {
         Self { simulated_clock: true, ..self }
     }

@@ -17,7 +17,7 @@ const EXIF_POSITION_SIGMA: [f32; 3] = [2.0, 2.0, 5.0];
 const EXIF_ROTATION_SIGMA: f32 = 0.05;
 
 /// How the camera sits on the airframe, and where the world's origin is.
-pub(crate) struct Mount {
+pub struct Mount {
     frame: EnuFrame,
     /// Mount → body; `None` when the gimbal says.
     fixed: Option<DQuat>,
@@ -28,7 +28,8 @@ pub(crate) struct Mount {
 }
 
 impl Mount {
-    pub(crate) fn new(settings: &MountSettings, frame: EnuFrame) -> Self {
+    /// The mount of a mission, with the origin of its frame.
+    pub fn new(settings: &MountSettings, frame: EnuFrame) -> Self {
         let fixed = match settings.attitude {
             MountAttitude::Gimbal => None,
             MountAttitude::Fixed => Some(fixed_mount(settings.rotation_deg)),
@@ -44,7 +45,7 @@ impl Mount {
 
     /// The camera's pose; `None` when the mount needs a gimbal attitude that is missing. `time_sigma_s` is how far the
     /// instant of exposure may be off.
-    pub(crate) fn camera_pose(&self, body: &BodyPose, time_sigma_s: f64) -> Option<CameraPose> {
+    pub fn camera_pose(&self, body: &BodyPose, time_sigma_s: f64) -> Option<CameraPose> {
         let mount = match self.fixed {
             Some(fixed) => body.attitude * fixed,
             None => body.gimbal?,

@@ -3,13 +3,13 @@
 
 mod picture;
 
+use sim::world::{FromAbove, MapKind, World};
 use std::path::Path;
 
 use engine::device::map_renderer;
 use engine::evaluate::heights::HeightScores;
 use engine::ortho::{DrawnBlock, Map, MapRequest};
 use glam::{DMat4, DVec2, DVec3, DVec4};
-use hal::sim::world::{FromAbove, MapKind, World};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, Chunks, ModelHeader};
 use serde::Serialize;

@@ -4,9 +4,9 @@ use std::path::Path;
 
 use engine::evaluate::save_png;
 use glam::{DQuat, DVec3};
-use hal::sim::world::{PinholeView, World, WorldSettings};
 use models::camera::Pose;
 use models::formats::transforms::pose_to_opengl;
+use sim::world::{PinholeView, World, WorldSettings};
 
 use super::figures::write_json;
 use crate::error::JobError;

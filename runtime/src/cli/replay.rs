@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use geometry::geodesy::{EnuFrame, Geodetic};
-use hal::replay::{Playlist, PlaylistItem, ReplaySettings, TlogSettings, play, play_tlog};
-use hal::sim::SessionSettings;
-use hal::sim::autopilot::AutopilotSettings;
-use hal::sim::reference::Lens;
-use hal::sim::world::WorldSettings;
+use sim::SessionSettings;
+use sim::autopilot::AutopilotSettings;
+use sim::reference::Lens;
+use sim::replay::{Playlist, PlaylistItem, ReplaySettings, TlogSettings, play, play_tlog};
+use sim::world::WorldSettings;
 use survey::dataset::{Dataset, DatasetFrame, PoseSource};
 
 use super::CliError;

@@ -6,14 +6,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use config::mission::{CameraSource, Mission};
 use hal::link::LinkAddress;
-use hal::sim::aircraft::Imperfections;
-use hal::sim::attached::{AttachedSettings, photograph};
-use hal::sim::autopilot::{Announcing, AutopilotSettings};
-use hal::sim::reference::Lens;
-use hal::sim::survey::SurveySettings;
-use hal::sim::world::WorldSettings;
-use hal::sim::{SessionSettings, SimSettings};
 use models::formats::flight_plan;
+use sim::aircraft::Imperfections;
+use sim::attached::{AttachedSettings, photograph};
+use sim::autopilot::{Announcing, AutopilotSettings};
+use sim::reference::Lens;
+use sim::survey::SurveySettings;
+use sim::world::WorldSettings;
+use sim::{SessionSettings, SimSettings};
 
 mod card;
 
@@ -163,7 +163,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Ok(());
     }
     let camera_dir = camera_dir(args.camera_dir.clone(), &aircraft.camera)?;
-    let report = hal::sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut say_where)?;
+    let report = sim::run(&settings, &address, &camera_dir, args.reference.as_deref(), &stop, &mut say_where)?;
     tracing::info!(
         "{} exposures, {} pictures, {:.0} s of flight",
         report.triggers,

@@ -4,10 +4,10 @@ use std::ops::ControlFlow;
 
 use config::refine::RefineSettings;
 use glam::{DQuat, DVec3};
-use hal::sim::world::{PinholeView, World, WorldSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::ModelHeader;
+use sim::world::{PinholeView, World, WorldSettings};
 use vulkan::gpu::Gpu;
 use vulkan::trainer::{RunBudget, StepReport};
 

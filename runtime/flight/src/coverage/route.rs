@@ -1,8 +1,8 @@
 //! A plan as the simulated aircraft flies it.
 
 use geometry::geodesy::{EnuFrame, Geodetic};
-use hal::sim::survey::{Route, Waypoint};
 use models::formats::flight_plan::FlightPlan;
+use sim::survey::{Route, Waypoint};
 
 /// The waypoints of `plan` around `origin`; where it says nothing of the camera's pitch it is `pitch_deg`.
 pub fn route(plan: &FlightPlan, origin: Geodetic, pitch_deg: f64) -> Route {

@@ -3,15 +3,15 @@
 
 use config::coverage::CoverageSettings;
 use glam::DVec2;
-use hal::sim::SessionSettings;
-use hal::sim::SimSettings;
-use hal::sim::aircraft::Imperfections;
-use hal::sim::autopilot::AutopilotSettings;
-use hal::sim::reference::{Lens, flown_views};
-use hal::sim::survey::SurveySettings;
-use hal::sim::world::{World, WorldSettings};
 use models::camera::{Intrinsics, Pose};
 use models::formats::flight_plan;
+use sim::SessionSettings;
+use sim::SimSettings;
+use sim::aircraft::Imperfections;
+use sim::autopilot::AutopilotSettings;
+use sim::reference::{Lens, flown_views};
+use sim::survey::SurveySettings;
+use sim::world::{World, WorldSettings};
 use survey::coverage::Region;
 
 use super::*;
@@ -56,10 +56,8 @@ fn flown(settings: &SimSettings) -> Vec<View> {
         cy: LENS.cy as f32,
     };
     let flight = settings.flight().expect("a flight");
-    let view = |v: hal::sim::world::PinholeView| View {
-        intrinsics: lens,
-        pose: Pose { rotation: v.rotation, center: v.position },
-    };
+    let view =
+        |v: sim::world::PinholeView| View { intrinsics: lens, pose: Pose { rotation: v.rotation, center: v.position } };
     flown_views(&flight, &settings.lens).into_iter().map(view).collect()
 }
 

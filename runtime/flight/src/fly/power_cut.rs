@@ -11,13 +11,13 @@ use disk::Disk;
 use engine::failsafe::Failsafe;
 use engine::model_path;
 use hal::camera::Picture;
-use hal::sim::world::{World, WorldSettings};
 use hal::time::ManualClock;
 use job::health::Health;
 use job::interrupt::Interrupt;
 use job::session::{Owner, Session};
 use models::formats::model;
 use rayon::prelude::*;
+use sim::world::{World, WorldSettings};
 use uplink::Offerer;
 use vulkan::trainer::RunBudget;
 

@@ -4,8 +4,8 @@
 use std::sync::Arc;
 
 use disk::Disk;
-use hal::sim::world::World;
 use models::formats::flight_plan;
+use sim::world::World;
 
 use super::fault_table::{ORIGIN, usual};
 use super::rehearsal::rehearse;

@@ -1,11 +1,11 @@
 //! A simulated survey as a data set: aircraft side by side over the ray-cast world, true poses, and points as a structure-from-motion
 //! leaves them.
 
+use sim::world::{PinholeView, World, WorldSettings};
 use std::path::Path;
 
 use engine::evaluate::save_png;
 use glam::{DQuat, DVec2, DVec3};
-use hal::sim::world::{PinholeView, World, WorldSettings};
 use models::camera::{Pinhole, Pose};
 use models::formats::transforms::pose_to_opengl;
 use serde_json::{Value, json};

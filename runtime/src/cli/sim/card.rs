@@ -7,12 +7,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use geometry::geodesy::EnuFrame;
 use glam::{DQuat, DVec3};
-use hal::sim::SimSettings;
-use hal::sim::photographer::{to_jpeg, write_whole};
-use hal::sim::reference::flown_views;
-use hal::sim::world::World;
 use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
 use models::formats::transforms;
+use sim::SimSettings;
+use sim::photographer::{to_jpeg, write_whole};
+use sim::reference::flown_views;
+use sim::world::World;
 use survey::card::write::Tags;
 
 use crate::error::JobError;
@@ -43,7 +43,7 @@ pub fn write(settings: &SimSettings, folder: &Path, stop: &AtomicBool) -> Result
             break;
         }
         let believed = flight.reported.at(exposure.middle_s);
-        let camera = hal::sim::axes::camera_to_enu(believed.gimbal);
+        let camera = sim::axes::camera_to_enu(believed.gimbal);
         let mut tags = Tags {
             camera: Some(("DJI".to_owned(), "dgtr sim".to_owned())),
             time_ns: Some(START_S * 1_000_000_000 + (exposure.middle_s * 1e9) as u64),

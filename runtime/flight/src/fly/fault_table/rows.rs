@@ -12,9 +12,9 @@ use disk::{Disk, Operations, Output, System};
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::failsafe::Action;
-use hal::sim::SessionReport;
-use hal::sim::autopilot::Announcing;
 use models::camera::{Pose, PoseSigma, PosedImage, View};
+use sim::SessionReport;
+use sim::autopilot::Announcing;
 
 use super::super::rehearsal::{Script, intrinsics};
 use crate::keyframe_store::{KeyFrame, KeyframeStore};

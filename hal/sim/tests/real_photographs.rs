@@ -14,10 +14,10 @@ use hal::link::{LinkAddress, PtyLink};
 use hal::mavlink::Signer;
 use hal::mavlink::channel::Channel;
 use hal::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot};
-use hal::replay::{Playlist, PlaylistItem, ReplaySettings, play};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
+use sim::replay::{Playlist, PlaylistItem, ReplaySettings, play};
 
-#[path = "../../tests/shared_data.rs"]
+#[path = "../../../tests/shared_data.rs"]
 mod shared_data;
 
 use shared_data::shared;

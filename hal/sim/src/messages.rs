@@ -4,8 +4,8 @@ use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::track::Sample;
-use crate::frames::{ned_to_enu, yaw_of_ned};
-use crate::mavlink::dialect::{
+use hal::frames::{ned_to_enu, yaw_of_ned};
+use hal::mavlink::dialect::{
     ATTITUDE_QUATERNION_DATA, CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_TRIGGER_DATA, COMMAND_LONG_DATA,
     CameraFeedbackFlags, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_RAW_INT_DATA,
     GimbalDeviceFlags, GpsFixType, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavModeFlag, MavState, MavType,

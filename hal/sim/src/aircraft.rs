@@ -8,7 +8,7 @@ use rand_pcg::Pcg64Mcg;
 
 use super::survey::{Line, Route};
 use super::track::{Sample, Track};
-use crate::frames::{euler_to_ned, ned_to_enu};
+use hal::frames::{euler_to_ned, ned_to_enu};
 
 /// Time step of the simulation, seconds.
 const STEP: f64 = 0.02;

@@ -9,9 +9,9 @@ use super::autopilot::Autopilot;
 use super::error::SimError;
 use super::faulty_link::{FaultyLink, LineFaults};
 use super::photographer::{Photographer, PictureCounters};
-use crate::error::HalError;
-use crate::link::{LinkAddress, Reconnecting};
-use crate::traits::Link;
+use hal::error::HalError;
+use hal::link::{LinkAddress, Reconnecting};
+use hal::traits::Link;
 
 /// Longest time between two looks at the link.
 const TICK: Duration = Duration::from_millis(2);

@@ -10,9 +10,9 @@ use super::faulty_link::FaultyLink;
 use super::session::{Session, SessionReport};
 use super::world::World;
 use super::{SimError, SimSettings, camera_over};
-use crate::link::WireLink;
-use crate::time::ManualClock;
-use crate::traits::Clock;
+use hal::link::WireLink;
+use hal::time::ManualClock;
+use hal::traits::Clock;
 
 /// An aircraft whose time is moved by hand.
 pub struct Rehearsal {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use config::error::{Error, ErrorKind};
 
-use crate::error::HalError;
+use hal::error::HalError;
 
 /// One line each: what, where, how to mend.
 #[derive(Debug, thiserror::Error)]

@@ -1,13 +1,13 @@
 //! What others ask of the autopilot: time, parameters (the faults, live), messages and their rates.
 
 use super::{Autopilot, TEXTS};
-use crate::error::HalError;
-use crate::mavlink::dialect::{
+use config::faults::FaultSettings;
+use hal::error::HalError;
+use hal::mavlink::dialect::{
     COMMAND_ACK_DATA, COMMAND_LONG_DATA, MavCmd, MavParamType, MavResult, PARAM_REQUEST_LIST_DATA,
     PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, PARAM_VALUE_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
 };
-use crate::traits::Link;
-use config::faults::FaultSettings;
+use hal::traits::Link;
 
 /// A request, copied out of the frame that carried it.
 enum Request {

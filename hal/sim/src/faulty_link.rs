@@ -6,9 +6,9 @@ use std::time::Duration;
 use config::faults::FaultSettings;
 
 use super::random::{About, bits, strikes};
-use crate::error::HalError;
-use crate::link::Reconnecting;
-use crate::traits::{Link, Received};
+use hal::error::HalError;
+use hal::link::Reconnecting;
+use hal::traits::{Link, Received};
 
 /// What was done to the line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

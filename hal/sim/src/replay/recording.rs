@@ -7,17 +7,17 @@ use std::time::Duration;
 use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DQuat;
 
-use crate::frames::{euler_to_ned, yaw_of_ned};
-use crate::link::TlogLink;
-use crate::mavlink::dialect::{
+use crate::SimError;
+use crate::messages;
+use crate::track::{Sample, Track};
+use hal::frames::{euler_to_ned, yaw_of_ned};
+use hal::link::TlogLink;
+use hal::mavlink::dialect::{
     CAMERA_FEEDBACK_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GimbalDeviceFlags,
     HEARTBEAT_DATA, MavAutopilot, SIM_STATE_DATA, SYSTEM_TIME_DATA,
 };
-use crate::mavlink::{Frame, Framer};
-use crate::sim::SimError;
-use crate::sim::messages;
-use crate::sim::track::{Sample, Track};
-use crate::traits::Link;
+use hal::mavlink::{Frame, Framer};
+use hal::traits::Link;
 
 /// Larger logs are refused before they are read: 1 GiB is a day of telemetry.
 const LARGEST_LOG: u64 = 1 << 30;
@@ -192,7 +192,7 @@ impl Recording {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mavlink::Encoder;
+    use hal::mavlink::Encoder;
 
     #[test]
     fn heights_at_the_ends_of_their_numbers_are_no_overflow() {

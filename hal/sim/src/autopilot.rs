@@ -16,16 +16,16 @@ use super::faulty_link::FaultyLink;
 use super::messages;
 use super::random::{About, bits, strikes};
 use super::track::Sample;
-use crate::error::HalError;
-use crate::link::Reconnecting;
-use crate::mavlink::channel::{Channel, ChannelCounters};
-use crate::mavlink::dialect::{
+use hal::error::HalError;
+use hal::link::Reconnecting;
+use hal::mavlink::channel::{Channel, ChannelCounters};
+use hal::mavlink::dialect::{
     ATTITUDE_QUATERNION_DATA, EXTENDED_SYS_STATE_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA,
     GPS_RAW_INT_DATA, HEARTBEAT_DATA, MavLandedState, SIM_STATE_DATA, SYSTEM_TIME_DATA, TIMESYNC_DATA,
 };
-use crate::mavlink::signing::timestamp_of_unix_us;
-use crate::mavlink::{MessageData, Signer, SigningMode};
-use crate::traits::Link;
+use hal::mavlink::signing::timestamp_of_unix_us;
+use hal::mavlink::{MessageData, Signer, SigningMode};
+use hal::traits::Link;
 
 mod announce;
 mod requests;

@@ -1,9 +1,9 @@
 //! Camera and gimbal attitudes as simulators and recordings need them: the inverse direction of what the decoder does,
-//! built from the same [`crate::frames`].
+//! built from the same [`hal::frames`].
 
 use glam::DQuat;
 
-use crate::frames::{attitude_to_enu, attitude_to_ned, camera_to_mount, euler_to_ned};
+use hal::frames::{attitude_to_enu, attitude_to_ned, camera_to_mount, euler_to_ned};
 
 /// Camera (OpenCV) → ENU out of gimbal (FRD, x along the optical axis) → NED.
 pub fn camera_to_enu(gimbal: DQuat) -> DQuat {

@@ -7,12 +7,12 @@ use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::*;
-use crate::sim::aircraft::angle_between;
-use crate::sim::companion::accompany;
-use crate::sim::reference::Lens;
-use crate::sim::world::WorldSettings;
+use crate::aircraft::angle_between;
+use crate::companion::accompany;
+use crate::reference::Lens;
+use crate::world::WorldSettings;
 
-#[path = "../../../tests/shared_data.rs"]
+#[path = "../../../../tests/shared_data.rs"]
 mod shared_data;
 
 use shared_data::shared;
@@ -149,7 +149,7 @@ fn recorded_survey_flies_again_and_all_forty_pictures_get_the_true_pose() {
         let got = companion.frame(&format!("IMG_{index:04}.jpg")).expect("a frame");
         let s = truth.at(*boot_s);
         metres += (got.pose.position - s.position).length() / 40.0;
-        degrees += angle_between(got.pose.rotation, crate::sim::axes::camera_to_enu(s.gimbal)).to_degrees() / 40.0;
+        degrees += angle_between(got.pose.rotation, crate::axes::camera_to_enu(s.gimbal)).to_degrees() / 40.0;
     }
     println!("run8: {metres:.3} m, {degrees:.2}° mean");
     assert!(metres < 0.25 && degrees < 1.5, "{metres} m, {degrees}°");

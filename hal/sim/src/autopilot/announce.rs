@@ -1,11 +1,11 @@
 //! How an exposure is announced, in the manner of ArduPilot or of PX4.
 
 use super::Autopilot;
-use crate::error::HalError;
-use crate::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag};
-use crate::sim::messages;
-use crate::sim::random::{About, strikes};
-use crate::traits::Link;
+use crate::messages;
+use crate::random::{About, strikes};
+use hal::error::HalError;
+use hal::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag};
+use hal::traits::Link;
 
 /// PX4's custom mode: main mode AUTO (4), sub-mode MISSION (4).
 const PX4_MISSION: u32 = 4 << 24 | 4 << 16;

@@ -20,22 +20,22 @@ use super::messages;
 use super::photographer::{Photographer, PictureCounters, to_jpeg};
 use super::reference::Lens;
 use super::world::{PinholeView, World, WorldSettings};
-use crate::autopilot::{Autopilot, Ids};
-use crate::frames::{attitude_to_enu, attitude_to_ned, euler_to_ned, yaw_of_ned};
-use crate::link::{LinkAddress, Reconnecting};
-use crate::mavlink::MessageData;
-use crate::mavlink::channel::Channel;
-use crate::mavlink::dialect::{
+use hal::autopilot::{Autopilot, Ids};
+use hal::frames::{attitude_to_enu, attitude_to_ned, euler_to_ned, yaw_of_ned};
+use hal::link::{LinkAddress, Reconnecting};
+use hal::mavlink::MessageData;
+use hal::mavlink::channel::Channel;
+use hal::mavlink::dialect::{
     ATTITUDE_QUATERNION_DATA, COMMAND_LONG_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA,
     HEARTBEAT_DATA, MavAutopilot, MavCmd, MavState, MavType, SIM_STATE_DATA, SYSTEM_TIME_DATA,
 };
-use crate::mavlink::signing_store;
-use crate::mavlink_camera::{CameraInfo, MavlinkCamera, Request};
-use crate::pose::{BodyPose, PoseError};
-use crate::time::MonotonicClock;
-use crate::traits::{Clock, PoseSource, TriggerSource};
-use crate::trigger::Trigger;
-use crate::vehicle::mount::Mount;
+use hal::mavlink::signing_store;
+use hal::mavlink_camera::{CameraInfo, MavlinkCamera, Request};
+use hal::pose::{BodyPose, PoseError};
+use hal::time::MonotonicClock;
+use hal::traits::{Clock, PoseSource, TriggerSource};
+use hal::trigger::Trigger;
+use hal::vehicle::mount::Mount;
 
 /// Our component: MAV_COMP_ID_ONBOARD_COMPUTER. The camera that ground stations see is the onboard job's.
 const COMPONENT: u8 = 191;

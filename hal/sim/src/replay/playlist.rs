@@ -6,11 +6,11 @@ use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
 use super::ReplaySettings;
-use crate::frames::euler_to_ned;
-use crate::sim::SimError;
-use crate::sim::aircraft::{Exposure, Flight};
-use crate::sim::axes::{camera_to_enu, from_degrees, gimbal_to_ned};
-use crate::sim::track::{Sample, Track};
+use crate::SimError;
+use crate::aircraft::{Exposure, Flight};
+use crate::axes::{camera_to_enu, from_degrees, gimbal_to_ned};
+use crate::track::{Sample, Track};
+use hal::frames::euler_to_ned;
 
 /// Standing still before the first and after the last picture, seconds.
 const HOVER: f64 = 4.0;

@@ -10,10 +10,10 @@ use geometry::geodesy::EnuFrame;
 use glam::DVec3;
 
 use super::*;
-use crate::link::SerialLink;
-use crate::mavlink::channel::Channel;
-use crate::mavlink::dialect::*;
-use crate::mavlink::{MessageData, Signer};
+use hal::link::SerialLink;
+use hal::mavlink::channel::Channel;
+use hal::mavlink::dialect::*;
+use hal::mavlink::{MessageData, Signer};
 
 /// A quick flight with small pictures over a small world.
 pub(super) fn quick() -> SimSettings {

@@ -1,5 +1,5 @@
 //! What stands in for reality: a ray-cast world, an aircraft that flies over it and speaks MAVLink, and the faults
-//! of both. Everything follows from a seed.
+//! of both. Everything follows from a seed. [`replay`] plays recordings back as a living aircraft.
 
 pub mod aircraft;
 pub mod attached;
@@ -12,6 +12,7 @@ pub mod photographer;
 mod random;
 pub mod reference;
 pub mod rehearsal;
+pub mod replay;
 pub mod session;
 pub mod survey;
 pub mod track;
@@ -27,9 +28,9 @@ use glam::DVec2;
 pub use error::SimError;
 pub use session::{SessionReport, SessionSettings};
 
-use crate::link::LinkAddress;
 use aircraft::{Flight, Imperfections, Leg, Manner};
 use autopilot::{Autopilot, AutopilotSettings};
+use hal::link::LinkAddress;
 use photographer::{Photographer, to_jpeg, write_whole};
 use reference::{Lens, flown_views};
 use survey::{Route, SurveySettings, lines};

@@ -8,9 +8,9 @@ use config::link::LinkSettings;
 use config::mission::{CameraSettings, CameraSource, MountSettings};
 use geometry::geodesy::Geodetic;
 
-use crate::counters::HalCounters;
-use crate::link::LinkAddress;
-use crate::vehicle::{Event, PosedPicture, Unmatched, Vehicle, VehicleSettings};
+use hal::counters::HalCounters;
+use hal::link::LinkAddress;
+use hal::vehicle::{Event, PosedPicture, Unmatched, Vehicle, VehicleSettings};
 
 /// What the companion got.
 #[derive(Debug, Default)]

@@ -15,11 +15,11 @@ pub use playlist::{Playlist, PlaylistItem};
 pub use recording::Recording;
 pub use tlog::{TlogReport, TlogSettings, play_tlog};
 
-use crate::link::LinkAddress;
-use crate::sim::SimError;
-use crate::sim::autopilot::{Autopilot, AutopilotSettings};
-use crate::sim::photographer::Photographer;
-use crate::sim::session::{self, SessionReport, SessionSettings};
+use crate::SimError;
+use crate::autopilot::{Autopilot, AutopilotSettings};
+use crate::photographer::Photographer;
+use crate::session::{self, SessionReport, SessionSettings};
+use hal::link::LinkAddress;
 
 /// How a playlist is played.
 #[derive(Clone, Debug, PartialEq)]

@@ -10,18 +10,18 @@ use ::mavlink::{MAVLinkV2MessageRaw, Message, calculate_crc};
 use config::faults::FaultSettings;
 
 use super::Recording;
-use crate::error::{Error, ErrorKind};
-use crate::link::LinkAddress;
-use crate::mavlink::dialect::{HEARTBEAT_DATA, MavMessage, TIMESYNC_DATA};
-use crate::mavlink::{Encoder, Framer};
-use crate::sim::aircraft::{Exposure, Flight};
-use crate::sim::faulty_link::FaultyLink;
-use crate::sim::photographer::{Photographer, PictureCounters};
-use crate::sim::reference::Lens;
-use crate::sim::session::{self, SessionSettings};
-use crate::sim::world::{World, WorldSettings};
-use crate::sim::{SimError, camera_over};
-use crate::traits::Link;
+use crate::aircraft::{Exposure, Flight};
+use crate::faulty_link::FaultyLink;
+use crate::photographer::{Photographer, PictureCounters};
+use crate::reference::Lens;
+use crate::session::{self, SessionSettings};
+use crate::world::{World, WorldSettings};
+use crate::{SimError, camera_over};
+use hal::error::{Error, ErrorKind};
+use hal::link::LinkAddress;
+use hal::mavlink::dialect::{HEARTBEAT_DATA, MavMessage, TIMESYNC_DATA};
+use hal::mavlink::{Encoder, Framer};
+use hal::traits::Link;
 
 /// From the exposure to the finished file, seconds of flight.
 const TRANSFER_S: f64 = 0.3;
@@ -207,14 +207,14 @@ impl Player {
     }
 
     /// Sends a message of the player's own in the autopilot's name.
-    fn say<D: crate::mavlink::MessageData>(&mut self, message: &D) -> Result<(), SimError> {
+    fn say<D: hal::mavlink::MessageData>(&mut self, message: &D) -> Result<(), SimError> {
         self.encoder.set_sequence(self.sequence);
         self.sequence = self.sequence.wrapping_add(1);
         let frame = self.encoder.encode(message, None);
         Self::count(self.link.write(frame), &mut self.sent, &mut self.dropped)
     }
 
-    fn count(result: Result<(), crate::error::HalError>, sent: &mut u64, dropped: &mut u64) -> Result<(), SimError> {
+    fn count(result: Result<(), hal::error::HalError>, sent: &mut u64, dropped: &mut u64) -> Result<(), SimError> {
         match result {
             Ok(()) => *sent += 1,
             Err(e) if e.kind() == ErrorKind::Busy => *dropped += 1,
@@ -224,7 +224,7 @@ impl Player {
     }
 
     fn beat(&mut self) -> Result<(), SimError> {
-        self.say(&crate::sim::messages::heartbeat())
+        self.say(&crate::messages::heartbeat())
     }
 
     /// Reads for a moment and answers requests for the time.
