@@ -40,6 +40,9 @@ mod train;
 
 use error::{CliError, EXIT_CODES, exit_code};
 
+/// Heading of what every command takes.
+const GLOBAL: &str = "Global options";
+
 /// Posed aerial pictures to 3D Gaussian Splatting on board, merged on the ground.
 #[derive(Debug, Parser)]
 #[command(
@@ -52,22 +55,21 @@ use error::{CliError, EXIT_CODES, exit_code};
 struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// More log lines: -v what each stage does, -vv everything. RUST_LOG overrides.
-    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    /// Write more log lines: -v what each stage does, -vv everything; RUST_LOG overrides.
+    #[arg(short, long, global = true, help_heading = GLOBAL, action = clap::ArgAction::Count)]
     verbose: u8,
-    /// Bound on the memory this process may write to, MiB (RLIMIT_DATA).
-    #[arg(long, global = true, value_name = "MIB")]
+    /// Most memory that this process may write to, MiB (RLIMIT_DATA).
+    #[arg(long, global = true, value_name = "MIB", help_heading = GLOBAL)]
     limit_mib: Option<u64>,
     // Not global: `train --log` is a flight's log.
     /// How log lines and errors are written: text for people, json one object a line. Given before the command.
     #[arg(long = "log", value_name = "FORMAT", value_enum, default_value_t = console::Format::Text)]
     log_format: console::Format,
-    /// Write what takes how long, the device's own times on a track of theirs, as a trace for ui.perfetto.dev; every step is timed
-    /// for it.
-    #[arg(long, global = true, value_name = "FILE")]
+    /// Write a trace of all stages, with the device's own times, for ui.perfetto.dev; it times every step.
+    #[arg(long, global = true, value_name = "FILE", help_heading = GLOBAL)]
     trace: Option<std::path::PathBuf>,
-    /// Warnings and errors only, no progress.
-    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    /// Write warnings and errors only, and no progress.
+    #[arg(short, long, global = true, conflicts_with = "verbose", help_heading = GLOBAL)]
     quiet: bool,
 }
 

@@ -39,24 +39,25 @@ pub struct Settings {
     /// How to merge.
     #[command(flatten)]
     pub merging: Merging,
-    /// Data set with held-out pictures (split `test`), to measure the models and to show them side by side.
-    #[arg(long, value_name = "DATASET")]
+    /// Data set whose held-out pictures (split `test`) measure the models and stand beside them in the report.
+    #[arg(long, value_name = "DATASET", help_heading = "Comparison")]
     pub compare: Option<PathBuf>,
     /// Size at which they are compared, above 0 and at most 1.
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, help_heading = "Comparison")]
     pub compare_scale: f64,
     /// Also measure a perceptual distance: manifest of a network of contract `metric`.
-    #[arg(long, value_name = "MANIFEST", requires = "compare")]
+    #[arg(long, value_name = "MANIFEST", requires = "compare", help_heading = "Comparison")]
     pub metric: Option<PathBuf>,
 }
 
 /// How to merge, over `[ground]`.
 #[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Merging")]
 pub struct Merging {
     /// Device memory, MiB.
     #[arg(long)]
     pub budget_mib: Option<u32>,
-    /// Upper bound of the global model.
+    /// Most Gaussians of the global model.
     #[arg(long)]
     pub max_gaussians: Option<usize>,
     /// Passes over the views that see a seam; 0 merges only.
@@ -68,7 +69,7 @@ pub struct Merging {
     /// Size of the distillation pictures relative to the training pictures.
     #[arg(long)]
     pub scale: Option<f32>,
-    /// Ground so near to a border is of whoever saw it best, metres; 0: of whose region it is
+    /// Width along a border where ground belongs to whoever saw it best, metres; 0 keeps to the regions.
     #[arg(long)]
     pub border_m: Option<f32>,
     /// Learning rates relative to training.
@@ -80,7 +81,7 @@ pub struct Merging {
     /// Seed of the order of views.
     #[arg(long)]
     pub seed: Option<u64>,
-    /// Side of the squares of ground that are jobs of their own, metres.
+    /// Side of a cell, the square of ground that is merged as one job, metres.
     #[arg(long, value_name = "METRES")]
     pub cell_m: Option<f32>,
 }

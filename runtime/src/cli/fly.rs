@@ -33,18 +33,16 @@ pub struct Args {
     /// Folder of key frames, model and run.json; a folder of an earlier run is continued.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Another link than the mission's, e.g. `serial:/dev/ttyAMA0:921600`.
+    /// Use this link instead of the mission's, e.g. `serial:/dev/ttyAMA0:921600`.
     #[arg(long, value_name = "ADDRESS")]
     link: Option<String>,
-    /// End a flight whose landing nobody saw after this many seconds without a sign of life; the mission's
-    /// `link.silence_limit_s` when left out.
+    /// End a flight after so many seconds of silence [default: the mission's `link.silence_limit_s`].
     #[arg(long, value_name = "S")]
     silence: Option<f64>,
-    /// Give up when nothing was ever heard for this many seconds; 0 waits for ever.
+    /// Stop when nothing was ever heard for so many seconds; 0 waits for ever.
     #[arg(long, value_name = "S", default_value_t = 0.0)]
     patience: f64,
-    /// Record the flight for Foxglove, as MCAP: poses, exposures, key frames with small pictures, state and figures, what the
-    /// ground station was told; 256 MiB at most.
+    /// Record poses, exposures, key frames and state for Foxglove, as MCAP, in at most 256 MiB.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// The live page.

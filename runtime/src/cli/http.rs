@@ -9,12 +9,13 @@ use super::CliError;
 
 /// The live page.
 #[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Live page")]
 pub struct HttpArgs {
-    /// Serve a live page there, as 127.0.0.1:8080; port 0 takes a free one. Addresses that others reach need a token.
+    /// Serve a live page at this address, e.g. 127.0.0.1:8080; port 0 takes a free one. Addresses that others reach need a token.
     #[arg(long, value_name = "ADDR")]
     http: Option<String>,
-    /// File of the token that a browser shows once as ?token=TOKEN (a program as Authorization: Bearer); `[http] token_file` of the
-    /// mission when left out. Nothing is encrypted: go through a VPN or an SSH tunnel where others listen.
+    /// File of the token that a browser shows once as ?token=TOKEN [default: the mission's `[http] token_file`]. Nothing is
+    /// encrypted: use a VPN or an SSH tunnel where others listen.
     #[arg(long, value_name = "FILE", requires = "http")]
     http_token_file: Option<PathBuf>,
 }

@@ -23,16 +23,16 @@ use super::http::HttpArgs;
 /// Arguments of `dgtr serve`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The mission file.
+    /// Mission file shared by all aircraft and the ground.
     #[arg(long)]
     pub mission: PathBuf,
     /// Folder for what is received, global.dgtr, run.json and report.html.
     #[arg(long)]
     pub out: PathBuf,
-    /// Seconds to wait for the aircraft; then what has arrived is merged. Without it: until all are in, or Ctrl-C.
+    /// Seconds to wait before what has arrived is merged [default: until all are in, or Ctrl-C].
     #[arg(long, value_name = "SECONDS")]
     pub timeout: Option<f64>,
-    /// Take models that an earlier session has received, too, as when the same stick is merged once more.
+    /// Take models that an earlier session received as well.
     #[arg(long)]
     pub again: bool,
     /// How to merge, over `[ground]` of the mission.

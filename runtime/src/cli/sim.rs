@@ -23,6 +23,10 @@ use job::interrupt::Interrupt;
 use super::CliError;
 use crate::cli::output::outln;
 
+/// Headings of the options.
+const FLIGHT: &str = "Flight";
+const INSTEAD: &str = "Instead of a simulated survey flight";
+
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
 /// the camera folder; or, with --autopilot, the camera alone beside an autopilot that runs already.
 #[derive(Debug, clap::Args)]
@@ -36,61 +40,62 @@ pub struct Args {
     /// Where to speak: `pty` (its path is printed), `pty:/path/of/a/link`, `udpout:HOST:PORT`, `tcpin:HOST:PORT`.
     #[arg(long, value_name = "ADDRESS", default_value = "pty")]
     link: String,
-    /// Instead of an aircraft: a camera for the vehicle that is heard there, a running ArduPilot or PX4 SITL or any other. It
-    /// photographs the simulated ground from where the vehicle is whenever a picture is triggered, until Ctrl-C; `dgtr fly`
-    /// runs beside it on a link of its own.
-    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["link", "reference", "card", "plan", "speed", "height",
+    /// Be only the camera of the vehicle that is heard at this address, e.g. a running SITL. It photographs the simulated ground
+    /// at each trigger, until Ctrl-C.
+    #[arg(long, value_name = "ADDRESS", help_heading = INSTEAD, conflicts_with_all = ["link", "reference", "card", "plan", "speed", "height",
         "forward_overlap", "side_overlap", "pitch", "triggers", "cross", "perfect", "linger"])]
     autopilot: Option<String>,
-    /// Camera folder; the mission's when left out.
+    /// Camera folder [default: the mission's].
     #[arg(long, value_name = "DIR")]
     camera_dir: Option<PathBuf>,
     /// Also write the truth here, as a data set with held-out views.
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
-    /// Instead of flying: write the survey's pictures here as a camera's card, with EXIF and XMP.
-    #[arg(long, value_name = "DIR")]
+    /// Write the survey's pictures here as a camera's card, with EXIF and XMP, instead of flying.
+    #[arg(long, value_name = "DIR", help_heading = INSTEAD)]
     card: Option<PathBuf>,
-    /// Instead of a survey: fly this plan (QGroundControl's `.plan`, as `dgtr fly` writes it), with its heights, headings and
-    /// pictures.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["height", "forward_overlap", "side_overlap", "cross"])]
+    /// Fly this plan (QGroundControl's `.plan`, as `dgtr fly` writes it) instead of a survey.
+    #[arg(long, value_name = "FILE", help_heading = INSTEAD, conflicts_with_all = ["height", "forward_overlap", "side_overlap", "cross"])]
     plan: Option<PathBuf>,
     /// Seconds of flight per second of wall clock.
-    #[arg(long, value_name = "X", default_value_t = 1.0)]
+    #[arg(long, help_heading = FLIGHT, value_name = "X", default_value_t = 1.0)]
     speed: f64,
     /// Height of the flight, metres.
-    #[arg(long, value_name = "M", default_value_t = 40.0)]
+    #[arg(long, help_heading = FLIGHT, value_name = "M", default_value_t = 40.0)]
     height: f64,
     /// Share of a picture seen again by the next one on the line.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.75)]
+    #[arg(long, help_heading = FLIGHT, value_name = "SHARE", default_value_t = 0.75)]
     forward_overlap: f64,
     /// Share of a picture seen again from the next line.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
+    #[arg(long, help_heading = FLIGHT, value_name = "SHARE", default_value_t = 0.6)]
     side_overlap: f64,
     /// Pitch of the camera, degrees; −90 looks straight down.
-    #[arg(long, value_name = "DEG", default_value_t = -90.0, allow_hyphen_values = true)]
+    #[arg(long, help_heading = FLIGHT, value_name = "DEG", default_value_t = -90.0, allow_hyphen_values = true)]
     pitch: f64,
-    /// By which messages exposures are announced: ArduPilot's CAMERA_FEEDBACK, PX4's CAMERA_TRIGGER with its two commands, the
-    /// same with CAMERA_IMAGE_CAPTURED, or CAMERA_IMAGE_CAPTURED alone.
-    #[arg(long, value_enum, default_value_t = Triggers::Ardupilot)]
+    /// Messages that announce exposures.
+    #[arg(long, help_heading = FLIGHT, value_enum, default_value_t = Triggers::Ardupilot)]
     triggers: Triggers,
     /// Fly a second set of lines across the first.
-    #[arg(long)]
+    #[arg(long, help_heading = FLIGHT)]
     cross: bool,
-    /// Without wind, noise and bias.
-    #[arg(long)]
+    /// Leave out wind, noise and bias.
+    #[arg(long, help_heading = FLIGHT)]
     perfect: bool,
     /// Seconds to go on speaking after the flight.
-    #[arg(long, value_name = "S", default_value_t = 5.0)]
+    #[arg(long, help_heading = FLIGHT, value_name = "S", default_value_t = 5.0)]
     linger: f64,
 }
 
 /// How exposures are announced.
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
 enum Triggers {
+    /// ArduPilot's CAMERA_FEEDBACK.
     Ardupilot,
+    /// PX4's CAMERA_TRIGGER with its two commands.
     Px4,
+    /// PX4's messages and CAMERA_IMAGE_CAPTURED.
     Px4Feedback,
+    /// CAMERA_IMAGE_CAPTURED alone.
     Captured,
 }
 

@@ -66,110 +66,117 @@ impl Fineness {
 /// Arguments of `dgtr train`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Folder of posed pictures (nerfstudio, COLMAP, OpenDroneMap), or folders of a camera's card (DCIM) with pictures that
-    /// say where they were taken.
+    /// Folder of posed pictures (nerfstudio, COLMAP, OpenDroneMap), or folders of a camera's card (DCIM).
     #[arg(required = true, value_name = "FOLDER")]
     pub folders: Vec<PathBuf>,
-    /// Positions of a card's pictures: geo.txt of OpenDroneMap, Mission Planner's list, geotags.csv of `dgtr fly`.
-    #[arg(long, value_name = "FILE")]
-    geotags: Option<PathBuf>,
-    /// Surveyed points marked in a card's pictures: gcp_list.txt of OpenDroneMap (found by that name without this).
-    #[arg(long, value_name = "FILE")]
-    gcp: Option<PathBuf>,
-    /// Other surveyed points, in a file of that form, that are not used: how far the finished model's renderings put them off.
-    #[arg(long, value_name = "FILE")]
-    check: Option<PathBuf>,
-    /// The flight's log beside a card: MAVLink (.tlog) or ArduPilot (.BIN), matched to the pictures by order and time.
-    #[arg(long, value_name = "FILE")]
-    log: Option<PathBuf>,
-    /// Where the model (model.dgtr) and run.json go; an unfinished model there is continued.
+    /// Folder for model.dgtr and run.json; an unfinished model there is continued.
     #[arg(long)]
     pub out: PathBuf,
-    /// Which pictures (a list of split.json; without that file every 8th is held out).
-    #[arg(long, default_value = "train")]
-    split: String,
-    /// Only the pictures of this region.
-    #[arg(long)]
-    region: Option<String>,
-    /// Only key frames by the rule of a flight: [keyframes] of --settings, or its defaults.
-    #[arg(long)]
-    keyframes: bool,
-    /// Spare this computer as a flight does when it is hot or throttled or its supply is weak, and warn of a full disk:
-    /// [failsafe] of --settings, or its defaults. The same seed then gives another model where it had to.
-    #[arg(long)]
-    failsafe: bool,
-    /// Where the first Gaussians come from.
-    #[arg(long, value_enum, default_value = "feed-forward")]
-    init: Init,
-    /// The first Gaussians are those of this model, in the frame of the data set, however many: those that find no room on the device wait
-    /// in a file in --out, and none are ever all in memory. The schedule begins anew.
-    #[arg(long, value_name = "MODEL", conflicts_with = "init")]
-    from: Option<PathBuf>,
-    /// Where camera poses come from.
-    #[arg(long, value_enum, default_value = "dataset")]
-    poses: Poses,
-    /// Take telemetry poses as they are.
-    #[arg(long)]
-    no_refine: bool,
-    /// Give up the Gaussians that the loss hangs on least ([training] thinned_share) and train the last share of the schedule with values
-    /// as the delivery encoding rounds them (rounded_share): for models that go out by `dgtr export --to delivery`.
-    #[arg(long, value_enum, num_args = 0..=1, require_equals = true, default_missing_value = "coarse")]
-    for_delivery: Option<Fineness>,
-    /// Optimiser steps; with neither --steps nor --seconds the recipe's own number ([training] steps, or
-    /// [training.views] visits to each picture where those are fewer).
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
-    steps: Option<u32>,
-    /// Seconds of training; with --steps, whichever comes first.
-    #[arg(long)]
-    seconds: Option<f64>,
-    /// Watt-hours that training may take; with --steps or --seconds, whichever comes first. Power is what the board says (hwmon,
-    /// vcgencmd) or --watts.
-    #[arg(long)]
-    energy_wh: Option<f64>,
-    /// Watts that this computer takes while it trains, where it does not say so itself.
-    #[arg(long, requires = "energy_wh")]
-    watts: Option<f32>,
-    /// Budgets of a size of job, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
-    #[arg(long, value_parser = presets())]
-    preset: Option<Preset>,
-    /// Device memory, MiB, allocated once [default: 512].
-    #[arg(long)]
-    budget_mib: Option<u32>,
-    /// Most Gaussians on the device; default: what the budget holds.
-    #[arg(long)]
-    max_gaussians: Option<usize>,
-    /// Gaussians of the whole scene, when they are more than those on the device; the others wait in a file in --out.
-    #[arg(long, value_name = "N")]
-    scene_gaussians: Option<usize>,
-    /// Pictures on the device at once, the others waiting in a file in --out [default: all while they leave half of the budget].
-    #[arg(long, value_name = "N")]
-    view_slots: Option<u32>,
-    /// Image scale, above 0 and at most 1 [default: as large as the budget holds].
-    #[arg(long)]
-    scale: Option<f64>,
-    /// Seed of everything random; same seed and device, same model.
-    #[arg(long)]
-    seed: Option<u64>,
-    /// Vulkan device whose name contains this.
-    #[arg(long)]
-    device: Option<String>,
-    /// Manifest of your own feed-forward network.
-    #[arg(long = "model", value_name = "FILE")]
-    network: Option<PathBuf>,
-    /// TOML file with any of the mission file's tables [training], [init], [refine], [network],
-    /// [keyframes], [failsafe].
-    #[arg(long, value_name = "FILE")]
-    settings: Option<PathBuf>,
-    /// Seconds between two checkpoints.
-    #[arg(long, default_value_t = 30.0)]
-    checkpoint_seconds: f64,
     /// Forget a model that is already in --out.
     #[arg(long)]
     fresh: bool,
     /// Do not score the split `test` at the end.
     #[arg(long)]
     no_eval: bool,
+    /// Seconds between two checkpoints.
+    #[arg(long, default_value_t = 30.0)]
+    checkpoint_seconds: f64,
+
+    /// Which pictures, by split.json; without that file every 8th is held out.
+    #[arg(long, default_value = "train", help_heading = PICTURES)]
+    split: String,
+    /// Only the pictures of this region.
+    #[arg(long, help_heading = PICTURES)]
+    region: Option<String>,
+    /// Only key frames by a flight's rule: [keyframes] of --settings, or its defaults.
+    #[arg(long, help_heading = PICTURES)]
+    keyframes: bool,
+    /// Image scale, above 0 and at most 1 [default: as large as the budget holds].
+    #[arg(long, help_heading = PICTURES)]
+    scale: Option<f64>,
+
+    /// Where camera poses come from.
+    #[arg(long, value_enum, default_value = "dataset", help_heading = POSES)]
+    poses: Poses,
+    /// Take telemetry poses as they are.
+    #[arg(long, help_heading = POSES)]
+    no_refine: bool,
+    /// Positions of a card's pictures: OpenDroneMap's geo.txt, Mission Planner's list, geotags.csv of `dgtr fly`.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    geotags: Option<PathBuf>,
+    /// The flight's log beside a card, MAVLink (.tlog) or ArduPilot (.BIN), matched by order and time.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    log: Option<PathBuf>,
+    /// Surveyed points marked in a card's pictures; a gcp_list.txt beside them is found without this.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    gcp: Option<PathBuf>,
+    /// Surveyed points in a file of that form that measure the finished model instead of helping it.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    check: Option<PathBuf>,
+
+    /// Where the first Gaussians come from.
+    #[arg(long, value_enum, default_value = "feed-forward", help_heading = START)]
+    init: Init,
+    /// Begin with the Gaussians of this model, which lies in the data set's frame; the schedule begins anew.
+    #[arg(long, value_name = "MODEL", conflicts_with = "init", help_heading = START)]
+    from: Option<PathBuf>,
+    /// Manifest of your own feed-forward network.
+    #[arg(long = "model", value_name = "FILE", help_heading = START)]
+    network: Option<PathBuf>,
+
+    /// Optimiser steps [default: a hundred visits to each picture].
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..), help_heading = BUDGET)]
+    steps: Option<u32>,
+    /// Seconds of training; with --steps, whichever comes first.
+    #[arg(long, help_heading = BUDGET)]
+    seconds: Option<f64>,
+    /// Watt-hours that training may take, by what the board measures or --watts says.
+    #[arg(long, help_heading = BUDGET)]
+    energy_wh: Option<f64>,
+    /// Watts that this computer takes while it trains, where it does not say so itself.
+    #[arg(long, requires = "energy_wh", help_heading = BUDGET)]
+    watts: Option<f32>,
+    /// Budgets of a size of job, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
+    #[arg(long, value_parser = presets(), help_heading = BUDGET)]
+    preset: Option<Preset>,
+    /// Pause or slow down as a flight does when this computer is hot, throttled or weakly fed.
+    #[arg(long, help_heading = BUDGET)]
+    failsafe: bool,
+
+    /// Device memory, MiB, allocated once [default: 512].
+    #[arg(long, help_heading = MEMORY)]
+    budget_mib: Option<u32>,
+    /// Most Gaussians on the device [default: what the budget holds].
+    #[arg(long, help_heading = MEMORY)]
+    max_gaussians: Option<usize>,
+    /// Gaussians of the whole scene, when the device holds fewer; the others wait in a file in --out.
+    #[arg(long, value_name = "N", help_heading = MEMORY)]
+    scene_gaussians: Option<usize>,
+    /// Pictures on the device at once; the others wait in a file in --out [default: what half of the budget holds].
+    #[arg(long, value_name = "N", help_heading = MEMORY)]
+    view_slots: Option<u32>,
+    /// Vulkan device whose name contains this.
+    #[arg(long, help_heading = MEMORY)]
+    device: Option<String>,
+
+    /// Seed of everything random; the same seed on the same device gives the same model.
+    #[arg(long, help_heading = RECIPE)]
+    seed: Option<u64>,
+    /// Prune what the loss needs least and train with quantised values, for `dgtr export --to delivery`.
+    #[arg(long, value_enum, num_args = 0..=1, require_equals = true, default_missing_value = "coarse", help_heading = RECIPE)]
+    for_delivery: Option<Fineness>,
+    /// TOML file with any of the mission file's tables [training], [init], [refine], [network], [keyframes], [failsafe].
+    #[arg(long, value_name = "FILE", help_heading = RECIPE)]
+    settings: Option<PathBuf>,
 }
+
+/// Headings of the options.
+const PICTURES: &str = "Pictures";
+const POSES: &str = "Poses and places";
+const START: &str = "First Gaussians";
+const BUDGET: &str = "Time and energy";
+const MEMORY: &str = "Memory and device";
+const RECIPE: &str = "Recipe";
 
 /// The recipe tables of a mission file.
 #[derive(Clone, Debug, Default, Deserialize)]

@@ -29,7 +29,7 @@ const LARGER: [(&str, Size); 23] = [
     ("hal/sim: autopilot::Autopilot", Size(17, 24, 3)),
     ("hal: counters::HalCounters", Size(43, 0, 0)),
     ("hal: vehicle::Vehicle", Size(21, 42, 3)),
-    ("models: dataset::Dataset", Size(5, 20, 5)),
+    ("models/survey: dataset::Dataset", Size(5, 20, 5)),
     ("models: formats::transforms::RawLens", Size(19, 0, 0)),
     ("models: init::initialiser::Initialiser", Size(14, 32, 6)),
     ("models: init::report::InitReport", Size(36, 1, 1)),

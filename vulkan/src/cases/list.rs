@@ -214,7 +214,7 @@ pub const ELSEWHERE: &[(&str, &str, &str)] = &[
         "vulkan/tests/gradients.rs",
         "every_parameter_group_agrees_with_central_differences",
     ),
-    ("UTM or ECEF in f32", "config/src/geodesy.rs", "enu_round_trip_stays_below_a_micrometre_everywhere"),
+    ("UTM or ECEF in f32", "config/geometry/src/geodesy.rs", "enu_round_trip_stays_below_a_micrometre_everywhere"),
     (
         "duplicate points, single points, NaN",
         "models/src/init/baselines.rs",
