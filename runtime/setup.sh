@@ -5,7 +5,7 @@
 #   - where npm is, the viewer that `dgtr export --to html` puts into its pages, at the version and with the hashes of viewer.pin,
 #     into ~/.local/share/dgtr/viewer. Nothing else needs it; `setup.sh --viewer` brings npm, too, and does nothing else.
 # Ends with 0 when everything is there, with 3 and one line that says what to install when it cannot be.
-# `setup.sh --tests` also brings what only the tests need (a C++ compiler for the shader check, Vulkan's validation layer).
+# `setup.sh --tests` also brings what only the tests need (a C++ compiler for the shader check, numpy, Vulkan's validation layer).
 set -eu
 
 lib="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/lib"
@@ -91,6 +91,8 @@ fi
 
 if [ "${1:-}" = --tests ]; then
     command -v c++ >/dev/null || apt g++
+    # The reader of models in Python.
+    python3 -c "import numpy" 2>/dev/null || apt python3 python3-numpy
     # Without it the validation test says that it is skipped.
     [ -e /usr/share/vulkan/explicit_layer.d/VkLayer_khronos_validation.json ] || (apt vulkan-validationlayers) || true
 fi
