@@ -184,6 +184,11 @@ impl Autopilot {
         &self.clock
     }
 
+    /// Unix time of a boot time, µs; `None` while the autopilot has not said it.
+    pub fn unix_us(&self, boot_ns: u64) -> Option<u64> {
+        self.unix.to_unix_us(boot_ns)
+    }
+
     /// The recent track.
     pub fn track(&self) -> &Track {
         &self.track

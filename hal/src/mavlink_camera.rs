@@ -2,6 +2,8 @@
 //! information on request, capture commands answered at once, its definition file by MAVLink FTP and its parameters,
 //! everything else refused politely. A state machine without I/O: frames in, replies out.
 
+mod album;
+mod commands;
 mod definition;
 mod ftp;
 mod parameters;
@@ -12,15 +14,18 @@ use core::cell::OnceCell;
 use heapless::Deque;
 
 use crate::mavlink::dialect::{
-    CAMERA_CAPTURE_STATUS_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_INFORMATION_DATA, CAMERA_SETTINGS_DATA,
-    COMMAND_ACK_DATA, COMMAND_LONG_DATA, CameraCapFlags, CameraMode, FILE_TRANSFER_PROTOCOL_DATA, HEARTBEAT_DATA,
-    MavAutopilot, MavCmd, MavResult, MavState, MavType, PARAM_EXT_ACK_DATA, PARAM_EXT_REQUEST_LIST_DATA,
-    PARAM_EXT_REQUEST_READ_DATA, PARAM_EXT_SET_DATA, STORAGE_INFORMATION_DATA, StorageStatus,
+    CAMERA_CAPTURE_STATUS_DATA, CAMERA_INFORMATION_DATA, CAMERA_SETTINGS_DATA, COMMAND_ACK_DATA, COMMAND_INT_DATA,
+    COMMAND_LONG_DATA, CameraCapFlags, CameraMode, DIGICAM_CONTROL_DATA, FILE_TRANSFER_PROTOCOL_DATA, HEARTBEAT_DATA,
+    MavAutopilot, MavState, MavType, PARAM_EXT_ACK_DATA, PARAM_EXT_REQUEST_LIST_DATA, PARAM_EXT_REQUEST_READ_DATA,
+    PARAM_EXT_SET_DATA, STORAGE_INFORMATION_DATA, StorageStatus,
 };
 use crate::mavlink::{Frame, MessageData};
 pub use parameters::{Activity, COUNT, Kind, Parameter, ParameterId, TABLE};
 pub use talk::{CameraInfo, Reply, Request};
 
+use album::Album;
+pub use album::Shot;
+use commands::{Captures, Command};
 use definition::{Definition, MODEL, VENDOR};
 use ftp::FileServer;
 use parameters::{Asked, Parameters};
@@ -29,10 +34,6 @@ use parameters::{Asked, Parameters};
 const REPLIES: usize = 16;
 /// Captures asked for and not yet made.
 const REQUESTS: usize = 8;
-/// Shortest interval of a series, s; shorter ones are denied (no companion computer can train on them).
-const LEAST_INTERVAL_S: f32 = 0.1;
-/// PX4 sends IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for the same exposure: one capture within this.
-const SAME_CAPTURE_NS: u64 = 200_000_000;
 /// Between two messages of a file or a list: 11 kB/s, what a line of 115,200 baud carries.
 const BULK_EVERY_NS: u64 = 25_000_000;
 
@@ -44,17 +45,9 @@ const URI: &str = "mftp:///definition.xml";
 enum Due {
     Ack(COMMAND_ACK_DATA),
     Message(u32),
-    Captured(CAMERA_IMAGE_CAPTURED_DATA),
+    /// The picture with this index.
+    Captured(u32),
     Set(PARAM_EXT_ACK_DATA),
-}
-
-/// A series of captures (an intervalometer set by IMAGE_START_CAPTURE).
-#[derive(Clone, Copy, Debug)]
-struct Series {
-    every_ns: u64,
-    next_ns: u64,
-    /// `None` = until stopped.
-    left: Option<u32>,
 }
 
 /// The MAVLink camera.
@@ -63,10 +56,9 @@ pub struct MavlinkCamera {
     component: u8,
     due: Deque<Due, REPLIES>,
     requests: Deque<Request, REQUESTS>,
-    captures: u32,
-    pictures: i32,
-    last_capture_ns: Option<u64>,
-    series: Option<Series>,
+    captures: Captures,
+    album: Album,
+    mode: CameraMode,
     /// SET_MESSAGE_INTERVAL for CAMERA_CAPTURE_STATUS: period and next time.
     status: Option<(u64, u64)>,
     /// Made when somebody first asks.
@@ -84,10 +76,9 @@ impl MavlinkCamera {
             component,
             due: Deque::new(),
             requests: Deque::new(),
-            captures: 0,
-            pictures: 0,
-            last_capture_ns: None,
-            series: None,
+            captures: Captures::default(),
+            album: Album::default(),
+            mode: CameraMode::CAMERA_MODE_IMAGE,
             status: None,
             definition: OnceCell::new(),
             files: FileServer::default(),
@@ -117,7 +108,16 @@ impl MavlinkCamera {
         };
         if let Some(m) = frame.message::<COMMAND_LONG_DATA>() {
             if to_us(m.target_system, m.target_component) {
-                self.on_command(&m, frame, now_ns);
+                self.on_command(&Command::from_long(&m, frame), now_ns);
+            }
+        } else if let Some(m) = frame.message::<COMMAND_INT_DATA>() {
+            if to_us(m.target_system, m.target_component) {
+                self.on_command(&Command::from_int(&m, frame), now_ns);
+            }
+        } else if let Some(m) = frame.message::<DIGICAM_CONTROL_DATA>() {
+            // What DO_DIGICAM_CONTROL was before it became a command; nobody expects an answer.
+            if to_us(m.target_system, m.target_component) && m.shot == 1 {
+                self.shoot(frame.id(), now_ns);
             }
         } else if let Some(m) = frame.message::<FILE_TRANSFER_PROTOCOL_DATA>() {
             // A file is asked of one component.
@@ -144,23 +144,6 @@ impl MavlinkCamera {
         }
     }
 
-    fn on_command(&mut self, m: &COMMAND_LONG_DATA, frame: &Frame<'_>, now_ns: u64) {
-        let result = self.command(m, now_ns);
-        // To all components: others may know what we do not.
-        if m.target_component == 0 && result == MavResult::MAV_RESULT_UNSUPPORTED {
-            return;
-        }
-        // The acknowledgement leaves before what was asked for.
-        let ack = COMMAND_ACK_DATA {
-            command: m.command,
-            result,
-            target_system: frame.system(),
-            target_component: frame.component(),
-            ..COMMAND_ACK_DATA::default()
-        };
-        self.queue_first(Due::Ack(ack));
-    }
-
     /// What a ground station is shown of the job: a count, a share in percent, or the number of a word. Bounded by the table.
     pub fn note_count(&mut self, id: ParameterId, value: u32) {
         self.parameters.note_count(id, value);
@@ -177,23 +160,16 @@ impl MavlinkCamera {
         self.queue(Due::Set(ack));
     }
 
-    /// A picture was taken and posed: everyone is told.
-    pub fn captured(&mut self, message: CAMERA_IMAGE_CAPTURED_DATA) {
-        self.pictures = self.pictures.saturating_add(1);
-        self.queue(Due::Captured(message));
+    /// A picture was taken and posed: everyone is told, and may ask again.
+    pub fn captured(&mut self, shot: Shot) {
+        let index = self.album.add(shot);
+        self.queue(Due::Captured(index));
     }
 
     /// The next thing to do.
     pub fn next_request(&mut self, now_ns: u64) -> Option<Request> {
-        if let Some(series) = &mut self.series
-            && now_ns >= series.next_ns
-        {
-            series.next_ns = now_ns + series.every_ns;
-            series.left = series.left.map(|n| n.saturating_sub(1));
-            if series.left == Some(0) {
-                self.series = None;
-            }
-            self.capture(now_ns);
+        if self.captures.is_due(now_ns) {
+            self.capture();
         }
         self.requests.pop_front()
     }
@@ -207,14 +183,15 @@ impl MavlinkCamera {
             self.queue(Due::Message(CAMERA_CAPTURE_STATUS_DATA::ID));
         }
         let Some(due) = self.due.pop_front() else { return self.next_bulk(now_ns) };
+        let interval_s = self.captures.interval_s();
         Some(match due {
             Due::Ack(ack) => Reply::Ack(ack),
             Due::Set(ack) => Reply::Set(ack),
-            Due::Captured(message) => Reply::Captured(CAMERA_IMAGE_CAPTURED_DATA { time_boot_ms: boot_ms, ..message }),
+            Due::Captured(index) => Reply::Captured(self.album.message(index)?),
             Due::Message(CAMERA_INFORMATION_DATA::ID) => Reply::Information(self.information(boot_ms)),
             Due::Message(CAMERA_SETTINGS_DATA::ID) => Reply::Settings(CAMERA_SETTINGS_DATA {
                 time_boot_ms: boot_ms,
-                mode_id: CameraMode::CAMERA_MODE_IMAGE,
+                mode_id: self.mode,
                 zoomLevel: f32::NAN,
                 focusLevel: f32::NAN,
                 ..CAMERA_SETTINGS_DATA::default()
@@ -229,10 +206,10 @@ impl MavlinkCamera {
             Due::Message(_) => Reply::Status(CAMERA_CAPTURE_STATUS_DATA {
                 time_boot_ms: boot_ms,
                 // 0 idle, 2 interval set but idle.
-                image_status: if self.series.is_some() { 2 } else { 0 },
-                image_interval: self.series.map_or(0.0, |s| s.every_ns as f32 * 1e-9),
+                image_status: if interval_s.is_some() { 2 } else { 0 },
+                image_interval: interval_s.unwrap_or(0.0),
                 available_capacity: f32::NAN,
-                image_count: self.pictures,
+                image_count: self.album.count() as i32,
                 ..CAMERA_CAPTURE_STATUS_DATA::default()
             }),
         })
@@ -273,75 +250,6 @@ impl MavlinkCamera {
             cam_definition_uri: URI.into(),
             ..CAMERA_INFORMATION_DATA::default()
         }
-    }
-
-    fn command(&mut self, m: &COMMAND_LONG_DATA, now_ns: u64) -> MavResult {
-        use MavResult::{MAV_RESULT_ACCEPTED as ACCEPTED, MAV_RESULT_DENIED as DENIED};
-        #[expect(deprecated, reason = "ArduPilot and older ground stations still send the superseded requests")]
-        let requested = match m.command {
-            MavCmd::MAV_CMD_REQUEST_MESSAGE => m.param1 as u32,
-            MavCmd::MAV_CMD_REQUEST_CAMERA_INFORMATION => CAMERA_INFORMATION_DATA::ID,
-            MavCmd::MAV_CMD_REQUEST_CAMERA_SETTINGS => CAMERA_SETTINGS_DATA::ID,
-            MavCmd::MAV_CMD_REQUEST_STORAGE_INFORMATION => STORAGE_INFORMATION_DATA::ID,
-            MavCmd::MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS => CAMERA_CAPTURE_STATUS_DATA::ID,
-            _ => 0,
-        };
-        match m.command {
-            _ if requested != 0 => match requested {
-                CAMERA_INFORMATION_DATA::ID
-                | CAMERA_SETTINGS_DATA::ID
-                | STORAGE_INFORMATION_DATA::ID
-                | CAMERA_CAPTURE_STATUS_DATA::ID => {
-                    self.queue(Due::Message(requested));
-                    ACCEPTED
-                }
-                _ => MavResult::MAV_RESULT_UNSUPPORTED,
-            },
-            // param2 interval s, param3 count (0 = until stopped), param4 sequence for single captures.
-            MavCmd::MAV_CMD_IMAGE_START_CAPTURE => self.start(m.param2, m.param3, now_ns),
-            MavCmd::MAV_CMD_IMAGE_STOP_CAPTURE => {
-                self.series = None;
-                ACCEPTED
-            }
-            // param5 is the shot.
-            MavCmd::MAV_CMD_DO_DIGICAM_CONTROL if m.param5 == 1.0 => self.start(0.0, 1.0, now_ns),
-            MavCmd::MAV_CMD_SET_CAMERA_MODE if m.param2 == 0.0 => ACCEPTED,
-            MavCmd::MAV_CMD_SET_CAMERA_MODE => DENIED,
-            // param1 message, param2 interval µs: −1 off, 0 default.
-            MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL if m.param1 as u32 == CAMERA_CAPTURE_STATUS_DATA::ID => {
-                let every_us = if m.param2 == 0.0 { 1e6 } else { m.param2 };
-                if every_us > 0.0 && every_us < 1e5 {
-                    return DENIED;
-                }
-                self.status = (every_us > 0.0).then_some(((f64::from(every_us) * 1e3) as u64, now_ns));
-                ACCEPTED
-            }
-            MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => DENIED,
-            _ => MavResult::MAV_RESULT_UNSUPPORTED,
-        }
-    }
-
-    fn start(&mut self, interval_s: f32, count: f32, now_ns: u64) -> MavResult {
-        if count == 1.0 {
-            self.capture(now_ns);
-            return MavResult::MAV_RESULT_ACCEPTED;
-        }
-        if !(LEAST_INTERVAL_S..=3600.0).contains(&interval_s) || !(0.0..=1e6).contains(&count) {
-            return MavResult::MAV_RESULT_DENIED;
-        }
-        let left = if count == 0.0 { None } else { Some(count as u32) };
-        self.series = Some(Series { every_ns: (f64::from(interval_s) * 1e9) as u64, next_ns: now_ns, left });
-        MavResult::MAV_RESULT_ACCEPTED
-    }
-
-    fn capture(&mut self, now_ns: u64) {
-        if self.last_capture_ns.is_some_and(|t| now_ns.saturating_sub(t) < SAME_CAPTURE_NS && self.series.is_none()) {
-            return;
-        }
-        self.last_capture_ns = Some(now_ns);
-        self.captures = self.captures.saturating_add(1);
-        // A full queue means that nobody takes pictures; the announcement would be untrue.
-        let _ = self.requests.push_back(Request::Capture(self.captures));
     }
 
     fn queue(&mut self, due: Due) {

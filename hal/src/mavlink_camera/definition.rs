@@ -102,6 +102,19 @@ mod tests {
     }
 
     #[test]
+    fn whole_numbers_fit_the_int_that_clients_read_them_into() {
+        let definition = Definition::new();
+        let text = core::str::from_utf8(definition.bytes()).expect("UTF-8");
+        let whole: std::vec::Vec<&str> = text
+            .split("<parameter ")
+            .filter(|parameter| parameter.contains("type=\"uint32\""))
+            .flat_map(|parameter| parameter.split('"'))
+            .filter(|value| value.parse::<f64>().is_ok())
+            .collect();
+        assert!(whole.len() > 20 && whole.iter().all(|value| value.parse::<i32>().is_ok()), "{whole:?}");
+    }
+
+    #[test]
     fn the_checksum_is_px4s() {
         // Of "123456789" from 0 and without inversion; the inverted one from all ones is 0xCBF43926.
         assert_eq!(crc32(b"123456789"), 0x2DFD_2D88);

@@ -104,6 +104,9 @@ const fn row(name: &'static str, label: &'static str, unit: &'static str, kind: 
     Parameter { name, label, unit, kind }
 }
 
+/// Clients read bounds of counts as `int` (MAVSDK 4.1 dies of more).
+const MOST: u32 = i32::MAX as u32;
+
 /// All of them, in the order of [`ParameterId`]. Defaults are the mission's, which a test compares; bounds lie within the
 /// mission's: a kilometre between key frames gives none, and nobody trains for more than a day on board.
 pub const TABLE: [Parameter; COUNT] = [
@@ -113,10 +116,10 @@ pub const TABLE: [Parameter; COUNT] = [
     row("KF_OVERLAP", "Overlap of key frames", "%", Kind::Count(100)),
     row("STATE", "State", "", Kind::Word(&ACTIVITIES)),
     row("FAILSAFE", "Failsafe", "", Kind::Word(&RUNGS)),
-    row("PICTURES", "Pictures", "", Kind::Count(u32::MAX)),
-    row("KEY_FRAMES", "Key frames", "", Kind::Count(u32::MAX)),
+    row("PICTURES", "Pictures", "", Kind::Count(MOST)),
+    row("KEY_FRAMES", "Key frames", "", Kind::Count(MOST)),
     row("COVERED", "Region covered", "%", Kind::Count(100)),
-    row("GAUSSIANS", "Gaussians", "", Kind::Count(u32::MAX)),
+    row("GAUSSIANS", "Gaussians", "", Kind::Count(MOST)),
     row("TRAINED", "Training done", "%", Kind::Count(100)),
 ];
 

@@ -3,7 +3,7 @@
 use std::vec::Vec;
 
 use super::*;
-use crate::mavlink::dialect::{MavParamExtType, ParamAck};
+use crate::mavlink::dialect::{MavCmd, MavParamExtType, MavResult, ParamAck};
 use crate::mavlink::{Encoder, Framer};
 
 const S: u64 = 1_000_000_000;
@@ -249,4 +249,141 @@ fn capture_status_comes_at_the_interval_asked_for() {
     command(&mut camera, MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL, [262.0, 5e5, 0.0, 0.0, 0.0], 0);
     let sent = (1..=20).filter(|tick| camera.next_reply(0, tick * S / 10).is_some()).count();
     assert_eq!(sent, 4);
+}
+
+/// The answer to a command with these of its fields.
+fn ask(camera: &mut MavlinkCamera, m: COMMAND_LONG_DATA, now_ns: u64) -> (Option<MavResult>, Vec<Reply>) {
+    hear(camera, &COMMAND_LONG_DATA { target_system: 1, target_component: 100, ..m }, now_ns);
+    let mut replies: Vec<Reply> = core::iter::from_fn(|| camera.next_reply(0, now_ns)).collect();
+    let Some(Reply::Ack(ack)) = replies.first() else { return (None, replies) };
+    let result = ack.result;
+    replies.remove(0);
+    (Some(result), replies)
+}
+
+#[test]
+fn a_capture_sent_again_because_its_acknowledgement_was_lost_is_one_picture() {
+    let mut camera = camera();
+    let start = |id: f32, confirmation: u8| COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_IMAGE_START_CAPTURE,
+        param3: 1.0,
+        param4: id,
+        confirmation,
+        ..COMMAND_LONG_DATA::default()
+    };
+    let accepted = Some(MavResult::MAV_RESULT_ACCEPTED);
+    let mut taken = |m, now_ns| {
+        let (result, _) = ask(&mut camera, m, now_ns);
+        (result, captures(&mut camera, now_ns))
+    };
+    assert_eq!(taken(start(7.0, 0), S), (accepted, 1));
+    // MAVSDK repeats it as it was, QGroundControl counts; both are told that it was done.
+    assert_eq!(taken(start(7.0, 0), S + 700_000_000), (accepted, 0));
+    assert_eq!(taken(start(7.0, 1), 4 * S), (accepted, 0));
+    assert_eq!(taken(start(8.0, 0), 4 * S + 100_000_000), (accepted, 1), "the next picture");
+    // Who does not number its captures means a new one each time, unless it says that it repeats itself.
+    assert_eq!(taken(start(0.0, 0), 6 * S), (accepted, 1));
+    assert_eq!(taken(start(0.0, 0), 7 * S), (accepted, 1));
+    assert_eq!(taken(start(0.0, 1), 8 * S), (accepted, 0));
+    // The first one was lost: what says that it is a repetition is the only one that came.
+    assert_eq!(taken(start(9.0, 1), 9 * S), (accepted, 1));
+    // A client that was started again counts from the beginning.
+    assert_eq!(taken(start(8.0, 0), 30 * S), (accepted, 1));
+}
+
+#[test]
+fn a_series_sent_again_goes_on_as_it_was() {
+    let mut camera = camera();
+    let series = |confirmation: u8| COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_IMAGE_START_CAPTURE,
+        param2: 2.0,
+        param3: 3.0,
+        confirmation,
+        ..COMMAND_LONG_DATA::default()
+    };
+    ask(&mut camera, series(0), 0);
+    assert_eq!(captures(&mut camera, 0), 1);
+    ask(&mut camera, series(1), S);
+    assert_eq!((1..20).map(|s| captures(&mut camera, s * S)).sum::<usize>(), 2);
+}
+
+#[test]
+fn a_command_int_is_obeyed_and_answered_as_its_long_form() {
+    let mut camera = camera();
+    let int = |command, x| COMMAND_INT_DATA {
+        command,
+        x,
+        param3: 1.0,
+        target_system: 1,
+        target_component: 100,
+        ..COMMAND_INT_DATA::default()
+    };
+    for (command, now_ns) in [(MavCmd::MAV_CMD_IMAGE_START_CAPTURE, S), (MavCmd::MAV_CMD_DO_DIGICAM_CONTROL, 2 * S)] {
+        hear(&mut camera, &int(command, 1), now_ns);
+        let Some(Reply::Ack(ack)) = camera.next_reply(0, now_ns) else { panic!("no answer to {command:?}") };
+        assert_eq!((ack.command, ack.result), (command, MavResult::MAV_RESULT_ACCEPTED));
+        assert_eq!(captures(&mut camera, now_ns), 1, "{command:?}");
+    }
+    hear(&mut camera, &DIGICAM_CONTROL_DATA { target_system: 1, shot: 1, ..Default::default() }, 3 * S);
+    assert_eq!(captures(&mut camera, 3 * S), 1, "the message that is older than both");
+}
+
+#[test]
+fn a_command_to_all_that_means_another_camera_is_left_to_it() {
+    let mut camera = camera();
+    let to_all = |param1: f32| COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_IMAGE_START_CAPTURE,
+        param1,
+        param3: 1.0,
+        target_system: 1,
+        ..COMMAND_LONG_DATA::default()
+    };
+    for (camera_id, expected) in [(101.0, 0), (2.0, 0), (100.0, 1), (0.0, 1)] {
+        hear(&mut camera, &to_all(camera_id), S);
+        assert_eq!(captures(&mut camera, S), expected, "{camera_id}");
+        assert_eq!(core::iter::from_fn(|| camera.next_reply(0, S)).count(), expected, "{camera_id}");
+    }
+}
+
+#[test]
+fn what_was_captured_is_told_with_its_own_time_and_can_be_asked_for_again() {
+    let mut camera = camera();
+    for k in 0..1500u32 {
+        camera.captured(Shot { boot_ms: 10_000 + k, unix_us: 1_790_000_000_000_000, lat: k as i32, ..Shot::default() });
+        let Some(Reply::Captured(m)) = camera.next_reply(99_000, S) else { panic!("{k} is not told") };
+        assert_eq!((m.image_index, m.time_boot_ms, m.time_utc), (k as i32, 10_000 + k, 1_790_000_000_000_000));
+    }
+    let message = |index: f32| COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_REQUEST_MESSAGE,
+        param1: 263.0,
+        param2: index,
+        ..COMMAND_LONG_DATA::default()
+    };
+    #[expect(deprecated, reason = "that is the point")]
+    let legacy = |index: f32| COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_REQUEST_CAMERA_IMAGE_CAPTURE,
+        param1: index,
+        ..COMMAND_LONG_DATA::default()
+    };
+    for m in [message(1499.0), message(476.0), legacy(1000.0)] {
+        let (result, replies) = ask(&mut camera, m.clone(), S);
+        assert_eq!(result, Some(MavResult::MAV_RESULT_ACCEPTED));
+        let [Reply::Captured(told)] = replies.as_slice() else { panic!("{replies:?}") };
+        assert_eq!(told.image_index as f32, m.param1 + m.param2 - if m.param2 > 0.0 { 263.0 } else { 0.0 });
+        assert_eq!(told.lat, told.image_index);
+    }
+    for m in [message(1500.0), message(475.0), message(-1.0), message(f32::NAN), legacy(9999.0)] {
+        assert_eq!(ask(&mut camera, m, S).0, Some(MavResult::MAV_RESULT_DENIED), "never taken, or no longer kept");
+    }
+}
+
+#[test]
+fn the_mode_that_a_survey_sets_is_taken_and_told() {
+    let mut camera = camera();
+    let survey = [0.0, 2.0, 0.0, 0.0, 0.0];
+    let (ack, _) = command(&mut camera, MavCmd::MAV_CMD_SET_CAMERA_MODE, survey, S);
+    assert_eq!(ack, Some(MavResult::MAV_RESULT_ACCEPTED));
+    let (_, replies) = command(&mut camera, MavCmd::MAV_CMD_REQUEST_MESSAGE, [260.0, 0.0, 0.0, 0.0, 0.0], S);
+    let Some(Reply::Settings(m)) = replies.first() else { panic!("{replies:?}") };
+    assert_eq!(m.mode_id, CameraMode::CAMERA_MODE_IMAGE_SURVEY);
 }

@@ -38,6 +38,12 @@ impl UnixMap {
         u64::try_from(boot).ok()
     }
 
+    /// Unix time of a boot time, µs; `None` before the first valid SYSTEM_TIME.
+    pub fn to_unix_us(&self, boot_ns: u64) -> Option<u64> {
+        let unix_ns = i64::try_from(boot_ns).ok()?.checked_add(self.offset()?)?;
+        Some(u64::try_from(unix_ns).ok()? / 1000)
+    }
+
     /// How often GPS time stepped.
     pub fn steps(&self) -> u32 {
         self.steps

@@ -258,7 +258,8 @@ where
         let PendingPicture { trigger, picture, confidence } = waiting;
         let time_ns = self.autopilot.clock().to_companion_ns(mid_boot_ns).unwrap_or(trigger.time_ns);
         self.counters.posed_frames += 1;
-        self.service.captured(trigger.sequence, mid_boot_ns, &pose, self.settings.origin);
+        let unix_us = self.autopilot.unix_us(mid_boot_ns);
+        self.service.captured(mid_boot_ns, unix_us, &pose, self.settings.origin);
         let sequence = trigger.sequence;
         self.emit(Event::Posed(PosedPicture { sequence, time_ns, pose, speed_m_s, confidence, picture }));
     }

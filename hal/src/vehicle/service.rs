@@ -7,10 +7,10 @@ use super::{CameraPose, Event, Vehicle, VehicleSettings};
 use crate::camera::Picture;
 use crate::error::HalError;
 use crate::mavlink::channel::Channel;
-use crate::mavlink::dialect::{CAMERA_IMAGE_CAPTURED_DATA, MavBool, MavSeverity, MavType, STATUSTEXT_DATA};
+use crate::mavlink::dialect::{MavSeverity, MavType, STATUSTEXT_DATA};
 use crate::mavlink::signing_store::{self, SigningStore};
 use crate::mavlink::{MessageData, Signer};
-use crate::mavlink_camera::{CameraInfo, MavlinkCamera, ParameterId, Reply, Request};
+use crate::mavlink_camera::{CameraInfo, MavlinkCamera, ParameterId, Reply, Request, Shot};
 use crate::traits::{Camera, Clock, Link};
 
 /// Heartbeats at 1 Hz, as the protocol asks.
@@ -85,19 +85,15 @@ impl Service {
     }
 
     /// A frame was posed: ground stations are told with CAMERA_IMAGE_CAPTURED.
-    pub(super) fn captured(&mut self, sequence: u32, mid_boot_ns: u64, pose: &CameraPose, origin: Geodetic) {
+    pub(super) fn captured(&mut self, mid_boot_ns: u64, unix_us: Option<u64>, pose: &CameraPose, origin: Geodetic) {
         let at = EnuFrame::new(origin).to_geodetic(pose.position);
-        let nan = f32::NAN; // attitude unknown in the message's frame
-        self.component.captured(CAMERA_IMAGE_CAPTURED_DATA {
-            time_boot_ms: (mid_boot_ns / 1_000_000) as u32,
+        self.component.captured(Shot {
+            boot_ms: (mid_boot_ns / 1_000_000) as u32,
+            unix_us: unix_us.unwrap_or(0),
             lat: (at.lat_deg * 1e7) as i32,
             lon: (at.lon_deg * 1e7) as i32,
-            alt: (at.alt_m * 1e3) as i32,
-            relative_alt: (pose.position.z * 1e3) as i32,
-            q: [nan; 4],
-            image_index: sequence as i32,
-            capture_result: MavBool::MAV_BOOL_TRUE,
-            ..CAMERA_IMAGE_CAPTURED_DATA::default()
+            alt_mm: (at.alt_m * 1e3) as i32,
+            relative_mm: (pose.position.z * 1e3) as i32,
         });
     }
 }
