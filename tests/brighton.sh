@@ -1,6 +1,6 @@
 #!/bin/sh
 # What crops are worth on real pictures: brighton_beach's card reduced to 1,600 x 900 with the data set's poses, whole pictures trained at
-# a quarter of that size, 400 x 225, `dgtr bench detail`, then crops in all steps from progress 0.2 on. Needs the data: DGTR_DATA, or ../shared beside the repository.
+# a quarter of that size, 400 x 225, `bench detail`, then crops in all steps from progress 0.2 on. Needs the data: DGTR_DATA, or ../shared beside the repository.
 #   tests/brighton.sh [OUT] [SECONDS] [SCALE]
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
@@ -10,7 +10,7 @@ out="${1:-brighton-out}"
 seconds="${2:-60}"
 scale="${3:-0.25}"
 dgtr="$here/target/release/dgtr"
-[ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime --package bench
 mkdir -p "$out/data/images"
 python3 -m venv "$out/python" && "$out/python/bin/pip" install --quiet pillow
 "$out/python/bin/python" - "$data" "$out/data" <<'PY'
@@ -29,7 +29,7 @@ description.update(camera_model="OPENCV", fl_x=951.0, fl_y=951.0, cx=800.0, cy=4
 json.dump(description, open(out + "/transforms.json", "w"))
 shutil.copy(data + "/brighton_beach/split.json", out)
 PY
-"$dgtr" --quiet bench detail "$out/data" --out "$out" --scale "$scale" --seconds "$seconds"
+"$here/target/release/bench" --quiet detail "$out/data" --out "$out" --scale "$scale" --seconds "$seconds"
 printf '[training.crops]\nfrom = 0.2\nshare = 1.0\n' > "$out/early.toml"
 "$dgtr" --quiet train "$out/data" --out "$out/early" --fresh --no-eval --scale "$scale" --max-gaussians 100000 --seconds "$seconds" --settings "$out/early.toml"
 "$dgtr" --quiet eval "$out/early/model.dgtr" "$out/data" --split test --scale 1

@@ -12,8 +12,8 @@ python3 -m venv "$work/python" && "$work/python/bin/pip" install --quiet rasteri
 folder=$1
 if [ "$folder" = --large ]; then
     dgtr="$here/target/release/dgtr"
-    [ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
-    "$dgtr" --quiet bench map --out "$work/survey" --steps 60 --max-gaussians 30000 > "$work/figures"
+    cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime --package bench
+    "$here/target/release/bench" --quiet map --out "$work/survey" --steps 60 --max-gaussians 30000 > "$work/figures"
     folder="$work/map"
     mkdir "$folder"
     # The survey's ground is some 90 m wide: at 0.4 cm a pixel it fills the raster.

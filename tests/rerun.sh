@@ -6,7 +6,7 @@ set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 out="${1:-/tmp/dgtr-rerun}"
 rm -rf "$out" && mkdir -p "$out"
-cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime --package bench
 cargo test --quiet --release --locked --manifest-path "$here/runtime/rerun/Cargo.toml"
 cargo build --quiet --release --locked --manifest-path "$here/runtime/rerun/Cargo.toml"
 dgtr="$here/target/release/dgtr"
@@ -14,7 +14,7 @@ follow="${CARGO_TARGET_DIR:-$here/runtime/rerun/target}/release/dgtr-rerun"
 python3 -m venv "$out/venv"
 "$out/venv/bin/pip" install --quiet rerun-sdk==0.36.3
 cd "$out"
-"$dgtr" bench map --out survey --steps 1 > /dev/null 2>&1 # for its pictures
+"$here/target/release/bench" map --out survey --steps 1 > /dev/null 2>&1 # for its pictures
 "$follow" model/model.dgtr --to scene.rrd > follow.log &
 watcher=$!
 "$dgtr" train survey/data --out model --steps 400 --checkpoint-seconds 3 --no-eval

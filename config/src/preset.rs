@@ -57,7 +57,7 @@ impl Preset {
         Self::ALL.iter().find(|p| p.0 == name).map(|p| p.1)
     }
 
-    /// Its budgets. Each row names the point of `dgtr bench time-error sheffield_cross --init feed-forward` that it is (43 key
+    /// Its budgets. Each row names the point of `bench time-error sheffield_cross --init feed-forward` that it is (43 key
     /// frames, an idle lavapipe on two cores, PSNR at the row's scale; all lie on the front, `long` by its SSIM). `None`: they are the
     /// device's to say.
     pub fn values(self) -> Option<PresetValues> {

@@ -58,9 +58,9 @@ pub enum OnnxError {
         /// The input or output.
         tensor: String,
         /// What was expected.
-        expected: String,
+        expected: Box<str>,
         /// What the file says.
-        found: String,
+        found: Box<str>,
     },
     /// ONNX Runtime failed while loading or running.
     #[error("network {network}: {reason}")]

@@ -11,13 +11,11 @@ use job::trace::Trace;
 
 mod aggregate;
 #[cfg(feature = "lab")]
-mod bench;
-#[cfg(feature = "lab")]
 mod demo;
 mod doctor;
 mod error;
 mod eval;
-mod examples;
+pub mod examples;
 mod export;
 mod fly;
 mod ground;
@@ -28,7 +26,7 @@ mod keys;
 #[cfg(feature = "lab")]
 mod manual;
 mod ortho;
-mod output;
+pub mod output;
 mod plan;
 mod render;
 #[cfg(feature = "lab")]
@@ -38,7 +36,8 @@ mod serve;
 mod sim;
 mod train;
 
-use error::{CliError, EXIT_CODES, exit_code};
+pub use error::CliError;
+use error::{EXIT_CODES, exit_code};
 
 /// Heading of what every command takes.
 const GLOBAL: &str = "Global options";
@@ -55,6 +54,13 @@ const GLOBAL: &str = "Global options";
 struct Cli {
     #[command(subcommand)]
     command: Command,
+    #[command(flatten)]
+    options: Options,
+}
+
+/// What every command takes.
+#[derive(Debug, clap::Args)]
+pub struct Options {
     /// Write more log lines: -v what each stage does, -vv everything; RUST_LOG overrides.
     #[arg(short, long, global = true, help_heading = GLOBAL, action = clap::ArgAction::Count)]
     verbose: u8,
@@ -74,7 +80,7 @@ struct Cli {
 }
 
 /// What `--help` ends with.
-fn notes() -> String {
+pub fn notes() -> String {
     let codes: Vec<String> = EXIT_CODES.iter().map(|(_, code, meaning)| format!("{code} {meaning}")).collect();
     format!(
         "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|processor|board|card: kernel configuration. auto measures it once per \
@@ -129,8 +135,6 @@ enum Lab {
     Replay(replay::Args),
     /// A simulated aircraft over a ray-cast world.
     Sim(sim::Args),
-    /// Measures run time, memory, error, skips and numerical promises.
-    Bench(bench::Args),
     /// Writes manual pages and shell completions.
     #[command(hide = true)]
     Manual(manual::Args),
@@ -138,7 +142,7 @@ enum Lab {
 
 /// All that the command line knows.
 fn program() -> clap::Command {
-    examples::with_examples(Cli::command())
+    examples::with_examples(Cli::command(), examples::EXAMPLES)
 }
 
 fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Error> {
@@ -149,24 +153,30 @@ fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Err
 /// Parses `arguments` (the first is the program's name), runs the command and says how it went: results on standard
 /// output, everything else on standard error.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
-    let cli = match parse(arguments) {
-        Ok(cli) => cli,
-        Err(e) => {
-            // A closed pipe is no reason to fail.
-            let _ = e.print();
-            let asked = !e.use_stderr();
-            return if asked { ExitCode::SUCCESS } else { exit_code(ErrorKind::Input) };
-        }
-    };
-    let trace = match cli.trace.as_deref().map(Trace::create).transpose() {
+    match parse(arguments) {
+        Ok(cli) => run(&cli.options, || command(cli.command)),
+        Err(e) => not_understood(&e),
+    }
+}
+
+/// Prints why a command line was not understood, or the help that was asked for.
+pub fn not_understood(e: &clap::Error) -> ExitCode {
+    // A closed pipe is no reason to fail.
+    let _ = e.print();
+    if e.use_stderr() { exit_code(ErrorKind::Input) } else { ExitCode::SUCCESS }
+}
+
+/// Does `job` as `options` say; its error is one line on standard error and the exit code.
+pub fn run(options: &Options, job: impl FnOnce() -> Result<(), CliError>) -> ExitCode {
+    let trace = match options.trace.as_deref().map(Trace::create).transpose() {
         Ok(trace) => trace,
         Err(e) => {
-            console::install(cli.verbose, cli.quiet, cli.log_format, None);
+            console::install(options.verbose, options.quiet, options.log_format, None);
             return failed(&e.into());
         }
     };
-    console::install(cli.verbose, cli.quiet, cli.log_format, trace.clone());
-    if let Some(mib) = cli.limit_mib
+    console::install(options.verbose, options.quiet, options.log_format, trace.clone());
+    if let Some(mib) = options.limit_mib
         && let Err(e) = job::resources::limit_data(mib)
     {
         console::error(&format!("--limit-mib {mib}: {e}"));
@@ -175,7 +185,18 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     if let Err(e) = job::resources::survive_file_size_limit() {
         tracing::debug!("SIGXFSZ: {e}");
     }
-    let result = match cli.command {
+    let result = job();
+    if let Some(trace) = trace {
+        trace.finish();
+    }
+    match result.and_then(|()| output::arrived()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => failed(&e),
+    }
+}
+
+fn command(command: Command) -> Result<(), CliError> {
+    match command {
         Command::Train(args) => train::run(*args),
         Command::Eval(args) => eval::run(args),
         Command::Render(args) => render::run(args),
@@ -197,16 +218,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         #[cfg(feature = "lab")]
         Command::Lab(Lab::Demo(args)) => demo::run(args),
         #[cfg(feature = "lab")]
-        Command::Lab(Lab::Bench(args)) => bench::run(args),
-        #[cfg(feature = "lab")]
         Command::Lab(Lab::Manual(args)) => manual::run(args, program(), Lab::has_subcommand),
-    };
-    if let Some(trace) = trace {
-        trace.finish();
-    }
-    match result.and_then(|()| output::arrived()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => failed(&e),
     }
 }
 

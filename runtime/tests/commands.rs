@@ -27,6 +27,9 @@ mod keys;
 mod manual;
 #[path = "commands/observed.rs"]
 mod observed;
+#[path = "commands/report.rs"]
+#[cfg(feature = "lab")]
+mod report;
 #[path = "commands/supervised.rs"]
 mod supervised;
 #[path = "commands/viewing.rs"]

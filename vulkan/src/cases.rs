@@ -1,6 +1,6 @@
 //! Numbers that broke other renderers: for each case what is promised, and a function that tries it — on the device, on
 //! the CPU reference, or both. The tests run them one by one (`tests/numerical_gpu.rs`, `tests/numerical_reference.rs`), and
-//! `dgtr bench stress` runs them all on whatever device is there.
+//! `bench stress` runs them all on whatever device is there.
 
 /// Ends the case as broken unless the condition holds.
 macro_rules! promise {

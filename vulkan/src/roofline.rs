@@ -1,5 +1,5 @@
 //! What the device itself can do, measured: bytes moved and multiply-adds per second by kernels that do nothing else.
-//! `dgtr bench stages` holds every stage's counted work against these two figures.
+//! `bench stages` holds every stage's counted work against these two figures.
 
 mod probe;
 

@@ -1,5 +1,5 @@
 //! Work that a scene does not need, each kind with its switch. All of these are on: none changes the picture (the last two
-//! change rounding only), and `dgtr bench skips` says what each is worth on a given device.
+//! change rounding only), and `bench skips` says what each is worth on a given device.
 
 use crate::settings::table;
 

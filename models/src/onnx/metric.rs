@@ -52,8 +52,8 @@ impl PerceptualMetric {
                 network: self.name().to_owned(),
                 contract: Contract::Metric.name(),
                 tensor: "output `distance`".to_owned(),
-                expected: "one finite number".to_owned(),
-                found: distance.to_string(),
+                expected: "one finite number".into(),
+                found: distance.to_string().into(),
             });
         }
         Ok(distance)

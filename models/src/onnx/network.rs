@@ -307,6 +307,7 @@ fn compare(manifest: &Manifest, found: &[TensorSpec], wanted: &[Promise], kind: 
 }
 
 fn contract_error(manifest: &Manifest, tensor: String, expected: String, found: String) -> OnnxError {
+    let (expected, found) = (expected.into(), found.into());
     OnnxError::Contract { network: manifest.name.clone(), contract: manifest.contract.name(), tensor, expected, found }
 }
 

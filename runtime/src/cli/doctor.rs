@@ -20,6 +20,8 @@ use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 use super::CliError;
 use crate::cli::output::outln;
 
+#[cfg(feature = "lab")]
+mod report;
 mod trust;
 
 /// Arguments of `dgtr doctor`.
@@ -35,6 +37,9 @@ pub struct Args {
     /// at its first training anyway, software renderers only here.
     #[arg(long)]
     pub autotune: bool,
+    #[cfg(feature = "lab")]
+    #[command(flatten)]
+    pub report: report::Args,
 }
 
 /// How a check came out. What is not well says how to mend it.
@@ -73,6 +78,10 @@ const LIBRARY: &str = "install ONNX Runtime 1.22 or newer there, or point ORT_DY
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
+    #[cfg(feature = "lab")]
+    if let Some(path) = &args.report.path {
+        return report::run(path, &args.report);
+    }
     let mut missing = 0;
     let mut tell = |what: &str, finding: Finding| {
         let (state, text) = match finding {

@@ -2,8 +2,11 @@
 
 use clap::Command;
 
-/// A command's path below `dgtr` and its examples.
-pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
+/// A command's path below the program and its examples.
+pub type Examples = [(&'static str, &'static [&'static str])];
+
+/// Those of `dgtr`.
+pub(super) const EXAMPLES: &Examples = &[
     (
         "train",
         &["dgtr train pictures --out model --seconds 120", "dgtr train /media/card/DCIM --out model --preset medium"],
@@ -34,46 +37,24 @@ pub(super) const EXAMPLES: &[(&str, &[&str])] = &[
     ("keys", &["dgtr keys --mission mission.toml", "dgtr keys --mission mission.toml --only west"]),
     ("init", &["dgtr init", "dgtr init --origin 47.4,8.5,430 --picture 4056x3040 --fov-deg 62"]),
     ("plan", &["dgtr plan --mission mission.toml", "dgtr plan --budget-mib 300 --json"]),
-    ("doctor", &["dgtr doctor", "dgtr doctor --mission mission.toml"]),
+    ("doctor", &["dgtr doctor --mission mission.toml", "dgtr doctor --report board.json"]),
     ("demo", &["dgtr demo", "dgtr demo --seconds 20 --http 127.0.0.1:8080"]),
     ("replay", &["dgtr replay pictures --link pty:port --speed 4"]),
     ("sim", &["dgtr sim --mission mission.toml --speed 4", "dgtr sim --mission mission.toml --card card"]),
-    ("bench stages", &["dgtr bench stages --json stages.json"]),
-    ("bench map", &["dgtr bench map --out map"]),
-    ("bench detail", &["dgtr bench detail --out detail"]),
-    ("bench device", &["dgtr bench device --out board.md"]),
-    ("bench forecast", &["dgtr bench forecast --json forecast.json"]),
-    ("bench ground", &["dgtr bench ground --out field --aircraft 24 --side-m 700"]),
-    (
-        "bench levels",
-        &["dgtr bench levels global.dgtr --out levels", "dgtr bench levels --gaussians 20000000 --out levels"],
-    ),
-    ("bench memory", &["dgtr bench memory pictures"]),
-    (
-        "bench methods",
-        &[
-            "dgtr bench methods pictures --regions 3 --steps 400 --out methods",
-            "dgtr bench methods --simulated 6 --methods dgtr,vastgaussian",
-        ],
-    ),
-    ("bench scene", &["dgtr bench scene --gaussians 5000000 --device-mib 512 --limit-mib 1024 --out scene"]),
-    ("bench skips", &["dgtr bench skips pictures"]),
-    ("bench stress", &["dgtr bench stress"]),
-    ("bench time-error", &["dgtr bench time-error pictures --out time-error"]),
 ];
 
 /// `program` with examples at the end of every command's help.
-pub(super) fn with_examples(program: Command) -> Command {
-    within(program, "")
+pub fn with_examples(program: Command, examples: &Examples) -> Command {
+    within(program, "", examples)
 }
 
-fn within(command: Command, path: &str) -> Command {
+fn within(command: Command, path: &str, all: &Examples) -> Command {
     let names: Vec<String> = command.get_subcommands().map(|c| c.get_name().to_owned()).collect();
     let command = names.into_iter().fold(command, |command, name| {
         let path = format!("{path} {name}");
-        command.mut_subcommand(&name, |c| within(c, path.trim_start()))
+        command.mut_subcommand(&name, |c| within(c, path.trim_start(), all))
     });
-    let Some((_, examples)) = EXAMPLES.iter().find(|e| e.0 == path) else { return command };
+    let Some((_, examples)) = all.iter().find(|e| e.0 == path) else { return command };
     let before = command.get_after_help().map(|text| format!("{text}\n\n")).unwrap_or_default();
     let word = if examples.len() > 1 { "Examples" } else { "Example" };
     command.after_help(format!("{before}{word}:\n  {}", examples.join("\n  ")))

@@ -11,18 +11,21 @@ use super::CliError;
 static FAILED: OnceLock<Error> = OnceLock::new();
 
 /// As `print!`, and a closed pipe is no panic.
+#[macro_export]
 macro_rules! out {
     ($($text:tt)*) => { $crate::cli::output::write(format_args!($($text)*)) };
 }
 
 /// As `println!`, and a closed pipe is no panic.
+#[macro_export]
 macro_rules! outln {
     ($($text:tt)*) => { $crate::cli::output::write(format_args!("{}\n", format_args!($($text)*))) };
 }
 
-pub(crate) use {out, outln};
+pub use {out, outln};
 
-pub(crate) fn write(text: Arguments<'_>) {
+/// Writes `text` to standard output, unless that failed before.
+pub fn write(text: Arguments<'_>) {
     if FAILED.get().is_none()
         && let Err(e) = std::io::stdout().lock().write_fmt(text)
     {

@@ -15,7 +15,7 @@ fn every_command_has_a_page_and_the_onboard_manual_leaves_out_what_does_not_fly(
     for page in ["dgtr.1", "dgtr-fly.1", "dgtr-serve.1", "dgtr-plan.1", "dgtr.bash", "_dgtr", "dgtr.fish"] {
         assert!(all.join(page).is_file() && onboard.join(page).is_file(), "{page}");
     }
-    for command in ["demo", "sim", "replay", "bench", "bench-stages"] {
+    for command in ["demo", "sim", "replay"] {
         let page = format!("dgtr-{command}.1");
         assert!(all.join(&page).is_file() && !onboard.join(&page).exists(), "{page}");
     }

@@ -41,12 +41,12 @@ const LARGER: [(&str, Size); 23] = [
     ("runtime/job: run_json::RunReport", Size(17, 5, 1)),
     ("runtime/pages: report::craft::Craft", Size(18, 3, 1)),
     ("runtime/uplink: receive::ReceiveCounters", Size(16, 2, 1)),
-    ("runtime: bench::methods::Request", Size(16, 0, 0)),
-    ("runtime: cli::bench::methods::Args", Size(18, 0, 0)),
     ("runtime: cli::plan::Args", Size(17, 0, 0)),
     ("runtime: cli::sim::Args", Size(17, 0, 0)),
     ("runtime: cli::train::Args", Size(32, 0, 0)),
     ("runtime: train_job::TrainJob", Size(29, 16, 3)),
+    ("tests/bench: cli::methods::Args", Size(18, 0, 0)),
+    ("tests/bench: methods::Request", Size(16, 0, 0)),
     ("vulkan: trainer::Trainer", Size(35, 146, 24)),
 ];
 

@@ -125,7 +125,7 @@ pub fn load(gaussians: u64, visible: u64, instances: u64, evaluations: u64, pixe
 pub(crate) mod tests {
     use super::*;
 
-    /// A processor of two cores: the slopes of `dgtr bench stages` there (4a95410).
+    /// A processor of two cores: the slopes of `bench stages` there (4a95410).
     pub(crate) const PROCESSOR: CostModel = CostModel {
         fixed_ms: 5.0,
         gaussian_ns: 54.0,
