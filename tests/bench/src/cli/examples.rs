@@ -24,10 +24,7 @@ pub const EXAMPLES: &Examples = &[
             "cargo run --release -p bench -- methods --simulated 6 --methods dgtr,vastgaussian",
         ],
     ),
-    (
-        "scene",
-        &["cargo run --release -p bench -- scene --gaussians 5000000 --device-mib 512 --limit-mib 1024 --out scene"],
-    ),
+    ("scene", &["cargo run --release -p bench -- scene --gaussians 5000000 --device-mib 512 --out scene"]),
     ("skips", &["cargo run --release -p bench -- skips pictures"]),
     ("stress", &["cargo run --release -p bench -- stress"]),
     ("time-error", &["cargo run --release -p bench -- time-error pictures --out time-error"]),
