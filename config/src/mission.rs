@@ -226,7 +226,8 @@ impl Mission {
     /// Whether offers and receipts are signed, that is, whether the ground and every aircraft have a key.
     ///
     /// # Errors
-    /// Only some have one; nobody has, and an endpoint of `[upload]` lies beyond this machine without `insecure = true`.
+    /// Only some have one; an endpoint of `[upload]` lies beyond this machine and is not signed and
+    /// encrypted without `insecure = true`; a `tls/` endpoint has neither keys nor certificates.
     pub fn check_trust(&self) -> Result<bool, SettingError> {
         let ground = ("ground".to_owned(), self.ground.public_key);
         let aircraft = self.aircraft.iter().enumerate().map(|(i, a)| (format!("aircraft[{i}]"), a.public_key));
@@ -240,6 +241,15 @@ impl Mission {
                 let wanted = "on this machine while nothing is signed; make keys with `dgtr keys`, or say insecure = true \
                               in [upload]";
                 Err(SettingError::new(field, endpoint, wanted).at("upload"))
+            }
+            Some((field, endpoint)) if !self.upload.insecure && !self.upload.has_tls() => {
+                let wanted = "encrypted, as it leaves this machine: write tls/HOST:PORT, for which the keys are enough, or say \
+                              insecure = true in [upload]";
+                Err(SettingError::new(field, endpoint, wanted).at("upload"))
+            }
+            _ if self.upload.has_tls() && self.upload.tls.is_none() && with.is_empty() => {
+                let wanted = "given, as tls/ endpoints are encrypted by the keys: `dgtr keys` makes them";
+                Err(SettingError::new("public_key", &self.ground.public_key, wanted).at("ground"))
             }
             _ => Ok(!with.is_empty()),
         }
@@ -377,7 +387,10 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
         );
         assert_eq!(trust(&format!("{outside}, insecure = true"), "", ""), Ok(false));
         assert_eq!(trust("listen = [\"tcp/127.0.0.1:7447\"]", "", ""), Ok(false));
-        assert_eq!(trust(outside, &key(1), &key(2)), Ok(true));
+        assert!(trust(outside, &key(1), &key(2)).is_err_and(|e| e.contains("tls/HOST:PORT")));
+        assert_eq!(trust(&format!("{outside}, insecure = true"), &key(1), &key(2)), Ok(true));
+        assert_eq!(trust("listen = [\"tls/0.0.0.0:7447\"]", &key(1), &key(2)), Ok(true));
+        assert!(trust("listen = [\"tls/127.0.0.1:7447\"]", "", "").is_err_and(|e| e.contains("dgtr keys")));
         // Half of the keys protect nobody, even here.
         assert!(trust("", &key(1), "").is_err_and(|e| e.starts_with("aircraft[0].public_key = absent")));
         assert!(trust("", "", &key(2)).is_err_and(|e| e.starts_with("ground.public_key = absent")));

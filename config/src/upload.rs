@@ -32,18 +32,19 @@ table! {
         pub encoding: Encoding = Encoding::Exact;
         /// A directory both ends can reach, at the same or at different times; absent = not used.
         pub folder: Option<PathBuf> = None;
-        /// Where the aircraft finds the ground, zenoh endpoints such as `tcp/10.0.0.2:7447` or `tls/ground.local:7447`.
+        /// Where the aircraft finds the ground, zenoh endpoints such as `tls/10.0.0.2:7447`; `tcp/` on this machine only.
         pub connect: Vec<String> = Vec::new();
-        /// Where the ground listens, such as `tcp/0.0.0.0:7447`; empty = not used.
+        /// Where the ground listens, such as `tls/0.0.0.0:7447`; empty = not used.
         pub listen: Vec<String> = Vec::new();
-        /// Certificates; required for `tls/` endpoints.
+        /// Certificates of your own authority for `tls/` endpoints; absent = those that the mission's keys make.
         pub tls: Option<TlsSettings> = None;
         /// Folder of this end's private key, `ID.key` of an aircraft or `ground.key`. What counts flights and models lies there, too,
         /// where there is no state folder (`STATE_DIRECTORY`).
         pub keys: PathBuf = PathBuf::from("keys");
         /// The ground takes models that an earlier session has received, too, as `dgtr serve --again` does.
         pub again: bool = false;
-        /// Endpoints beyond this machine are used although nothing is signed: anybody there can replace any model.
+        /// Endpoints beyond this machine are used although nothing is signed (anybody there can replace any model) or encrypted
+        /// (anybody there can read it, and slow down what is sent).
         pub insecure: bool = false;
         /// Bound on what an aircraft sends; absent = what the link carries.
         pub max_kib_s: Option<u32> = None, in Limits::at_least(1.0), unit "KiB/s";
@@ -94,6 +95,11 @@ impl UploadSettings {
         connect.chain(listen).find(|(_, e)| !is_loopback(e))
     }
 
+    /// Whether endpoints are encrypted; all are, or none.
+    pub fn has_tls(&self) -> bool {
+        self.connect.iter().chain(&self.listen).any(|e| e.starts_with("tls/"))
+    }
+
     /// Largest model accepted, bytes.
     pub fn max_model_bytes(&self) -> u64 {
         u64::from(self.max_model_mib) << 20
@@ -110,11 +116,11 @@ impl UploadSettings {
         for (field, endpoints) in [("connect", &self.connect), ("listen", &self.listen)] {
             for endpoint in endpoints {
                 let wanted = match (endpoint.split_once('/'), &self.tls) {
-                    (Some(("tcp", at)), None) | (Some(("tls", at)), Some(_)) if at.contains(':') => continue,
+                    (Some(("tcp", _)), None) if self.has_tls() => "encrypted as another one is: write tls/HOST:PORT",
+                    (Some(("tcp", at)), None) | (Some(("tls", at)), _) if at.contains(':') => continue,
                     (Some(("tcp", _)), Some(_)) => {
                         "encrypted as [upload.tls] is set: write tls/HOST:PORT or drop [upload.tls]"
                     }
-                    (Some(("tls", _)), None) => "with certificates: give [upload.tls] authority, certificate and key",
                     _ => "TCP or TLS: write tcp/HOST:PORT or tls/HOST:PORT",
                 };
                 return Err(SettingError::new(field, endpoint, wanted));
@@ -186,7 +192,9 @@ mod tests {
             UploadSettings { listen: vec!["tcp/0.0.0.0:7447".into()], tls: Some(tls.clone()), ..Default::default() };
         assert!(plain.check().is_err_and(|e| e.field == "listen" && e.wanted.contains("encrypted")));
         let bare = UploadSettings { listen: vec!["tls/0.0.0.0:7447".into()], ..Default::default() };
-        assert!(bare.check().is_err_and(|e| e.field == "listen" && e.wanted.contains("certificate")));
+        assert_eq!(bare.check(), Ok(()), "the mission's keys make the certificates");
+        let mixed = UploadSettings { connect: vec!["tcp/127.0.0.1:7447".into()], ..bare.clone() };
+        assert!(mixed.check().is_err_and(|e| e.field == "connect" && e.wanted.contains("tls/HOST:PORT")));
         assert_eq!(UploadSettings { tls: Some(tls), ..bare }.check(), Ok(()));
     }
 

@@ -68,7 +68,7 @@ fn whatever_the_doctor_finds_it_says_how_to_mend_it() {
         ("", "udpin:0.0.0.0:14550", ""),
         ("upload = { listen = [\"tcp/0.0.0.0:7447\"] }\n", "carrier:pigeon", ""),
         ("upload = { listen = [\"tcp/0.0.0.0:7447\"], insecure = true }\n", "serial:/dev/null:57600", ""),
-        ("upload = { listen = [\"tcp/0.0.0.0:7447\"] }\nground = { public_key = \"KEY\" }\n", "tcpin:0.0.0.0:1", &key),
+        ("upload = { listen = [\"tls/0.0.0.0:7447\"] }\nground = { public_key = \"KEY\" }\n", "tcpin:0.0.0.0:1", &key),
     ];
     for (n, (upload, link, key)) in missions.into_iter().enumerate() {
         let path = dir.path().join(format!("{n}.toml"));

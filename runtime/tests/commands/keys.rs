@@ -55,10 +55,14 @@ fn a_mission_is_keyed_by_its_own_commands_and_refused_beyond_this_machine_withou
     assert_eq!(keys.len(), 3);
     assert_eq!(printed_keys(&dgtr(&["keys", "--mission", path, "--only", "west"])), keys[1..2]);
     assert_eq!(dgtr(&["keys", "--mission", path, "--only", "nobody"]).status.code(), Some(2));
+    // Signed, but for all to read.
     let all: Vec<(&str, String)> = ["ground", "west", "east"].into_iter().zip(keys).collect();
     mission(dir.path(), outside, &all);
+    assert!(error_line(&serve()).contains("tls/HOST:PORT"));
+    let outside = "tls/0.0.0.0:1";
+    mission(dir.path(), outside, &all);
     let keyed = String::from_utf8_lossy(&dgtr(&["doctor", "--mission", path]).stdout).into_owned();
-    for line in ["ok       signatures", "ok       private key", "note     encryption"] {
+    for line in ["ok       signatures", "ok       private key", "ok       encryption"] {
         assert!(keyed.contains(line), "{line}: {keyed}");
     }
     // Port 1 is not ours to listen on, or nobody comes in time: either way it is not refused for its keys.

@@ -204,6 +204,18 @@ impl Identity {
         self.own.is_some()
     }
 
+    /// The private key's 32 bytes; `None` in a mission without keys.
+    #[cfg(feature = "zenoh")]
+    pub(crate) fn seed(&self) -> Option<[u8; 32]> {
+        self.own.as_ref().map(SigningKey::to_bytes)
+    }
+
+    /// Everybody's name and public key.
+    #[cfg(feature = "zenoh")]
+    pub(crate) fn public_keys(&self) -> impl Iterator<Item = (&str, [u8; 32])> {
+        self.keys.iter().map(|(id, key)| (id.as_str(), key.to_bytes()))
+    }
+
     /// The public key of `id` in hexadecimal; empty in a mission without keys.
     pub fn key_of(&self, id: &str) -> String {
         self.keys.get(id).map_or(String::new(), |key| to_hex(key.as_bytes()))

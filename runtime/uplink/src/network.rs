@@ -7,6 +7,7 @@
 //! over TLS an aircraft speaks only under the id that is its certificate's common name (zenoh's access control). What the
 //! ground asks is signed, so that an aircraft answers nobody else.
 
+mod certificates;
 mod inlet;
 mod outlet;
 
@@ -19,6 +20,7 @@ use zenoh::{Session, Wait};
 
 use config::upload::{CHUNK_KIB, UploadSettings};
 
+use super::keys::Identity;
 use super::offer::Offer;
 use super::transport::TransportError;
 
@@ -41,6 +43,7 @@ fn open(
     settings: &UploadSettings,
     listen: &[String],
     connect: &[String],
+    (id, identity): (&str, &Identity),
     access: Option<serde_json::Value>,
 ) -> Result<Session, TransportError> {
     let retry = serde_json::json!({
@@ -63,15 +66,20 @@ fn open(
             "link": { "rx": { "max_message_size": largest } },
         },
     });
-    if let Some(tls) = &settings.tls {
-        json["transport"]["link"]["tls"] = serde_json::json!({
+    let tls = match &settings.tls {
+        Some(tls) => Some(serde_json::json!({
             "root_ca_certificate": tls.authority,
             "enable_mtls": true,
             "listen_certificate": tls.certificate,
             "listen_private_key": tls.key,
             "connect_certificate": tls.certificate,
             "connect_private_key": tls.key,
-        });
+        })),
+        None if settings.has_tls() => certificates::settings(identity, id)?,
+        None => None,
+    };
+    if let Some(tls) = tls {
+        json["transport"]["link"]["tls"] = tls;
     }
     if let Some(access) = access {
         json["access_control"] = access;
@@ -83,7 +91,7 @@ fn open(
 /// A stranger that answers every question about `keys` with `answer`, as fast as it can.
 #[cfg(test)]
 pub(super) fn open_client(settings: &UploadSettings, keys: &str, answer: Vec<u8>) -> Session {
-    let session = open(settings, &[], &settings.connect, None).expect("session");
+    let session = open(settings, &[], &settings.connect, ("a1", &Identity::unsigned()), None).expect("session");
     session
         .declare_queryable(keys.to_owned())
         .callback(move |query| {

@@ -60,12 +60,12 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
     all.push(("state folder", finding));
     all.extend(exposed.map(|endpoint| {
         let finding = match &upload.tls {
-            Some(_) => {
+            _ if upload.has_tls() => {
                 Finding::Ok(format!("{endpoint} by TLS; an aircraft's certificate speaks under its own id only"))
             }
-            None => Finding::note(
+            _ => Finding::note(
                 format!("{endpoint} is not encrypted: models can be read on the way"),
-                "use a tls/ endpoint with certificates in [upload] tls",
+                "write tls/ for tcp/: the keys make the certificates",
             ),
         };
         ("encryption", finding)

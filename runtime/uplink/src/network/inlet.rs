@@ -13,7 +13,7 @@ use zenoh::{Session, Wait};
 use super::super::offer::{Offer, hex};
 use super::super::transport::{Inlet, Patience, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
-use crate::keys::{Domain, Identity};
+use crate::keys::{Domain, GROUND, Identity};
 
 /// What zenoh lets pass on the ground: from each aircraft, known by its certificate's common name, what lies under its own
 /// key; to everybody, what the ground itself asks.
@@ -61,8 +61,13 @@ impl NetworkInlet {
         identity: &Identity,
         wake: SyncSender<()>,
     ) -> Result<Self, TransportError> {
-        let session =
-            open(settings, &settings.listen, &[], Some(access_control(mission, aircraft, settings.tls.is_some())))?;
+        let session = open(
+            settings,
+            &settings.listen,
+            &[],
+            (GROUND, identity),
+            Some(access_control(mission, aircraft, settings.has_tls())),
+        )?;
         session
             .declare_subscriber(format!("dgtr/{mission}/*/offer"))
             .callback(move |_| {

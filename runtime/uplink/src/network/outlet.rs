@@ -87,7 +87,7 @@ impl NetworkOutlet {
     /// # Errors
     /// An endpoint or certificate that zenoh cannot use at all.
     pub fn open(settings: &UploadSettings, source: Source) -> Result<Self, TransportError> {
-        let session = open(settings, &[], &settings.connect, None)?;
+        let session = open(settings, &[], &settings.connect, (&source.aircraft, &source.identity), None)?;
         let prefix = format!("dgtr/{}/{}", source.mission, source.aircraft);
         let queries =
             session.declare_queryable(format!("{prefix}/**")).with(FifoChannel::new(64)).wait().map_err(network)?;

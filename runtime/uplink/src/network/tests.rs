@@ -60,7 +60,7 @@ fn a_false_receipt_over_the_network_is_not_believed() {
     let path = dir.path().join("m.dgtr");
     std::fs::write(&path, noise(100_000, 1)).expect("write");
     // Where the ground should be sits somebody else.
-    let stranger = open(&settings, &settings.listen, &[], None).expect("session");
+    let stranger = open(&settings, &settings.listen, &[], ("stranger", &Identity::unsigned()), None).expect("session");
     let o = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
     o.offer_final(&path);
     let order = Order { flight: 1, counter: 1 };
@@ -184,4 +184,28 @@ fn connections_that_say_nothing_keep_no_aircraft_out() {
     a1.offer_final(&path);
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?}", r.counters);
     drop(idle);
+}
+
+/// Off this machine encryption is the default, and nobody has to make, sign or copy certificates for it.
+#[test]
+fn the_keys_of_the_mission_are_all_that_tls_needs_and_keep_strangers_out() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = settings(&format!("tls/127.0.0.1:{}", free_port()));
+    // In the second the name a1 has another key.
+    let (ids, others) = (identities(["a1", "a2"]), identities(["a0", "a1"]));
+    let mut r = ground(&settings, &["a1", "a2"], &ids[2], &dir.path().join("g"));
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 5)).expect("write");
+    let stranger = Offerer::start(&settings, source("a1", &others[1])).expect("offerer");
+    stranger.offer_final(&path);
+    assert!(
+        !receive(&mut r, Duration::from_secs(3), |r| r.counters.forged + r.counters.models > 0),
+        "a stranger got in"
+    );
+    let a1 = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
+    let a2 = Offerer::start(&settings, source("a2", &ids[1])).expect("offerer");
+    a1.offer_final(&path);
+    a2.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished() && r.all_told()), "{:?}", r.counters);
+    assert!(!stranger.status().delivered);
 }
