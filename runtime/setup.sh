@@ -11,6 +11,7 @@ set -eu
 lib="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/lib"
 viewer="${XDG_DATA_HOME:-$HOME/.local/share}/dgtr/viewer"
 pin="$(cd "$(dirname "$0")" && pwd)/viewer.pin"
+onnxruntime="$(cd "$(dirname "$0")" && pwd)/onnxruntime.txt"
 
 say() { echo "dgtr setup: $*" >&2; }
 give_up() { say "$*"; exit 3; }
@@ -70,8 +71,11 @@ if [ -z "${ORT_DYLIB_PATH:-}" ] && [ ! -e "$lib/libonnxruntime.so" ] && ! have_l
     say "fetching ONNX Runtime into $lib"
     wheel=$(mktemp -d)
     trap 'rm -rf "$wheel"' EXIT
-    python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --dest "$wheel" onnxruntime ||
-        give_up "pip could not fetch the package onnxruntime; or set ORT_DYLIB_PATH to a libonnxruntime.so of 1.22 or later"
+    # Whatever Python is here: of the wheel only the library is used.
+    python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --implementation cp \
+        --python-version 3.13 --abi cp313 --platform "manylinux_2_28_$(uname -m)" --platform "manylinux_2_27_$(uname -m)" \
+        --dest "$wheel" --require-hashes -r "$onnxruntime" ||
+        give_up "pip could not fetch ONNX Runtime as onnxruntime.txt names it; or set ORT_DYLIB_PATH to a libonnxruntime.so of 1.22 or later"
     mkdir -p "$lib"
     python3 - "$wheel" "$lib" <<'PY'
 import glob, os, sys, zipfile

@@ -6,7 +6,6 @@ mod folder;
 mod jpeg;
 mod picture;
 mod pipe;
-mod regular;
 mod restart;
 mod undistort;
 #[cfg(feature = "v4l2")]

@@ -1,7 +1,6 @@
 //! Files this project reads and writes. Everything that comes from outside is bounded before memory is taken
 //! for it, and every error is one line: which file, what is wrong with it, how to mend it.
 
-use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
@@ -124,7 +123,7 @@ impl FormatError {
 /// # Errors
 /// [`FormatError::TooLarge`], else the operating system's.
 pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let too_large = |size| FormatError::TooLarge { path: path.to_owned(), what: "its size in bytes", size, limit };
     if size > limit {

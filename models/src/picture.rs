@@ -10,12 +10,12 @@ pub mod mask;
 pub mod tiff;
 
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use geometry::lens::Distortion;
 use glam::DQuat;
-use image::{DynamicImage, ImageReader, Limits, RgbImage, imageops};
+use image::{DynamicImage, ImageFormat, ImageReader, Limits, RgbImage, imageops};
 use jpeg_decoder::{Decoder, PixelFormat};
 
 use crate::formats::one_line;
@@ -144,7 +144,17 @@ fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PictureError> {
     if !tiff::fits_its_tags(path).map_err(failed)? {
         return Err(bad(path, "is a damaged TIFF (a tag is larger than the file); copy it again"));
     }
-    ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(failed)
+    let file = disk::regular::open(path).map_err(failed)?;
+    ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(failed)
+}
+
+/// Bounds on what a decoder may allocate.
+fn limits() -> Limits {
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_EDGE);
+    limits.max_image_height = Some(MAX_EDGE);
+    limits.max_alloc = Some(u64::from(MAX_EDGE) * u64::from(MAX_EDGE) * 3);
+    limits
 }
 
 /// A JPEG, PNG or TIFF as 8-bit RGB, refused before decoding when it is too large.
@@ -161,17 +171,20 @@ pub fn decode(path: &Path) -> Result<RgbImage, PictureError> {
 /// # Errors
 /// As [`decode`].
 pub fn decode_at_least(path: &Path, wanted: (u32, u32)) -> Result<RgbImage, PictureError> {
-    if let Some(image) = scaled_jpeg(path, wanted)? {
-        return Ok(image);
-    }
-    let mut reader = open(path)?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_EDGE);
-    limits.max_image_height = Some(MAX_EDGE);
-    limits.max_alloc = Some(u64::from(MAX_EDGE) * u64::from(MAX_EDGE) * 3);
-    reader.limits(limits);
-    let image =
-        reader.decode().map_err(|e| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e))))?;
+    let undecoded = |e: image::ImageError| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e)));
+    let image = if let Some(bytes) = jpeg(path)? {
+        if let Some(image) = scaled_jpeg(path, &bytes, wanted)? {
+            return Ok(image);
+        }
+        let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg);
+        reader.limits(limits());
+        reader.decode()
+    } else {
+        let mut reader = open(path)?;
+        reader.limits(limits());
+        reader.decode()
+    };
+    let image = image.map_err(undecoded)?;
     if matches!(image, DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) | DynamicImage::ImageLuma16(_)) {
         tracing::info!("{}: 16 bits a colour, of which 8 are used", path.display());
     }
@@ -186,13 +199,12 @@ pub fn resized(image: RgbImage, (width, height): (u32, u32)) -> RgbImage {
     }
 }
 
-/// The picture reduced while it is decoded; `None` where it is no JPEG, or where less than half its size is not enough.
-fn scaled_jpeg(path: &Path, (width, height): (u32, u32)) -> Result<Option<RgbImage>, PictureError> {
-    let damaged = |e: jpeg_decoder::Error| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e)));
+/// A JPEG's bytes; `None` for another kind of file. A cut one is refused here, as decoders fill what is missing with grey.
+fn jpeg(path: &Path) -> Result<Option<Vec<u8>>, PictureError> {
     let io = |e: std::io::Error| bad(path, format!("cannot be opened ({e}); is the picture folder complete?"));
-    let mut file = File::open(path).map_err(io)?;
+    let mut file = disk::regular::open(path).map_err(io)?;
     let mut magic = [0; 3];
-    if file.read_exact(&mut magic).is_err() || magic != [0xFF, 0xD8, 0xFF] || width.max(height) > MAX_EDGE {
+    if file.read_exact(&mut magic).is_err() || magic != [0xFF, 0xD8, 0xFF] {
         return Ok(None);
     }
     let size = file.metadata().map_err(io)?.len();
@@ -203,7 +215,50 @@ fn scaled_jpeg(path: &Path, (width, height): (u32, u32)) -> Result<Option<RgbIma
     let mut bytes = Vec::with_capacity(size as usize);
     file.seek(SeekFrom::Start(0)).map_err(io)?;
     file.take(MAX_FILE).read_to_end(&mut bytes).map_err(io)?;
-    let mut decoder = Decoder::new(bytes.as_slice());
+    match has_end(&bytes) {
+        true => Ok(Some(bytes)),
+        false => Err(bad(path, "is cut off or damaged (its end marker is missing); copy it again")),
+    }
+}
+
+/// Whether a JPEG's segments and scans lead to its end marker (ITU-T T.81, annex B). What lies behind it does not matter, nor
+/// do end markers of previews within a segment.
+fn has_end(jpeg: &[u8]) -> bool {
+    let (mut at, mut in_scan) = (2, false);
+    loop {
+        if in_scan {
+            let Some(skipped) = jpeg.get(at..).and_then(|rest| rest.iter().position(|b| *b == 0xFF)) else {
+                return false;
+            };
+            at += skipped;
+        } else if jpeg.get(at) != Some(&0xFF) {
+            return false;
+        }
+        // Fill bytes may stand before a marker.
+        let Some(fill) = jpeg.get(at..).and_then(|rest| rest.iter().position(|b| *b != 0xFF)) else { return false };
+        let marker = jpeg[at + fill];
+        at += fill + 1;
+        match marker {
+            0xD9 => return true,
+            0 | 0xD0..=0xD7 if in_scan => {}
+            0x01 => {}
+            0 | 0xD0..=0xD8 => return false,
+            _ => {
+                let Some(&[high, low]) = jpeg.get(at..at + 2) else { return false };
+                at += usize::from(u16::from_be_bytes([high, low]));
+                in_scan = marker == 0xDA;
+            }
+        }
+    }
+}
+
+/// The picture reduced while it is decoded; `None` where less than half its size is not enough.
+fn scaled_jpeg(path: &Path, bytes: &[u8], (width, height): (u32, u32)) -> Result<Option<RgbImage>, PictureError> {
+    if width.max(height) > MAX_EDGE {
+        return Ok(None);
+    }
+    let damaged = |e: jpeg_decoder::Error| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e)));
+    let mut decoder = Decoder::new(bytes);
     decoder.set_max_decoding_buffer_size(MAX_EDGE as usize * MAX_EDGE as usize * 3);
     decoder.read_info().map_err(damaged)?;
     let Some(info) = decoder.info() else { return Ok(None) };
@@ -317,6 +372,13 @@ mod tests {
             let error = decode_at_least(&path, (40, 30)).unwrap_err().to_string();
             assert!(error.contains("a.jpg") && !error.contains('\n'), "{error}");
         }
+        for keep in [whole.len() / 4, whole.len() / 2, whole.len() * 9 / 10, whole.len() - 1] {
+            std::fs::write(&path, &whole[..keep]).unwrap();
+            assert!(decode(&path).is_err_and(|e| e.what.contains("cut off")), "{keep} bytes at full size");
+        }
+        // Bytes behind the end belong to nobody.
+        std::fs::write(&path, [whole.as_slice(), &[7; 999]].concat()).unwrap();
+        assert_eq!(decode(&path).unwrap().dimensions(), (160, 120));
         // At full size another decoder reads it, whose words may end with a line break.
         let said = (2..whole.len().min(700)).filter_map(|n| {
             std::fs::write(&path, &whole[..n]).unwrap();

@@ -1,9 +1,9 @@
 # Sourced. onnxruntime MACHINE FOLDER: libonnxruntime.so and its licences for x86_64 or aarch64, out of its published Python package.
-# 1.24.4 has no client of its makers' telemetry in it; 1.32 has one (with libcurl and mbedTLS), although dgtr turns it off.
+# Version and hashes are in runtime/onnxruntime.txt.
 onnxruntime() {
     python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --implementation cp \
         --python-version 3.13 --abi cp313 --platform "manylinux_2_28_$1" --platform "manylinux_2_27_$1" \
-        --dest "$2/wheel" onnxruntime==1.24.4
+        --dest "$2/wheel" --require-hashes -r runtime/onnxruntime.txt
     python3 - "$2" <<'PY'
 import glob, gzip, sys, zipfile
 made = sys.argv[1]

@@ -6,6 +6,7 @@
 
 use std::fmt;
 use std::fs::File;
+use std::hash::{BuildHasher, RandomState};
 use std::io::{self, BufRead, BufReader, BufWriter, ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,6 +15,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 pub mod bounded;
 mod operations;
 pub mod plan;
+pub mod regular;
 
 pub use operations::{Operations, Output, System};
 
@@ -316,11 +318,12 @@ fn tagged(path: &Path, tag: &str) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// A name that no other thread and no other process uses.
+/// A name that no other thread and no other process uses, and that nobody can guess to put a file or a link there first.
 fn temporary_beside(path: &Path) -> PathBuf {
     static NEXT: AtomicU32 = AtomicU32::new(0);
-    let n = NEXT.fetch_add(1, Ordering::Relaxed);
-    folder_of(path).join(format!("{TEMPORARY}{}-{n}", std::process::id()))
+    // The hasher's key is the system's random bytes.
+    let unguessable = RandomState::new().hash_one(NEXT.fetch_add(1, Ordering::Relaxed));
+    folder_of(path).join(format!("{TEMPORARY}{}-{unguessable:016x}", std::process::id()))
 }
 
 /// Bytes of the whole lines a file begins with. A hole that the file system left where lines should be ends them as well.

@@ -12,7 +12,7 @@ pub trait Operations: fmt::Debug + Send + Sync {
     /// # Errors
     /// The system's.
     fn make_folder(&self, path: &Path) -> io::Result<()>;
-    /// Opens a new, empty file for writing; one of that name loses its content.
+    /// Opens a new, empty file for writing; what has that name already, a link too, is an error.
     ///
     /// # Errors
     /// The system's.
@@ -76,7 +76,7 @@ impl Operations for System {
     }
 
     fn create(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        Ok(Box::new(File::create(path)?))
+        Ok(Box::new(File::create_new(path)?))
     }
 
     fn append(&self, path: &Path) -> io::Result<Box<dyn Output>> {

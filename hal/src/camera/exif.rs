@@ -8,7 +8,6 @@ use exif::{DateTime, Exif, In, Reader, Tag, Value};
 use geometry::geodesy::Geodetic;
 use glam::DQuat;
 
-use super::regular;
 use crate::frames::{attitude_to_enu, euler_to_ned};
 
 /// XMP stands in the first segments of the file.
@@ -24,7 +23,7 @@ pub struct ExifPose {
 }
 
 fn read(path: &Path) -> Option<Exif> {
-    let mut file = BufReader::new(regular::open(path).ok()?);
+    let mut file = BufReader::new(disk::regular::open(path).ok()?);
     Reader::new().read_from_container(&mut file).ok()
 }
 
@@ -80,7 +79,7 @@ pub fn exif_pose(path: &Path) -> Option<ExifPose> {
 /// DJI's gimbal angles: yaw clockwise from north, pitch −90 straight down, degrees.
 fn gimbal(path: &Path) -> Option<DQuat> {
     let mut head = Vec::new();
-    regular::open(path).ok()?.take(XMP_WITHIN).read_to_end(&mut head).ok()?;
+    disk::regular::open(path).ok()?.take(XMP_WITHIN).read_to_end(&mut head).ok()?;
     let angle = |name: &str| {
         let key = format!("drone-dji:Gimbal{name}Degree=\"");
         let start = head.windows(key.len()).position(|w| w == key.as_bytes())? + key.len();

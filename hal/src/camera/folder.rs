@@ -319,7 +319,7 @@ mod tests {
         let everything = std::fs::File::open(at("a_6.jpg")).is_ok();
         let expected = if everything { vec!["a_5.jpg", "a_6.jpg"] } else { vec!["a_5.jpg"] };
         assert_eq!(names(&mut camera, 1), expected);
-        assert!(super::super::regular::open(&at("a_1.jpg")).is_err(), "refused, not waited for");
+        assert!(disk::regular::open(&at("a_1.jpg")).is_err(), "refused, not waited for");
         if !everything {
             let error = camera.next_picture(2 * STALLED_NS).expect_err("named once").to_string();
             assert!(error.contains("a_6.jpg") && error.contains("ermission"), "{error}");

@@ -1,15 +1,17 @@
 //! Where a JPEG ends: needed to know that a file is complete, and to cut a stream of them (MJPEG) into pictures. Walks the
 //! segments instead of searching for end markers, because EXIF thumbnails contain some.
 
-use std::io::{Read, Seek, SeekFrom};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-use super::regular;
+use disk::regular;
 
 /// Largest picture of a stream; more without an end is garbage.
 const MAX_PICTURE: usize = 32 << 20;
 
-/// True when the file at `path` ends as a JPEG or PNG does. Half-written files do not.
+/// True when the file at `path` holds a JPEG or PNG to its end. Half-written files do not; what a camera writes behind the
+/// end is not looked at.
 ///
 /// # Errors
 /// It cannot be read, or is no regular file.
@@ -26,14 +28,59 @@ pub fn is_complete(path: &Path) -> std::io::Result<bool> {
     file.seek(SeekFrom::Start(len - 32))?;
     file.read_exact(&mut tail)?;
     Ok(match head {
-        // Some cameras pad after the end marker.
+        // Some cameras pad after the end marker, some write a preview or notes there.
         [0xFF, 0xD8] => {
             let end = tail.iter().rposition(|b| *b != 0).unwrap_or(0);
-            tail[..=end].ends_with(&[0xFF, 0xD9])
+            tail[..=end].ends_with(&[0xFF, 0xD9]) || has_end(file)?
         }
         [0x89, b'P'] => tail[20..].starts_with(&[0, 0, 0, 0]) && tail[24..28] == *b"IEND",
         _ => false,
     })
+}
+
+/// Walks the segments and scans of a JPEG; true when its end marker is met.
+fn has_end(mut file: File) -> std::io::Result<bool> {
+    file.seek(SeekFrom::Start(2))?;
+    let mut file = BufReader::with_capacity(1 << 13, file);
+    match walk(&mut file) {
+        Err(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => Ok(false),
+        walked => walked,
+    }
+}
+
+/// As [`has_end`], from behind the start marker; a file that ends before is an error.
+fn walk(file: &mut BufReader<File>) -> std::io::Result<bool> {
+    let byte = |file: &mut BufReader<File>| {
+        let mut one = [0];
+        file.read_exact(&mut one).map(|()| one[0])
+    };
+    let mut in_scan = false;
+    loop {
+        if in_scan {
+            // What was skipped is no marker: markers begin with FF.
+            file.skip_until(0xFF)?;
+        } else if byte(file)? != 0xFF {
+            return Ok(false);
+        }
+        let mut marker = byte(file)?;
+        while marker == 0xFF {
+            marker = byte(file)?;
+        }
+        match marker {
+            0xD9 => return Ok(true),
+            0 | 0xD0..=0xD7 if in_scan => {}
+            0x01 => {}
+            0 | 0xD0..=0xD8 => return Ok(false),
+            _ => {
+                let length = i64::from(u16::from_be_bytes([byte(file)?, byte(file)?]));
+                if length < 2 {
+                    return Ok(false);
+                }
+                file.seek_relative(length - 2)?;
+                in_scan = marker == 0xDA;
+            }
+        }
+    }
 }
 
 /// The same picture with the marker of motion JPEG. Many cameras leave the Huffman tables out of the pictures of a stream,
@@ -203,6 +250,19 @@ mod tests {
         for len in (0..=whole.len()).step_by(13).chain([whole.len()]) {
             std::fs::write(&path, &whole[..len]).expect("written");
             assert_eq!(is_complete(&path).expect("read"), len == whole.len(), "{len}");
+        }
+    }
+
+    #[test]
+    fn what_a_camera_writes_behind_the_end_does_not_hide_a_picture() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.jpg");
+        let (whole, notes) = (jpeg(5), [b"SEFT notes ".as_slice(); 9].concat());
+        std::fs::write(&path, [whole.as_slice(), &notes].concat()).expect("written");
+        assert!(is_complete(&path).expect("read"));
+        for len in (0..whole.len()).step_by(7) {
+            std::fs::write(&path, [&whole[..len], &[b'.'; 64]].concat()).expect("written");
+            assert!(!is_complete(&path).expect("read"), "{len}");
         }
     }
 

@@ -7,9 +7,9 @@ use config::mission::CameraSettings;
 use image::{ImageReader, RgbImage};
 
 use super::jpeg::marked_as_mjpeg;
-use super::regular;
 use super::undistort::undistort;
 use crate::error::HalError;
+use disk::regular;
 
 /// Pixels or where they are.
 #[derive(Clone, Debug, PartialEq)]

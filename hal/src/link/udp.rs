@@ -105,3 +105,27 @@ impl Link for UdpLink {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn udpout_hears_the_address_and_the_port_it_sends_to_and_nobody_else() {
+        let wait = Duration::from_secs(5);
+        let mission = UdpSocket::bind("127.0.0.1:0").expect("a port");
+        let port = mission.local_addr().expect("bound").port();
+        let mut link = UdpLink::connect(&format!("127.0.0.1:{port}")).expect("a link");
+        let here = ("127.0.0.1", link.local().expect("bound").port());
+        // The same port at another address, another port at the same address.
+        let strangers = [UdpSocket::bind(("127.0.0.2", port)), UdpSocket::bind("127.0.0.1:0")];
+        let mut into = [0; 64];
+        for stranger in strangers.map(|s| s.expect("a port")) {
+            stranger.send_to(b"stranger", here).expect("sent");
+            assert_eq!(link.read(&mut into, wait).expect("read").bytes, 0);
+        }
+        mission.send_to(b"autopilot", here).expect("sent");
+        let heard = link.read(&mut into, wait).expect("read").bytes;
+        assert_eq!(&into[..heard], b"autopilot");
+    }
+}

@@ -3,7 +3,6 @@
 //! world to camera; the world is east-north-up around `reference_lla`.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
@@ -129,7 +128,7 @@ pub fn find(root: &Path) -> Option<PathBuf> {
 
 /// Parses the file from front to back without holding it: points, the bulk of it, are passed over or taken one by one.
 fn parse<'de, S: DeserializeSeed<'de>>(path: &Path, seed: S) -> Result<S::Value, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let mut json = serde_json::Deserializer::from_reader(BufReader::with_capacity(1 << 16, file));
     seed.deserialize(&mut json)
         .map_err(|e| FormatError::invalid(path, format!("not a reconstruction.json of OpenSfM: {e}")))

@@ -1,7 +1,6 @@
 //! The 3DGS point cloud PLY that every viewer reads: log scales, logit opacities, w x y z quaternions, and the SH
 //! rest channel by channel (all red, all green, all blue), which is the transpose of [`GaussianCloud::sh`].
 
-use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
@@ -73,7 +72,7 @@ pub fn write(path: &Path, cloud: &GaussianCloud, origin: Option<Geodetic>) -> Re
 /// # Errors
 /// As [`FormatError`] says; what is allocated is bounded by the file's own size.
 pub fn read(path: &Path) -> Result<PlyModel, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let mut input = BufReader::with_capacity(1 << 16, file);
     let header = read_header(path, &mut input)?;

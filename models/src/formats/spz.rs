@@ -5,7 +5,6 @@
 //! rotations, SH above degree 0 (source: the format's own README and `load-spz.cc`). The axes are kept as they are, like
 //! the PLY's: east, north, up.
 
-use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Write};
 use std::path::Path;
 
@@ -88,7 +87,7 @@ pub fn write(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatError> {
 /// # Errors
 /// As [`FormatError`] says; nothing is allocated before the header was checked against the file's size.
 pub fn read(path: &Path) -> Result<SpzModel, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let mut input = GzDecoder::new(BufReader::new(file));
     let mut head = [0u8; HEADER_BYTES];

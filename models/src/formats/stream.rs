@@ -22,7 +22,7 @@ pub(crate) struct Stream<'p> {
 
 impl<'p> Stream<'p> {
     pub(crate) fn open(path: &'p Path) -> Result<Self, FormatError> {
-        let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+        let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
         let len = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
         Ok(Self { path, reader: BufReader::with_capacity(BUFFER, file), len, at: 0 })
     }
@@ -108,7 +108,7 @@ pub(crate) struct Lines<'p> {
 impl<'p> Lines<'p> {
     /// Keeps at most `limit` bytes of a line; the rest is read and forgotten.
     pub(crate) fn open(path: &'p Path, limit: usize) -> Result<Self, FormatError> {
-        let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+        let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
         Ok(Self { path, reader: BufReader::with_capacity(BUFFER, file), line: Vec::new(), limit, number: 0 })
     }
 

@@ -1,7 +1,6 @@
 //! What a TIFF declares, against what it can hold: decoders allocate for a tag before they read it, 32 bytes for each of its
 //! numbers, so that a file of some hundred bytes could take hundreds of MiB.
 
-use std::fs::File;
 use std::io::{BufReader, Read, Result, Seek, SeekFrom};
 use std::path::Path;
 
@@ -13,7 +12,7 @@ const DIRECTORIES: usize = 16;
 /// # Errors
 /// The file cannot be read, or ends within a directory.
 pub fn fits_its_tags(path: &Path) -> Result<bool> {
-    let mut file = BufReader::new(File::open(path)?);
+    let mut file = BufReader::new(disk::regular::open(path)?);
     let mut head = [0; 8];
     if file.read_exact(&mut head).is_err() {
         return Ok(true);

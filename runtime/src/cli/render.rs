@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use engine::device::file_renderer;
 use engine::evaluate::save_png;
-use engine::transfer::stem;
 use image::{ImageBuffer, Luma};
 use job::console;
 use job::interrupt;
@@ -38,6 +37,18 @@ pub struct Args {
     pub device: Option<String>,
 }
 
+/// What a camera's picture is called in the output folder.
+///
+/// # Errors
+/// The camera's name ends in no file name, and would lead out of the folder.
+fn picture_name(cameras: &Path, name: &str) -> Result<String, CliError> {
+    let file = Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned());
+    file.ok_or_else(|| {
+        let said = format!("{name:?} is no name of a picture; end file_path in one, such as images/0001.jpg");
+        CliError::input(format!("{}: {said}", cameras.display()))
+    })
+}
+
 /// Runs `dgtr render`.
 ///
 /// # Errors
@@ -47,8 +58,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Err(CliError::input(format!("--depth-unit {} must be a positive number of metres", args.depth_unit)));
     }
     let cameras = transforms::read(&args.cameras)?;
-    let views: Vec<(String, View)> =
-        cameras.shots.iter().map(|s| Ok((stem(&s.path), view(&args.cameras, s)?))).collect::<Result<_, CliError>>()?;
+    let views: Vec<(String, View)> = cameras
+        .shots
+        .iter()
+        .map(|s| Ok((picture_name(&args.cameras, &s.path)?, view(&args.cameras, s)?)))
+        .collect::<Result<_, CliError>>()?;
     let width = views.iter().map(|v| v.1.intrinsics.width).max().unwrap_or(1);
     let height = views.iter().map(|v| v.1.intrinsics.height).max().unwrap_or(1);
     let (_, mut trainer) = file_renderer(args.device.as_deref(), &args.model, (width, height))?;
@@ -99,4 +113,19 @@ fn save_depth(rendering: &Rendering, unit: f32, path: &Path) -> Result<(), CliEr
     let mut bytes = std::io::Cursor::new(Vec::new());
     picture.write_to(&mut bytes, image::ImageFormat::Png).map_err(|e| bad(format!("cannot be encoded: {e}")))?;
     Ok(write_atomic(path, |out| out.write_all(bytes.get_ref()))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_name_of_a_camera_leads_out_of_the_output_folder() {
+        let named = |name| picture_name(Path::new("cameras.json"), name).ok();
+        assert_eq!(named("/etc/images/0001.jpg").as_deref(), Some("0001"));
+        assert_eq!(named("../../a").as_deref(), Some("a"));
+        for out in ["../../up/..", "/tmp/esc/..", "..", "/", ""] {
+            assert_eq!(named(out), None, "{out}");
+        }
+    }
 }

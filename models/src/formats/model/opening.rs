@@ -39,7 +39,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
 
 /// As [`open`]; what is not `whole` may end before its Gaussians do, when they lie in layers.
 pub(super) fn open_to(path: &Path, whole: bool) -> Result<Opened, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let mut input = Hashing { inner: BufReader::with_capacity(1 << 16, file), hasher: blake3::Hasher::new() };
     let truncated = |what| FormatError::Truncated { path: path.to_owned(), at: size, what };

@@ -35,7 +35,7 @@ pub(super) struct Head {
 /// # Errors
 /// Why it is no picture that can be used, in a few words; the same words for the same reason.
 pub(super) fn read(path: &Path) -> Result<Head, String> {
-    let mut file = File::open(path).map_err(|e| format!("cannot be opened ({e})"))?;
+    let mut file = disk::regular::open(path).map_err(|e| format!("cannot be opened ({e})"))?;
     let len = file.metadata().map_err(|e| format!("cannot be read ({e})"))?.len();
     let mut magic = [0; 8];
     let read = file.read(&mut magic).map_err(|e| format!("cannot be read ({e})"))?;
@@ -133,8 +133,8 @@ fn other(path: &Path, file: File) -> Result<Head, String> {
     if !tiff::fits_its_tags(path).map_err(|e| bad(&e))? {
         return Err("is a damaged TIFF (a tag is larger than the file)".into());
     }
-    let size = ImageReader::open(path)
-        .and_then(ImageReader::with_guessed_format)
+    let size = disk::regular::open(path)
+        .and_then(|file| ImageReader::new(BufReader::new(file)).with_guessed_format())
         .map_err(|e| bad(&e))?
         .into_dimensions()
         .map_err(|e| bad(&e))?;
@@ -152,7 +152,7 @@ fn other(path: &Path, file: File) -> Result<Head, String> {
 
 /// The XMP of a PNG: an uncompressed `iTXt` chunk before the pixels.
 fn png_text(path: &Path) -> Option<String> {
-    let mut reader = BufReader::new(File::open(path).ok()?);
+    let mut reader = BufReader::new(disk::regular::open(path).ok()?);
     let mut head = [0; 8];
     reader.read_exact(&mut head).ok()?;
     if !head.starts_with(&[0x89, b'P', b'N', b'G']) {

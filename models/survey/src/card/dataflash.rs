@@ -2,7 +2,6 @@
 //! with the camera's feedback) or else TRIG (the command to take one) say where and how the aircraft was.
 
 use std::collections::HashMap;
-use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
@@ -36,7 +35,7 @@ struct Format {
 /// # Errors
 /// The file cannot be read, is no such log, or holds neither message.
 pub fn read(path: &Path) -> Result<Vec<Exposure>, FormatError> {
-    let file = File::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let mut bytes = BufReader::with_capacity(1 << 16, file).bytes();
     let mut next = || bytes.next().transpose().map_err(|e| FormatError::io(path, "reading", e));
     let mut formats: HashMap<u8, Format> = HashMap::new();

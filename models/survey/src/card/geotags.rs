@@ -117,7 +117,14 @@ pub(super) fn apply(file: &Path, tags: &HashMap<String, Geotag>, records: &mut [
 fn split(line: &str) -> Vec<&str> {
     let separator = [',', ';', '\t'].into_iter().find(|s| line.contains(*s));
     match separator {
-        Some(s) => line.split(s).map(|c| c.trim().trim_matches('"')).collect(),
+        Some(s) => {
+            let mut quoted = false;
+            let between = |c: char| {
+                quoted ^= c == '"';
+                c == s && !quoted
+            };
+            line.split(between).map(|c| c.trim().trim_matches('"')).collect()
+        }
         None => line.split_whitespace().collect(),
     }
 }
@@ -294,6 +301,12 @@ mod tests {
             assert_eq!((tag.fix.position, tag.fix.sigma_m), (position, sigma), "{text}");
             assert!((tag.attitude.unwrap().rotation * glam::DVec3::Z).z < -0.999, "{text}");
         }
+    }
+
+    #[test]
+    fn a_separator_within_quotation_marks_belongs_to_the_name() {
+        assert_eq!(split("\"a,b.jpg\", 1,\"2\""), ["a,b.jpg", "1", "2"]);
+        assert_eq!(split("\"a b.jpg\";1;2"), ["a b.jpg", "1", "2"]);
     }
 
     #[test]

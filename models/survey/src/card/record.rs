@@ -1,7 +1,6 @@
 //! One picture's own word: EXIF, maker note and XMP brought to one meaning. See the table in [`super`].
 
 use std::collections::{HashMap, HashSet};
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
@@ -113,7 +112,7 @@ fn file_name(path: &Path) -> String {
 /// Length and content hash of the file's ends: two different exposures never agree in both.
 fn fingerprint(path: &Path) -> Option<(u64, [u8; 32])> {
     const END: u64 = 64 << 10;
-    let mut file = File::open(path).ok()?;
+    let mut file = disk::regular::open(path).ok()?;
     let len = file.metadata().ok()?.len();
     let mut bytes = Vec::new();
     file.by_ref().take(END).read_to_end(&mut bytes).ok()?;

@@ -39,7 +39,7 @@ pub fn read(path: &Path, origin: Option<Geodetic>, bounds: [DVec2; 2]) -> Result
         return Err(bad("is a damaged TIFF (a tag is larger than the file)".into()));
     }
     let damaged = |e: tiff::TiffError| FormatError::invalid(path, format!("no raster of heights ({})", one_line(e)));
-    let file = File::open(path).map_err(failed)?;
+    let file = disk::regular::open(path).map_err(failed)?;
     let most = MOST_CHUNK.min(MOST_INFLATED * file.metadata().map_err(failed)?.len()) as usize;
     let mut limits = Limits::default();
     (limits.decoding_buffer_size, limits.intermediate_buffer_size) = (most, most);

@@ -1,6 +1,7 @@
 //! `geotags.csv`: where every matched picture was taken, as the HAL measured it, before any refinement. One line per
 //! picture, written at once; a line that a power cut tore is taken off at the next start. Surveyors feed such files to other tools.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::path::Path;
@@ -17,12 +18,17 @@ pub const FILE: &str = "geotags.csv";
 const HEADER: &str = "picture,sequence,lat_deg,lon_deg,alt_m,east_m,north_m,up_m,qw,qx,qy,qz,\
                       sigma_m,sigma_deg,speed_m_s,key_frame,confidence";
 
+/// Lines that a power cut may take: a line is a hundred bytes, a sync tens of milliseconds on an SD card.
+const SYNC_EVERY: u32 = 16;
+
 /// The open file.
 pub struct Geotags {
     file: Box<dyn Output>,
     frame: EnuFrame,
     /// The present line; reused.
     line: String,
+    /// Lines since the last sync.
+    unsynced: u32,
     /// The disk failed once; said once.
     failed: bool,
 }
@@ -38,7 +44,7 @@ impl Geotags {
         if path.metadata().map_or(0, |m| m.len()) == 0 {
             writeln!(file, "{HEADER}")?;
         }
-        Ok(Self { file, frame: EnuFrame::new(origin), line: String::with_capacity(512), failed: false })
+        Ok(Self { file, frame: EnuFrame::new(origin), line: String::with_capacity(512), unsynced: 0, failed: false })
     }
 
     /// Notes a matched picture. A full disk must not end a flight: the first failure is said, later ones are not.
@@ -59,7 +65,7 @@ impl Geotags {
         let written = writeln!(
             self.line,
             "{},{},{:.9},{:.9},{:.3},{:.3},{:.3},{:.3},{:.6},{:.6},{:.6},{:.6},{:.3},{:.3},{:.2},{},{:.3}",
-            name.file_name().unwrap_or(name.as_os_str()).to_string_lossy(),
+            field(&name.file_name().unwrap_or(name.as_os_str()).to_string_lossy()),
             frame.sequence,
             at.lat_deg,
             at.lon_deg,
@@ -79,6 +85,47 @@ impl Geotags {
         );
         written.map_err(io::Error::other)?;
         // One call per line: the lines of a torn file are whole but for the last.
-        self.file.write_all(self.line.as_bytes())
+        self.file.write_all(self.line.as_bytes())?;
+        self.unsynced += 1;
+        if self.unsynced >= SYNC_EVERY {
+            self.unsynced = 0;
+            self.file.sync()?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Geotags {
+    fn drop(&mut self) {
+        if self.unsynced > 0
+            && let Err(e) = self.file.sync()
+            && !self.failed
+        {
+            tracing::warn!("{FILE}: {e}; its last lines may be lost");
+        }
+    }
+}
+
+/// A name as one field of one line (RFC 4180). A line end in it would begin a line of its own, and a spreadsheet computes
+/// what begins with one of `=+-@`: such names get a quotation mark before them.
+fn field(name: &str) -> Cow<'_, str> {
+    let formula = name.starts_with(['=', '+', '-', '@']);
+    if !formula && !name.contains(|c: char| c.is_control() || matches!(c, ',' | '"')) {
+        return Cow::Borrowed(name);
+    }
+    let printable = name.replace(|c: char| c.is_control(), "_").replace('"', "\"\"");
+    Cow::Owned(format!("\"{}{printable}\"", if formula { "'" } else { "" }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_is_one_field_of_one_line_and_no_formula() {
+        assert_eq!(field("DJI_0001.JPG"), "DJI_0001.JPG");
+        assert_eq!(field("a,b\n0,1\u{85}.jpg"), "\"a,b_0,1_.jpg\"");
+        assert_eq!(field("a\"b.jpg"), "\"a\"\"b.jpg\"");
+        assert_eq!(field("=HYPERLINK(1).jpg"), "\"'=HYPERLINK(1).jpg\"");
     }
 }

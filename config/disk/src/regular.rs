@@ -1,4 +1,5 @@
-//! Opening what a folder holds: only regular files, and never waiting. Opening a FIFO waits for its writer, for ever.
+//! Opening what somebody else named or left in a folder: only regular files, and never waiting. Opening a FIFO waits for its
+//! writer, reading a terminal for its keys, for ever.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -7,11 +8,11 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-/// The file at `path`, for reading.
+/// Opens the file at `path` for reading.
 ///
 /// # Errors
 /// The system's; `InvalidInput` for what is no regular file.
-pub(super) fn open(path: &Path) -> io::Result<File> {
+pub fn open(path: &Path) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let file = OpenOptions::new().read(true).custom_flags(flags.bits().cast_signed()).open(path)?;
     if file.metadata()?.is_file() {
