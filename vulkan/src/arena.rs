@@ -7,17 +7,11 @@ mod memory;
 mod mirror;
 
 use crate::gpu::{Gpu, GpuError};
+use crate::layout::Section;
 use ash::vk;
 use config::plan::Plan;
 use memory::{Placement, allocate, map, placement};
 use mirror::Mirror;
-
-/// A section's place in the arena, bytes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Section {
-    pub offset: u64,
-    pub bytes: u64,
-}
 
 /// How the host gets at the sections.
 enum Host {

@@ -1,10 +1,11 @@
 //! One command buffer, recorded and submitted again and again: dispatches in order, a barrier and a timestamp after
 //! each stage. Nothing here allocates after start-up.
 
-use crate::arena::{Arena, Section};
+use crate::arena::Arena;
 use crate::gpu::{Gpu, GpuError};
 use crate::kernels::{GROUPS, Group, KERNELS, Kernel};
 use crate::layout::Push;
+use crate::layout::Section;
 use crate::pipelines::Pipelines;
 use crate::stages::{DEVICE_TIMES, STAGE_NAMES, Stage};
 use ash::vk;

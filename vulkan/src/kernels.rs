@@ -1,6 +1,6 @@
 //! The list of kernels: for each its checked-in SPIR-V and the sections of the arena it binds, in binding order.
 
-use crate::arena::Section;
+use crate::layout::Section;
 use crate::stages::Stage;
 
 /// How many lanes a workgroup has.

@@ -9,6 +9,13 @@ pub(crate) const DEFERRED_STEPS: usize = 512;
 /// Cursors in the status section: the largest number of sorting lanes.
 const CURSORS: usize = Lanes::CARD.sort as usize;
 
+/// A section's place in the arena, bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Section {
+    pub offset: u64,
+    pub bytes: u64,
+}
+
 /// A type that both languages have.
 trait Glsl {
     /// What a block's fields of this type must be aligned to.

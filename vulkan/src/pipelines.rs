@@ -3,7 +3,7 @@
 #[cfg(test)]
 mod listed;
 
-use crate::arena::{Arena, Section};
+use crate::arena::Arena;
 use crate::constants::STRIP;
 use crate::gpu::{DeviceLimits, Gpu, GpuError};
 use crate::kernel_config::KernelConfig;
@@ -11,6 +11,7 @@ use crate::kernels::{
     DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
 };
 use crate::kernels::{texel_bytes, texel_format};
+use crate::layout::Section;
 use ash::vk;
 use config::plan::{Plan, sh_columns};
 

@@ -5,8 +5,9 @@
 //! looked at, at its end.
 
 use super::memory::{allocate, map};
-use super::{Section, named};
+use super::named;
 use crate::gpu::{Gpu, GpuError};
+use crate::layout::Section;
 use ash::vk;
 use config::plan::{Plan, view_bytes};
 use std::cell::{Cell, RefCell};

@@ -1,8 +1,8 @@
 //! Vulkan objects that more than one part of the crate makes: compute pipelines, and texel views within the device's limit.
 
 use super::{Gpu, GpuError};
-use crate::arena::Section;
 use crate::kernels::texel_bytes;
+use crate::layout::Section;
 use ash::vk;
 use std::io::Cursor;
 

@@ -2,7 +2,8 @@
 
 use half::f16;
 
-use crate::arena::{Arena, Section};
+use crate::arena::Arena;
+use crate::layout::Section;
 
 /// A second moment that holds a number where it is: its root is 1e15, gradients are below 1, and it decays by less than half of its
 /// digits in 30,000 steps. Small enough that bias correction at the first step does not overflow.

@@ -2,7 +2,8 @@
 
 use super::moments::{HEAVY, ShMoments};
 use super::{Trainer, state};
-use crate::arena::{Arena, Section};
+use crate::arena::Arena;
+use crate::layout::Section;
 use config::plan::Plan;
 use models::cloud::{GaussianCloud, sh_coefficients};
 

@@ -4,7 +4,7 @@
 //! order of pictures follows from the seed, so that the next one is known while a step runs, and the system reads it ahead.
 
 use super::{TrainError, Trainer};
-use crate::arena::Section;
+use crate::layout::Section;
 use config::plan::{Plan, crop_bytes, view_bytes};
 use rustix::fs::{Advice, fadvise};
 use std::fs::File;
