@@ -89,12 +89,17 @@ table! {
     }
 }
 
+/// The share, 0…1, that `spent` steps and seconds are of those that there are; whichever is further.
+pub fn share_spent(of: (u32, Option<f64>), spent: (u32, f64)) -> f32 {
+    let by_steps = f64::from(spent.0) / f64::from(of.0.max(1));
+    let by_time = of.1.map_or(0.0, |s| spent.1 / s.max(1e-3));
+    by_steps.max(by_time).clamp(0.0, 1.0) as f32
+}
+
 impl TrainSettings {
     /// How much of the schedule is over after `steps` steps and `elapsed_s` seconds, 0…1.
     pub fn progress(&self, steps: u32, elapsed_s: f64) -> f32 {
-        let by_steps = f64::from(steps) / f64::from(self.steps.max(1));
-        let by_time = self.seconds.map_or(0.0, |s| elapsed_s / s.max(1e-3));
-        by_steps.max(by_time).clamp(0.0, 1.0) as f32
+        share_spent((self.steps, self.seconds), (steps, elapsed_s))
     }
 
     /// Length of the schedule for so many pictures, where neither steps nor seconds are given: [`Self::steps`], unless each view

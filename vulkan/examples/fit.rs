@@ -6,7 +6,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use survey::dataset::Dataset;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{Rendering, RunBudget, Trainer};
+use vulkan::trainer::{PictureStore, Rendering, RunBudget, Trainer};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let args: Vec<String> = std::env::args().collect();
@@ -32,16 +32,17 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let gpu = Gpu::open(std::env::var("DGTR_DEVICE").ok().as_deref())?;
     println!("{:?}: N {} M {} bytes {}", gpu.info(), plan.gaussians, plan.instances, plan.total_bytes);
     let mut trainer = Trainer::new(&gpu, &plan, &settings)?;
+    let mut pictures = PictureStore::new(&plan);
     let points = dataset.sparse_points()?;
     let positions: Vec<[f32; 3]> = points.iter().map(|p| p.position.map(|v| v as f32)).collect();
     let colours: Vec<[u8; 3]> = points.iter().map(|p| p.color).collect();
     let cloud = models::init::from_sfm(&positions, &colours, capacity)?;
     println!("{:?}", trainer.load(&cloud)?);
     for i in &train {
-        trainer.add_view(&dataset.load(*i, 1.0)?, None)?;
+        pictures.add(trainer.device_mut(), &dataset.load(*i, 1.0)?, None)?;
     }
     let before = cpu_seconds();
-    let summary = trainer.run(&RunBudget { steps: Some(steps as u32), seconds: None }, &mut |r| {
+    let summary = trainer.run(&mut pictures, &RunBudget { steps: Some(steps as u32), seconds: None }, &mut |r| {
         if r.step % (steps as u32 / 10).max(1) == 0 || r.step == 1 {
             println!(
                 "{} loss {:.4} l1 {:.4} ssim {:.4} visible {} of {} instances {} bands {}",
@@ -55,7 +56,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("{summary:?}\nwall {:.1} ms/step, cpu {:.1} ms/step", summary.seconds * 1e3 / n, cpu * 1e3 / n);
     let c = summary.counters;
     println!("per step: instances {:.0} evaluations {:.2} M", c.instances as f64 / n, c.evaluations as f64 / n * 1e-6);
-    for (name, ms) in trainer.stage_ms() {
+    for (name, ms) in trainer.device().stage_ms() {
         println!("{name:>20} {:8.2} ms", ms / n);
     }
     let mut rendering = Rendering::default();

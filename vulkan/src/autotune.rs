@@ -14,7 +14,7 @@ use crate::gpu::{Gpu, GpuInfo};
 use crate::kernel_config::KernelConfig;
 use crate::kernels::Group;
 use crate::synthetic::{cloud, photo, plain, posed, view};
-use crate::trainer::{TrainError, Trainer};
+use crate::trainer::{PictureStore, TrainError, Trainer};
 use config::plan::{Plan, PlanRequest};
 use models::cloud::GaussianCloud;
 use std::time::{Duration, Instant};
@@ -69,7 +69,7 @@ pub fn autotune(gpu: &Gpu, limit: Option<Duration>) -> Result<Autotuned, TrainEr
         let mut trainer = trainer(gpu, config)?;
         // The first pass compiles; its time says nothing.
         let mut gradient = GaussianCloud::default();
-        trainer.gradient(0, &mut gradient)?;
+        trainer.0.gradient(&mut trainer.1, 0, &mut gradient)?;
         if *expected.get_or_insert_with(|| gradient.clone()) != gradient {
             refused.push(config);
             continue;
@@ -96,7 +96,7 @@ pub fn autotune(gpu: &Gpu, limit: Option<Duration>) -> Result<Autotuned, TrainEr
 pub fn step_ms(gpu: &Gpu) -> Result<f64, TrainError> {
     let mut trainer = trainer(gpu, KernelConfig::standard(gpu.info()))?;
     // The first one compiles.
-    trainer.step()?;
+    step(&mut trainer, false)?;
     let mut least = f64::INFINITY;
     for _ in 0..REPEATS {
         let [ms, ..] = step(&mut trainer, false)?;
@@ -194,7 +194,7 @@ fn least(times: impl Iterator<Item = (Sizes, f64)>, standard: Sizes) -> Sizes {
 }
 
 /// The scene, loaded.
-fn trainer(gpu: &Gpu, config: KernelConfig) -> Result<Trainer, TrainError> {
+fn trainer(gpu: &Gpu, config: KernelConfig) -> Result<(Trainer, PictureStore), TrainError> {
     let v = view(SIDE.0, SIDE.1);
     let mut gaussians = cloud(1, GAUSSIANS, 3);
     // As small against the picture as trained ones are.
@@ -212,20 +212,21 @@ fn trainer(gpu: &Gpu, config: KernelConfig) -> Result<Trainer, TrainError> {
     };
     let plan = Plan::with_capacities(&request, GAUSSIANS, INSTANCES * GAUSSIANS);
     let mut trainer = Trainer::with_config(gpu, &plan, &plain(), config)?;
-    trainer.time_every_step();
+    trainer.device_mut().time_every_step();
     trainer.load(&gaussians)?;
-    trainer.add_view(&posed(&v, &photo(1, &v)), None)?;
-    Ok(trainer)
+    let mut pictures = PictureStore::new(&plan);
+    pictures.add(trainer.device_mut(), &posed(&v, &photo(1, &v)), None)?;
+    Ok((trainer, pictures))
 }
 
 /// One step: milliseconds of each kind of its kernels.
-fn step(trainer: &mut Trainer, timed: bool) -> Result<[f64; 3], TrainError> {
-    let (start, before) = (Instant::now(), trainer.group_ms());
-    trainer.step()?;
+fn step((trainer, pictures): &mut (Trainer, PictureStore), timed: bool) -> Result<[f64; 3], TrainError> {
+    let (start, before) = (Instant::now(), trainer.device().group_ms());
+    trainer.step(pictures)?;
     if !timed {
         return Ok([start.elapsed().as_secs_f64() * 1e3; 3]);
     }
-    let after = trainer.group_ms();
+    let after = trainer.device().group_ms();
     let of = |group: Group| after[group as usize] - before[group as usize];
     Ok([of(Group::Wide) + of(Group::Strips), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)])
 }

@@ -1,6 +1,7 @@
 //! The renderer and the fixed-memory trainer: Vulkan compute over one device allocation.
 //!
-//! [`gpu::Gpu`] opens a device, [`config::plan::Plan`] says what is allocated, [`trainer::Trainer`] trains and renders.
+//! [`gpu::Gpu`] opens a device, [`config::plan::Plan`] says what is allocated, [`trainer::PictureStore`] holds the
+//! pictures, [`trainer::Trainer`] trains and renders.
 
 mod arena;
 pub mod autotune;
@@ -8,10 +9,16 @@ pub mod autotune;
 pub mod cases;
 mod commands;
 pub mod constants;
+mod device;
+mod error;
+#[cfg(any(test, feature = "lab"))]
+pub mod fixture;
 pub mod gpu;
 pub mod kernel_config;
 mod kernels;
 mod layout;
+mod model;
+mod pictures;
 mod pipelines;
 pub mod reference;
 pub mod roofline;

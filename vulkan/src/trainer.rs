@@ -1,135 +1,65 @@
-//! The trainer: views and Gaussians in one arena, one gradient step after the other, nothing allocated in between.
+//! Training: one gradient step after the other on pictures that are borrowed, nothing allocated in between.
 //!
-//! A step is two submissions: projection, sort and counting first, so that the host knows how many instances there are;
-//! then blending, loss, gradient and Adam — in several bands of tiles when the instances do not fit, with the same bits.
+//! The parts: [`Device`] (one allocation, the kernels' passes), the model (Gaussians with their moments, cells), [`Schedule`] (how much of
+//! it is over), densification, and whose turn it is.
 
-mod bands;
 mod check;
-mod control;
-mod crops;
-mod deferred;
-mod degrees;
-mod density;
-mod error;
-pub(crate) mod frame;
 mod gradient;
-mod grow;
-mod load;
-mod moments;
-mod parameters;
-mod pose;
 mod render;
 mod run;
-mod sampler;
-mod scene;
 mod schedule;
-mod slots;
-mod snapshot;
-mod state;
 mod step;
+mod strategy;
+mod turns;
 mod validation;
-mod views;
 
+pub use crate::device::Device;
+pub use crate::error::TrainError;
+pub use crate::model::{BoundingBox, Counters, Fate, LoadReport, Pieces, Trained};
+pub use crate::pictures::{CropPlace, PictureStore};
 pub use check::{PlanFit, TrainingCheck, check_device, check_plan, check_training};
-pub use crops::CropPlace;
-pub use error::TrainError;
 pub use gradient::ViewGradients;
-pub use grow::{BoundingBox, Fate, Trained};
-pub use load::{LoadReport, Pieces};
 pub use render::Rendering;
-pub use run::{Counters, RunBudget, StepReport, StopReason, TrainSummary};
+pub use run::{RunBudget, StepReport, StopReason, TrainSummary};
+pub use schedule::Schedule;
 pub use validation::Validated;
 
-use crate::arena::Arena;
-use crate::commands::{Commands, Recording};
 use crate::gpu::Gpu;
 use crate::kernel_config::KernelConfig;
-use crate::kernels::{ALL, GROUPS, Kernel};
-use crate::layout::{Frame, Push, Status};
-use crate::pipelines::Pipelines;
-use crate::stages::STAGE_NAMES;
-use bytemuck::Zeroable;
+use crate::kernels::{ALL, Kernel};
+use crate::layout::Frame;
+use crate::model::Model;
 use config::plan::Plan;
 use config::settings::SettingError;
-use config::training::{MOST_STEPS, Strategy, TrainSettings, scene_extent};
+use config::training::{LossSettings, MOST_STEPS, RateSettings, TrainSettings};
+use models::camera::{OrthographicView, View};
+use models::cloud::GaussianCloud;
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-/// Of so many steps one is timed: on lavapipe timestamps make a step longer (`tests/results/TRIED.md`).
-const TIMED_EVERY: u32 = 16;
-
-/// How many steps the times of the one after `steps` stand for.
-fn timed_weight(steps: u32, every: u32) -> f64 {
-    match steps {
-        steps if steps < every => 1.0,
-        steps if steps.is_multiple_of(every) => f64::from(every),
-        _ => 0.0,
-    }
-}
-
-/// Gaussians, views and optimiser state on one device.
+/// Gaussians and their optimiser on one device.
 pub struct Trainer {
-    // Dropped in this order: what refers to the arena first, the device last.
-    commands: Commands,
-    pipelines: Pipelines,
-    arena: Arena,
-    gpu: Gpu,
-    plan: Plan,
+    pub(crate) device: Device,
+    pub(crate) model: Model,
+    schedule: Schedule,
     settings: TrainSettings,
-    parameters: parameters::Parameters,
-    frame: Box<Frame>,
-    deferred: deferred::Deferred,
-    views: Vec<views::TrainingView>,
-    crops: Vec<crops::TrainingCrop>,
-    slots: slots::Slots,
-    scene: scene::Scene,
-    /// One Gaussian on its way to the host.
-    record: Vec<u8>,
-    sampler: sampler::Sampler,
-    crop_sampler: sampler::Sampler,
-    density: density::Scratch,
-    degrees: degrees::Degrees,
+    pub(crate) turns: turns::Turns,
+    density: strategy::Density,
     validation: validation::Validation,
-    bands: Vec<bands::Band>,
-    /// Dispatches that counting and emitting are spread over.
-    walk_rounds: u32,
-    strategy: Strategy,
-    /// Those on the device.
-    gaussians: usize,
-    extent: f32,
-    /// Updates of the Gaussians since `load`: one for each picture looked at, or for each part of one.
-    updates: u32,
-    /// Pictures looked at since `load`, parts of them by their share of its pixels.
-    looked: f64,
-    /// Whether the lazy Adam updates of all Gaussians are done.
-    flushed: bool,
-    /// Gradients are left where the first moments are, and nothing moves (gradient checks).
-    gradients_only: bool,
-    /// Of so many steps one is timed, after as many at the beginning.
-    timed_every: u32,
-    /// Seconds of training since `load`.
-    elapsed_s: f64,
-    /// Steps and seconds that earlier processes spent on the same schedule.
-    before: (u32, f64),
-    /// Progress at which the schedule begins.
-    begun_at: f32,
-    /// Pictures looked at and seconds spent when the schedule began anew.
-    since: (f64, f64),
     patience: run::Patience,
-    counters: Counters,
 }
 
 impl std::fmt::Debug for Trainer {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Trainer({} Gaussians, {} views, step {})", self.gaussians, self.views.len(), self.updates)
+        write!(f, "Trainer({} Gaussians, step {})", self.gaussians(), self.model.updates)
     }
 }
 
 impl Trainer {
-    /// As [`Trainer::with_config`], with the device's standard configuration.
+    /// Opens a trainer with the device's standard configuration; else as [`Trainer::with_config`].
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`Trainer::with_config`].
     pub fn new(gpu: &Gpu, plan: &Plan, settings: &TrainSettings) -> Result<Self, TrainError> {
         Self::with_config(gpu, plan, settings, KernelConfig::standard(gpu.info()))
     }
@@ -148,7 +78,7 @@ impl Trainer {
         Self::with_kernels(gpu, plan, settings, config, ALL)
     }
 
-    /// The same with some of the kernels only.
+    /// Opens a trainer with some of the kernels only.
     pub(crate) fn with_kernels(
         gpu: &Gpu,
         plan: &Plan,
@@ -161,68 +91,47 @@ impl Trainer {
             let wanted = "1 where the scene has more Gaussians than the device: degrees are ranked among all of them";
             return Err(SettingError::new("sh.raise_share", &settings.sh.raise_share, wanted).into());
         }
-        let arena = Arena::new(gpu, plan)?;
-        let pipelines = Pipelines::new(gpu, plan, &arena, config, settings.sh.raise_share < 1.0, kernels)?;
-        let commands = Commands::new(gpu)?;
-        let parameters = parameters::Parameters::new(&arena, plan);
+        let device = Device::new(gpu, plan, config, settings.sh.raise_share < 1.0, kernels)?;
         Ok(Self {
-            commands,
-            pipelines,
-            arena,
-            gpu: gpu.clone(),
-            plan: plan.clone(),
-            parameters,
-            frame: Box::new(Frame::zeroed()),
-            deferred: deferred::Deferred::new(&settings.adam),
-            views: Vec::with_capacity(plan.views),
-            crops: Vec::with_capacity(plan.crops),
-            slots: slots::Slots::new(plan),
-            scene: scene::Scene::new(plan),
-            record: vec![0; plan.record_bytes()],
-            sampler: sampler::Sampler::new(settings.seed, plan.views),
-            crop_sampler: sampler::Sampler::new(settings.seed, plan.crops),
-            density: density::Scratch::new(plan.gaussians),
-            degrees: degrees::Degrees::new(plan.gaussians),
+            model: Model::new(&device, settings),
+            device,
+            schedule: Schedule::new(settings),
+            turns: turns::Turns::new(settings.seed, plan.views, plan.crops),
+            density: strategy::Density::new(plan.gaussians),
             validation: validation::Validation::new(plan.views),
-            bands: Vec::with_capacity(plan.tiles),
-            walk_rounds: bands::WALK_ROUNDS,
-            strategy: Strategy::None,
-            gaussians: 0,
-            extent: 1.0,
-            updates: 0,
-            looked: 0.0,
-            flushed: true,
-            gradients_only: false,
-            timed_every: TIMED_EVERY,
-            elapsed_s: 0.0,
-            before: (0, 0.0),
-            begun_at: 0.0,
             patience: run::Patience::default(),
-            since: (0.0, 0.0),
-            counters: Counters::default(),
             settings: settings.clone(),
         })
     }
 
-    /// Starts the schedule anew for the Gaussians just loaded.
-    fn restart(&mut self) {
-        (self.updates, self.looked) = (0, 0.0);
-        self.elapsed_s = 0.0;
-        (self.before, self.since, self.begun_at) = ((0, 0.0), (0.0, 0.0), 0.0);
-        self.flushed = true;
-        self.deferred.reset();
-        self.sampler.look_at_newest(false);
-        self.sampler.reset();
-        self.crop_sampler.reset();
-        self.strategy = self.settings.density.resolve(self.gaussians(), self.plan.scene);
-        self.counters = Counters::default();
-        self.extent = 0.0;
-        self.density.last = 0.0;
-        self.density.last_flush = 0;
-        self.degrees.reset();
+    /// Keeps the cells that find no room on the device in `file`, empty and with room for [`Plan::scene_file_bytes`]. Call it before
+    /// [`Trainer::load`] where the plan holds fewer Gaussians than the scene.
+    pub fn keep_scene_in(&mut self, file: std::fs::File) {
+        self.model.scene.store.keep_in(file);
+    }
+
+    /// Replaces the Gaussians and starts the schedule anew. Those that are not finite are left out, and so are the least
+    /// important ones beyond the plan's capacity.
+    ///
+    /// # Errors
+    /// [`TrainError::Empty`] when nothing remains; [`TrainError::SceneFile`] where they are more than the device holds.
+    pub fn load(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
+        self.load_pieces::<TrainError>(&|take| take(cloud))
+    }
+
+    /// Loads all pieces in one, of which the host holds one at a time; else as [`Trainer::load`].
+    ///
+    /// # Errors
+    /// Those of [`Trainer::load`], and those of `pieces`: no Gaussians are there then, where it had begun to replace them.
+    pub fn load_pieces<E: From<TrainError>>(&mut self, pieces: Pieces<'_, E>) -> Result<LoadReport, E> {
+        let report = self.model.load_pieces(&mut self.device, &self.settings, pieces)?;
+        self.schedule.restart();
+        self.turns.restart();
+        self.density.restart(self.settings.density.resolve(self.gaussians(), self.plan().scene));
         self.validation.reset();
         self.patience = run::Patience::default();
-        self.commands.clear_times();
+        self.device.clear_times();
+        Ok(report)
     }
 
     /// Trains until the budget, the schedule or `each` says stop. The schedule fits itself to the budget: `steps` and
@@ -232,23 +141,26 @@ impl Trainer {
     /// [`TrainError::NoViews`], [`TrainError::Empty`], [`TrainError::Gpu`]. What was trained before stays.
     pub fn run(
         &mut self,
+        pictures: &mut PictureStore,
         budget: &RunBudget,
         each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
     ) -> Result<TrainSummary, TrainError> {
         if let Some(steps) = budget.steps {
-            self.settings.steps = steps.clamp(1, MOST_STEPS);
+            self.schedule.set_steps(steps.clamp(1, MOST_STEPS));
         } else if budget.seconds.is_some() {
-            self.settings.steps = MOST_STEPS;
+            self.schedule.set_steps(MOST_STEPS);
         }
-        self.settings.seconds = budget.seconds.or(self.settings.seconds);
-        let start = (Instant::now(), self.steps());
+        if budget.seconds.is_some() {
+            self.schedule.set_seconds(budget.seconds);
+        }
+        let start = (Instant::now(), self.schedule.taken());
         let mut reason = StopReason::Schedule;
         let mut last = None;
-        while self.progress() < 1.0 {
-            let report = self.step()?;
+        while self.schedule.progress() < 1.0 {
+            let report = self.step(pictures)?;
             let stop = each(&report).is_break();
             last = Some(report);
-            let converged = self.patience.is_over(&self.settings, &report, self.views.len());
+            let converged = self.patience.is_over(&self.settings, &report, pictures.len());
             if stop {
                 reason = StopReason::Caller;
                 break;
@@ -260,123 +172,189 @@ impl Trainer {
             }
         }
         Ok(TrainSummary {
-            steps: self.steps() - start.1,
+            steps: self.schedule.taken() - start.1,
             seconds: start.0.elapsed().as_secs_f64(),
             reason,
             gaussians: self.gaussians(),
             last,
-            counters: self.counters,
+            counters: self.model.counters,
         })
-    }
-
-    /// Seconds of training since the last [`Trainer::load`].
-    pub fn elapsed_s(&self) -> f64 {
-        self.elapsed_s
     }
 
     /// Number of Gaussians, those that are not on the device included.
     pub fn gaussians(&self) -> usize {
-        self.gaussians + self.scene.away
+        self.model.total()
     }
 
-    /// Steps taken since the last [`Trainer::load`]: pictures looked at. Where a scene is larger than the device a picture is looked at
-    /// in parts, each of which updates the Gaussians, and its step is over when they amount to it.
-    pub fn steps(&self) -> u32 {
-        self.looked as u32
+    /// Cells of ground, and how many of them are on the device; (0, 0) while all Gaussians are.
+    pub fn cells(&self) -> (usize, usize) {
+        self.model.scene.cells()
     }
 
     /// The plan everything was allocated by.
     pub fn plan(&self) -> &Plan {
-        &self.plan
+        self.device.plan()
     }
 
-    /// The device.
-    pub fn gpu(&self) -> &Gpu {
-        &self.gpu
+    /// The device at work.
+    pub fn device(&self) -> &Device {
+        &self.device
     }
 
-    /// Bytes really allocated on the device.
-    pub fn device_bytes(&self) -> u64 {
-        self.arena.total_bytes
+    /// The device at work, whose memory pictures are put into.
+    pub fn device_mut(&mut self) -> &mut Device {
+        &mut self.device
     }
 
-    /// Bytes of the host's memory beside them, where the device is a card with memory of its own.
-    pub fn mirror_bytes(&self) -> u64 {
-        self.arena.mirror_bytes()
+    /// How much of the schedule is over.
+    pub fn schedule(&self) -> &Schedule {
+        &self.schedule
     }
 
-    /// Times every step from here on instead of one in sixteen: for those who measure, not for those who train.
-    pub fn time_every_step(&mut self) {
-        self.timed_every = 1;
+    /// The schedule, to be continued, begun anew or bounded.
+    pub fn schedule_mut(&mut self) -> &mut Schedule {
+        &mut self.schedule
     }
 
-    /// Device milliseconds per stage since `load`, in pipeline order, of all steps as the timed ones let one expect; zeros on
-    /// devices without timestamps.
-    pub fn stage_ms(&self) -> [(&'static str, f64); STAGE_NAMES.len()] {
-        let ms = self.commands.stage_ms();
-        std::array::from_fn(|i| (STAGE_NAMES[i], ms[i]))
+    /// Trains on pictures of at most 1/`divisor` of their size from now on, whatever the schedule says (1 = as scheduled):
+    /// the failsafe's way to a third of the work without touching the model.
+    pub fn set_least_divisor(&mut self, divisor: u32) {
+        self.settings.resolution.least_divisor = divisor.max(1);
     }
 
-    /// Device milliseconds of each kind of kernel since `load` (by `Group as usize`); zeros without timestamps.
-    pub(crate) fn group_ms(&self) -> [f64; GROUPS] {
-        self.commands.group_ms()
-    }
-
-    /// Length scale of the scene, metres (see [`scene_extent`]); learning rates of positions are relative to it.
-    fn measure_extent(&mut self) {
-        if self.extent > 0.0 {
-            return;
-        }
-        let centres: Vec<[f64; 3]> = self.views.iter().map(|v| v.view.pose.center.to_array()).collect();
-        if self.scene.is_paged() {
-            self.extent = scene_extent(self.scene.means(), &centres);
-            return;
-        }
-        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        let means: Vec<[f32; 3]> = geometry.iter().map(|g| g.mean).collect();
-        self.extent = scene_extent(&means, &centres);
-    }
-
-    /// Does the lazy Adam updates of all Gaussians, so that they may be read or moved.
-    fn flush(&mut self) -> Result<(), TrainError> {
-        if self.flushed || self.gaussians == 0 {
-            return Ok(());
-        }
-        self.frame.gaussians = self.gaussians as u32;
-        self.frame.step = self.updates + 1;
-        self.deferred.write(&mut self.frame.deferred);
-        self.write_frame();
-        let all = Push { mode: 1, ..Push::default() };
-        let recording = self.take_recording()?;
-        recording.run(Kernel::Project, self.gaussians, all);
-        recording.run(Kernel::CatchUp, self.plan.lanes.loops as usize, all);
-        recording.submit()?;
-        self.flushed = true;
+    /// Takes other learning rates from the next step on.
+    ///
+    /// # Errors
+    /// [`TrainError::Settings`] when one is negative or not a number; the old ones then stay.
+    pub fn set_rates(&mut self, rates: &RateSettings) -> Result<(), TrainError> {
+        let mut settings = self.settings.clone();
+        settings.rates = *rates;
+        settings.check()?;
+        self.settings = settings;
         Ok(())
     }
 
-    fn take_recording(&self) -> Result<Recording<'_>, TrainError> {
-        Ok(self.commands.begin(&self.pipelines, &self.arena)?)
+    /// Takes another loss from the next step on.
+    ///
+    /// # Errors
+    /// [`TrainError::Settings`] when a weight is negative or not a number; the old one then stays.
+    pub fn set_loss(&mut self, loss: &LossSettings) -> Result<(), TrainError> {
+        let mut settings = self.settings.clone();
+        settings.loss = *loss;
+        settings.check()?;
+        self.settings = settings;
+        Ok(())
     }
 
-    fn write_frame(&mut self) {
-        let section = self.arena.section("frame");
-        self.arena.slice_mut::<Frame>(section)[0] = *self.frame;
+    /// From here on, until the next [`Trainer::load`] that is followed by none of this: views are visited newest first, with an
+    /// exponential tail of older ones, instead of once in an epoch each, and the number of Gaussians is the caller's: nothing is
+    /// densified.
+    pub fn while_views_come(&mut self) {
+        self.turns.views.prefer_newest(true);
+        self.keep_number();
     }
 
-    /// What the kernels left; the device must be idle.
-    fn status(&self) -> &Status {
-        &self.arena.slice::<Status>(self.arena.section("status"))[0]
+    /// From here on, until the next [`Trainer::load`], nothing is densified: the number of Gaussians is the caller's.
+    pub fn keep_number(&mut self) {
+        self.density.keep_number();
     }
-}
 
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn the_timed_steps_stand_for_all_steps() {
-        for (every, steps) in [(1, 37), (16, 16), (16, 32), (16, 1600)] {
-            let stand_for: f64 = (0..steps).map(|step| super::timed_weight(step, every)).sum();
-            assert_eq!(stand_for, f64::from(steps), "one of {every}");
-        }
+    /// Holds the Gaussians just loaded for which `is_held(row of the cloud)` says so: they are drawn and blended, and the others are
+    /// trained as if they could not move. Adam does it, by second moments that no gradient comes near: what is held moves by
+    /// less than rounding shows, but for numbers that are nearly zero. Until the next [`Trainer::load`]; only for a scene that is
+    /// on the device as a whole, of which no row was left out.
+    pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
+        self.model.hold(&mut self.device, is_held);
+    }
+
+    /// Shows every Gaussian of `within`, in order.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
+    pub fn each(&mut self, within: &BoundingBox, see: impl FnMut(&Trained)) -> Result<(), TrainError> {
+        let unbias = self.second_unbias();
+        self.model.each(&mut self.device, within, unbias, see)
+    }
+
+    /// Moves Gaussians of `within` and takes others out, as `fate` says of each in the order of [`Trainer::each`]; never the last one.
+    /// Returns how many went.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
+    pub fn revise(&mut self, within: &BoundingBox, fate: impl FnMut(&Trained) -> Fate) -> Result<usize, TrainError> {
+        let unbias = self.second_unbias();
+        self.model.revise(&mut self.device, within, unbias, fate)
+    }
+
+    /// Adds Gaussians, as many as find room; those that are not finite are left out. A scene that outgrows the device goes into cells.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
+    pub fn extend(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
+        self.model.extend(&mut self.device, &self.settings, cloud)
+    }
+
+    /// Writes the present parameters to `cloud`, reusing its memory.
+    ///
+    /// # Errors
+    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
+    pub fn snapshot(&mut self, cloud: &mut GaussianCloud) -> Result<(), TrainError> {
+        self.model.snapshot(&mut self.device, cloud)
+    }
+
+    /// Moves every parameter of `cloud`, which is an earlier [`Trainer::snapshot`] of as many Gaussians, by `share` of the way to the present
+    /// one. Allocates nothing.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::snapshot`]; the cloud is of no use then.
+    pub fn blend_into(&mut self, cloud: &mut GaussianCloud, share: f32) -> Result<(), TrainError> {
+        self.model.blend_into(&mut self.device, cloud, share)
+    }
+
+    /// Gives the present parameters to `take` piece by piece, in the order of [`Trainer::snapshot`]. What it has not flushed before it
+    /// does first, so that it gives the same Gaussians until the next step.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::snapshot`], and those of `take`.
+    pub fn each_piece<E: From<TrainError>>(
+        &mut self,
+        take: &mut dyn FnMut(&GaussianCloud) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.model.each_piece(&mut self.device, take)
+    }
+
+    /// Renders the present Gaussians with all trained SH degrees, without exposure, over black.
+    ///
+    /// # Errors
+    /// [`TrainError::BadView`] for a camera that is not finite, [`TrainError::TooWide`], [`TrainError::Gpu`].
+    pub fn render(&mut self, view: &View, into: &mut Rendering) -> Result<(), TrainError> {
+        render::check(view)?;
+        self.draw((view.intrinsics.width, view.intrinsics.height), into, |frame| frame.look(view))
+    }
+
+    /// Renders with parallel rays, else as [`Trainer::render`]. Depth is the distance from the view's plane to where half of the light is
+    /// gone (the median, not the mean; 0 where less than half goes): what floats thinly above the ground does not raise it.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::render`].
+    pub fn render_orthographic(&mut self, view: &OrthographicView, into: &mut Rendering) -> Result<(), TrainError> {
+        render::check_orthographic(view)?;
+        self.draw((view.width, view.height), into, |frame| frame.look_orthographic(view))
+    }
+
+    fn draw(
+        &mut self,
+        size: (u32, u32),
+        into: &mut Rendering,
+        look: impl FnOnce(&mut Frame),
+    ) -> Result<(), TrainError> {
+        let sh_degree = self.settings.sh.degree_at(1.0).min(self.plan().sh_degree);
+        render::Drawing { device: &mut self.device, model: &mut self.model, into }.draw(size, sh_degree, look)
+    }
+
+    /// What Adam multiplies second moments by, which begin at zero.
+    fn second_unbias(&self) -> f32 {
+        let steps = self.schedule.taken().max(1) as i32;
+        (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(steps))) as f32
     }
 }

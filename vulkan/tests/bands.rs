@@ -8,8 +8,9 @@ use config::plan::{Plan, PlanRequest};
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{Rendering, Trainer};
+use vulkan::trainer::Rendering;
 
 const SIZE: [u32; 2] = [96, 70];
 
@@ -27,7 +28,7 @@ fn train(gpu: &Gpu, instances: usize) -> (Rendering, GaussianCloud, usize) {
         ..Default::default()
     };
     let plan = Plan::with_capacities(&request, 300, instances);
-    let mut t = Trainer::new(gpu, &plan, &plain()).unwrap();
+    let mut t = Fixture::new(gpu, &plan, &plain()).unwrap();
     t.load(&cloud(21, 300, 2)).unwrap();
     for seed in [1, 2] {
         t.add_view(&posed(&v, &photo(seed, &v)), None).unwrap();

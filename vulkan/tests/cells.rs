@@ -16,10 +16,11 @@ use models::cloud::GaussianCloud;
 use scenes::device::{model, open, plain, posed};
 use scenes::photo;
 use scenes::places::{look, three_places};
-use vulkan::trainer::{CropPlace, Rendering, RunBudget, TrainError, Trainer};
+use vulkan::fixture::Fixture;
+use vulkan::trainer::{CropPlace, Rendering, RunBudget, TrainError};
 
 /// A trainer of `on_device` Gaussians at once, of a scene of so many, for three views of 64 × 48.
-fn trainer(on_device: usize, scene: Option<usize>, settings: &TrainSettings) -> Option<Trainer> {
+fn trainer(on_device: usize, scene: Option<usize>, settings: &TrainSettings) -> Option<Fixture> {
     let gpu = open()?;
     let request = PlanRequest {
         device_mib: 64,
@@ -30,7 +31,7 @@ fn trainer(on_device: usize, scene: Option<usize>, settings: &TrainSettings) -> 
         scene_gaussians: scene,
         ..Default::default()
     };
-    let mut trainer = Trainer::new(&gpu, &Plan::new(&request).unwrap(), settings).unwrap();
+    let mut trainer = Fixture::new(&gpu, &Plan::new(&request).unwrap(), settings).unwrap();
     if trainer.plan().is_paged() {
         trainer.keep_scene_in(tempfile::tempfile().unwrap());
     }
@@ -171,7 +172,7 @@ fn a_scene_that_outgrows_the_device_goes_into_cells_and_grows_on() {
         t.add_view(&posed(&v, &photo(place as u64, &v)), None).unwrap();
     }
     let mut most = 0;
-    while t.progress() < 1.0 {
+    while t.schedule().progress() < 1.0 {
         most = most.max(t.step().unwrap().gaussians);
     }
     assert!(t.cells().0 > 0 && most > 700 && most <= 1400, "{most} Gaussians, {:?}", t.cells());
@@ -230,7 +231,7 @@ fn a_step_is_a_picture_looked_at_however_many_parts_it_takes() {
     let summary = summary.unwrap();
     assert!(steps.len() >= 18, "{} updates", steps.len());
     assert!(steps.is_sorted() && steps[0] == 1 && (12..=13).contains(steps.last().unwrap()), "{steps:?}");
-    assert_eq!((summary.steps, t.steps(), t.spent().0, t.progress()), (12, 12, 12, 1.0));
+    assert_eq!((summary.steps, t.steps(), t.schedule().spent().0, t.schedule().progress()), (12, 12, 12, 1.0));
     assert_eq!(summary.counters.windows as usize, steps.len());
 }
 
@@ -249,9 +250,9 @@ fn crops_of_a_scene_in_cells_are_trained_in_parts_too() {
         scene_gaussians: Some(900),
         ..Default::default()
     };
-    let mut t = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+    let mut t = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
     t.keep_scene_in(tempfile::tempfile().unwrap());
-    t.keep_views_in(tempfile::tempfile().unwrap());
+    t.pictures.keep_in(tempfile::tempfile().unwrap());
     t.load(&three_places_afar()).unwrap();
     let v = look_from_afar(0);
     t.add_view(&posed(&v, &photo(0, &v)), None).unwrap();
@@ -331,6 +332,6 @@ fn what_cannot_be_trained_is_said_in_one_line() {
     let mut ranked = plain();
     ranked.sh.raise_share = 0.3;
     let plan = Plan::new(&PlanRequest { max_gaussians: Some(300), scene_gaussians: Some(900), ..Default::default() });
-    let refused = Trainer::new(t.gpu(), &plan.unwrap(), &ranked).unwrap_err();
+    let refused = Fixture::new(t.device().gpu(), &plan.unwrap(), &ranked).unwrap_err();
     assert!(refused.to_string().contains("sh.raise_share = 0.3"), "{refused}");
 }

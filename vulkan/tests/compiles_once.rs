@@ -36,8 +36,8 @@ fn the_driver_compiles_nothing_more_however_many_cameras_are_seen() {
         let turn = DQuat::from_axis_angle(DVec3::new(0.3, 1.0, 0.2).normalize(), 0.2 + 0.01 * f64::from(i));
         let mut turned = v;
         turned.pose.rotation = turn * v.pose.rotation;
-        trainer.set_pose(0, turned.pose).unwrap();
-        trainer.set_pose(1, turned.pose).unwrap();
+        trainer.pictures.set_pose(0, turned.pose).unwrap();
+        trainer.pictures.set_pose(1, turned.pose).unwrap();
         trainer.step().unwrap();
         trainer.render(&turned, &mut drawn).unwrap();
     };

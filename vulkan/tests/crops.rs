@@ -14,11 +14,12 @@ use models::camera::View;
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{CropPlace, TrainError, Trainer};
+use vulkan::trainer::{CropPlace, TrainError};
 
 /// A trainer for two views of 64 × 48 and four crops, with so many slots on the device.
-fn trainer(crops: CropSettings, slots: u32) -> Option<Trainer> {
+fn trainer(crops: CropSettings, slots: u32) -> Option<Fixture> {
     let Ok(gpu) = Gpu::open(None) else {
         println!("skipped: no Vulkan device");
         return None;
@@ -36,10 +37,10 @@ fn trainer(crops: CropSettings, slots: u32) -> Option<Trainer> {
     };
     let mut settings = plain();
     settings.crops = crops;
-    let mut trainer = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+    let mut trainer = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
     trainer.load(&cloud(8, 300, 3)).unwrap();
     if request.view_file_bytes() > 0 {
-        trainer.keep_views_in(tempfile::tempfile().unwrap());
+        trainer.pictures.keep_in(tempfile::tempfile().unwrap());
     }
     Some(trainer)
 }
@@ -54,7 +55,7 @@ fn quarter(whole: &RgbImage, x: u32, y: u32) -> (RgbImage, CropPlace) {
     (crop_imm(whole, x, y, 64, 48).to_image(), CropPlace { x, y, whole: whole.dimensions() })
 }
 
-fn model(trainer: &mut Trainer) -> GaussianCloud {
+fn model(trainer: &mut Fixture) -> GaussianCloud {
     let mut model = GaussianCloud::with_capacity(3, 300);
     trainer.snapshot(&mut model).unwrap();
     model
@@ -94,7 +95,7 @@ fn crops_and_views_give_the_same_bits_however_few_of_them_are_on_the_device() {
         }
         let looked_at: Vec<_> =
             (0..40).map(|_| trainer.step().unwrap()).map(|r| (r.view, r.crop, r.loss.to_bits())).collect();
-        Some((looked_at, model(&mut trainer), trainer.views_read_back()))
+        Some((looked_at, model(&mut trainer), trainer.pictures.read_back()))
     };
     let Some((looked_at, same, none)) = trained(6) else { return };
     assert_eq!(none, 0);
@@ -117,15 +118,15 @@ fn a_crop_moves_with_its_view_and_allocates_nothing() {
         trainer.add_crop(0, &image, None, place).unwrap();
     }
     (0..6).for_each(|_| _ = trainer.step().unwrap());
-    let before = (allocations(), trainer.views_read_back());
+    let before = (allocations(), trainer.pictures.read_back());
     (0..20).for_each(|_| _ = trainer.step().unwrap());
     assert_eq!(allocations(), before.0);
-    assert!(trainer.views_read_back() > before.1);
-    assert_eq!(trainer.device_bytes(), trainer.plan().total_bytes);
+    assert!(trainer.pictures.read_back() > before.1);
+    assert_eq!(trainer.device().bytes(), trainer.plan().total_bytes);
     // Turned away, the camera sees nothing; so do its crops.
     let mut away = v;
     away.pose.rotation *= glam::DQuat::from_rotation_y(std::f64::consts::PI);
-    trainer.renew_view(0, away).unwrap();
+    trainer.pictures.renew(0, away).unwrap();
     let report = trainer.step().unwrap();
     assert!(report.crop.is_some() && report.visible == 0, "{report:?}");
 }
@@ -137,7 +138,7 @@ fn a_crop_that_does_not_fit_is_an_error_and_none_is_added() {
     trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
     let whole = larger(&v);
     let (image, place) = quarter(&whole, 64, 48);
-    let refused = |trainer: &mut Trainer, view: usize, image: &RgbImage, place: CropPlace| {
+    let refused = |trainer: &mut Fixture, view: usize, image: &RgbImage, place: CropPlace| {
         matches!(trainer.add_crop(view, image, None, place), Err(TrainError::BadView { .. }))
     };
     assert!(refused(&mut trainer, 1, &image, place), "no such view");
@@ -145,8 +146,8 @@ fn a_crop_that_does_not_fit_is_an_error_and_none_is_added() {
     assert!(refused(&mut trainer, 0, &image, CropPlace { y: u32::MAX, ..place }), "beyond the lower edge");
     assert!(refused(&mut trainer, 0, &RgbImage::new(0, 0), place), "no pixels");
     assert!(refused(&mut trainer, 0, &whole, CropPlace { x: 0, y: 0, ..place }), "more pixels than planned");
-    assert_eq!(trainer.crops(), 0);
+    assert_eq!(trainer.pictures.crops(), 0);
     (0..4).for_each(|_| trainer.add_crop(0, &image, None, place).unwrap());
     assert_eq!(trainer.add_crop(0, &image, None, place), Err(TrainError::TooManyCrops { planned: 4 }));
-    assert_eq!(trainer.crops(), 4);
+    assert_eq!(trainer.pictures.crops(), 4);
 }

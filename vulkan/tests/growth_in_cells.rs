@@ -9,10 +9,11 @@ use models::cloud::GaussianCloud;
 use scenes::device::{model, open, plain, posed};
 use scenes::photo;
 use scenes::places::{APART, at, look, three_places};
-use vulkan::trainer::{BoundingBox, Fate, TrainError, Trained, Trainer};
+use vulkan::fixture::Fixture;
+use vulkan::trainer::{BoundingBox, Fate, TrainError, Trained};
 
 /// A trainer that has room for 400 Gaussians, or all, of a scene of 1,300.
-fn trainer(paged: bool) -> Option<Trainer> {
+fn trainer(paged: bool) -> Option<Fixture> {
     let gpu = open()?;
     let request = PlanRequest {
         device_mib: 64,
@@ -25,14 +26,14 @@ fn trainer(paged: bool) -> Option<Trainer> {
     };
     let mut settings = plain();
     settings.density.strategy = Strategy::None;
-    let mut trainer = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+    let mut trainer = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
     if paged {
         trainer.keep_scene_in(tempfile::tempfile().unwrap());
     }
     Some(trainer)
 }
 
-fn add_view(t: &mut Trainer, place: usize) {
+fn add_view(t: &mut Fixture, place: usize) {
     let v = look(place);
     t.add_view(&posed(&v, &photo(place as u64, &v)), None).unwrap();
 }

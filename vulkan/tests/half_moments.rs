@@ -9,8 +9,8 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use vulkan::cases::half::request;
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::Trainer;
 
 fn open() -> Option<Gpu> {
     Gpu::open(None).map_err(|e| println!("skipped: {e}")).ok()
@@ -31,7 +31,7 @@ fn gradients_are_read_back_from_half_moments_too() {
     let Some(gpu) = open() else { return };
     let (c, v) = (cloud(13, 200, 3), view(64, 48));
     let gradients = [false, true].map(|h| {
-        let mut t = Trainer::new(&gpu, &Plan::new(&request(h)).unwrap(), &plain()).unwrap();
+        let mut t = Fixture::new(&gpu, &Plan::new(&request(h)).unwrap(), &plain()).unwrap();
         t.load(&c).unwrap();
         t.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
         let mut into = GaussianCloud::default();

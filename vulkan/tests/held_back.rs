@@ -14,7 +14,8 @@ use glam::DVec3;
 use models::camera::View;
 use scenes::device::{model, open, plain, posed};
 use scenes::{cloud, photo, view};
-use vulkan::trainer::{CropPlace, Rendering, Trainer};
+use vulkan::fixture::Fixture;
+use vulkan::trainer::{CropPlace, Rendering};
 
 const VIEWS: usize = 10;
 const STEPS: u32 = 600;
@@ -28,7 +29,7 @@ fn settings() -> TrainSettings {
     settings
 }
 
-fn trainer(settings: &TrainSettings) -> Option<Trainer> {
+fn trainer(settings: &TrainSettings) -> Option<Fixture> {
     let gpu = open()?;
     let request = PlanRequest {
         device_mib: 64,
@@ -39,7 +40,7 @@ fn trainer(settings: &TrainSettings) -> Option<Trainer> {
         max_gaussians: Some(400),
         ..Default::default()
     };
-    Some(Trainer::new(&gpu, &Plan::new(&request).unwrap(), settings).unwrap())
+    Some(Fixture::new(&gpu, &Plan::new(&request).unwrap(), settings).unwrap())
 }
 
 /// A camera so many metres to the east.
@@ -50,7 +51,7 @@ fn look(east_m: f64) -> View {
 }
 
 /// Ten pictures of one thing, seen from nearly the same place: what is learnt of some holds for all.
-fn of_one_thing(settings: &TrainSettings) -> Option<Trainer> {
+fn of_one_thing(settings: &TrainSettings) -> Option<Fixture> {
     let mut t = trainer(settings)?;
     let (thing, mut drawn) = (cloud(3, 200, 1), Rendering::default());
     t.load(&thing).unwrap();
@@ -70,7 +71,7 @@ fn of_one_thing(settings: &TrainSettings) -> Option<Trainer> {
 }
 
 /// Ten pictures that have nothing in common, from all around: they can only be learnt by heart.
-fn of_nothing(settings: &TrainSettings) -> Option<Trainer> {
+fn of_nothing(settings: &TrainSettings) -> Option<Fixture> {
     let mut t = trainer(settings)?;
     for k in 0..VIEWS {
         let v = look(0.6 * k as f64 - 2.7);
@@ -80,10 +81,10 @@ fn of_nothing(settings: &TrainSettings) -> Option<Trainer> {
     Some(t)
 }
 
-/// Views looked at while the schedule goes from one progress to the other.
-fn looked_at(t: &mut Trainer, until: f32) -> BTreeSet<usize> {
+/// Views visited while the schedule goes from one progress to the other.
+fn looked_at(t: &mut Fixture, until: f32) -> BTreeSet<usize> {
     let mut seen = BTreeSet::new();
-    while t.progress() < until {
+    while t.schedule().progress() < until {
         seen.insert(t.step().unwrap().view);
     }
     seen
@@ -113,7 +114,7 @@ fn views_kept_back_and_what_is_left_out_follow_the_steps_and_allocate_nothing() 
         let mut t = of_nothing(&settings())?;
         (0..4).for_each(|_| _ = t.step().unwrap());
         let before = allocations();
-        while t.progress() < 0.4 {
+        while t.schedule().progress() < 0.4 {
             t.step().unwrap();
         }
         assert_eq!(allocations() - before, 0);
@@ -133,12 +134,12 @@ fn views_kept_back_and_what_is_left_out_follow_the_steps_and_allocate_nothing() 
 fn what_was_found_is_gone_with_a_load_and_goes_on_where_the_schedule_does() {
     let Some(mut t) = of_nothing(&settings()) else { return };
     looked_at(&mut t, 0.4);
-    let (found, there, spent) = (t.validated(), model(&mut t), t.spent());
+    let (found, there, spent) = (t.validated(), model(&mut t), t.schedule().spent());
     assert!(found.is_some_and(|found| found.drop > 0.0));
     let mut after = |continued: bool| {
         t.load(&there).unwrap();
         assert_eq!(t.validated(), None);
-        t.continue_from(spent.0, spent.1);
+        t.schedule_mut().continue_from(spent.0, spent.1);
         if continued {
             t.continue_validated(found);
         }
@@ -172,7 +173,7 @@ fn whoever_looks_at_crops_meanwhile_keeps_nothing_back_as_they_are_no_whole_pict
         let mut settings = settings();
         settings.crops.from = from;
         let Some(mut t) = of_nothing(&settings) else { return };
-        t.keep_views_in(tempfile::tempfile().unwrap());
+        t.pictures.keep_in(tempfile::tempfile().unwrap());
         let v = look(-2.7);
         let large = View { intrinsics: v.intrinsics.resized(128, 96), ..v };
         let part = image::imageops::crop_imm(&posed(&large, &photo(0, &large)).image, 32, 24, 64, 48).to_image();

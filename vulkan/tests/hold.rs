@@ -8,8 +8,8 @@ use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use vulkan::cases::half::request;
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::Trainer;
 
 #[test]
 fn what_is_held_stays_to_the_seventh_digit_and_the_rest_learns() {
@@ -19,7 +19,7 @@ fn what_is_held_stays_to_the_seventh_digit_and_the_rest_learns() {
     // Sixteen bits hold smaller moments.
     for (half_moments, digits) in [(false, 1e-7), (true, 1e-4)] {
         let plan = Plan::new(&request(half_moments)).unwrap();
-        let mut trainer = Trainer::new(&gpu, &plan, &plain()).unwrap();
+        let mut trainer = Fixture::new(&gpu, &plan, &plain()).unwrap();
         trainer.load(&start).unwrap();
         trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
         trainer.hold(|row| row % 3 > 0);

@@ -11,9 +11,10 @@ use scenes::{cloud, photo, view};
 use std::time::Duration;
 use vulkan::autotune::autotune;
 use vulkan::constants::{RUNS, SHORT_PART, STRIP};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
 use vulkan::kernel_config::KernelConfig;
-use vulkan::trainer::{Rendering, Trainer};
+use vulkan::trainer::Rendering;
 
 fn gpu() -> Option<Gpu> {
     let gpu = Gpu::open(None);
@@ -47,7 +48,7 @@ fn trained_with(
     (settings.refine_poses, settings.refine_exposure) = (refine, true);
     let request = PlanRequest { device_mib: 64, width: 77, height: 53, views: 2, lanes, ..Default::default() };
     let plan = Plan::with_capacities(&request, 3000, instances);
-    let mut trainer = Trainer::with_config(gpu, &plan, &settings, config).unwrap();
+    let mut trainer = Fixture::with_config(gpu, &plan, &settings, config).unwrap();
     trainer.load(&cloud(8, 1500, 3)).unwrap();
     let depth: Vec<f32> = (0..77 * 53).map(|i| 2.0 + (i % 77) as f32 * 0.05).collect();
     let confidence = depth.iter().map(|d| d / 8.0).collect();

@@ -6,8 +6,9 @@ use config::training::TrainSettings;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{Rendering, Trainer};
+use vulkan::trainer::Rendering;
 
 /// A carpet of small opaque Gaussians that fills a 640×480 view, seen at a slant so that all depths differ.
 fn carpet(columns: usize, rows: usize) -> GaussianCloud {
@@ -42,7 +43,7 @@ fn a_view_of_a_hundred_and_twenty_thousand_gaussians_has_no_holes() {
     };
     let mut settings = TrainSettings::default();
     settings.sh.degree = 0;
-    let mut trainer = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+    let mut trainer = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
     trainer.load(&cloud).unwrap();
     let intrinsics = Intrinsics { width: 640, height: 480, fx: 320.0, fy: 320.0, cx: 320.0, cy: 240.0 };
     // Looking straight down from 40 m: the carpet reaches the picture's edges.

@@ -13,14 +13,15 @@ use models::cloud::GaussianCloud;
 use peak_allocator::peak_of;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{LoadReport, TrainError, Trainer};
+use vulkan::trainer::{LoadReport, TrainError};
 
 /// The mark of memory is the process's: one test at a time.
 static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 /// A trainer of `on_device` Gaussians at once, of a scene of so many, with a view of 64 × 48.
-fn trainer(on_device: usize, scene: usize) -> Option<Trainer> {
+fn trainer(on_device: usize, scene: usize) -> Option<Fixture> {
     let Ok(gpu) = Gpu::open(None) else {
         println!("skipped: no Vulkan device");
         return None;
@@ -34,7 +35,7 @@ fn trainer(on_device: usize, scene: usize) -> Option<Trainer> {
         scene_gaussians: Some(scene),
         ..Default::default()
     };
-    let mut trainer = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap();
+    let mut trainer = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap();
     trainer.keep_scene_in(tempfile::tempfile().unwrap());
     let v = view(64, 48);
     trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
@@ -56,12 +57,12 @@ fn places(many: usize) -> GaussianCloud {
     all
 }
 
-fn in_pieces(t: &mut Trainer, scene: &GaussianCloud, piece: usize) -> LoadReport {
+fn in_pieces(t: &mut Fixture, scene: &GaussianCloud, piece: usize) -> LoadReport {
     let rows: Vec<u32> = (0..scene.len() as u32).collect();
     t.load_pieces::<TrainError>(&|take| rows.chunks(piece).try_for_each(|rows| take(&scene.rows(rows)))).unwrap()
 }
 
-fn model(t: &mut Trainer) -> GaussianCloud {
+fn model(t: &mut Fixture) -> GaussianCloud {
     let mut model = GaussianCloud::default();
     t.snapshot(&mut model).unwrap();
     model

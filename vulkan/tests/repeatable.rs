@@ -9,13 +9,14 @@ use scenes::device::{empty_trainer, plain, posed};
 use scenes::{cloud, photo, view};
 use std::ops::ControlFlow;
 use std::process::Command;
-use vulkan::trainer::{RunBudget, Trainer};
+use vulkan::fixture::Fixture;
+use vulkan::trainer::RunBudget;
 
 /// Set in the child: what it is to do.
 const ROLE: &str = "DGTR_TEST_ROLE";
 
 /// Two views, growth, relocation and noise: everything that draws random numbers.
-fn growing(steps: u32) -> Option<Trainer> {
+fn growing(steps: u32) -> Option<Fixture> {
     let v = view(64, 48);
     let mut settings = plain();
     settings.density.strategy = config::training::Strategy::Relocate;
@@ -31,7 +32,7 @@ fn growing(steps: u32) -> Option<Trainer> {
 }
 
 /// FNV-1a over every parameter's bits.
-fn hash(trainer: &mut Trainer) -> u64 {
+fn hash(trainer: &mut Fixture) -> u64 {
     let mut cloud = GaussianCloud::with_capacity(3, trainer.gaussians());
     trainer.snapshot(&mut cloud).unwrap();
     let all = cloud.means.as_flattened().iter().chain(cloud.log_scales.as_flattened());

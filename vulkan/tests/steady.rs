@@ -31,5 +31,5 @@ fn steps_allocate_nothing_density_control_and_bands_included() {
     println!("40 steps, {grown} Gaussians: {made} heap allocations");
     assert_eq!(made, 0);
     assert!(grown > 300, "density control did not run");
-    assert_eq!(trainer.device_bytes(), trainer.plan().total_bytes);
+    assert_eq!(trainer.device().bytes(), trainer.plan().total_bytes);
 }

@@ -11,9 +11,10 @@ use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
 use std::process::Command;
 use vulkan::constants::{RUNS, SHORT_PART};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
 use vulkan::kernel_config::KernelConfig;
-use vulkan::trainer::{Rendering, Trainer};
+use vulkan::trainer::Rendering;
 
 const CHILD: &str = "DGTR_VALIDATION_CHILD";
 
@@ -75,7 +76,7 @@ fn work() {
         let mut settings = plain();
         settings.refine_poses = true;
         settings.refine_exposure = true;
-        let mut t = Trainer::with_config(&gpu, &plan, &settings, config).unwrap();
+        let mut t = Fixture::with_config(&gpu, &plan, &settings, config).unwrap();
         t.load(&cloud(3, 200, 3)).unwrap();
         let depth: Vec<f32> = (0..64 * 48).map(|i| (i % 64) as f32).collect();
         let prior = DepthPrior { width: 64, height: 48, confidence: vec![1.0; depth.len()], depth };

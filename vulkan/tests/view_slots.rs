@@ -11,13 +11,14 @@ use models::camera::{DepthPrior, View};
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{cloud, photo, view};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::{TrainError, Trainer};
+use vulkan::trainer::TrainError;
 
 const VIEWS: u32 = 5;
 
 /// A trainer for views of `view`'s size with so many slots on the device and the others in a file.
-fn trainer(view: &View, slots: u32) -> Option<Trainer> {
+fn trainer(view: &View, slots: u32) -> Option<Fixture> {
     let Ok(gpu) = Gpu::open(None) else {
         println!("skipped: no Vulkan device");
         return None;
@@ -35,10 +36,10 @@ fn trainer(view: &View, slots: u32) -> Option<Trainer> {
     };
     let mut settings = plain();
     settings.views.residual_share = 0.4;
-    let mut trainer = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+    let mut trainer = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
     trainer.load(&cloud(8, 300, 3)).unwrap();
     if request.view_file_bytes() > 0 {
-        trainer.keep_views_in(tempfile::tempfile().unwrap());
+        trainer.pictures.keep_in(tempfile::tempfile().unwrap());
     }
     Some(trainer)
 }
@@ -66,7 +67,7 @@ fn trained(slots: u32) -> Option<(Vec<u32>, GaussianCloud, u64)> {
     let losses = (0..40).map(|_| trainer.step().unwrap().loss.to_bits()).collect();
     let mut model = GaussianCloud::with_capacity(3, 300);
     trainer.snapshot(&mut model).unwrap();
-    Some((losses, model, trainer.views_read_back()))
+    Some((losses, model, trainer.pictures.read_back()))
 }
 
 #[test]
@@ -91,11 +92,11 @@ fn a_view_that_comes_back_allocates_nothing() {
     }
     // The first epoch fills the view order and measures the scene.
     (0..8).for_each(|_| _ = trainer.step().unwrap());
-    let before = (allocations(), trainer.views_read_back());
+    let before = (allocations(), trainer.pictures.read_back());
     (0..30).for_each(|_| _ = trainer.step().unwrap());
     assert_eq!(allocations(), before.0);
-    assert!(trainer.views_read_back() >= before.1 + 10);
-    assert_eq!(trainer.device_bytes(), trainer.plan().total_bytes);
+    assert!(trainer.pictures.read_back() >= before.1 + 10);
+    assert_eq!(trainer.device().bytes(), trainer.plan().total_bytes);
 }
 
 #[test]
@@ -104,7 +105,7 @@ fn a_file_that_is_missing_or_cut_is_an_error_and_never_another_picture() {
     let Some(mut forgotten) = trainer(&v, 2) else { return };
     let file = tempfile::tempfile().unwrap();
     let mut trainer = trainer(&v, 2).unwrap();
-    trainer.keep_views_in(file.try_clone().unwrap());
+    trainer.pictures.keep_in(file.try_clone().unwrap());
     for seed in 0..VIEWS {
         trainer.add_view(&posed(&v, &photo(seed.into(), &v)), None).unwrap();
     }
@@ -116,7 +117,7 @@ fn a_file_that_is_missing_or_cut_is_an_error_and_never_another_picture() {
 
     // A disk that is full: nothing that was added before is lost.
     let full = std::fs::OpenOptions::new().read(true).write(true).open("/dev/full").unwrap();
-    forgotten.keep_views_in(full);
+    forgotten.pictures.keep_in(full);
     let picture = posed(&v, &photo(1, &v));
     assert!(matches!(forgotten.add_view(&picture, None), Err(TrainError::ViewFile(_))));
     assert!(matches!(forgotten.step(), Err(TrainError::NoViews)));

@@ -7,8 +7,8 @@ use config::plan::{Plan, PlanRequest};
 use models::cloud::GaussianCloud;
 use scenes::device::{plain, posed};
 use scenes::{grey, photo, view};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::Trainer;
 
 #[test]
 fn every_tile_of_every_giant_is_counted_and_emitted() {
@@ -36,7 +36,7 @@ fn every_tile_of_every_giant_is_counted_and_emitted() {
     };
     let mut pictures = Vec::new();
     for instances in [1 << 19, 2_796_202] {
-        let mut t = Trainer::new(&gpu, &Plan::with_capacities(&request, count, instances), &plain()).unwrap();
+        let mut t = Fixture::new(&gpu, &Plan::with_capacities(&request, count, instances), &plain()).unwrap();
         t.load(&cloud).unwrap();
         t.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
         let report = t.step().unwrap();

@@ -42,10 +42,10 @@ impl Reconstruction {
     /// An epoch is over: its end counts where the schedule is long enough.
     pub(super) fn end_epoch(&mut self) -> Result<(), EngineError> {
         let looks = u64::from(self.settings.training.average.visits) * self.views.len() as u64;
-        if u64::from(self.trainer.expected_steps()) >= looks {
+        if u64::from(self.trainer.schedule().expected_steps()) >= looks {
             return self.average();
         }
-        self.average.step = self.trainer.steps();
+        self.average.step = self.trainer.schedule().taken();
         Ok(())
     }
 
@@ -61,7 +61,7 @@ impl Reconstruction {
             0 => self.trainer.snapshot(&mut self.cloud)?,
             _ => self.trainer.blend_into(&mut self.cloud, 1.0 / (before + 1) as f32)?,
         }
-        self.average = Average { epochs: before + 1, step: self.trainer.steps() };
+        self.average = Average { epochs: before + 1, step: self.trainer.schedule().taken() };
         Ok(())
     }
 
@@ -70,7 +70,7 @@ impl Reconstruction {
         if !self.is_average() {
             return Ok(());
         }
-        if self.trainer.steps() > self.average.step {
+        if self.trainer.schedule().taken() > self.average.step {
             self.average()?;
         }
         self.reload()?;
@@ -82,12 +82,12 @@ impl Reconstruction {
 
     /// Loads the cloud in place of the Gaussians that it was made of; the schedule goes on where it was.
     pub(super) fn reload(&mut self) -> Result<(), EngineError> {
-        let ((steps, seconds), begun_at) = (self.trainer.spent(), self.trainer.begun_at());
+        let ((steps, seconds), begun_at) = (self.trainer.schedule().spent(), self.trainer.schedule().begun_at());
         let validated = self.trainer.validated();
         self.trainer.load(&self.cloud)?;
         self.trainer.continue_validated(validated);
-        self.trainer.continue_from(steps, seconds);
-        self.trainer.begin_at(begun_at);
+        self.trainer.schedule_mut().continue_from(steps, seconds);
+        self.trainer.schedule_mut().begin_at(begun_at);
         self.trainer.keep_number();
         Ok(())
     }

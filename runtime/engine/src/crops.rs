@@ -24,7 +24,7 @@ impl Reconstruction {
         go_on: &dyn Fn() -> bool,
     ) -> Result<bool, EngineError> {
         let most = self.trainer.plan().crops;
-        if most == 0 || self.trainer.crops() > 0 {
+        if most == 0 || self.pictures.store.crops() > 0 {
             return Ok(true);
         }
         let _span = tracing::info_span!("crops").entered();
@@ -46,8 +46,8 @@ impl Reconstruction {
             }
         }
         self.report.stage("crops", from);
-        self.report.more.insert("crops".into(), self.trainer.crops().into());
-        tracing::info!("{} crops of pictures of {}x{}", self.trainer.crops(), size.0, size.1);
+        self.report.more.insert("crops".into(), self.pictures.store.crops().into());
+        tracing::info!("{} crops of pictures of {}x{}", self.pictures.store.crops(), size.0, size.1);
         Ok(true)
     }
 
@@ -93,7 +93,8 @@ impl Reconstruction {
         }
         for c in finest(&windows, share) {
             let image = imageops::crop_imm(whole, c.x, c.y, c.width, c.height).to_image();
-            self.trainer.add_crop(
+            self.pictures.store.add_crop(
+                self.trainer.device_mut(),
                 index,
                 &image,
                 masks(&c).as_ref(),

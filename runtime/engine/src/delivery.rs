@@ -75,7 +75,7 @@ impl Reconstruction {
             Next::Thin => {
                 (self.delivery.thinned, self.header.thinned) = (true, true);
                 let t = &self.settings.training;
-                let gone = self.thin(t.thinned_share, t.thinned_loss * self.trainer.mean_loss())?;
+                let gone = self.thin(t.thinned_share, t.thinned_loss * self.pictures.store.mean_loss())?;
                 self.trainer.keep_number();
                 self.report.skip("gaussians_thinned", gone as u64);
                 tracing::info!("thinned for delivery by {gone} Gaussians, {} remain", self.trainer.gaussians());
@@ -89,7 +89,7 @@ impl Reconstruction {
     /// many as have sensitivities of no more than `most_loss` together. How many those were. The least opaque ones where too few steps
     /// were taken to tell.
     pub(super) fn thin(&mut self, share: f32, most_loss: f32) -> Result<usize, EngineError> {
-        let told = self.trainer.steps() >= self.least_steps();
+        let told = self.trainer.schedule().taken() >= self.least_steps();
         let worth = |g: &Trained| if told { g.sensitivity } else { g.opacity_logit };
         let mut all = Vec::with_capacity(self.trainer.gaussians());
         self.trainer.each(&BoundingBox::ALL, |g| all.push(worth(g)))?;

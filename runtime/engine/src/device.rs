@@ -14,7 +14,7 @@ use models::formats::model::{self, Chunks, ModelHeader};
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use survey::ortho::grid::BLOCK;
-use vulkan::trainer::{TrainError, Trainer};
+use vulkan::trainer::{PictureStore, TrainError, Trainer};
 
 use super::pieces;
 use crate::devices;
@@ -98,22 +98,26 @@ impl DeviceRequest {
         }
     }
 
-    /// Opens the device and allocates the plan. Call it before anything that must not wait: a device seen for the first
+    /// Opens the device, allocates the plan, and makes room for the pictures. Call it before anything that must not wait: a device seen for the first
     /// time is measured for a second or two.
     ///
     /// # Errors
     /// No device, or a plan that does not fit into it or into `device_mib`.
-    pub fn open<E: From<PlanError> + From<TrainError>>(&self, training: &TrainSettings) -> Result<Trainer, E> {
+    pub fn open<E: From<PlanError> + From<TrainError>>(
+        &self,
+        training: &TrainSettings,
+    ) -> Result<(Trainer, PictureStore), E> {
         let gpu = devices::open(self.device.as_deref()).map_err(TrainError::from)?;
         let request = self.plan_request(&training.sh, gpu.info().lanes());
         let mut trainer = Trainer::with_config(&gpu, &Plan::new(&request)?, training, kernels::config_of(&gpu))?;
+        let mut pictures = PictureStore::new(trainer.plan());
         if request.view_file_bytes() > 0 {
-            trainer.keep_views_in(scratch_file(&self.scratch_folder(), request.view_file_bytes())?);
+            pictures.keep_in(scratch_file(&self.scratch_folder(), request.view_file_bytes())?);
         }
         if trainer.plan().is_paged() {
             trainer.keep_scene_in(scratch_file(&self.scratch_folder(), trainer.plan().scene_file_bytes())?);
         }
-        Ok(trainer)
+        Ok((trainer, pictures))
     }
 
     /// Where the job's scratch files lie.

@@ -72,9 +72,9 @@ impl Reconstruction {
     /// Reads the power, where energy ends the schedule, and sets its seconds by it.
     pub(super) fn read_power(&mut self) {
         let Some(meter) = &mut self.meter else { return };
-        let by_energy = meter.read(self.trainer.spent().1);
+        let by_energy = meter.read(self.trainer.schedule().spent().1);
         self.report.more.insert("energy_wh".into(), meter.used_wh().into());
-        self.trainer.set_seconds(shorter(self.settings.training.seconds, Some(by_energy)));
+        self.trainer.schedule_mut().set_seconds(shorter(self.settings.training.seconds, Some(by_energy)));
     }
 }
 

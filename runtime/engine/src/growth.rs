@@ -133,9 +133,9 @@ impl Reconstruction {
         }
         self.built.extend(self.views[first..].iter().map(|v| v.1));
         for i in moved {
-            self.trainer.renew_view(i, self.views[i].1)?;
+            self.pictures.store.renew(i, self.views[i].1)?;
         }
-        self.trainer.renew_schedule(RENEWED_AT);
+        self.trainer.schedule_mut().renew(RENEWED_AT);
         self.growing.totals.growths += 1;
         self.growing.totals.pictures += (self.views.len() - first) as u64;
         self.report.views = self.views.len() as u64;
@@ -155,10 +155,10 @@ impl Reconstruction {
         let (from, share) = (Instant::now(), self.share());
         let Some(mut initialiser) = self.initialiser.take() else { return Ok(None) };
         let own_network = self.depth.is_some();
-        let (index, trainer, mut failed) = (&self.index, &mut self.trainer, Ok(()));
+        let (index, trainer, pictures, mut failed) = (&self.index, &mut self.trainer, &mut self.pictures.store, Ok(()));
         let mut prior = |name: &str, depth: DepthPrior| {
             if let (Some(&i), Ok(()), false) = (index.get(name), &failed, own_network) {
-                failed = trainer.set_prior(i, Some(&depth));
+                failed = pictures.set_prior(trainer.device_mut(), i, Some(&depth));
             }
         };
         let made = initialiser.grow(&|m2| share.of(m2), &mut prior);

@@ -118,6 +118,8 @@ pub struct Reconstruction {
     /// The user's own network for the depth loss.
     depth: Option<DepthNetwork>,
     trainer: Trainer,
+    /// What the trainer trains on.
+    pictures: light::LitPictures,
     /// As of the last checkpoint; none where the scene is in pieces.
     cloud: GaussianCloud,
     /// All Gaussians are in the trainer's file only.
@@ -144,8 +146,6 @@ pub struct Reconstruction {
     resumed: HashMap<String, View>,
     /// Lights of the model that is continued.
     resumed_lights: HashMap<String, PictureLight>,
-    /// The light that is taken out of each view's picture already.
-    taken_out: Vec<PictureLight>,
     /// Points of the scene known beforehand.
     points: Vec<Point>,
     /// The last refinement.
@@ -192,13 +192,17 @@ impl Reconstruction {
             InitKind::SparsePoints | InitKind::Random | InitKind::Model if !wants_depths => None,
             _ => Some(Initialiser::open(&init, settings.network.pair.as_deref())?),
         };
-        let trainer: Trainer = settings.device.open::<EngineError>(&settings.training)?;
+        let (trainer, pictures): (Trainer, _) = settings.device.open::<EngineError>(&settings.training)?;
         let in_pieces = pieces::is_in_pieces(&settings, &trainer);
         let mut refiner: Option<Refiner> = refiner.transpose()?;
         let plan = |initialiser: u64, refine_in_file: bool| {
             HostPlan::new(&HostRequest {
                 plan: trainer.plan(),
-                on_host: if trainer.gpu().info().is_cpu { trainer.device_bytes() } else { trainer.mirror_bytes() },
+                on_host: if trainer.device().gpu().info().is_cpu {
+                    trainer.device().bytes()
+                } else {
+                    trainer.device().mirror_bytes()
+                },
                 initialiser,
                 refine: settings.refine.as_ref(),
                 refine_in_file,
@@ -213,9 +217,10 @@ impl Reconstruction {
         let host = waiting::place(&settings, trainer.plan(), initialiser.as_mut(), refiner.as_mut(), &plan)?;
         let mut report = RunReport::new(command);
         report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
-        report.device = trainer.gpu().info().name.clone();
+        report.device = trainer.device().gpu().info().name.clone();
         report.seed = header.seed;
-        (report.device_bytes_planned, report.device_bytes_peak) = (trainer.plan().total_bytes, trainer.device_bytes());
+        (report.device_bytes_planned, report.device_bytes_peak) =
+            (trainer.plan().total_bytes, trainer.device().bytes());
         Ok(Self {
             refiner,
             initialiser,
@@ -227,6 +232,7 @@ impl Reconstruction {
             in_pieces,
             first: None,
             trainer,
+            pictures: light::LitPictures::new(pictures),
             views: Vec::with_capacity(views),
             index: HashMap::with_capacity(views),
             flying: settings.incremental,
@@ -237,7 +243,6 @@ impl Reconstruction {
             built: Vec::with_capacity(views),
             resumed: HashMap::new(),
             resumed_lights: HashMap::new(),
-            taken_out: Vec::new(),
             points: Vec::new(),
             refined: None,
             builds: 0,
@@ -333,8 +338,11 @@ impl Reconstruction {
     fn initialise_waiting(&mut self, until: usize) -> Result<(), EngineError> {
         let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
         for i in self.initialised..until {
-            if let Some(view) = self.trainer.view_pose(i) {
-                let (image, mask) = (self.trainer.view_image(i)?, self.trainer.view_mask(i)?);
+            if let Some(view) = self.pictures.store.view(i) {
+                let (image, mask) = (
+                    self.pictures.store.image(self.trainer.device_mut(), i)?,
+                    self.pictures.store.mask(self.trainer.device_mut(), i)?,
+                );
                 let (name, View { pose, .. }) = self.views[i].clone();
                 let view = View { pose, ..view };
                 let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
@@ -363,11 +371,11 @@ impl Reconstruction {
         if let Some(initialiser) = &mut self.initialiser {
             let capacity = share.map_or(capacity, |share| share.of(initialiser.ground_m2()));
             let index = &self.index;
-            let (trainer, own_network) = (&mut self.trainer, self.depth.is_some());
+            let (trainer, pictures, own_network) = (&mut self.trainer, &mut self.pictures.store, self.depth.is_some());
             let mut failed = Ok(());
             let mut prior = |name: &str, depth: DepthPrior| {
                 if let (Some(&i), Ok(()), false) = (index.get(name), &failed, own_network) {
-                    failed = trainer.set_prior(i, Some(&depth));
+                    failed = pictures.set_prior(trainer.device_mut(), i, Some(&depth));
                 }
             };
             let made = feed_forward(initialiser, self.views.len(), capacity, at_once, &mut prior, go_on)?;

@@ -28,7 +28,7 @@ impl Reconstruction {
     pub(super) fn begin_after_landing(&mut self, loaded: usize, new: usize) {
         let landed = self.settings.incremental && !self.flying;
         if landed && 2 * new < loaded {
-            self.trainer.begin_at(RENEWED_AT);
+            self.trainer.schedule_mut().begin_at(RENEWED_AT);
         }
     }
 

@@ -123,7 +123,7 @@ impl Reconstruct for Reconstruction {
         }
         picture.view.intrinsics = lens;
         let prior = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
-        self.trainer.add_view(&picture, prior.as_ref())?;
+        self.pictures.store.add(self.trainer.device_mut(), &picture, prior.as_ref())?;
         self.index.insert(picture.name.clone(), self.views.len());
         self.views.push((picture.name.clone(), picture.view));
         let waiting = self.views.len() - self.initialised;
@@ -204,10 +204,10 @@ impl Reconstruct for Reconstruction {
         self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
         let mut with_prior = 0;
         for (i, (name, view)) in self.views.iter().enumerate() {
-            self.trainer.renew_view(i, *view)?;
+            self.pictures.store.renew(i, *view)?;
             let has_depth = fresh.with_depth.contains(name);
             if self.depth.is_none() && !has_depth {
-                self.trainer.set_prior(i, None)?;
+                self.pictures.store.set_prior(self.trainer.device_mut(), i, None)?;
             }
             with_prior += u64::from(self.depth.is_some() || has_depth);
         }
@@ -234,7 +234,7 @@ impl Reconstruct for Reconstruction {
         }
         if self.is_continued() && !self.settings.incremental {
             let steps = u32::try_from(self.header.steps).unwrap_or(u32::MAX);
-            self.trainer.continue_from(steps, self.train_s);
+            self.trainer.schedule_mut().continue_from(steps, self.train_s);
         }
         self.builds += 1;
         self.report.views = self.views.len() as u64;
@@ -256,11 +256,11 @@ impl Reconstruct for Reconstruction {
 
     fn set_seconds(&mut self, seconds: Option<f64>) {
         self.settings.training.seconds = seconds;
-        self.trainer.set_seconds(seconds);
+        self.trainer.schedule_mut().set_seconds(seconds);
     }
 
     fn is_done(&self, budget: &RunBudget) -> bool {
-        let (steps, seconds) = self.trainer.spent();
+        let (steps, seconds) = self.trainer.schedule().spent();
         let by_steps = budget.steps.is_some_and(|s| steps >= s);
         let by_time = budget.seconds.is_some_and(|s| seconds >= s);
         by_steps || by_time
@@ -276,11 +276,11 @@ impl Reconstruct for Reconstruction {
         let mut last = None;
         let summary = loop {
             self.read_power();
-            let (due, before, mut next) = (self.delivery_due(), self.trainer.elapsed_s(), None);
+            let (due, before, mut next) = (self.delivery_due(), self.trainer.schedule().elapsed_s(), None);
             let read_s = if self.meter.is_some() { before + EVERY_S } else { f64::INFINITY };
             let (mut asked_to_stop, mut reads, mut counts) = (false, false, false);
             let average = self.average_due();
-            let summary = self.trainer.run(budget, &mut |step| {
+            let summary = self.trainer.run(&mut self.pictures.store, budget, &mut |step| {
                 next = due.after(step);
                 reads = step.elapsed_s >= read_s;
                 counts = average.is_some_and(|due| due.after(step));
@@ -291,7 +291,7 @@ impl Reconstruct for Reconstruction {
             last = summary.last.or(last);
             self.header.steps += u64::from(summary.steps);
             self.report.steps += u64::from(summary.steps);
-            self.train_s += self.trainer.elapsed_s() - before;
+            self.train_s += self.trainer.schedule().elapsed_s() - before;
             if counts {
                 self.end_epoch()?;
             }
@@ -328,11 +328,11 @@ impl Reconstruct for Reconstruction {
                 );
             }
         }
-        self.report.more.insert("views_read_back".into(), self.trainer.views_read_back().into());
+        self.report.more.insert("views_read_back".into(), self.pictures.store.read_back().into());
         if let Some(last) = last.filter(|last| last.loss.is_finite()) {
             self.report.more.insert("loss".into(), f64::from(last.loss).into());
         }
-        for (name, ms) in self.trainer.stage_ms() {
+        for (name, ms) in self.trainer.device().stage_ms() {
             self.report.stage_ms.insert(format!("device_{name}"), ms);
         }
         self.report.gaussians = self.trainer.gaussians() as u64;
@@ -366,7 +366,7 @@ impl Reconstruct for Reconstruction {
         }
         self.header.finished = finished;
         let views = self.views.iter().enumerate().take(self.built.len());
-        self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), self.trainer.view_pose(i)?))).collect();
+        self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), self.pictures.store.view(i)?))).collect();
         self.header.lights = self.lights(self.header.views.len());
         let path = model_path(out);
         let gaussians = match in_pieces {

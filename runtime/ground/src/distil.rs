@@ -17,7 +17,7 @@ use models::camera::Intrinsics;
 use models::camera::View;
 use models::cloud::GaussianCloud;
 use serde::{Deserialize, Serialize};
-use vulkan::trainer::{Rendering, RunBudget, Trainer};
+use vulkan::trainer::{PictureStore, Rendering, RunBudget, Trainer};
 
 use super::AggregateError;
 use super::block::Block;
@@ -181,14 +181,14 @@ pub fn distil(
         return Ok(Some((report, effort)));
     }
     let mut rows = seams.with_halo(merged);
-    let mut trainer = open(block, &lessons, rows.len(), merged.cloud.sh_degree, device)?;
+    let (mut trainer, mut pictures) = open(block, &lessons, rows.len(), merged.cloud.sh_degree, device)?;
     while rows.len() > trainer.plan().gaussians && !seams.cells.is_empty() {
         seams.keep((seams.cells.len() as f64 * FEWER) as usize);
         rows = seams.with_halo(merged);
     }
     report.over_plan = report.cells - seams.cells.len();
-    effort.device = trainer.gpu().info().name.clone();
-    effort.device_bytes = [trainer.plan().total_bytes, trainer.device_bytes()];
+    effort.device = trainer.device().gpu().info().name.clone();
+    effort.device_bytes = [trainer.plan().total_bytes, trainer.device().bytes()];
 
     let start = Instant::now();
     for m in 0..models {
@@ -215,7 +215,7 @@ pub fn distil(
     trainer.load(&part)?;
     let before = Shown::of(&mut trainer, &kept_back, models, seams.cells.len())?;
     for lesson in &taught {
-        trainer.add_view(&lesson.picture(), None)?;
+        pictures.add(trainer.device_mut(), &lesson.picture(), None)?;
     }
     let of_row: Vec<Option<u16>> = part.means.iter().map(|mean| seams.index_of(mean)).collect();
     // The union has them still, and this is where the ground holds most at once.
@@ -224,7 +224,7 @@ pub fn distil(
     let steps = recipe.epochs.saturating_mul(taught.len() as u32);
     let budget = RunBudget { steps: Some(steps), seconds: recipe.seconds };
     let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
-    report.steps = trainer.run(&budget, &mut each)?.steps;
+    report.steps = trainer.run(&mut pictures, &budget, &mut each)?.steps;
     if !go_on() {
         return Ok(None);
     }
@@ -264,7 +264,7 @@ fn open(
     rows: usize,
     sh_degree: u8,
     device: Option<&str>,
-) -> Result<Trainer, AggregateError> {
+) -> Result<(Trainer, PictureStore), AggregateError> {
     let recipe = &block.inputs.recipe;
     let largest = (0..block.inputs.models.len()).map(|m| block.rows(m)).max().unwrap_or(0).max(rows);
     let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);

@@ -107,7 +107,7 @@ pub fn measure(request: &Request, out: &Path) -> Result<Figures, JobError> {
     let written = clock.lap();
     let settings = settings(request);
     let wanted = device_request(request, out, (ALONG * ALONG) as usize, Some(request.gaussians));
-    let mut trainer: Trainer = wanted.open::<JobError>(&settings)?;
+    let (mut trainer, mut trained_on): (Trainer, _) = wanted.open::<JobError>(&settings)?;
     pieces::load(&mut trainer, &Chunks::open(&file)?)?;
     let loaded = clock.lap();
     let side = SPACING_M * (request.gaussians as f64).sqrt();
@@ -116,10 +116,10 @@ pub fn measure(request: &Request, out: &Path) -> Result<Figures, JobError> {
         let at = [i % ALONG, i / ALONG].map(|k| side * (f64::from(k) + 0.5) / f64::from(ALONG));
         let center = DVec3::new(at[0], at[1], near.pose.center.z);
         let view = View { pose: Pose { center, ..near.pose }, ..near };
-        trainer.add_view(&picture(&view, i.into()), None)?;
+        trained_on.add(trainer.device_mut(), &picture(&view, i.into()), None)?;
     }
     let budget = RunBudget { steps: Some(request.steps), seconds: None };
-    let summary = trainer.run(&budget, &mut |_| std::ops::ControlFlow::Continue(()))?;
+    let summary = trainer.run(&mut trained_on, &budget, &mut |_| std::ops::ControlFlow::Continue(()))?;
     let trained = clock.lap();
     let header = ModelHeader { mission: "scene".into(), steps: summary.steps.into(), ..ModelHeader::default() };
     let gaussians = pieces::save(&mut trainer, &Disk::default(), &model, &header)?;
@@ -133,7 +133,7 @@ pub fn measure(request: &Request, out: &Path) -> Result<Figures, JobError> {
         save_png(&shown.ok_or_else(|| EngineError::RenderingSize(name.into()))?, &path)?;
         pictures.push((view, rendering, path, clock.lap()));
     }
-    let info = trainer.gpu().info();
+    let info = trainer.device().gpu().info();
     let (plan, counters) = (trainer.plan(), summary.counters);
     let mut figures = Figures {
         device: info.name.clone(),
@@ -141,7 +141,7 @@ pub fn measure(request: &Request, out: &Path) -> Result<Figures, JobError> {
         gaussians: [gaussians, plan.gaussians],
         cells: [trainer.cells().0 as u64, counters.windows],
         file_bytes: [plan.scene_file_bytes(), counters.paged_bytes],
-        device_bytes: [plan.total_bytes, trainer.device_bytes()],
+        device_bytes: [plan.total_bytes, trainer.device().bytes()],
         host_bytes_planned: host_plan(&trainer).total_bytes(),
         resident_bytes: peak_rss_bytes().unwrap_or(0),
         steps: summary.steps,
@@ -192,7 +192,11 @@ fn device_request(request: &Request, out: &Path, views: usize, scene_gaussians: 
 fn host_plan(trainer: &Trainer) -> HostPlan {
     HostPlan::new(&HostRequest {
         plan: trainer.plan(),
-        on_host: if trainer.gpu().info().is_cpu { trainer.device_bytes() } else { trainer.mirror_bytes() },
+        on_host: if trainer.device().gpu().info().is_cpu {
+            trainer.device().bytes()
+        } else {
+            trainer.device().mirror_bytes()
+        },
         initialiser: 0,
         refine: None,
         refine_in_file: false,
@@ -249,7 +253,7 @@ fn compare(
     if seen == 0 || Plan::new(&wanted.plan_request(&settings.sh, Lanes::CARD))?.gaussians < seen {
         return Ok((seen, None));
     }
-    let mut trainer: Trainer = wanted.open::<JobError>(&settings)?;
+    let (mut trainer, _): (Trainer, _) = wanted.open::<JobError>(&settings)?;
     trainer.load_pieces(&each)?;
     let mut unpaged = Rendering::default();
     trainer.render(view, &mut unpaged)?;

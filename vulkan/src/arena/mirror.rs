@@ -291,9 +291,10 @@ impl Mirror {
 
 #[cfg(test)]
 mod tests {
+    use crate::fixture::Fixture;
     use crate::gpu::{Forced, Gpu};
     use crate::synthetic::{cloud, photo, plain, posed, view};
-    use crate::trainer::{Rendering, RunBudget, Trainer};
+    use crate::trainer::{Rendering, RunBudget};
     use config::plan::{Plan, PlanRequest};
     use config::training::Strategy;
     use models::cloud::GaussianCloud;
@@ -308,8 +309,8 @@ mod tests {
         settings.sh.raise_share = 0.5;
         settings.regularise.noise = 2.0;
         let request = PlanRequest { width: 64, height: 48, views: 3, view_slots: Some(2), ..Default::default() };
-        let mut trainer = Trainer::new(&gpu, &Plan::with_capacities(&request, 500, 4000), &settings).unwrap();
-        trainer.keep_views_in(tempfile::tempfile().unwrap());
+        let mut trainer = Fixture::new(&gpu, &Plan::with_capacities(&request, 500, 4000), &settings).unwrap();
+        trainer.pictures.keep_in(tempfile::tempfile().unwrap());
         trainer.load(&cloud(8, 300, 3)).unwrap();
         for seed in 1..4 {
             trainer.add_view(&posed(&v, &photo(seed, &v)), None).unwrap();
@@ -320,7 +321,7 @@ mod tests {
         trainer.snapshot(&mut cloud).unwrap();
         trainer.render(&v, &mut drawn).unwrap();
         let pictures = (0..3).map(|i| trainer.view_image(i).unwrap()).collect();
-        Some((cloud, drawn, pictures, trainer.mirror_bytes()))
+        Some((cloud, drawn, pictures, trainer.device().mirror_bytes()))
     }
 
     #[test]

@@ -4,8 +4,9 @@
 use super::scenes::{answer, cloud, empty_trainer, grey, parameter, photo, plain, posed, trainer, view};
 use super::{Broken, Outcome, Tally};
 use crate::constants::COLOUR_MAX;
+use crate::fixture::Fixture;
 use crate::gpu::Gpu;
-use crate::trainer::{Rendering, RunBudget, StepReport, TrainError, Trainer};
+use crate::trainer::{Rendering, RunBudget, StepReport, TrainError};
 use config::training::{Strategy, TrainSettings};
 use models::camera::{DepthPrior, View};
 use models::cloud::GaussianCloud;
@@ -14,7 +15,7 @@ use std::ops::ControlFlow;
 /// Loads, renders and trains `steps` steps; everything that comes back must be finite.
 pub(super) fn survive(
     counted: &mut Tally,
-    t: &mut Trainer,
+    t: &mut Fixture,
     c: &GaussianCloud,
     v: &View,
     case: &str,
@@ -38,7 +39,7 @@ pub(super) fn survive(
 }
 
 /// Room for 256 Gaussians of `degree` and one photograph from `v`.
-pub(super) fn ready(gpu: &Gpu, degree: u8, v: &View, settings: &TrainSettings) -> Result<Trainer, Broken> {
+pub(super) fn ready(gpu: &Gpu, degree: u8, v: &View, settings: &TrainSettings) -> Result<Fixture, Broken> {
     let mut t = empty_trainer(gpu, degree, 256, v, settings)?;
     t.add_view(&posed(v, &photo(1, v)), None)?;
     Ok(t)
@@ -205,7 +206,7 @@ pub fn a_black_photograph_of_nothing_has_loss_zero_and_exposure_stays_finite(gpu
     for _ in 0..20 {
         promise!(t.step()?.loss.is_finite());
     }
-    let pose = t.view_pose(0).ok_or(TrainError::NoViews)?.pose;
+    let pose = t.pictures.view(0).ok_or(TrainError::NoViews)?.pose;
     promise!(pose.center.is_finite() && pose.rotation.is_finite());
     Ok(counted.said())
 }

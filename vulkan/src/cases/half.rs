@@ -5,9 +5,10 @@ use std::ops::ControlFlow;
 
 use super::scenes::{cloud, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
+use crate::fixture::Fixture;
 use crate::gpu::Gpu;
 use crate::reference::adam::{Moments, adam, half_moments};
-use crate::trainer::{RunBudget, Trainer};
+use crate::trainer::RunBudget;
 use config::plan::{Plan, PlanRequest};
 use config::training::TrainSettings;
 use models::cloud::GaussianCloud;
@@ -31,7 +32,7 @@ pub fn request(half_moments: bool) -> PlanRequest {
 /// Loss and Gaussians after `steps` steps on two photographs of noise.
 fn train(gpu: &Gpu, half_moments: bool, c: &GaussianCloud, steps: u32) -> Result<(f32, GaussianCloud), Broken> {
     let v = view(64, 48);
-    let mut t = Trainer::new(gpu, &Plan::new(&request(half_moments))?, &TrainSettings { seed: 3, ..plain() })?;
+    let mut t = Fixture::new(gpu, &Plan::new(&request(half_moments))?, &TrainSettings { seed: 3, ..plain() })?;
     t.load(c)?;
     let mut turned = posed(&v, &photo(2, &v));
     turned.view.pose.rotation = glam::DQuat::from_rotation_y(0.2);

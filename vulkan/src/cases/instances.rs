@@ -4,12 +4,13 @@
 use super::device::{ready, survive};
 use super::scenes::{answer, answer_in, cloud, grey, photo, plain, posed, view};
 use super::{Broken, Outcome, Tally};
+use crate::fixture::Fixture;
 use crate::gpu::Gpu;
 use crate::reference::camera::Camera;
 use crate::reference::gaussian::{Gaussian, PARAMETERS};
 use crate::reference::project::Limits;
 use crate::reference::step::forward;
-use crate::trainer::{Rendering, StepReport, Trainer};
+use crate::trainer::{Rendering, StepReport};
 use config::plan::{Plan, PlanRequest};
 use models::camera::View;
 use models::cloud::GaussianCloud;
@@ -63,7 +64,7 @@ fn odd_shapes() -> GaussianCloud {
 }
 
 /// A trainer with room for `instances`, the cloud loaded and one photograph.
-fn loaded(gpu: &Gpu, c: &GaussianCloud, v: &View, instances: usize) -> Result<Trainer, Broken> {
+fn loaded(gpu: &Gpu, c: &GaussianCloud, v: &View, instances: usize) -> Result<Fixture, Broken> {
     let request = PlanRequest {
         device_mib: 64,
         width: v.intrinsics.width,
@@ -74,7 +75,7 @@ fn loaded(gpu: &Gpu, c: &GaussianCloud, v: &View, instances: usize) -> Result<Tr
         scene_gaussians: None,
         ..Default::default()
     };
-    let mut t = Trainer::new(gpu, &Plan::with_capacities(&request, c.len(), instances), &plain())?;
+    let mut t = Fixture::new(gpu, &Plan::with_capacities(&request, c.len(), instances), &plain())?;
     t.load(c)?;
     t.add_view(&posed(v, &photo(1, v)), None)?;
     Ok(t)
@@ -244,7 +245,7 @@ pub fn a_gaussian_with_more_tiles_than_a_loop_may_turn_has_its_whole_gradient(gp
         scene_gaussians: None,
         ..Default::default()
     };
-    let mut t = Trainer::new(gpu, &Plan::with_capacities(&request, 1, 1 << 17), &plain())?;
+    let mut t = Fixture::new(gpu, &Plan::with_capacities(&request, 1, 1 << 17), &plain())?;
     t.load(&c)?;
     t.add_view(&posed(&v, &photo), None)?;
     let mut gradient = GaussianCloud::default();

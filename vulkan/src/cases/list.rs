@@ -191,7 +191,7 @@ pub const ELSEWHERE: &[(&str, &str, &str)] = &[
     ),
     (
         "more than 2³¹ and 2³² instances: cutting",
-        "vulkan/src/trainer/bands.rs",
+        "vulkan/src/device/bands.rs",
         "more_than_two_to_the_thirty_second_instances_are_counted_and_cut_without_wrapping",
     ),
     (
@@ -201,7 +201,7 @@ pub const ELSEWHERE: &[(&str, &str, &str)] = &[
     ),
     (
         "(L−min)/(max−min) = 0/0",
-        "vulkan/src/trainer/sampler.rs",
+        "vulkan/src/pictures/sampler.rs",
         "views_of_equal_or_unknown_loss_are_ranked_never_divided",
     ),
     (

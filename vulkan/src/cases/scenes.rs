@@ -4,6 +4,7 @@ use models::camera::View;
 use models::cloud::GaussianCloud;
 
 use super::Broken;
+use crate::fixture::Fixture;
 use crate::gpu::Gpu;
 use crate::reference::camera::Camera;
 use crate::reference::gaussian::Gaussian;
@@ -12,7 +13,6 @@ use crate::reference::project::{Culled, Limits};
 use crate::reference::rasterise::Pixel;
 use crate::reference::real::Real;
 use crate::reference::step::{ViewGradient, backward, forward};
-use crate::trainer::Trainer;
 use config::plan::{Plan, PlanRequest};
 use config::training::{LossSettings, TrainSettings};
 
@@ -89,7 +89,7 @@ pub fn answer_in<R: Real>(
 ///
 /// # Errors
 /// The device refuses the plan or the scene.
-pub fn trainer(gpu: &Gpu, cloud: &GaussianCloud, view: &View, settings: &TrainSettings) -> Result<Trainer, Broken> {
+pub fn trainer(gpu: &Gpu, cloud: &GaussianCloud, view: &View, settings: &TrainSettings) -> Result<Fixture, Broken> {
     let mut trainer = empty_trainer(gpu, cloud.sh_degree, cloud.len().max(256), view, settings)?;
     trainer.load(cloud)?;
     Ok(trainer)
@@ -105,7 +105,7 @@ pub fn empty_trainer(
     capacity: usize,
     view: &View,
     settings: &TrainSettings,
-) -> Result<Trainer, Broken> {
+) -> Result<Fixture, Broken> {
     let request = PlanRequest {
         device_mib: 64,
         width: view.intrinsics.width,
@@ -116,7 +116,7 @@ pub fn empty_trainer(
         scene_gaussians: None,
         ..Default::default()
     };
-    Ok(Trainer::new(gpu, &Plan::new(&request)?, settings)?)
+    Ok(Fixture::new(gpu, &Plan::new(&request)?, settings)?)
 }
 
 /// Parameter `k` of row `i`: mean, log scale, rotation, opacity, SH.

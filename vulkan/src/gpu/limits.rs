@@ -40,9 +40,10 @@ impl DeviceLimits {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fixture::Fixture;
     use crate::gpu::Gpu;
     use crate::synthetic::{cloud, photo, plain, posed, view};
-    use crate::trainer::{TrainError, Trainer};
+    use crate::trainer::TrainError;
     use config::plan::{Plan, PlanRequest};
     use models::camera::DepthPrior;
     use models::cloud::GaussianCloud;
@@ -50,7 +51,7 @@ mod tests {
     const COMMON: DeviceLimits = DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 };
 
     /// A trainer of 10,000 Gaussians on this machine's device, were its limits these.
-    fn under(limits: DeviceLimits) -> Option<Result<Trainer, TrainError>> {
+    fn under(limits: DeviceLimits) -> Option<Result<Fixture, TrainError>> {
         let Ok(gpu) = Gpu::open(None) else {
             println!("skipped: no Vulkan device");
             return None;
@@ -66,7 +67,7 @@ mod tests {
             ..Default::default()
         };
         let plan = Plan::new(&request).unwrap();
-        Some(Trainer::new(&gpu.limited(limits), &plan, &plain()))
+        Some(Fixture::new(&gpu.limited(limits), &plan, &plain()))
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Whether a device can be relied on, found out without training: one kernel against its reference, and a plan against what the
 //! device refuses.
 
-use super::{TrainError, Trainer};
+use super::{PictureStore, TrainError, Trainer};
 use crate::arena::Arena;
 use crate::gpu::{Gpu, GpuError};
 use crate::kernel_config::KernelConfig;
@@ -32,15 +32,16 @@ pub fn check_device(gpu: &Gpu) -> Result<usize, TrainError> {
     let config = KernelConfig::standard(gpu.info());
     let mut trainer = Trainer::with_kernels(gpu, &plan, &plain(), config, &[Kernel::Project])?;
     trainer.load(&c)?;
-    trainer.frame.plain();
-    (trainer.frame.gaussians, trainer.frame.step) = (TRIED as u32, 1);
-    trainer.frame.look(&v);
-    trainer.write_frame();
-    let recording = trainer.take_recording()?;
+    let device = &mut trainer.device;
+    device.frame.plain();
+    (device.frame.gaussians, device.frame.step) = (TRIED as u32, 1);
+    device.frame.look(&v);
+    device.write_frame();
+    let recording = device.begin()?;
     recording.run(Kernel::Project, TRIED, Push::default());
     recording.submit()?;
-    let keys = trainer.arena.copied::<u32>(trainer.arena.section("keys"));
-    let projected = trainer.arena.copied::<[f32; 4]>(trainer.arena.section("projected"));
+    let keys = device.arena.copied::<u32>(device.arena.section("keys"));
+    let projected = device.arena.copied::<[f32; 4]>(device.arena.section("projected"));
     if keys[..TRIED].iter().all(|k| *k == 0) {
         return Err(GpuError::ComputesNothing.into());
     }
@@ -94,7 +95,8 @@ pub fn check_training(gpu: &Gpu, config: KernelConfig, steps: u32) -> Result<Tra
     let plan = Plan::with_capacities(&request, TRIED, 64 * TRIED);
     let mut trainer = Trainer::with_config(gpu, &plan, &settings, config)?;
     trainer.load(&c)?;
-    trainer.add_view(&posed(&v, &photo), None)?;
+    let mut pictures = PictureStore::new(&plan);
+    pictures.add(trainer.device_mut(), &posed(&v, &photo), None)?;
     let extent = scene_extent(&c.means, &[v.pose.center.to_array()]);
     let mut reference =
         ReferenceTrainer::new(Gaussian::<f64>::of_cloud(&c), settings.clone(), extent, Limits::default());
@@ -102,7 +104,7 @@ pub fn check_training(gpu: &Gpu, config: KernelConfig, steps: u32) -> Result<Tra
     let mut check = TrainingCheck { steps, loss: f32::NAN, reference_loss: f64::NAN };
     for step in 0..steps {
         let target = Target { width: 64, rgb: &rgb, depth: None, kept: None, background: [0.0; 3] };
-        check.loss = trainer.step()?.loss;
+        check.loss = trainer.step(&mut pictures)?.loss;
         check.reference_loss = reference.step(&camera, &target, settings.progress(step, 0.0)).loss.total;
     }
     Ok(check)

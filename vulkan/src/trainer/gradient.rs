@@ -1,9 +1,10 @@
 //! Gradients for inspection: what a step would follow, for every parameter, the camera and the exposure. The gradient
 //! checks compare them with the CPU references and with central differences.
 
-use super::scene::Blocks;
-use super::slots::Picture;
-use super::{TrainError, Trainer};
+use super::step::Visit;
+use super::{PictureStore, TrainError, Trainer};
+use crate::device::Gradients;
+use crate::pictures::Picture;
 use models::cloud::GaussianCloud;
 
 /// Loss and its gradient by what a view owns.
@@ -23,46 +24,44 @@ impl Trainer {
     ///
     /// # Errors
     /// [`TrainError::Empty`], [`TrainError::BadView`] when there is no such view, [`TrainError::Gpu`].
-    pub fn gradient(&mut self, index: usize, into: &mut GaussianCloud) -> Result<ViewGradients, TrainError> {
-        if self.gaussians == 0 {
+    pub fn gradient(
+        &mut self,
+        pictures: &mut PictureStore,
+        index: usize,
+        into: &mut GaussianCloud,
+    ) -> Result<ViewGradients, TrainError> {
+        if self.model.gaussians == 0 {
             return Err(TrainError::Empty { non_finite: 0 });
         }
-        if index >= self.views.len() {
+        if index >= pictures.len() {
             return Err(TrainError::BadView { name: format!("view {index}"), why: "does not exist".into() });
         }
-        self.flush()?;
-        self.measure_extent();
-        self.open_degrees();
-        self.forget_all();
-        let (_, first_pixel, _) = self.prepare_frame(Picture::View(index), Blocks::WHOLE, 1.0);
-        (self.frame.background, self.frame.drop_share) = ([0.0; 3], 0.0);
-        self.write_frame();
-        self.forward_count(Picture::View(index), first_pixel)?;
-        self.gradients_only = true;
-        let done = self.forward_backward();
-        self.gradients_only = false;
-        done?;
-        let sums = self.partial_sums();
-        let loss = self.weigh(&sums).loss;
-        super::parameters::clear(into, self.plan.sh_degree);
-        for g in &self.parameters.geometry(&self.arena)[..self.gaussians] {
+        self.model.flush(&mut self.device)?;
+        self.model.measure_extent(&self.device, || pictures.centers());
+        self.model.open_degrees(&mut self.device);
+        self.model.forget_moments(&mut self.device);
+        let framed = self.frame(pictures, Visit::whole(Picture::View(index), 1.0));
+        (self.device.frame.background, self.device.frame.drop_share) = ([0.0; 3], 0.0);
+        self.device.write_frame();
+        self.project(pictures, Picture::View(index), framed)?;
+        let by = Gradients { pose: true, exposure: true, keep: true };
+        self.device.differentiate(by)?;
+        let sums = self.device.partial_sums(by);
+        let loss = self.device.weigh(&sums, &self.settings.loss).loss;
+        crate::model::clear(into, self.plan().sh_degree);
+        for g in self.model.geometry(&self.device) {
             let [[x, y, z, opacity], [sx, sy, sz, _], rotation] = g.first;
             into.means.push([x, y, z]);
             into.opacity_logits.push(opacity);
             into.log_scales.push([sx, sy, sz]);
             into.rotations.push(rotation);
         }
-        let (sh, scale, stride) = (self.parameters.sh_first, self.frame.moment_scale, into.sh_stride());
-        for index in 0..self.gaussians {
-            into.sh.extend((0..stride).map(|k| sh.first(&self.arena, index, k, scale)));
+        let (sh, scale) = (self.model.parameters.sh_first, self.device.frame.moment_scale);
+        let stride = into.sh_stride();
+        for index in 0..self.model.gaussians {
+            into.sh.extend((0..stride).map(|k| sh.first(&self.device.arena, index, k, scale)));
         }
-        self.forget_all();
+        self.model.forget_moments(&mut self.device);
         Ok(ViewGradients { loss, pose: sums.pose, exposure: sums.exposure })
-    }
-
-    fn forget_all(&mut self) {
-        for index in 0..self.gaussians {
-            self.parameters.forget(&mut self.arena, index);
-        }
     }
 }

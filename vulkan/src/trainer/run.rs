@@ -1,5 +1,6 @@
 //! A run of steps: how long it may take, what it says about itself, and when it ends early.
 
+use crate::model::Counters;
 use config::training::TrainSettings;
 
 /// How long [`run`](super::Trainer::run) may take; whichever comes first. Neither given: the settings' schedule.
@@ -14,11 +15,11 @@ pub struct RunBudget {
 /// One step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
-    /// Number of this step, from 1: of the pictures looked at, which a scene larger than the device makes of several updates.
+    /// Number of this step, from 1: of the pictures visited, which a scene larger than the device makes of several updates.
     pub step: u32,
-    /// The view it looked at.
+    /// The view it visited.
     pub view: usize,
-    /// The crop of its picture that it looked at; `None`: the whole picture at training size.
+    /// The crop of its picture that it visited; `None`: the whole picture at training size.
     pub crop: Option<usize>,
     /// The whole loss.
     pub loss: f32,
@@ -55,38 +56,6 @@ pub enum StopReason {
     Caller,
     /// The loss stopped falling.
     Converged,
-}
-
-/// Counted work and skipped work since `load`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counters {
-    /// Gaussians that were projected and found out of view.
-    pub culled: u64,
-    /// Gaussian–tile instances.
-    pub instances: u64,
-    /// Gaussian–pixel evaluations of the forward blend (the backward repeats them).
-    pub evaluations: u64,
-    /// Instances not evaluated because their tile was already opaque.
-    pub behind_opaque: u64,
-    /// Steps that needed more than one band.
-    pub banded_steps: u64,
-    /// Gaussians whose gradient was not finite and was left out.
-    pub non_finite_gradients: u64,
-    /// Dead Gaussians moved onto live ones.
-    pub relocated: u64,
-    /// Gaussians added by splitting.
-    pub added: u64,
-    /// Gaussians removed.
-    pub pruned: u64,
-    /// Windows of cells that were trained.
-    pub windows: u64,
-    /// Bytes of cells written to their file and read from it.
-    pub paged_bytes: u64,
-    /// Times a Gaussian's own SH degree was raised because the residual asked for it.
-    pub sh_raised: u64,
-    /// SH coefficients that were not there to be evaluated and stepped, summed over Gaussians and steps (as of the last
-    /// raise).
-    pub sh_missing: u64,
 }
 
 /// A run.

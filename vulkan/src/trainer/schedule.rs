@@ -1,10 +1,68 @@
-//! How much of the schedule is over: its steps and seconds, where it begins, and what earlier processes spent on it.
+//! How much of the schedule is over: its steps and seconds, where it begins, and what earlier processes spent on it. Nothing but numbers.
 
-use super::Trainer;
+use config::training::{TrainSettings, share_spent};
 
-impl Trainer {
-    /// Goes on with a schedule on which earlier processes spent `steps` and `seconds`; holds until the next
-    /// [`Trainer::load`].
+/// A schedule and what is spent of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Schedule {
+    /// Steps that it takes at most.
+    steps: u32,
+    /// Seconds that it takes at most.
+    seconds: Option<f64>,
+    /// Pictures visited since the Gaussians were loaded, parts of them by their share of its pixels.
+    pub(crate) visited: f64,
+    /// Seconds of training since then.
+    elapsed_s: f64,
+    /// Steps and seconds that earlier processes spent on the same schedule.
+    before: (u32, f64),
+    /// Pictures visited and seconds spent when it began anew.
+    since: (f64, f64),
+    /// Progress at which it begins.
+    begun_at: f32,
+}
+
+impl Schedule {
+    pub(crate) fn new(settings: &TrainSettings) -> Self {
+        Self {
+            steps: settings.steps,
+            seconds: settings.seconds,
+            visited: 0.0,
+            elapsed_s: 0.0,
+            before: (0, 0.0),
+            since: (0.0, 0.0),
+            begun_at: 0.0,
+        }
+    }
+
+    /// Begins with nothing spent.
+    pub(crate) fn restart(&mut self) {
+        (self.visited, self.elapsed_s) = (0.0, 0.0);
+        (self.before, self.since, self.begun_at) = ((0, 0.0), (0.0, 0.0), 0.0);
+    }
+
+    /// Takes so many steps from now on.
+    pub(crate) fn set_steps(&mut self, steps: u32) {
+        self.steps = steps;
+    }
+
+    /// Spends a share of a picture, and seconds.
+    pub(crate) fn spend(&mut self, share: f64, seconds: f64) {
+        self.visited += share;
+        self.elapsed_s += seconds;
+    }
+
+    /// Steps taken since the Gaussians were loaded: pictures visited. Where a scene is larger than the device a picture is visited in
+    /// parts, each of which updates the Gaussians, and its step is over when they amount to it.
+    pub fn taken(&self) -> u32 {
+        self.visited as u32
+    }
+
+    /// Seconds of training since the Gaussians were loaded.
+    pub fn elapsed_s(&self) -> f64 {
+        self.elapsed_s
+    }
+
+    /// Goes on with a schedule on which earlier processes spent `steps` and `seconds`; holds until the next load.
     pub fn continue_from(&mut self, steps: u32, seconds: f64) {
         self.before = (steps, seconds);
     }
@@ -12,18 +70,18 @@ impl Trainer {
     /// How long the schedule may take from now on, seconds; `None`: its steps alone decide. What is over is over: its share
     /// changes.
     pub fn set_seconds(&mut self, seconds: Option<f64>) {
-        self.settings.seconds = seconds;
+        self.seconds = seconds;
     }
 
     /// Puts the schedule to `progress`, 0…1, for what is there; moments stay.
-    pub fn renew_schedule(&mut self, progress: f32) {
+    pub fn renew(&mut self, progress: f32) {
         let share = f64::from(progress.clamp(0.0, 1.0));
-        let steps = (share * f64::from(self.settings.steps)) as u32;
-        self.before = (steps, share * self.settings.seconds.unwrap_or(0.0));
-        self.since = (self.looked, self.elapsed_s);
+        let steps = (share * f64::from(self.steps)) as u32;
+        self.before = (steps, share * self.seconds.unwrap_or(0.0));
+        self.since = (self.visited, self.elapsed_s);
     }
 
-    /// Until the next [`Trainer::load`] the schedule begins at `progress`, 0…1, and takes as long as it would from its beginning: what is
+    /// Until the next load the schedule begins at `progress`, 0…1, and takes as long as it would from its beginning: what is
     /// trained already needs no large rates and no small pictures.
     pub fn begin_at(&mut self, progress: f32) {
         self.begun_at = progress.clamp(0.0, 1.0);
@@ -36,8 +94,8 @@ impl Trainer {
 
     /// Steps and seconds spent on the schedule, earlier processes' included.
     pub fn spent(&self) -> (u32, f64) {
-        let (looked, seconds) = (self.looked - self.since.0, self.elapsed_s - self.since.1);
-        (self.before.0.saturating_add(looked as u32), self.before.1 + seconds)
+        let (visited, seconds) = (self.visited - self.since.0, self.elapsed_s - self.since.1);
+        (self.before.0.saturating_add(visited as u32), self.before.1 + seconds)
     }
 
     /// Where in the schedule it is, 0…1.
@@ -47,48 +105,35 @@ impl Trainer {
 
     /// The share of its steps or seconds that is spent.
     fn spent_share(&self) -> f32 {
-        let (steps, seconds) = self.spent();
-        self.settings.progress(steps, seconds)
+        share_spent((self.steps, self.seconds), self.spent())
     }
 
     /// How many steps the schedule takes, wherever it begins. With a budget in seconds that is what the pace so far promises.
     pub fn expected_steps(&self) -> u32 {
         let share = self.spent_share();
-        match self.settings.seconds {
+        match self.seconds {
             Some(_) if share > 0.01 => (self.spent().0 as f32 / share) as u32,
-            _ => self.settings.steps,
+            _ => self.steps,
         }
     }
 
-    /// Weight of view dependence: none where views are looked at too seldom to be learnt by heart.
-    pub(super) fn view_dependence(&self) -> f32 {
-        let loss = &self.settings.loss;
-        let looks = u64::from(loss.view_dependence_visits) * self.views.len() as u64;
-        if u64::from(self.expected_steps()) >= looks { loss.view_dependence } else { 0.0 }
+    /// Whether each of `views` is visited so often in it.
+    pub(crate) fn visits_each(&self, views: usize, visits: u32) -> bool {
+        u64::from(self.expected_steps()) >= u64::from(visits) * views as u64
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use config::plan::{Plan, PlanRequest};
-
     use super::*;
-    use crate::gpu::Gpu;
-    use crate::synthetic::plain;
 
-    fn trainer() -> Option<Trainer> {
-        let Ok(gpu) = Gpu::open(None) else {
-            println!("skipped: no Vulkan device");
-            return None;
-        };
-        let request = PlanRequest { width: 48, height: 32, views: 1, max_gaussians: Some(10), ..Default::default() };
-        Some(Trainer::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap())
+    fn of(steps: u32) -> Schedule {
+        Schedule::new(&TrainSettings { steps, ..TrainSettings::default() })
     }
 
     #[test]
     fn a_schedule_takes_as_many_steps_wherever_it_begins() {
-        let Some(mut t) = trainer() else { return };
-        t.settings.steps = 100_000;
+        let mut t = of(100_000);
         // A tenth of the seconds for a thousand steps.
         t.set_seconds(Some(100.0));
         t.continue_from(1_000, 10.0);
@@ -101,8 +146,7 @@ mod tests {
 
     #[test]
     fn before_a_pace_is_known_and_without_seconds_the_schedule_takes_its_steps() {
-        let Some(mut t) = trainer() else { return };
-        t.settings.steps = 7_000;
+        let mut t = of(7_000);
         t.set_seconds(Some(100.0));
         t.continue_from(50, 0.5);
         assert_eq!(t.expected_steps(), 7_000);

@@ -4,17 +4,19 @@
 
 use config::training::ValidationSettings;
 
-use super::scene::Blocks;
-use super::slots::Picture;
-use super::{TrainError, Trainer};
+use super::step::Visit;
+use super::{PictureStore, TrainError, Trainer};
+use crate::device::Gradients;
 use crate::layout::FLAG_DEPTH;
+use crate::pictures::Picture;
+use crate::pictures::sampler::Sampler;
 
-/// Progress at which views are kept back: by then the pace says how often each will be looked at, and what was learnt of them so far is
+/// Progress at which views are kept back: by then the pace says how often each will be visited, and what was learnt of them so far is
 /// soon forgotten.
 const FROM: f32 = 0.1;
 /// Progress from which losses are compared, and until which.
 const COMPARED: [f32; 2] = [0.15, 0.35];
-/// Times each other view is looked at between two comparisons.
+/// Times each other view is visited between two comparisons.
 const BETWEEN: f64 = 2.0;
 /// Comparisons that say something.
 const FEWEST: u32 = 5;
@@ -53,7 +55,7 @@ pub struct Validated {
 pub(crate) struct Validation {
     phase: Phase,
     views: Vec<u32>,
-    /// Pictures looked at when losses were compared last.
+    /// Pictures visited when losses were compared last.
     compared: f64,
     /// Resolution of the losses compared: those of small pictures say nothing about those of larger ones.
     divisor: u32,
@@ -81,6 +83,22 @@ impl Validation {
         let wanted = ((views as f32 * share) as usize).clamp(KEPT[0], KEPT[1]);
         self.views.clear();
         self.views.extend((0..wanted).map(|k| ((2 * k + 1) * views / (2 * wanted)) as u32));
+    }
+
+    /// Keeps views back.
+    fn keep_back(&mut self, views: usize, share: f32, sampler: &mut Sampler) {
+        self.choose(views, share);
+        self.phase = Phase::KeptBack;
+        sampler.leave_out(|view| self.views.contains(&(view as u32)));
+    }
+
+    /// Gives the views back, and draws the conclusion.
+    fn end(&mut self, settings: &ValidationSettings, sampler: &mut Sampler) {
+        sampler.leave_out(|_| false);
+        self.phase = Phase::Over;
+        let views = self.views.len();
+        let validated = |holds| Validated { views, holds, drop: drop_for(holds, settings) };
+        self.found = self.falls.slope().map(validated);
     }
 }
 
@@ -133,49 +151,43 @@ impl Trainer {
     }
 
     /// Keeps views back, compares their loss with the others', or gives them back, as the schedule is at `progress`.
-    pub(super) fn validate(&mut self, progress: f32) -> Result<(), TrainError> {
+    pub(super) fn validate(&mut self, pictures: &mut PictureStore, progress: f32) -> Result<(), TrainError> {
+        let views = pictures.len();
         match self.validation.phase {
-            Phase::Before if progress >= FROM => self.keep_back(progress),
-            Phase::KeptBack => self.compare(progress)?,
-            Phase::Before | Phase::Over => {}
+            Phase::Before if progress >= FROM => {
+                let s = &self.settings;
+                let asked = s.validation.share > 0.0 && s.validation.drop > 0.0 && s.regularise.drop == 0.0;
+                let early = progress < COMPARED[0];
+                // What crops teach is no whole picture's loss.
+                let crops = pictures.crops() > 0 && s.crops.from < COMPARED[1];
+                let worth_it = views >= FEWEST_VIEWS && self.schedule.visits_each(views, s.validation.visits);
+                let whole = !(crops || self.model.scene.is_paged() || self.turns.views.prefers_newest());
+                self.validation.phase = Phase::Over;
+                if asked && early && worth_it && whole {
+                    self.validation.keep_back(views, s.validation.share, &mut self.turns.views);
+                }
+            }
+            Phase::KeptBack if progress >= COMPARED[1] => {
+                self.validation.end(&self.settings.validation, &mut self.turns.views);
+            }
+            Phase::KeptBack if progress >= COMPARED[0] => self.compare(pictures, progress)?,
+            Phase::Before | Phase::KeptBack | Phase::Over => {}
         }
         Ok(())
     }
 
-    fn keep_back(&mut self, progress: f32) {
-        let (s, views) = (&self.settings.validation, self.views.len());
-        let looks = u64::from(s.visits) * views as u64;
-        let asked = s.share > 0.0 && s.drop > 0.0 && self.settings.regularise.drop == 0.0;
-        let early = progress < COMPARED[0];
-        // What crops teach is no whole picture's loss.
-        let crops = !self.crops.is_empty() && self.settings.crops.from < COMPARED[1];
-        let worth_it = views >= FEWEST_VIEWS && u64::from(self.expected_steps()) >= looks;
-        if !(asked && early && worth_it) || crops || self.scene.is_paged() || self.sampler.looks_at_newest() {
-            self.validation.phase = Phase::Over;
-            return;
-        }
-        self.validation.choose(views, s.share);
-        self.validation.phase = Phase::KeptBack;
-        let kept = &self.validation.views;
-        self.sampler.leave_out(|view| kept.contains(&(view as u32)));
-    }
-
-    fn compare(&mut self, progress: f32) -> Result<(), TrainError> {
-        if progress >= COMPARED[1] {
-            self.end_validation();
+    fn compare(&mut self, pictures: &mut PictureStore, progress: f32) -> Result<(), TrainError> {
+        let (views, visited) = (pictures.len(), self.schedule.visited);
+        if visited < self.validation.compared + BETWEEN * views as f64 {
             return Ok(());
         }
-        let views = self.views.len();
-        if progress < COMPARED[0] || self.looked < self.validation.compared + BETWEEN * views as f64 {
-            return Ok(());
-        }
-        self.validation.compared = self.looked;
+        self.validation.compared = visited;
         let mut sums = [0.0; 2];
         for k in 0..self.validation.views.len() {
             let kept = self.validation.views[k] as usize;
             // Its neighbour in the order of capture sees what it sees.
             for (sum, view) in sums.iter_mut().zip([kept, (kept + 1) % views]) {
-                let (loss, divisor) = self.loss_of(view, progress)?;
+                let (loss, divisor) = self.loss_of(pictures, view, progress)?;
                 *sum += f64::from(loss);
                 if std::mem::replace(&mut self.validation.divisor, divisor) != divisor {
                     self.validation.falls = Falls::default();
@@ -186,29 +198,19 @@ impl Trainer {
         Ok(())
     }
 
-    /// Gives the views back, and draws the conclusion.
-    fn end_validation(&mut self) {
-        self.sampler.leave_out(|_| false);
-        let v = &mut self.validation;
-        v.phase = Phase::Over;
-        let validated =
-            |holds| Validated { views: v.views.len(), holds, drop: drop_for(holds, &self.settings.validation) };
-        v.found = v.falls.slope().map(validated);
-    }
-
-    /// Loss of a view as it would be looked at, but for its depth, and by how much its picture was reduced. Nothing learns from it.
-    fn loss_of(&mut self, index: usize, progress: f32) -> Result<(f32, u32), TrainError> {
-        self.flush()?;
+    /// Loss of a view as it would be visited, but for its depth, and by how much its picture was reduced. Nothing learns from it.
+    fn loss_of(&mut self, pictures: &mut PictureStore, index: usize, progress: f32) -> Result<(f32, u32), TrainError> {
+        self.model.flush(&mut self.device)?;
         let picture = Picture::View(index);
-        let (divisor, first_pixel, _) = self.prepare_frame(picture, Blocks::WHOLE, progress);
-        (self.frame.background, self.frame.drop_share) = ([0.0; 3], 0.0);
-        self.frame.flags &= !FLAG_DEPTH;
-        self.write_frame();
-        self.forward_count(picture, first_pixel)?;
-        let recording = self.blend()?;
-        self.record_loss(&recording);
-        recording.submit_and_read(&["strip_sums"])?;
-        Ok((self.weigh(&self.partial_sums()).loss, divisor))
+        let framed = self.frame(pictures, Visit::whole(picture, progress));
+        let frame = &mut self.device.frame;
+        (frame.background, frame.drop_share) = ([0.0; 3], 0.0);
+        frame.flags &= !FLAG_DEPTH;
+        self.device.write_frame();
+        self.project(pictures, picture, framed)?;
+        let by = Gradients { exposure: self.settings.refine_exposure, ..Gradients::default() };
+        self.device.compare(by)?;
+        Ok((self.device.weigh(&self.device.partial_sums(by), &self.settings.loss).loss, framed.divisor))
     }
 }
 

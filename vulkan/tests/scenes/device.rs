@@ -6,21 +6,21 @@ use config::training::TrainSettings;
 use models::camera::View;
 use models::cloud::GaussianCloud;
 pub use vulkan::cases::scenes::{plain, posed};
+use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
-use vulkan::trainer::Trainer;
 
 /// A trainer with `cloud` loaded and room for two views of `view`'s size.
-pub fn trainer(cloud: &GaussianCloud, view: &View, settings: &TrainSettings) -> Option<Trainer> {
+pub fn trainer(cloud: &GaussianCloud, view: &View, settings: &TrainSettings) -> Option<Fixture> {
     Some(vulkan::cases::scenes::trainer(&open()?, cloud, view, settings).unwrap())
 }
 
 /// The same with nothing loaded yet.
-pub fn empty_trainer(sh_degree: u8, capacity: usize, view: &View, settings: &TrainSettings) -> Option<Trainer> {
+pub fn empty_trainer(sh_degree: u8, capacity: usize, view: &View, settings: &TrainSettings) -> Option<Fixture> {
     Some(vulkan::cases::scenes::empty_trainer(&open()?, sh_degree, capacity, view, settings).unwrap())
 }
 
 /// The Gaussians as they are.
-pub fn model(trainer: &mut Trainer) -> GaussianCloud {
+pub fn model(trainer: &mut Fixture) -> GaussianCloud {
     let mut model = GaussianCloud::with_capacity(3, trainer.gaussians());
     trainer.snapshot(&mut model).unwrap();
     model

@@ -125,7 +125,7 @@ fn a_schedule_that_ends_early_is_over_at_the_same_step_and_ends_with_the_mean_of
     let Some(mut engine) = built_with(1, stops) else { return };
     for engine in [&mut uninterrupted, &mut engine] {
         let (_, reason) = train(engine, 21);
-        assert_eq!((reason, engine.trainer.spent().0), (StopReason::Converged, 19));
+        assert_eq!((reason, engine.trainer.schedule().spent().0), (StopReason::Converged, 19));
     }
     // Steps 11, 14, 17 and the last one.
     assert_eq!(uninterrupted.report.more.get("averaged_epochs"), None);

@@ -8,7 +8,7 @@ use models::camera::PosedImage;
 use vulkan::gpu::Gpu;
 use vulkan::kernel_config::KernelConfig;
 use vulkan::stages::STAGES;
-use vulkan::trainer::{Counters, RunBudget, TrainError, Trainer};
+use vulkan::trainer::{Counters, PictureStore, RunBudget, TrainError, Trainer};
 
 use super::model::{CostModel, SH_DEGREE, Sample, load};
 use super::synthetic;
@@ -50,6 +50,7 @@ pub struct Timed {
 #[derive(Debug)]
 pub struct Stopwatch {
     trainer: Trainer,
+    pictures: PictureStore,
     counters: Counters,
     stage_ms: [f64; STAGES.len()],
 }
@@ -61,11 +62,12 @@ impl Stopwatch {
     /// The device, or its memory.
     pub fn new(gpu: &Gpu, config: KernelConfig, plan: &Plan, pictures: &[PosedImage]) -> Result<Self, TrainError> {
         let mut trainer = Trainer::with_config(gpu, plan, &settings(), config)?;
-        trainer.time_every_step();
+        trainer.device_mut().time_every_step();
+        let mut store = PictureStore::new(plan);
         for picture in pictures {
-            trainer.add_view(picture, None)?;
+            store.add(trainer.device_mut(), picture, None)?;
         }
-        Ok(Self { trainer, counters: Counters::default(), stage_ms: [0.0; STAGES.len()] })
+        Ok(Self { trainer, pictures: store, counters: Counters::default(), stage_ms: [0.0; STAGES.len()] })
     }
 
     /// Takes these Gaussians from here on.
@@ -84,16 +86,16 @@ impl Stopwatch {
     /// The device.
     pub fn step(&mut self) -> Result<Timed, TrainError> {
         let mut report = None;
-        let summary = self.trainer.run(&RunBudget::default(), &mut |r| {
+        let summary = self.trainer.run(&mut self.pictures, &RunBudget::default(), &mut |r| {
             report = Some(*r);
             ControlFlow::Break(())
         })?;
         let Some(report) = report else { return Err(TrainError::NoViews) };
-        let stage_ms = self.trainer.stage_ms().map(|s| s.1);
+        let stage_ms = self.trainer.device().stage_ms().map(|s| s.1);
         let before = std::mem::replace(&mut self.stage_ms, stage_ms);
         let evaluations = summary.counters.evaluations - self.counters.evaluations;
         self.counters = summary.counters;
-        let pixels = self.trainer.view_pose(report.view).map_or(0, |v| v.intrinsics.pixels() as u64);
+        let pixels = self.pictures.view(report.view).map_or(0, |v| v.intrinsics.pixels() as u64);
         let gaussians = self.trainer.gaussians() as u64;
         Ok(Timed {
             view: report.view,

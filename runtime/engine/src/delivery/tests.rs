@@ -52,11 +52,11 @@ fn sensitivities(engine: &mut Reconstruction) -> Vec<u32> {
 fn those_leave_that_the_loss_hangs_on_least_and_the_others_stay_as_they_are() {
     let Some(mut engine) = built(false) else { return };
     train(&mut engine, 9);
-    let (before, steps) = (sensitivities(&mut engine), engine.trainer.steps());
+    let (before, steps) = (sensitivities(&mut engine), engine.trainer.schedule().taken());
     assert!(f32::from_bits(before[before.len() / 2]) > 0.0 && before[0] < before[before.len() - 1]);
     let gone = engine.thin(0.25, f32::INFINITY).expect("the device works");
     assert_eq!(gone, before.len() / 4);
-    assert!(sensitivities(&mut engine) == before[gone..] && engine.trainer.steps() == steps);
+    assert!(sensitivities(&mut engine) == before[gone..] && engine.trainer.schedule().taken() == steps);
 }
 
 #[test]
@@ -65,7 +65,7 @@ fn no_more_leave_than_what_they_may_cost_together() {
     train(&mut engine, 9);
     let before = sensitivities(&mut engine);
     let cost = |n: usize| before[..n].iter().map(|v| f64::from(f32::from_bits(*v))).sum::<f64>() as f32;
-    let (few, loss) = (before.len() / 10, engine.trainer.mean_loss());
+    let (few, loss) = (before.len() / 10, engine.pictures.store.mean_loss());
     assert!(loss > 0.0 && loss < 1.0 && cost(before.len() / 2) > cost(few + 1), "{loss}");
     let between = 0.5 * (cost(few) + cost(few + 1));
     assert_eq!(engine.thin(0.5, between).expect("the device works"), few);

@@ -230,7 +230,7 @@ fn landed(pictures: &[PosedImage], share: f64) -> Option<(GaussianCloud, usize, 
     assert!(engine.wants_build(true) && engine.build(&|| true).expect("built") && !engine.wants_build(true));
     assert!(!engine.wants_growth());
     let kept = engine.report.more["gaussians_kept"].as_u64().expect("a number") as usize;
-    let progress = engine.trainer.progress();
+    let progress = engine.trainer.schedule().progress();
     Some((in_flight, kept, snapshot(&mut engine), progress))
 }
 

@@ -24,7 +24,7 @@ fn take(engine: &mut Reconstruction) {
 
 /// Looks at so many pictures, in parts.
 fn train(engine: &mut Reconstruction, steps: u32) {
-    let budget = RunBudget { steps: Some(engine.trainer.spent().0 + steps), seconds: None };
+    let budget = RunBudget { steps: Some(engine.trainer.schedule().spent().0 + steps), seconds: None };
     engine.train(&budget, &mut |_| ControlFlow::Continue(())).expect("trains");
 }
 
@@ -74,11 +74,14 @@ fn a_checkpoint_in_pieces_is_the_file_of_the_whole_and_is_continued_as_it_was() 
     assert_eq!(second.resume(dir.path()).expect("read").map(|views| views.len()), Some(3));
     take(&mut second);
     assert!(sorted(&trained(&mut second)) == sorted(&cloud), "other Gaussians than were saved");
-    assert_eq!(second.trainer.spent().0, 5);
+    assert_eq!(second.trainer.schedule().spent().0, 5);
     let mut third = engine(120, InitKind::Model);
     third.begin_with(Chunks::open(&path).expect("a model"));
     take(&mut third);
-    assert!(sorted(&trained(&mut third)) == sorted(&cloud) && third.trainer.spent().0 == 0, "a schedule of its own");
+    assert!(
+        sorted(&trained(&mut third)) == sorted(&cloud) && third.trainer.schedule().spent().0 == 0,
+        "a schedule of its own"
+    );
     train(&mut third, 3);
 }
 

@@ -121,7 +121,7 @@ impl Painter {
 
     /// Name of the device.
     pub fn device(&self) -> String {
-        self.trainer.gpu().info().name.clone()
+        self.trainer.device().gpu().info().name.clone()
     }
 
     /// Colours and transmittance of a picture; no depths.

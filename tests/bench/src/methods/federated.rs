@@ -104,7 +104,7 @@ pub fn merge(
         scene_gaussians: None,
     };
     let recipe = recipe(ground.seed, degree);
-    let mut trainer: Trainer = request.open::<JobError>(&recipe)?;
+    let (mut trainer, mut pictures): (Trainer, _) = request.open::<JobError>(&recipe)?;
     let mut lessons = Vec::with_capacity(views.len());
     let mut drawn = Rendering::default();
     for (i, (_, cloud)) in clients.iter().enumerate() {
@@ -121,13 +121,13 @@ pub fn merge(
     }
     trainer.load(&all)?;
     for lesson in &lessons {
-        trainer.add_view(lesson, None)?;
+        pictures.add(trainer.device_mut(), lesson, None)?;
     }
     let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
     let pass = lessons.len() as u32;
     for (until, entropy) in [(pass, 0.0), (EPOCHS * pass, ENTROPY)] {
         trainer.set_loss(&LossSettings { entropy, ..recipe.loss })?;
-        let run = trainer.run(&RunBudget { steps: Some(until), seconds: None }, &mut each)?;
+        let run = trainer.run(&mut pictures, &RunBudget { steps: Some(until), seconds: None }, &mut each)?;
         if run.reason == StopReason::Caller {
             return Ok(None);
         }
@@ -139,7 +139,7 @@ pub fn merge(
         aircraft: "global".into(),
         origin: clients.first().and_then(|c| c.0.origin),
         views: clients.iter().flat_map(|c| c.0.views.clone()).collect(),
-        steps: trainer.steps().into(),
+        steps: trainer.schedule().taken().into(),
         seed: ground.seed,
         finished: true,
         ..ModelHeader::default()

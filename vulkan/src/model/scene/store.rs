@@ -6,7 +6,7 @@ use std::os::unix::fs::FileExt;
 
 use config::plan::{BLOCK_GAUSSIANS, Plan};
 
-use crate::trainer::TrainError;
+use crate::error::TrainError;
 
 /// No block.
 const NONE: u32 = u32::MAX;
@@ -24,7 +24,7 @@ impl Chain {
     pub const EMPTY: Self = Self { first: NONE, last: NONE, count: 0 };
 }
 
-/// What becomes of a record that is looked at.
+/// What becomes of a record that is visited.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Rewritten {
     /// Nothing.
@@ -171,7 +171,7 @@ impl Store {
         Ok(())
     }
 
-    /// Rewrites the cell's records where they lie, as `look` says of each; those behind one that goes move up, and blocks that become
+    /// Rewrites the cell's records where they lie, as `revised` says of each; those behind one that goes move up, and blocks that become
     /// empty are free.
     ///
     /// # Errors
@@ -179,7 +179,7 @@ impl Store {
     pub fn rewrite(
         &mut self,
         chain: &mut Chain,
-        mut look: impl FnMut(&mut [u8]) -> Rewritten,
+        mut revised: impl FnMut(&mut [u8]) -> Rewritten,
     ) -> Result<(), TrainError> {
         let (mut from, mut to, mut done, mut kept, count) = (chain.first, chain.first, 0, 0, chain.count as usize);
         while done < count && from != NONE {
@@ -190,7 +190,7 @@ impl Store {
             self.moved += bytes.len() as u64;
             let (mut changed, mut stay) = (kept < done, 0);
             for i in 0..records {
-                let rewritten = look(&mut bytes[i * record..(i + 1) * record]);
+                let rewritten = revised(&mut bytes[i * record..(i + 1) * record]);
                 changed |= rewritten != Rewritten::Stays;
                 if rewritten != Rewritten::Goes {
                     bytes.copy_within(i * record..(i + 1) * record, stay * record);

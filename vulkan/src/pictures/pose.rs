@@ -30,7 +30,7 @@ impl Six {
 
 /// What a view learns besides the Gaussians.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Adjust {
+pub(super) struct Adjust {
     pose_steps: Six,
     exposure_steps: Six,
     /// Logarithm of the gain (r, g, b), then the offset.
@@ -62,7 +62,7 @@ impl Adjust {
 }
 
 /// The pose after p' = exp(turn) p + shift in the camera's frame.
-pub(crate) fn moved(pose: &Pose, d: [f64; 6]) -> Pose {
+fn moved(pose: &Pose, d: [f64; 6]) -> Pose {
     let turned = DQuat::from_scaled_axis(DVec3::new(d[0], d[1], d[2]));
     let to_camera = pose.rotation.normalize().conjugate();
     let translation = turned * -(to_camera * pose.center) + DVec3::new(d[3], d[4], d[5]);

@@ -4,13 +4,15 @@
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// Mean age of the views that are looked at while new ones come, in views: from two lines of flight every view of the last line is
-/// still looked at.
+/// Mean age of the views that are visited while new ones come, in views: from two lines of flight every view of the last line is
+/// still visited.
 const TAIL: u32 = 12;
 /// Views drawn at once, so that the next one is known.
 const DRAWN: usize = 4;
 
 pub(crate) struct Sampler {
+    /// Views when the last one was chosen.
+    views: usize,
     newest: bool,
     /// Views drawn since the last new one.
     drawn: u32,
@@ -30,6 +32,7 @@ impl Sampler {
     pub fn new(seed: u64, capacity: usize) -> Self {
         let order = Vec::with_capacity(2 * capacity + 1);
         Self {
+            views: 0,
             newest: false,
             drawn: 0,
             seed,
@@ -54,8 +57,8 @@ impl Sampler {
         self.order.clear();
     }
 
-    /// Whether the newest views are looked at first.
-    pub fn looks_at_newest(&self) -> bool {
+    /// Whether the newest views are visited first.
+    pub fn prefers_newest(&self) -> bool {
         self.newest
     }
 
@@ -66,7 +69,7 @@ impl Sampler {
     }
 
     /// Newest first, or epochs.
-    pub fn look_at_newest(&mut self, on: bool) {
+    pub fn prefer_newest(&mut self, on: bool) {
         if std::mem::replace(&mut self.newest, on) != on {
             self.order.clear();
             self.uneven = !on;
@@ -97,13 +100,16 @@ impl Sampler {
         self.order.last().map(|v| *v as usize)
     }
 
-    /// The next one while the newest are looked at first.
+    /// The next one while the newest are visited first.
     pub fn next_newest(&mut self, views: usize) -> Option<usize> {
         self.newest.then(|| self.next(views, 0.0, |_| 0.0))
     }
 
-    /// `losses(view)` is the view's last loss; `views` is at least 1.
+    /// `losses(view)` is the view's last loss; `views` is at least 1. Where they are others than before the present epoch ends.
     pub fn next(&mut self, views: usize, residual_share: f32, losses: impl Fn(usize) -> f32) -> usize {
+        if std::mem::replace(&mut self.views, views) != views {
+            self.forget();
+        }
         if self.order.is_empty() && self.newest {
             self.draw_newest(views);
         }
@@ -158,14 +164,13 @@ mod tests {
     }
 
     #[test]
-    fn while_views_come_the_newest_are_looked_at_first_and_each_as_often_however_many_there_are() {
+    fn while_views_come_the_newest_are_visited_first_and_each_as_often_however_many_there_are() {
         // A view every eight steps.
         let flown = |views: usize| {
             let mut sampler = Sampler::new(3, views);
-            sampler.look_at_newest(true);
+            sampler.prefer_newest(true);
             let mut visits = vec![0; views];
             for newest in 0..views {
-                sampler.forget();
                 (0..8).for_each(|_| visits[sampler.next(newest + 1, 0.0, |_| 0.0)] += 1);
             }
             visits
@@ -176,20 +181,20 @@ mod tests {
         assert!((early / late - 1.0).abs() < 0.1 && (late - 8.0).abs() < 1.0, "{early} {late}");
         // When nothing new comes every view has its turn.
         let mut sampler = Sampler::new(3, 100);
-        sampler.look_at_newest(true);
+        sampler.prefer_newest(true);
         let mut seen = vec![0; 100];
         (0..2000).for_each(|_| seen[sampler.next(100, 0.0, |_| 0.0)] += 1);
         assert!(seen.iter().all(|n| *n > 0), "{seen:?}");
     }
 
     #[test]
-    fn when_no_more_views_come_those_looked_at_least_have_the_first_turns() {
+    fn when_no_more_views_come_those_visited_least_have_the_first_turns() {
         let (views, mut sampler) = (100, Sampler::new(3, 100));
-        sampler.look_at_newest(true);
+        sampler.prefer_newest(true);
         let mut before = vec![0; views];
         (0..400).for_each(|_| before[sampler.next(views, 0.0, |_| 0.0)] += 1);
         // As a load after the landing does it.
-        sampler.look_at_newest(false);
+        sampler.prefer_newest(false);
         sampler.reset();
         let turns: Vec<i32> = (0..views).map(|_| before[sampler.next(views, 0.0, |_| 0.0)]).collect();
         assert!(turns.is_sorted() && turns[0] < turns[99], "{turns:?}");

@@ -2,8 +2,9 @@
 //! picture cannot show is learnt at the cost of a step on one. A crop has the pose and the exposure of its view; only its lens is its
 //! own, with a principal point that may lie outside of it.
 
-use super::slots::Picture;
-use super::{TrainError, Trainer};
+use super::{Picture, PictureStore};
+use crate::device::Device;
+use crate::error::TrainError;
 use image::RgbImage;
 use models::camera::{Intrinsics, View};
 use models::picture::mask::Mask;
@@ -19,8 +20,8 @@ pub struct CropPlace {
     pub whole: (u32, u32),
 }
 
-/// What the trainer keeps of a crop.
-pub(crate) struct TrainingCrop {
+/// A crop.
+pub(super) struct Crop {
     /// Its view.
     pub view: usize,
     pub place: CropPlace,
@@ -29,7 +30,7 @@ pub(crate) struct TrainingCrop {
     pub last_loss: f32,
 }
 
-impl TrainingCrop {
+impl Crop {
     /// Its camera: that of the view it was cut out of, whose focal length and pose may have been refined since.
     pub fn seen_from(&self, view: &View) -> View {
         let (CropPlace { x, y, whole }, (width, height)) = (self.place, (self.width, self.height));
@@ -39,7 +40,7 @@ impl TrainingCrop {
     }
 }
 
-impl Trainer {
+impl PictureStore {
     /// Takes in a crop of the picture of view `view`, of which the pixels count that `mask` keeps, where there is one.
     ///
     /// # Errors
@@ -47,6 +48,7 @@ impl Trainer {
     /// or lies outside of its picture; [`TrainError::ViewFile`].
     pub fn add_crop(
         &mut self,
+        device: &mut Device,
         view: usize,
         image: &RgbImage,
         mask: Option<&Mask>,
@@ -65,11 +67,10 @@ impl Trainer {
                 format!("a crop of {width}x{height} of a picture of {}x{} does not fit", place.whole.0, place.whole.1);
             return Err(TrainError::BadView { name: format!("view {view}"), why });
         }
-        self.crops.push(TrainingCrop { view, place, width, height, last_loss: f32::INFINITY });
-        let slot = self.write_pixels(Picture::Crop(index), image, mask);
-        self.crop_sampler.forget();
+        self.crops.push(Crop { view, place, width, height, last_loss: f32::INFINITY });
+        let slot = self.write_pixels(device, Picture::Crop(index), image, mask);
         // A crop without its pixels is none.
-        self.keep(slot, Picture::Crop(index)).inspect_err(|_| _ = self.crops.pop())
+        self.keep(device, slot, Picture::Crop(index)).inspect_err(|_| _ = self.crops.pop())
     }
 
     /// Number of crops.
@@ -78,29 +79,19 @@ impl Trainer {
     }
 
     /// The view whose camera a picture was taken with.
-    pub(super) fn view_of(&self, picture: Picture) -> usize {
+    pub(crate) fn view_of(&self, picture: Picture) -> usize {
         match picture {
             Picture::View(index) => index,
             Picture::Crop(index) => self.crops[index].view,
         }
     }
 
-    /// What the next step looks at.
-    pub(super) fn choose(&mut self, progress: f32) -> Picture {
-        let (share, views, crops) = (self.settings.views.residual_share, &self.views, &self.crops);
-        if !crops.is_empty() && self.settings.crops.is_due(self.updates, progress) {
-            Picture::Crop(self.crop_sampler.next(crops.len(), share, |i| crops[i].last_loss))
-        } else {
-            Picture::View(self.sampler.next(views.len(), share, |i| views[i].last_loss))
-        }
-    }
-
-    /// What [`Self::choose`] will give after the step at work, as far as that is known.
-    pub(super) fn next_picture(&self) -> Option<Picture> {
-        if !self.crops.is_empty() && self.settings.crops.is_due(self.updates + 1, self.progress()) {
-            self.crop_sampler.peek().map(Picture::Crop)
-        } else {
-            self.sampler.peek().map(Picture::View)
+    /// The camera of a picture as it is now.
+    pub(crate) fn camera(&self, picture: Picture) -> View {
+        let view = self.views[self.view_of(picture)].view;
+        match picture {
+            Picture::View(_) => view,
+            Picture::Crop(index) => self.crops[index].seen_from(&view),
         }
     }
 }
@@ -117,7 +108,7 @@ mod tests {
         let small = Intrinsics { width: 64, height: 48, fx: 60.0, fy: 61.0, cx: 32.5, cy: 23.5 };
         let view = View { intrinsics: small, pose: Pose { rotation: DQuat::IDENTITY, center: DVec3::ZERO } };
         let place = CropPlace { x: 100, y: 40, whole: (256, 192) };
-        let crop = TrainingCrop { view: 0, place, width: 64, height: 48, last_loss: 0.0 };
+        let crop = Crop { view: 0, place, width: 64, height: 48, last_loss: 0.0 };
         let lens = crop.seen_from(&view).intrinsics;
         // A ray through the whole picture's pixel (130, 60) goes through the crop's (30, 20).
         let whole = small.resized(256, 192);

@@ -1,11 +1,8 @@
 //! Bands: consecutive tiles whose instances fit the plan. One band is the rule; several give the same bits.
 
-use super::{TrainError, Trainer};
-use crate::commands::Recording;
+use super::Device;
+use crate::error::TrainError;
 use crate::gpu::GpuError;
-use crate::kernels::Kernel;
-use crate::layout::{FLAG_ORTHOGRAPHIC, Push};
-use crate::stages::Stage;
 
 /// Rounds of counting and emitting to begin with; more are taken, and kept, when a frame needs them.
 pub(crate) const WALK_ROUNDS: u32 = 2;
@@ -27,54 +24,7 @@ pub(crate) struct Counted {
     pub instances: u64,
 }
 
-impl Trainer {
-    /// Depth sort, colours, instances per tile; everything up to where the number of instances is needed.
-    pub(super) fn record_counting(&self, recording: &Recording<'_>) {
-        let lanes = self.plan.lanes.loops as usize;
-        recording.run(Kernel::Project, self.gaussians, Push::default());
-        recording.run(Kernel::CatchUp, lanes, Push::default());
-        let blocks = self.plan.lanes.sort as usize;
-        for pass in 0..4 {
-            let push = Push { pass, ..Push::default() };
-            let (count, scatter) = if pass % 2 == 0 {
-                (Kernel::SortCount, Kernel::SortScatter)
-            } else {
-                (Kernel::SortCountOther, Kernel::SortScatterBack)
-            };
-            recording.run(count, blocks, push);
-            recording.run(Kernel::SortScan, 256, push);
-            recording.run(scatter, blocks, push);
-        }
-        recording.run(Kernel::Shade, lanes, Push::default());
-        self.record_tiles(recording);
-    }
-
-    /// Instances per tile and their prefix sums.
-    pub(super) fn record_tiles(&self, recording: &Recording<'_>) {
-        let tiles = self.frame.tiles();
-        let all = Push { first: 0, last: tiles, ..Push::default() };
-        let bytes = 4 * u64::from(tiles) * u64::from(self.plan.lanes.sort);
-        recording.clear(self.arena.section("tiles"), bytes, Stage::Count);
-        recording.run_rounds(Kernel::Count, self.plan.lanes.sort as usize, all, self.walk_rounds);
-        recording.run(Kernel::TilePrefix, tiles as usize, all);
-        recording.run(Kernel::TileScan, 256, all);
-    }
-
-    /// Instance lists of a band. The only band of a frame was counted already.
-    pub(super) fn record_emit(&self, recording: &Recording<'_>, band: Band, single: bool) {
-        let push = Push { first: band.first, last: band.last, mode: 1, pass: 0 };
-        if !single {
-            recording.run_rounds(Kernel::Count, self.plan.lanes.sort as usize, push, self.walk_rounds);
-        }
-        recording.run_rounds(Kernel::Emit, self.plan.lanes.sort as usize, push, self.walk_rounds);
-    }
-
-    pub(super) fn record_blend(&self, recording: &Recording<'_>, band: Band) {
-        let push = Push { first: band.first, last: band.last, ..Push::default() };
-        let blend = if self.frame.has(FLAG_ORTHOGRAPHIC) { Kernel::RasteriseMedian } else { Kernel::Rasterise };
-        recording.run(blend, self.frame.places(band), push);
-    }
-
+impl Device {
     /// Reads the counts and cuts the tiles into bands. Counting is done again with twice the rounds for as long as some
     /// lane did not reach the end of its share.
     ///
@@ -89,7 +39,7 @@ impl Trainer {
             }
             reached = Some(walked);
             self.walk_rounds = self.walk_rounds.saturating_mul(2);
-            let recording = self.take_recording()?;
+            let recording = self.begin()?;
             self.record_tiles(&recording);
             recording.submit_and_read(&COUNTS)?;
         }
@@ -137,8 +87,10 @@ fn cut(starts: &[u32], total: u32, capacity: usize, bands: &mut Vec<Band>) -> u6
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fixture::Fixture;
     use crate::gpu::{Forced, Gpu};
     use crate::synthetic::{cloud, photo, plain, posed, view};
+    use crate::trainer::Trainer;
     use config::plan::{Plan, PlanRequest};
 
     #[test]
@@ -150,11 +102,12 @@ mod tests {
         let plan = Plan::with_capacities(&request, 256, 4096);
         let mut trainer =
             Trainer::with_kernels(&gpu, &plan, &plain(), crate::kernel_config::KernelConfig::standard(gpu.info()), &[])
+                .map(Fixture::from)
                 .unwrap();
         trainer.load(&cloud(1, 64, 0)).unwrap();
         trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
         assert_eq!(trainer.step().err(), Some(TrainError::Gpu(GpuError::ComputesNothing)));
-        assert_eq!(trainer.walk_rounds, 2 * WALK_ROUNDS, "one more try");
+        assert_eq!(trainer.device.walk_rounds, 2 * WALK_ROUNDS, "one more try");
     }
 
     /// Starts modulo 2^32 and the saturated total, as `tile_scan` leaves them.

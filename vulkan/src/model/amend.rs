@@ -1,14 +1,16 @@
 //! A scene that grows while it is trained: Gaussians of new ground come to those there are, and others move or go, while all that
 //! nobody touches keeps its place, its moments and its part of the schedule.
 
-use super::load::LoadReport;
+use super::contents::LoadReport;
 use super::parameters::{Geometry, LEAST_LEFT, record_of};
-use super::{TrainError, Trainer, state};
-use config::training::Strategy;
+use super::{Model, common_degree, state};
+use crate::device::Device;
+use crate::error::TrainError;
+use config::training::TrainSettings;
 use models::cloud::{GaussianCloud, sh_coefficients};
 
 /// Gaussians among which one is sought whose second moments new ones begin with.
-pub(super) const LOOKED_AT: usize = 1024;
+pub(super) const SAMPLED: usize = 1024;
 
 /// A Gaussian as it is trained.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,7 +23,7 @@ pub struct Trained {
     pub rotation: [f32; 4],
     /// Opacity before the sigmoid.
     pub opacity_logit: f32,
-    /// What the loss may lose with it: root mean square, over the steps since the last [`Trainer::load`] (the last thousand above all), of
+    /// What the loss may lose with it: root mean square, over the steps since the last [`Trainer::load`](crate::trainer::Trainer::load) (the last thousand above all), of
     /// the loss's derivative by the logarithm of the opacity. 0 before the first step; infinite where the Gaussian is too opaque for
     /// a derivative to be left.
     pub sensitivity: f32,
@@ -44,7 +46,7 @@ impl Trained {
     }
 }
 
-/// A box of space whose edges run along the axes, metres: where Gaussians are looked at. Of a scene in cells the others are not read.
+/// A box of space whose edges run along the axes, metres: which Gaussians are visited. Of a scene in cells the others are not read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BoundingBox {
     /// Its corner to the west, the south and below.
@@ -79,70 +81,49 @@ pub enum Fate {
     Goes,
 }
 
-impl Trainer {
-    /// From here on, until the next [`Trainer::load`] that is followed by none of this: views are looked at newest first, with an
-    /// exponential tail of older ones, instead of once in an epoch each, and the number of Gaussians is the caller's: nothing is
-    /// densified.
-    pub fn while_views_come(&mut self) {
-        self.sampler.look_at_newest(true);
-        self.strategy = Strategy::None;
-    }
-
-    /// From here on, until the next [`Trainer::load`], nothing is densified: the number of Gaussians is the caller's.
-    pub fn keep_number(&mut self) {
-        self.strategy = Strategy::None;
-    }
-
-    /// Shows every Gaussian of `within`, in order.
-    ///
-    /// # Errors
-    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
-    pub fn each(&mut self, within: &BoundingBox, mut see: impl FnMut(&Trained)) -> Result<(), TrainError> {
-        self.flush()?;
-        let unbias = self.second_unbias();
+impl Model {
+    /// Shows every Gaussian of `within`, in order. `unbias`: what Adam multiplies second moments by.
+    pub fn each(
+        &mut self,
+        device: &mut Device,
+        within: &BoundingBox,
+        unbias: f32,
+        mut see: impl FnMut(&Trained),
+    ) -> Result<(), TrainError> {
+        self.flush(device)?;
         if self.scene.is_paged() {
-            return self.each_in_cells(within, |g| see(&Trained::of(g, unbias)));
+            self.leave_for_file(device)?;
+            return self.page(device, |scene, _| scene.each_within(within, |g| see(&Trained::of(g, unbias))));
         }
-        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        geometry.iter().filter(|g| within.holds(g.mean)).for_each(|g| see(&Trained::of(g, unbias)));
+        let geometry = self.geometry(device).iter();
+        geometry.filter(|g| within.holds(g.mean)).for_each(|g| see(&Trained::of(g, unbias)));
         Ok(())
     }
 
-    /// Mean over the views of the loss when each was last looked at; 0 before any was.
-    pub fn mean_loss(&self) -> f32 {
-        let seen = || self.views.iter().map(|v| f64::from(v.last_loss)).filter(|loss| loss.is_finite());
-        (seen().sum::<f64>() / seen().count().max(1) as f64) as f32
-    }
-
-    /// What Adam multiplies second moments by, which begin at zero.
-    fn second_unbias(&self) -> f32 {
-        (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(self.steps().max(1) as i32))) as f32
-    }
-
-    /// Moves Gaussians of `within` and takes others out, as `fate` says of each in the order of [`Trainer::each`]; never the last one.
+    /// Moves Gaussians of `within` and takes others out, as `fate` says of each in the order of [`Model::each`]; never the last one.
     /// Returns how many went.
-    ///
-    /// # Errors
-    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
     pub fn revise(
         &mut self,
+        device: &mut Device,
         within: &BoundingBox,
+        unbias: f32,
         mut fate: impl FnMut(&Trained) -> Fate,
     ) -> Result<usize, TrainError> {
-        self.flush()?;
-        let (mut gone, unbias): (Vec<u32>, _) = (Vec::new(), self.second_unbias());
+        self.flush(device)?;
+        let before = self.total();
         if self.scene.is_paged() {
-            return self.revise_cells(within, |g| fate(&Trained::of(g, unbias)));
+            self.leave_for_file(device)?;
+            self.page(device, |scene, _| scene.revise(within, |g| fate(&Trained::of(g, unbias))))?;
+            return Ok(before - self.total());
         }
-        let geometry = &mut self.parameters.geometry_mut(&mut self.arena)[..self.gaussians];
-        for (i, g) in geometry.iter_mut().enumerate().filter(|(_, g)| within.holds(g.mean)) {
+        let mut gone: Vec<u32> = Vec::new();
+        for (i, g) in self.geometry_mut(device).iter_mut().enumerate().filter(|(_, g)| within.holds(g.mean)) {
             match fate(&Trained::of(g, unbias)) {
                 Fate::Stays => {}
                 Fate::Moves { mean, rotation } => (g.mean, g.rotation) = (mean, rotation),
                 Fate::Goes => gone.push(i as u32),
             }
         }
-        let before = self.gaussians;
         // From the last one on: what takes a place is one that stays.
         for index in gone.iter().rev().map(|i| *i as usize) {
             if self.gaussians <= 1 {
@@ -150,64 +131,85 @@ impl Trainer {
             }
             self.gaussians -= 1;
             if index != self.gaussians {
-                self.parameters.shift(&mut self.arena, self.gaussians, index);
+                self.parameters.shift(&mut device.arena, self.gaussians, index);
             }
         }
-        self.count_missing();
-        Ok(before - self.gaussians)
+        self.count_missing(device);
+        Ok(before - self.total())
+    }
+
+    /// Removes Gaussians of the device, but never the last one; the last ones take the places of those removed.
+    pub fn remove_where(&mut self, device: &mut Device, leaves: impl Fn(&Geometry) -> bool) {
+        let mut index = 0;
+        while index < self.gaussians && self.gaussians > 1 {
+            if !leaves(&self.geometry(device)[index]) {
+                index += 1;
+                continue;
+            }
+            self.gaussians -= 1;
+            if index != self.gaussians {
+                self.parameters.shift(&mut device.arena, self.gaussians, index);
+                self.scene.place(self.gaussians, index);
+            }
+            self.counters.pruned += 1;
+        }
+        self.scene.truncate(self.gaussians);
     }
 
     /// Adds Gaussians, as many as find room; those that are not finite are left out. A scene that outgrows the device goes into cells.
-    ///
-    /// # Errors
-    /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
-    pub fn extend(&mut self, cloud: &GaussianCloud) -> Result<LoadReport, TrainError> {
-        self.flush()?;
+    pub fn extend(
+        &mut self,
+        device: &mut Device,
+        settings: &TrainSettings,
+        cloud: &GaussianCloud,
+    ) -> Result<LoadReport, TrainError> {
+        self.flush(device)?;
         let valid: Vec<usize> = (0..cloud.len()).filter(|i| cloud.is_valid(*i)).collect();
-        let room = self.plan.scene.saturating_sub(self.gaussians());
+        let room = device.plan().scene.saturating_sub(self.total());
         let report = LoadReport {
             loaded: valid.len().min(room),
             dropped_non_finite: cloud.len() - valid.len(),
             dropped_over_capacity: valid.len().saturating_sub(room),
         };
-        if !self.scene.is_paged() && self.gaussians + report.loaded > self.plan.gaussians {
-            self.enter_cells()?;
+        let new = &valid[..report.loaded];
+        if !self.scene.is_paged() && self.gaussians + report.loaded > device.plan().gaussians {
+            self.enter_cells(device, settings)?;
         }
+        let coefficients = sh_coefficients(device.plan().sh_degree.min(cloud.sh_degree)) * 3;
         if self.scene.is_paged() {
-            self.extend_cells(cloud, &valid[..report.loaded])?;
+            self.leave_for_file(device)?;
+            let parameters = self.parameters;
+            self.page(device, |scene, _| scene.extend(cloud, new, coefficients, &parameters))?;
             return Ok(report);
         }
-        let donor = self.donor();
-        let coefficients = sh_coefficients(self.plan.sh_degree.min(cloud.sh_degree)) * 3;
-        let all_degrees = self.settings.sh.raise_share >= 1.0;
-        let mut record = std::mem::take(&mut self.record);
-        for from in valid.into_iter().take(room) {
+        let donor = self.donor(device);
+        let degree = common_degree(device.plan(), self.own_degrees);
+        let Self { record, parameters, .. } = self;
+        for from in new {
             let to = self.gaussians;
-            record_of(cloud, from, coefficients, &mut record);
-            self.parameters.write_record(&mut self.arena, to, &record);
+            record_of(cloud, *from, coefficients, record);
+            parameters.write_record(&mut device.arena, to, record);
             let second = donor.map(|donor| {
-                self.parameters.sh_second.copy(&mut self.arena, donor, to);
-                self.parameters.geometry(&self.arena)[donor].second
+                parameters.sh_second.copy(&mut device.arena, donor, to);
+                parameters.geometry(&device.arena)[donor].second
             });
-            let g = &mut self.parameters.geometry_mut(&mut self.arena)[to];
+            let g = &mut parameters.geometry_mut(&mut device.arena)[to];
             // It missed nothing before it was there.
             g.state = state::up_to(g.state, self.updates);
-            if all_degrees {
-                g.state = state::with_degree(g.state, self.plan.sh_degree);
+            if let Some(degree) = degree {
+                g.state = state::with_degree(g.state, degree);
             }
             g.second = second.unwrap_or(g.second);
             self.gaussians += 1;
         }
-        self.record = record;
-        self.count_missing();
+        self.count_missing(device);
         Ok(report)
     }
 
     /// The [donor](donor_of) among those on the device.
-    fn donor(&self) -> Option<usize> {
-        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
-        let every = self.gaussians.div_ceil(LOOKED_AT).max(1);
-        donor_of(geometry.iter().enumerate().step_by(every).map(|(i, g)| (pull_of(g), i)))
+    fn donor(&self, device: &Device) -> Option<usize> {
+        let every = self.gaussians.div_ceil(SAMPLED).max(1);
+        donor_of(self.geometry(device).iter().enumerate().step_by(every).map(|(i, g)| (pull_of(g), i)))
     }
 }
 
@@ -218,9 +220,9 @@ pub(super) fn pull_of(g: &Geometry) -> f32 {
 
 /// The Gaussian whose second moments new ones begin with: from zero, their first steps would be several times too long, as Adam no
 /// longer corrects that bias after many steps ([`Parameters::copy`](super::parameters::Parameters::copy)). Its position is
-/// [pulled](pull_of) harder than three quarters of those looked at are, as new ones are; none before the first step.
-pub(super) fn donor_of<T: Copy + Ord>(looked_at: impl Iterator<Item = (f32, T)>) -> Option<T> {
-    let mut moved: Vec<(f32, T)> = looked_at.filter(|(pull, _)| *pull > 0.0 && pull.is_finite()).collect();
+/// [pulled](pull_of) harder than three quarters of those sampled are, as new ones are; none before the first step.
+pub(super) fn donor_of<T: Copy + Ord>(sampled: impl Iterator<Item = (f32, T)>) -> Option<T> {
+    let mut moved: Vec<(f32, T)> = sampled.filter(|(pull, _)| *pull > 0.0 && pull.is_finite()).collect();
     let at = moved.len() * 3 / 4;
     (at < moved.len()).then(|| moved.select_nth_unstable_by(at, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).1.1)
 }
@@ -230,16 +232,17 @@ mod tests {
     use config::plan::{Plan, PlanRequest};
 
     use super::*;
+    use crate::fixture::Fixture;
     use crate::gpu::Gpu;
     use crate::synthetic::{cloud, photo, plain, posed, view};
 
-    fn trainer(views: u32) -> Option<Trainer> {
+    fn trainer(views: u32) -> Option<Fixture> {
         let Ok(gpu) = Gpu::open(None) else {
             println!("skipped: no Vulkan device");
             return None;
         };
         let request = PlanRequest { width: 48, height: 32, views, max_gaussians: Some(200), ..Default::default() };
-        let mut t = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap();
+        let mut t = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &plain()).unwrap();
         for k in 0..views {
             let v = view(48, 32);
             t.add_view(&posed(&v, &photo(u64::from(k), &v)), None).unwrap();
@@ -247,7 +250,7 @@ mod tests {
         Some(t)
     }
 
-    fn snapshot(t: &mut Trainer) -> GaussianCloud {
+    fn snapshot(t: &mut Fixture) -> GaussianCloud {
         let mut out = GaussianCloud::default();
         t.snapshot(&mut out).unwrap();
         out
@@ -260,7 +263,7 @@ mod tests {
         (0..6).for_each(|_| _ = t.step().unwrap());
         let before = snapshot(&mut t);
         let moments =
-            |t: &Trainer| t.parameters.geometry(&t.arena)[..80].iter().map(|g| (g.first, g.second)).collect::<Vec<_>>();
+            |t: &Fixture| t.model.geometry(&t.device)[..80].iter().map(|g| (g.first, g.second)).collect::<Vec<_>>();
         let (then, steps) = (moments(&t), t.steps());
         let mut more = cloud(2, 150, 0);
         more.means[3][1] = f32::NAN;
@@ -273,7 +276,7 @@ mod tests {
         assert_eq!(after.means[80..83], more.means[..3]);
         assert_eq!(after.means[83], more.means[4], "what is no number is left out");
         assert!(moments(&t) == then);
-        let new = t.parameters.geometry(&t.arena)[90];
+        let new = t.model.geometry(&t.device)[90];
         assert!(new.second[0][0] > 0.0 && new.first == [[0.0; 4]; 3], "the first step is of the usual length");
         // The next steps move new ones no further than the first steps of all moved the old ones.
         let first = cloud(1, 80, 0);
@@ -351,17 +354,17 @@ mod tests {
         let Some(mut t) = trainer(1) else { return };
         t.load(&cloud(1, 40, 0)).unwrap();
         (0..5).for_each(|_| _ = t.step().unwrap());
-        assert_eq!(t.spent().0, 5);
+        assert_eq!(t.schedule().spent().0, 5);
         let before = snapshot(&mut t);
-        t.renew_schedule(0.5);
-        assert_eq!((t.progress(), t.steps()), (0.5, 5));
-        t.renew_schedule(0.0);
-        assert_eq!((t.spent().0, t.steps(), t.progress()), (0, 5, 0.0));
+        t.schedule_mut().renew(0.5);
+        assert_eq!((t.schedule().progress(), t.steps()), (0.5, 5));
+        t.schedule_mut().renew(0.0);
+        assert_eq!((t.schedule().spent().0, t.steps(), t.schedule().progress()), (0, 5, 0.0));
         assert_eq!(snapshot(&mut t), before);
         t.step().unwrap();
-        assert_eq!((t.spent().0, t.steps()), (1, 6));
+        assert_eq!((t.schedule().spent().0, t.steps()), (1, 6));
         t.load(&before).unwrap();
-        assert_eq!((t.spent().0, t.steps()), (0, 0));
+        assert_eq!((t.schedule().spent().0, t.steps()), (0, 0));
     }
 
     #[test]
@@ -373,7 +376,7 @@ mod tests {
             for k in 0..4 {
                 (0..5).for_each(|_| _ = t.step().unwrap());
                 t.extend(&cloud(10 + k, 20, 0)).unwrap();
-                t.renew_schedule(0.3);
+                t.schedule_mut().renew(0.3);
             }
             (0..5).for_each(|_| _ = t.step().unwrap());
             Some(snapshot(&mut t))

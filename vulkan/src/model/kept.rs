@@ -1,11 +1,11 @@
 //! Which Gaussians of a scene are kept: those that are finite, and of more than there is room for the most important ones. Found in a
 //! few readings of the scene, in memory that does not grow with it.
 
-use super::{LoadReport, Pieces};
-use crate::trainer::TrainError;
+use super::contents::{LoadReport, Pieces};
+use crate::error::TrainError;
 use models::cloud::GaussianCloud;
 
-/// Rows of a piece that are looked at together: bounds the lists of who looks.
+/// Rows of a piece that are visited together: bounds the lists of their visitors.
 const ROWS: usize = 16 << 10;
 /// Weights are counted by half of their bits, then by the other half.
 const HALF: usize = 1 << 16;

@@ -3,7 +3,9 @@
 //! What a step computes does not depend on how many slots there are: a picture comes back as it was written, byte for byte. The
 //! order of pictures follows from the seed, so that the next one is known while a step runs, and the system reads it ahead.
 
-use super::{TrainError, Trainer};
+use super::{Picture, PictureStore};
+use crate::device::Device;
+use crate::error::TrainError;
 use crate::layout::Section;
 use config::plan::{Plan, crop_bytes, view_bytes};
 use rustix::fs::{Advice, fadvise};
@@ -11,26 +13,8 @@ use std::fs::File;
 use std::num::NonZeroU64;
 use std::os::unix::fs::FileExt;
 
-/// What a step may look at, by its index.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Picture {
-    /// A whole picture at training size.
-    View(usize),
-    /// A crop of a larger one.
-    Crop(usize),
-}
-
-impl std::fmt::Display for Picture {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::View(index) => write!(f, "view {index}"),
-            Self::Crop(index) => write!(f, "crop {index}"),
-        }
-    }
-}
-
 /// The slots and the file behind them.
-pub(crate) struct Slots {
+pub(super) struct Slots {
     held: Vec<Held>,
     /// Uses of any slot so far.
     uses: u64,
@@ -56,7 +40,7 @@ impl Slots {
     }
 
     /// The slot of `picture`, and whether its pixels are there; where they are not, the slot unused for longest is now its.
-    fn claim(&mut self, picture: Picture) -> (usize, bool) {
+    pub fn claim(&mut self, picture: Picture) -> (usize, bool) {
         self.uses += 1;
         let there = self.held.iter().position(|held| held.picture == Some(picture));
         let oldest = || (0..self.held.len()).min_by_key(|&slot| self.held[slot].last_use).unwrap_or(0);
@@ -75,12 +59,12 @@ impl Slots {
     }
 
     /// Nothing is in `slot` that could be used.
-    fn give_up(&mut self, slot: usize) {
+    fn vacate(&mut self, slot: usize) {
         self.held[slot] = Held::default();
     }
 
     fn file(&self) -> Result<&File, TrainError> {
-        self.file.as_ref().ok_or_else(|| TrainError::ViewFile("none was given; call Trainer::keep_views_in".into()))
+        self.file.as_ref().ok_or_else(|| TrainError::ViewFile("none was given; call PictureStore::keep_in".into()))
     }
 }
 
@@ -88,34 +72,29 @@ fn failed(picture: Picture, e: std::io::Error) -> TrainError {
     TrainError::ViewFile(format!("{picture}: {e}"))
 }
 
-impl Trainer {
+impl PictureStore {
     /// Keeps the views and crops that find no slot on the device in `file`, empty and with room for
     /// [`config::plan::PlanRequest::view_file_bytes`]. Call it before the first view where the plan holds fewer slots than those.
-    pub fn keep_views_in(&mut self, file: File) {
+    pub fn keep_in(&mut self, file: File) {
         self.slots.file = Some(file);
     }
 
     /// Views and crops read back from the file so far.
-    pub fn views_read_back(&self) -> u64 {
+    pub fn read_back(&self) -> u64 {
         self.slots.read_back
     }
 
-    /// A slot for a new picture.
-    pub(super) fn slot_for_new(&mut self, picture: Picture) -> usize {
-        self.slots.claim(picture).0
-    }
-
     /// The slot of a picture, read back from the file when it is not on the device. The device must be idle.
-    pub(super) fn resident(&mut self, picture: Picture) -> Result<usize, TrainError> {
+    pub(crate) fn resident(&mut self, device: &mut Device, picture: Picture) -> Result<usize, TrainError> {
         let (slot, there) = self.slots.claim(picture);
         if !there {
             let _phase = tracing::trace_span!("read view", %picture).entered();
-            let section = self.pixels_in(slot, picture);
+            let section = self.pixels_in(device, slot, picture);
             let (at, _) = self.slots.record(picture);
-            let bytes = self.arena.slice_mut::<u8>(section);
+            let bytes = device.arena.slice_mut::<u8>(section);
             let read = self.slots.file().and_then(|f| f.read_exact_at(bytes, at).map_err(|e| failed(picture, e)));
             if let Err(e) = read {
-                self.slots.give_up(slot);
+                self.slots.vacate(slot);
                 return Err(e);
             }
             self.slots.read_back += 1;
@@ -124,20 +103,20 @@ impl Trainer {
     }
 
     /// Writes a picture's slot to the file, where there is not a slot for every picture.
-    pub(super) fn keep(&mut self, slot: usize, picture: Picture) -> Result<(), TrainError> {
+    pub(super) fn keep(&mut self, device: &Device, slot: usize, picture: Picture) -> Result<(), TrainError> {
         if self.plan.view_slots >= self.plan.views + self.plan.crops {
             return Ok(());
         }
         let (at, _) = self.slots.record(picture);
-        let bytes = self.arena.slice::<u8>(self.pixels_in(slot, picture));
+        let bytes = device.arena.slice::<u8>(self.pixels_in(device, slot, picture));
         let kept = self.slots.file().and_then(|f| f.write_all_at(bytes, at).map_err(|e| failed(picture, e)));
-        kept.inspect_err(|_| self.slots.give_up(slot))
+        kept.inspect_err(|_| self.slots.vacate(slot))
     }
 
     /// Has the system read the picture that comes next.
-    pub(super) fn read_ahead(&self) {
+    pub(crate) fn read_ahead(&self, next: Option<Picture>) {
         let slots = &self.slots;
-        if let (Some(file), Some(next)) = (&slots.file, self.next_picture())
+        if let (Some(file), Some(next)) = (&slots.file, next)
             && !slots.held.iter().any(|held| held.picture == Some(next))
         {
             let (at, bytes) = slots.record(next);
@@ -147,13 +126,13 @@ impl Trainer {
     }
 
     /// What a picture takes of its slot.
-    pub(super) fn pixels_in(&self, slot: usize, picture: Picture) -> Section {
+    pub(super) fn pixels_in(&self, device: &Device, slot: usize, picture: Picture) -> Section {
         let of = |width: u32, height: u32| u64::from(width) * u64::from(height);
         let bytes = match picture {
             Picture::View(index) => view_bytes(of(self.views[index].width, self.views[index].height)),
             Picture::Crop(index) => crop_bytes(of(self.crops[index].width, self.crops[index].height)),
         };
-        Section { bytes, ..self.arena.view_slot(&self.plan, slot) }
+        Section { bytes, ..device.arena.view_slot(&self.plan, slot) }
     }
 }
 
@@ -174,11 +153,11 @@ mod tests {
             [view(0), view(8), crop(0), crop(1)].map(|p| slots.record(p)),
             [(0, 512), (8 * 512, 512), (9 * 512, 256), (9 * 512 + 256, 256)]
         );
-        slots.give_up(0);
+        slots.vacate(0);
         assert_eq!(
             (slots.claim(view(3)), slots.claim(view(1))),
             ((0, false), (1, true)),
-            "what was given up goes first"
+            "what was vacated goes first"
         );
     }
 }

@@ -1,10 +1,11 @@
 //! Cells of ground on the device: how far a Gaussian reaches, and where in a picture a cell may show.
 
 use glam::{Vec2, Vec3};
+use models::camera::View;
 
 use crate::constants::{ALPHA_MIN, LOW_PASS};
 use crate::layout::{FLAG_ORTHOGRAPHIC, Frame};
-use crate::trainer::parameters::Geometry;
+use crate::model::parameters::Geometry;
 
 /// Rounding of the bounds below: a hundredth of a pixel, as `project` adds, and as much again.
 const ROUNDING_PX: f32 = 0.02;
@@ -103,8 +104,20 @@ pub(crate) struct Sight {
 }
 
 impl Sight {
-    /// Of the picture that `frame` looks at: its window of so many pixels from `origin` on.
-    pub fn new(frame: &Frame, origin: [u32; 2], size: [u32; 2]) -> Self {
+    /// Of a whole picture.
+    pub fn of(camera: &View) -> Self {
+        let mut frame: Frame = bytemuck::Zeroable::zeroed();
+        frame.look(camera);
+        Self::new(&frame, [0, 0], frame.size)
+    }
+
+    /// Of the region that `frame` shows.
+    pub fn of_region(frame: &Frame) -> Self {
+        Self::new(frame, frame.region_origin, frame.region)
+    }
+
+    /// Of a window of so many pixels from `origin` on of the picture that `frame` shows.
+    fn new(frame: &Frame, origin: [u32; 2], size: [u32; 2]) -> Self {
         let row = |i: usize| Vec3::from_slice(&frame.view_rows[i][..3]);
         let perspective = !frame.has(FLAG_ORTHOGRAPHIC);
         let edge = |axis: usize, block: usize| {

@@ -1,30 +1,30 @@
 //! Which cells are on the device, for how long, and which parts of which pictures are trained meanwhile.
 //!
-//! A window [begins](super::begin) with a part of a picture that was looked at least, and the cells which that part sees. Where it lasts
+//! A window [begins](super::begin) with a part of a picture that was visited least, and the cells which that part sees. Where it lasts
 //! for one update, cells stay beside those for as long as there is room, as the next window may want them. Where it lasts for several,
 //! the nearest cells come, too: the same ground, seen from many places, and of every picture the largest rectangle is trained that sees
 //! no cell which is away meanwhile.
 
 use config::plan::Plan;
-use config::training::Strategy;
 use glam::Vec2;
 use rand::Rng;
 use std::ops::Range;
 
+use super::Cell;
 use super::cell::{Blocks, SIDE, Sight};
 use super::parts::largest_rectangle;
-use super::{Cell, Scene};
-use crate::trainer::slots::Picture;
-use crate::trainer::{TrainError, Trainer};
+use crate::error::TrainError;
+use crate::pictures::sampler::Sampler;
+use crate::pictures::{Picture, PictureStore};
 
 /// Blocks of a picture.
 pub(super) const BLOCKS: usize = SIDE as usize * SIDE as usize;
 /// A sixteenth of a picture is worth an update; what the window began with always is.
 const LEAST_BLOCKS: u32 = 4;
-/// The chance of a block that was looked at least.
-const LEAST_SEEN: u64 = 1 << 20;
-/// How much the chance of a block shrinks with each look more than that, in powers of two.
-const SEEN_SHIFT: u32 = 3;
+/// The chance of a block that was visited least.
+const MOST_CHANCE: u64 = 1 << 20;
+/// How much the chance of a block shrinks with each visit more than that, in powers of two.
+const VISIT_SHIFT: u32 = 3;
 /// Where several updates share a window, the part that it begins with sees such a share of what the device holds: most of the room is left
 /// to the ground around, which other pictures see from elsewhere.
 const FIRST_SHARE: usize = 4;
@@ -40,21 +40,39 @@ struct Item {
     weight: u32,
 }
 
+/// By what a window is chosen.
+pub(crate) struct Choice<'a> {
+    pub pictures: &'a PictureStore,
+    pub sampler: &'a mut Sampler,
+    /// Gaussians that a window may begin with.
+    pub capacity: usize,
+    /// Updates that it lasts.
+    pub updates: u32,
+    /// Whether the next update visits a crop.
+    pub crops_due: bool,
+}
+
+impl Choice<'_> {
+    pub(super) fn sight_of(&self, picture: Picture) -> Sight {
+        Sight::of(&self.pictures.camera(picture))
+    }
+}
+
 /// The cells at work and what is trained with them.
 pub(crate) struct Window {
     /// By index, in order.
-    cells: Vec<u32>,
+    pub cells: Vec<u32>,
     wanted: Vec<bool>,
     /// Gaussians of the cells wanted.
     held: usize,
     items: Vec<Item>,
     /// Nothing was trained yet: the part that the window began with comes first.
     first: bool,
-    /// The fewest looks at any block.
-    least_looks: u32,
+    /// The fewest visits to any block.
+    least_visits: u32,
     /// The update after which it ends.
     pub until: u32,
-    /// Updates that looked at each block of each view.
+    /// Updates that visited each block of each view.
     pub(super) visits: Vec<u32>,
     sights: Vec<Sight>,
     by_distance: Vec<(f32, u32)>,
@@ -71,7 +89,7 @@ impl Window {
             held: 0,
             items: Vec::with_capacity(views + crops + 1),
             first: false,
-            least_looks: 0,
+            least_visits: 0,
             until: 0,
             visits: vec![0; views * BLOCKS],
             sights: Vec::with_capacity(views + crops),
@@ -93,17 +111,17 @@ impl Window {
         self.visits.iter_mut().filter(|visits| **visits == NEVER).for_each(|visits| *visits = 0);
     }
 
-    /// How likely an item is chosen: by its blocks, each the less the oftener it was looked at.
+    /// How likely an item is chosen: by its blocks, each the less the oftener it was visited.
     fn chance(&self, item: &Item) -> u64 {
         let Picture::View(view) = item.picture else { return item.weight.into() };
         let visits = self.visits[view * BLOCKS..(view + 1) * BLOCKS].iter().enumerate();
         let part = visits.filter(|(block, visits)| item.part.mask() >> block & 1 == 1 && **visits != NEVER);
-        let shift = |visits: u32| (SEEN_SHIFT * visits.saturating_sub(self.least_looks)).min(LEAST_SEEN.ilog2());
+        let shift = |visits: u32| (VISIT_SHIFT * visits.saturating_sub(self.least_visits)).min(MOST_CHANCE.ilog2());
         // An update on a large part is worth more than one on each of its blocks.
-        u64::from(item.part.count()) * part.map(|(_, visits)| LEAST_SEEN >> shift(*visits)).sum::<u64>()
+        u64::from(item.part.count()) * part.map(|(_, visits)| MOST_CHANCE >> shift(*visits)).sum::<u64>()
     }
 
-    /// Blocks of `views`, of those that were looked at least, by chance; `None` when none can be.
+    /// Blocks of `views`, of those that were visited least, by chance; `None` when none can be.
     pub(super) fn least_visited<const N: usize>(
         &self,
         views: Range<usize>,
@@ -129,112 +147,52 @@ impl Window {
     }
 }
 
-impl Trainer {
-    /// Has the cells of a window on the device: the present one's, or those of the next when it is over.
-    pub(in crate::trainer) fn hold_window(&mut self, progress: f32) -> Result<(), TrainError> {
-        self.end_drawing()?;
-        if !self.window_ends() {
-            return Ok(());
+impl Window {
+    /// The cells of the next window, and what is trained with them.
+    pub fn choose(&mut self, cells: &[Cell], mut by: Choice<'_>) -> Result<(), TrainError> {
+        let (capacity, updates) = (by.capacity, by.updates as usize);
+        let first = capacity / updates.clamp(1, FIRST_SHARE);
+        let crop = if by.crops_due { self.begin_with_crop(cells, &mut by, first) } else { None };
+        let (picture, part) = match crop {
+            Some(first) => first,
+            None => self.begin_with_view(cells, &mut by, first)?,
+        };
+        self.begin(cells, picture, part);
+        self.fill_up(cells, capacity, updates > 1);
+        if updates > 1 {
+            self.sights.clear();
+            self.sights.extend(by.pictures.all().map(|picture| by.sight_of(picture)));
+            self.choose_items(cells, by.pictures.len());
         }
-        self.end_window()?;
-        self.choose_cells(progress)?;
-        let cells = std::mem::take(&mut self.scene.window.cells);
-        let done = self.exchange(&cells);
-        self.scene.window.cells = cells;
-        done?;
-        self.scene.window.until = self.updates + self.settings.cells.updates;
-        self.counters.windows += 1;
+        let blocks: u32 = self.items.iter().map(|item| item.part.count()).sum();
+        let (cells, parts) = (self.cells.len(), self.items.len());
+        tracing::debug!(cells, gaussians = self.held, parts, blocks, "window of cells");
         Ok(())
     }
 
-    /// Counts to their cells again what a window that is over moved.
-    pub(super) fn end_window(&mut self) -> Result<(), TrainError> {
-        if self.gaussians == 0 || !self.window_ends() {
-            return Ok(());
-        }
-        self.settle_in_cells()
-    }
-
-    /// What the next update looks at, and which part of it.
-    pub(in crate::trainer) fn choose_part(&mut self, progress: f32) -> (Picture, Blocks) {
-        let crops_due = self.settings.crops.is_due(self.updates, progress);
-        let (window, rng) = (&mut self.scene.window, self.sampler.rng());
+    /// What the next update visits, and which part of it.
+    pub fn next_part(&mut self, crops_due: bool, rng: &mut impl Rng) -> (Picture, Blocks) {
         let is_crop = |item: &Item| matches!(item.picture, Picture::Crop(_));
-        let crops = crops_due && !window.first && window.items.iter().any(is_crop);
-        let of_kind = || window.items.iter().filter(|item| is_crop(item) == crops);
-        let all: u64 = of_kind().map(|item| window.chance(item)).sum();
-        let mut drawn = if window.first { 0 } else { rng.random_range(0..all.max(1)) };
-        let mut chosen = window.items[0];
+        let crops = crops_due && !self.first && self.items.iter().any(is_crop);
+        let of_kind = || self.items.iter().filter(|item| is_crop(item) == crops);
+        let all: u64 = of_kind().map(|item| self.chance(item)).sum();
+        let mut drawn = if self.first { 0 } else { rng.random_range(0..all.max(1)) };
+        let mut chosen = self.items[0];
         for item in of_kind() {
             chosen = *item;
-            let chance = window.chance(item);
-            if drawn < chance || window.first {
+            let chance = self.chance(item);
+            if drawn < chance || self.first {
                 break;
             }
             drawn -= chance;
         }
-        window.first = false;
+        self.first = false;
         if let Picture::View(view) = chosen.picture {
-            window.look_at(view, chosen.part);
+            self.count_visit(view, chosen.part);
         }
         (chosen.picture, chosen.part)
     }
 
-    /// Where each view, and behind them each crop, looks.
-    fn look_around(&mut self) {
-        self.scene.window.sights.clear();
-        let crops = (0..self.crops.len()).map(Picture::Crop);
-        for picture in (0..self.views.len()).map(Picture::View).chain(crops) {
-            let sight = self.sight_of(picture);
-            self.scene.window.sights.push(sight);
-        }
-    }
-
-    pub(super) fn sight_of(&mut self, picture: Picture) -> Sight {
-        let view = match picture {
-            Picture::View(view) => self.views[view].view,
-            Picture::Crop(crop) => self.crops[crop].seen_from(&self.views[self.crops[crop].view].view),
-        };
-        self.frame.flags = 0;
-        self.frame.look(&view);
-        Sight::new(&self.frame, [0, 0], self.frame.size)
-    }
-
-    /// Gaussians that a window begins with: all that the device holds, but for those that densification adds to them.
-    fn window_capacity(&self) -> usize {
-        let d = &self.settings.density;
-        let grows = self.strategy == Strategy::Relocate && self.progress() < d.until;
-        let most = self.plan.gaussians;
-        if grows { (most as f32 / (1.0 + d.growth)) as usize } else { most }
-    }
-
-    /// The cells of the next window, and what is trained with them.
-    fn choose_cells(&mut self, progress: f32) -> Result<(), TrainError> {
-        let (capacity, views, updates) =
-            (self.window_capacity(), self.views.len(), self.settings.cells.updates as usize);
-        let first = capacity / updates.clamp(1, FIRST_SHARE);
-        let crop = if self.settings.crops.is_due(self.updates, progress) { self.begin_with_crop(first) } else { None };
-        let (picture, part) = match crop {
-            Some(first) => first,
-            None => self.begin_with_view(first, capacity)?,
-        };
-        let Scene { window, cells, .. } = &mut self.scene;
-        window.begin(cells, picture, part);
-        window.fill_up(cells, capacity, updates > 1);
-        if updates > 1 {
-            self.look_around();
-            let Scene { window, cells, .. } = &mut self.scene;
-            window.choose_items(cells, views);
-        }
-        let window = &self.scene.window;
-        let blocks: u32 = window.items.iter().map(|item| item.part.count()).sum();
-        let (cells, parts) = (window.cells.len(), window.items.len());
-        tracing::debug!(cells, gaussians = window.held, parts, blocks, "window of cells");
-        Ok(())
-    }
-}
-
-impl Window {
     /// Wants the cells that show in a part of the picture that was [grown around](super::parts::grown_around) last: it is trained first.
     fn begin(&mut self, cells: &[Cell], picture: Picture, part: Blocks) {
         let Self { wanted, shown, items, held, .. } = self;
@@ -250,11 +208,11 @@ impl Window {
         self.first = true;
     }
 
-    /// Counts a look at a part of a view.
-    fn look_at(&mut self, view: usize, part: Blocks) {
+    /// Counts a visit to a part of a view.
+    fn count_visit(&mut self, view: usize, part: Blocks) {
         let (mask, visits) = (part.mask(), &mut self.visits[view * BLOCKS..(view + 1) * BLOCKS]);
-        let looked_at = visits.iter_mut().enumerate().filter(|(block, v)| mask >> block & 1 == 1 && **v != NEVER);
-        looked_at.for_each(|(_, visits)| *visits += 1);
+        let visited = visits.iter_mut().enumerate().filter(|(block, v)| mask >> block & 1 == 1 && **v != NEVER);
+        visited.for_each(|(_, visits)| *visits += 1);
     }
 
     /// The nearest cells for as long as there is room, by their nearest edge: a rectangle of a picture needs the large Gaussians, too,
@@ -306,7 +264,7 @@ impl Window {
                 self.items.push(Item { picture, part, weight });
             }
         }
-        self.least_looks = self.visits[..views * BLOCKS].iter().copied().min().unwrap_or(0);
+        self.least_visits = self.visits[..views * BLOCKS].iter().copied().min().unwrap_or(0);
     }
 }
 
@@ -318,11 +276,12 @@ mod tests {
     use rand_pcg::Pcg64Mcg;
 
     use super::*;
+    use crate::fixture::Fixture;
     use crate::gpu::Gpu;
     use crate::synthetic::{cloud, photo, plain, posed, view};
 
     #[test]
-    fn a_window_begins_where_pictures_were_looked_at_least() {
+    fn a_window_begins_where_pictures_were_visited_least() {
         let request =
             PlanRequest { views: 2, max_gaussians: Some(256), scene_gaussians: Some(1000), ..Default::default() };
         let mut window = Window::new(&Plan::new(&request).unwrap());
@@ -350,20 +309,18 @@ mod tests {
             let mut settings = plain();
             settings.resolution =
                 ResolutionSettings { quarter_until: 0.0, half_until, least_side: 1, ..Default::default() };
-            let mut t = Trainer::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
+            let mut t = Fixture::new(&gpu, &Plan::new(&request).unwrap(), &settings).unwrap();
             t.load(&cloud(1, 64, 0)).unwrap();
             t.add_view(&picture, None).unwrap();
-            let (chosen, first_pixel, _) = t.prepare_frame(Picture::View(0), part, 0.0);
-            t.write_frame();
-            t.forward_count(Picture::View(0), first_pixel).unwrap();
+            let chosen = t.project_part(part);
             let ((x, width), (y, height)) =
                 (Blocks::pixels(part.x, 70 / divisor), Blocks::pixels(part.y, 49 / divisor));
-            assert_eq!((chosen, t.frame.size), (divisor, [width, height]));
+            assert_eq!((chosen, t.device.frame.size), (divisor, [width, height]));
             assert_eq!(
-                t.frame.principal_point,
+                t.device.frame.principal_point,
                 [v.intrinsics.cx / divisor as f32 - x as f32, v.intrinsics.cy / divisor as f32 - y as f32]
             );
-            let words = t.arena.copied::<[u32; 2]>(t.arena.section("target"));
+            let words = t.device.arena.copied::<[u32; 2]>(t.device.arena.section("target"));
             for (i, [word, _]) in words[..(width * height) as usize].iter().enumerate() {
                 let (left, top) = (divisor * (x + i as u32 % width), divisor * (y + i as u32 / width));
                 let block =

@@ -8,14 +8,15 @@
 mod amend;
 mod begin;
 mod cell;
-mod drawing;
-mod growth;
 mod page;
 mod parts;
 mod store;
 mod window;
 
 pub(crate) use cell::Blocks;
+pub(super) use cell::Sight;
+pub(super) use page::Places;
+pub(crate) use window::Choice;
 
 use cell::Bounds;
 use config::plan::Plan;
@@ -26,11 +27,13 @@ use std::collections::BTreeMap;
 use store::{Chain, Store};
 use window::Window;
 
-use super::load::Kept;
+use super::kept::Kept;
 use super::parameters::Geometry;
-use super::{TrainError, Trainer};
+use crate::error::TrainError;
+use crate::pictures::Picture;
+use rand::Rng;
 
-/// Means by which the scene's extent is measured ([`config::training::scene_extent`] looks at no more).
+/// Means by which the scene's extent is measured ([`config::training::scene_extent`] takes no more).
 const SAMPLED_MEANS: usize = 4096;
 /// Share of the ground that is left out on each side when the size of cells is chosen: strays.
 const STRAY_SHARE: f32 = 0.02;
@@ -48,18 +51,18 @@ const WIDER: f32 = 1.2;
 type Visit<'a, E> = &'a dyn Fn(&mut dyn FnMut(&Geometry)) -> Result<(), E>;
 
 /// One cell.
-struct Cell {
+pub(super) struct Cell {
     key: CellKey,
-    bounds: Bounds,
+    pub bounds: Bounds,
     /// Gaussians.
-    count: usize,
+    pub count: usize,
     /// Where its Gaussians lie in the file, or lay before they came to the device.
     chain: Chain,
-    on_device: bool,
+    pub on_device: bool,
     /// Of the window: on the device but while something is drawn.
-    at_work: bool,
+    pub at_work: bool,
     /// A copy of it is on the device, to be drawn.
-    copied: bool,
+    pub copied: bool,
 }
 
 impl Cell {
@@ -80,10 +83,10 @@ impl Cell {
 pub(crate) struct Scene {
     grid: Grid,
     /// By key; none while all Gaussians are on the device.
-    cells: Vec<Cell>,
-    store: Store,
+    pub(super) cells: Vec<Cell>,
+    pub store: Store,
     /// The cell of each Gaussian on the device.
-    tags: Vec<u32>,
+    pub(super) tags: Vec<u32>,
     /// Gaussians on the device by cell.
     order: Vec<u32>,
     /// Where in `order` each cell begins, and in the end where it ends.
@@ -93,14 +96,14 @@ pub(crate) struct Scene {
     /// While something is drawn: the cell of each Gaussian of the window, as `tags` will have it again.
     window_tags: Vec<u32>,
     /// The device holds copies that are drawn.
-    drawing: bool,
+    pub(super) drawing: bool,
     /// Gaussians that are not on the device.
     pub away: usize,
     /// Every Gaussian is where the cells say: false from when the file fails while cells are moved until the next load.
     whole: bool,
-    window: Window,
+    pub(super) window: Window,
     /// Cells that a rendering sees.
-    drawn: Vec<u32>,
+    pub(super) drawn: Vec<u32>,
     /// Some means of all cells.
     means: Vec<[f32; 3]>,
 }
@@ -136,6 +139,16 @@ impl Scene {
         &self.means
     }
 
+    /// Cells, and how many of them are on the device.
+    pub fn cells(&self) -> (usize, usize) {
+        (self.cells.len(), self.cells.iter().filter(|c| c.on_device).count())
+    }
+
+    /// What the next update visits, and which part of it.
+    pub fn next_part(&mut self, crops_due: bool, rng: &mut impl Rng) -> (Picture, Blocks) {
+        self.window.next_part(crops_due, rng)
+    }
+
     /// All Gaussians are on the device from here on.
     pub fn close(&mut self) {
         self.cells.clear();
@@ -167,6 +180,21 @@ impl Scene {
             return Err(e);
         }
         self.away = n;
+        Ok(())
+    }
+
+    /// Puts Gaussians, all of which are on the device, into cells, of which there are enough for as many as the scene may come to hold.
+    pub fn enclose(&mut self, plan: &Plan, settings: &TrainSettings, geometry: &[Geometry]) -> Result<(), TrainError> {
+        self.close();
+        self.divide::<TrainError>(plan, settings, [geometry.len(), plan.scene], &|see| {
+            geometry.iter().for_each(see);
+            Ok(())
+        })?;
+        for g in geometry {
+            let cell = self.cell_of(g).ok_or(TrainError::SceneChanged)?;
+            self.tags.push(cell as u32);
+        }
+        self.cells.iter_mut().for_each(|cell| cell.on_device = true);
         Ok(())
     }
 
@@ -317,17 +345,4 @@ impl Scene {
 /// What cells are made by.
 fn geometry_of(cloud: &GaussianCloud, row: usize) -> Geometry {
     Geometry { mean: cloud.means[row], log_scale: cloud.log_scales[row], ..bytemuck::Zeroable::zeroed() }
-}
-
-impl Trainer {
-    /// Keeps the cells that find no room on the device in `file`, empty and with room for [`Plan::scene_file_bytes`]. Call it before
-    /// [`Trainer::load`] where the plan holds fewer Gaussians than the scene.
-    pub fn keep_scene_in(&mut self, file: std::fs::File) {
-        self.scene.store.keep_in(file);
-    }
-
-    /// Cells of ground, and how many of them are on the device; (0, 0) while all Gaussians are.
-    pub fn cells(&self) -> (usize, usize) {
-        (self.scene.cells.len(), self.scene.cells.iter().filter(|c| c.on_device).count())
-    }
 }

@@ -1,7 +1,7 @@
 //! Gaussians in and out of the arena: the only place that knows how their parameters lie in memory.
 
 use super::moments::{HEAVY, ShMoments};
-use super::{Trainer, state};
+use super::state;
 use crate::arena::Arena;
 use crate::layout::Section;
 use config::plan::Plan;
@@ -175,7 +175,7 @@ impl Parameters {
     }
 
     /// Holds Gaussian `index` where it is.
-    fn hold(&self, arena: &mut Arena, index: usize) {
+    pub fn hold(&self, arena: &mut Arena, index: usize) {
         self.geometry_mut(arena)[index].hold();
         self.sh_second.fill(arena, index);
     }
@@ -189,25 +189,13 @@ impl Parameters {
 }
 
 /// An empty cloud of `degree` that keeps its memory.
-pub(super) fn clear(cloud: &mut GaussianCloud, degree: u8) {
+pub(crate) fn clear(cloud: &mut GaussianCloud, degree: u8) {
     cloud.sh_degree = degree;
     cloud.means.clear();
     cloud.log_scales.clear();
     cloud.rotations.clear();
     cloud.opacity_logits.clear();
     cloud.sh.clear();
-}
-
-impl Trainer {
-    /// Holds the Gaussians just loaded for which `is_held(row of the cloud)` says so: they are drawn and blended, and the others are
-    /// trained as if they could not move. Adam does it, by second moments that no gradient comes near: what is held moves by
-    /// less than rounding shows, but for numbers that are nearly zero. Until the next [`Trainer::load`]; only for a scene that is
-    /// on the device as a whole, of which no row was left out.
-    pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
-        for index in (0..self.gaussians).filter(|i| is_held(*i)) {
-            self.parameters.hold(&mut self.arena, index);
-        }
-    }
 }
 
 /// A record of Gaussian `from` with its first `coefficients` numbers of SH, without moments.

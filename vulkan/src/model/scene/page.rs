@@ -6,20 +6,21 @@
 use super::cell::{self, Bounds};
 use super::{Cell, Scene};
 use crate::arena::Arena;
-use crate::trainer::parameters::{Held, Parameters};
-use crate::trainer::{TrainError, Trainer, state};
+use crate::error::TrainError;
+use crate::model::parameters::{Held, Parameters};
+use crate::model::state;
 
-/// The device's memory while cells come and go.
-pub(super) struct Device<'a> {
-    arena: &'a mut Arena,
-    parameters: Parameters,
+/// The Gaussians' places in the arena while cells come and go.
+pub(in crate::model) struct Places<'a> {
+    pub arena: &'a mut Arena,
+    pub parameters: Parameters,
     /// Updates so far.
-    updates: u32,
+    pub updates: u32,
     /// The SH degree that all Gaussians have, where they have one.
-    degree: Option<u8>,
+    pub degree: Option<u8>,
 }
 
-impl Device<'_> {
+impl Places<'_> {
     /// Copies Gaussian `index` to a record. Its state says there how many steps it missed: while it is away it misses none.
     fn page_out(&self, index: usize, record: &mut [u8]) {
         self.parameters.read_record(self.arena, index, record);
@@ -110,7 +111,7 @@ impl Scene {
     }
 
     /// Counts those that left their cell, or outgrew it, to another; while there is room for one more it may be a new one.
-    fn count_to_cells_again(&mut self, arena: &Arena, parameters: &Parameters) {
+    pub(in crate::model) fn count_to_cells_again(&mut self, arena: &Arena, parameters: &Parameters) {
         for (i, g) in parameters.geometry(arena)[..self.tags.len()].iter().enumerate() {
             let (home, reach) = (self.cells[self.tags[i] as usize].key, cell::reach_of(g));
             if self.grid.holds(home, g.mean, reach) || !g.is_finite() {
@@ -124,7 +125,11 @@ impl Scene {
     }
 
     /// Writes those to the file whose cell does not stay; their places are holes then.
-    fn leave(&mut self, device: &Device<'_>, stays: impl Fn(&Cell) -> bool) -> Result<(), TrainError> {
+    pub(in crate::model) fn leave(
+        &mut self,
+        places: &Places<'_>,
+        stays: impl Fn(&Cell) -> bool,
+    ) -> Result<(), TrainError> {
         self.check_whole()?;
         self.sort_by_cell();
         self.whole = false;
@@ -136,7 +141,7 @@ impl Scene {
             let run = run_of(&order[from..], tags, index);
             let cell = &mut cells[index as usize];
             if !stays(cell) {
-                store.append(&mut cell.chain, run.len(), |i, record| device.page_out(run[i] as usize, record))?;
+                store.append(&mut cell.chain, run.len(), |i, record| places.page_out(run[i] as usize, record))?;
                 holes.extend_from_slice(run);
             }
             from += run.len();
@@ -150,7 +155,7 @@ impl Scene {
 
     /// Pages the cells at work in: into the holes, then behind the others. Whoever is last comes to the holes
     /// that are left.
-    fn come(&mut self, device: &mut Device<'_>) -> Result<(), TrainError> {
+    pub(in crate::model) fn come(&mut self, places: &mut Places<'_>) -> Result<(), TrainError> {
         self.check_whole()?;
         self.whole = false;
         let mut filled = 0;
@@ -158,7 +163,7 @@ impl Scene {
         for (index, cell) in cells.iter_mut().enumerate().filter(|(_, cell)| cell.at_work && !cell.on_device) {
             store.read(&cell.chain, |_, record| {
                 let place = holes.get(filled).map_or(tags.len(), |hole| *hole as usize);
-                device.page_in(place, record);
+                places.page_in(place, record);
                 match tags.get_mut(place) {
                     Some(tag) => *tag = index as u32,
                     None => tags.push(index as u32),
@@ -171,19 +176,19 @@ impl Scene {
             cell.on_device = true;
         }
         let left = filled.min(holes.len());
-        self.close_up(device, left);
+        self.close_up(places, left);
         self.whole = true;
         Ok(())
     }
 
     /// The last ones come to the holes, but for the first `filled` of them.
-    fn close_up(&mut self, device: &mut Device<'_>, filled: usize) {
+    pub(in crate::model) fn close_up(&mut self, places: &mut Places<'_>, filled: usize) {
         for hole in self.holes.drain(filled..).rev() {
             let hole = hole as usize;
             let Some(last) = self.tags.pop() else { break };
             if let Some(tag) = self.tags.get_mut(hole) {
                 *tag = last;
-                device.parameters.shift(device.arena, self.tags.len(), hole);
+                places.parameters.shift(places.arena, self.tags.len(), hole);
             }
         }
         self.holes.clear();
@@ -191,9 +196,9 @@ impl Scene {
 
     /// Pages the window out, remembers where each of it was, and pages copies of the cells `drawn`, by index and in order,
     /// there instead.
-    fn draw_instead(&mut self, device: &mut Device<'_>, drawn: &[u32]) -> Result<(), TrainError> {
+    pub(in crate::model) fn draw_instead(&mut self, places: &mut Places<'_>, drawn: &[u32]) -> Result<(), TrainError> {
         if !self.drawing {
-            self.leave(device, |_| false)?;
+            self.leave(places, |_| false)?;
             std::mem::swap(&mut self.tags, &mut self.window_tags);
             self.drawing = true;
         }
@@ -202,9 +207,9 @@ impl Scene {
         for &index in drawn {
             let (n, cell) = (tags.len(), &mut cells[index as usize]);
             store.read(&cell.chain, |i, record| {
-                device.page_in(n + i, record);
+                places.page_in(n + i, record);
                 // What it missed it still has to do: here it is drawn as it is.
-                device.up_to_date(n + i);
+                places.up_to_date(n + i);
                 Ok::<(), TrainError>(())
             })?;
             tags.resize(n + cell.chain.count as usize, index);
@@ -221,7 +226,7 @@ impl Scene {
     }
 
     /// Puts the window back to where each of it was.
-    fn end_drawing(&mut self, device: &mut Device<'_>) -> Result<(), TrainError> {
+    pub(in crate::model) fn end_drawing(&mut self, places: &mut Places<'_>) -> Result<(), TrainError> {
         self.check_whole()?;
         self.forget_copies();
         self.whole = false;
@@ -235,7 +240,7 @@ impl Scene {
             let run = run_of(&order[from..], tags, index);
             let cell = &mut cells[index as usize];
             store.read(&cell.chain, |i, record| {
-                device.page_in(run[i] as usize, record);
+                places.page_in(run[i] as usize, record);
                 Ok::<(), TrainError>(())
             })?;
             store.forget(&mut cell.chain);
@@ -253,65 +258,4 @@ impl Scene {
 fn run_of<'a>(order: &'a [u32], tags: &[u32], index: u32) -> &'a [u32] {
     let end = order.iter().position(|i| tags[*i as usize] != index).unwrap_or(order.len());
     &order[..end]
-}
-
-impl Trainer {
-    /// Moves cells, and counts what was moved.
-    pub(super) fn page(
-        &mut self,
-        how: impl FnOnce(&mut Scene, Device<'_>) -> Result<(), TrainError>,
-    ) -> Result<(), TrainError> {
-        let _phase = tracing::trace_span!("page").entered();
-        let moved = self.scene.store.moved;
-        let degree = (self.settings.sh.raise_share >= 1.0).then_some(self.plan.sh_degree);
-        let arena = &mut self.arena;
-        let device = Device { arena, parameters: self.parameters, updates: self.updates, degree };
-        let done = how(&mut self.scene, device);
-        self.counters.paged_bytes += self.scene.store.moved - moved;
-        self.gaussians = self.scene.tags.len();
-        done
-    }
-
-    /// Pages all out; no window is at work.
-    pub(super) fn page_out(&mut self) -> Result<(), TrainError> {
-        self.page(|scene, device| {
-            scene.leave(&device, |_| false)?;
-            scene.tags.clear();
-            Ok(())
-        })
-    }
-
-    /// Those that left their cell for one that is away leave the device, too.
-    pub(super) fn settle_in_cells(&mut self) -> Result<(), TrainError> {
-        self.page(|scene, mut device| {
-            scene.count_to_cells_again(device.arena, &device.parameters);
-            scene.measure(device.arena, &device.parameters);
-            scene.leave(&device, |cell| cell.on_device)?;
-            scene.close_up(&mut device, 0);
-            Ok(())
-        })
-    }
-
-    /// Has the cells `wanted`, by index, on the device instead of those that are there.
-    pub(super) fn exchange(&mut self, wanted: &[u32]) -> Result<(), TrainError> {
-        self.page(|scene, mut device| {
-            scene.cells.iter_mut().for_each(|cell| cell.at_work = false);
-            wanted.iter().for_each(|index| scene.cells[*index as usize].at_work = true);
-            scene.leave(&device, |cell| cell.at_work)?;
-            scene.come(&mut device)
-        })
-    }
-
-    /// Has copies of the cells `drawn`, by index and in order, on the device while something is drawn.
-    pub(super) fn draw_instead(&mut self, drawn: &[u32]) -> Result<(), TrainError> {
-        self.page(|scene, mut device| scene.draw_instead(&mut device, drawn))
-    }
-
-    /// Has the window back that was on the device before something was drawn.
-    pub(super) fn end_drawing(&mut self) -> Result<(), TrainError> {
-        if !self.scene.drawing {
-            return Ok(());
-        }
-        self.page(|scene, mut device| scene.end_drawing(&mut device))
-    }
 }

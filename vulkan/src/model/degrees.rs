@@ -2,22 +2,23 @@
 //! raised, one degree at a time, where the residual asks for it: where a Gaussian's colour is pulled one way by some
 //! views and another way by others.
 
-use super::parameters::Parameters;
+use super::parameters::{Geometry, Parameters};
 use super::state::{degree_of, with_degree};
-use super::{TrainError, Trainer};
 use crate::arena::Arena;
+use crate::device::Device;
+use config::plan::Plan;
 use models::cloud::sh_coefficients;
 
 /// Progress from which the next raise is due, one after the other.
 const OCCASIONS: [f32; 6] = [0.05, 0.1, 0.2, 0.3, 0.4, 0.5];
 
 /// Room for the ranking, allocated once, and how many raises are over.
-pub(crate) struct Degrees {
+pub(super) struct Degrees {
     asks: Vec<f32>,
     ranked: Vec<f32>,
     raises: usize,
     /// Coefficients (of three numbers) that Gaussians could have and have not.
-    missing: u64,
+    pub missing: u64,
 }
 
 impl Degrees {
@@ -30,35 +31,34 @@ impl Degrees {
     }
 }
 
-impl Trainer {
-    /// Before the first step: where degrees are not raised by residual, every Gaussian has the highest at once.
-    pub(super) fn open_degrees(&mut self) {
-        if self.settings.sh.raise_share >= 1.0 {
-            let degree = self.plan.sh_degree;
-            for g in &mut self.parameters.geometry_mut(&mut self.arena)[..self.gaussians] {
-                g.state = with_degree(g.state, degree);
-            }
-        }
-        self.count_missing();
+/// What a raise goes by.
+pub(super) struct Asking {
+    /// Gaussians on the device.
+    pub of: usize,
+    /// Share of them that is raised at most.
+    pub share: f32,
+    /// The highest degree.
+    pub limit: u8,
+    /// What first and second moments are multiplied by.
+    pub unbias: [f32; 2],
+}
+
+impl Degrees {
+    /// Whether an occasion has come since the last raise; it is taken then.
+    pub fn is_due(&mut self, progress: f32) -> bool {
+        let due = OCCASIONS.iter().take_while(|p| progress >= **p).count();
+        let is_due = due > self.raises;
+        self.raises = due.max(self.raises);
+        is_due
     }
 
-    /// Raises the degree of those that ask most, when an occasion has come.
-    pub(super) fn raise_degrees(&mut self, progress: f32) -> Result<(), TrainError> {
-        let share = self.settings.sh.raise_share;
-        let due = OCCASIONS.iter().take_while(|p| progress >= **p).count();
-        if share >= 1.0 || due <= self.degrees.raises {
-            return Ok(());
-        }
-        self.degrees.raises = due;
-        self.flush()?;
-        let limit = self.settings.sh.degree.min(self.plan.sh_degree);
-        let (n, parameters, t) = (self.gaussians, self.parameters, self.updates as i32);
-        let unbias = |beta: f32| 1.0 / (1.0 - f64::from(beta).powi(t)) as f32;
-        let (first, second) = (unbias(self.settings.adam.beta1), unbias(self.settings.adam.beta2));
-        let Degrees { asks, ranked, .. } = &mut self.degrees;
+    /// Raises the degree of those that ask most; returns of how many.
+    pub fn raise(&mut self, device: &mut Device, parameters: &Parameters, asking: &Asking) -> u64 {
+        let Self { asks, ranked, .. } = self;
+        let Asking { of: n, share, limit, unbias } = *asking;
         asks.clear();
-        let scale = self.frame.moment_scale;
-        asks.extend((0..n).map(|i| ask(&self.arena, &parameters, i, limit, scale, [first, second])));
+        let scale = device.frame.moment_scale;
+        asks.extend((0..n).map(|i| ask(&device.arena, parameters, i, limit, scale, unbias)));
         ranked.clear();
         ranked.extend_from_slice(asks);
         let raised = ((n as f32 * share) as usize).min(n.saturating_sub(1));
@@ -66,26 +66,18 @@ impl Trainer {
         // No one is raised for asking more than others where all ask about the same.
         let mean = asks.iter().map(|a| f64::from(*a)).sum::<f64>() / n.max(1) as f64;
         let least = least.max(mean as f32);
-        for index in 0..n {
-            if self.degrees.asks[index] > least {
-                raise(&mut self.arena, &parameters, index);
-                self.counters.sh_raised += 1;
-            }
+        let mut count = 0;
+        for index in (0..n).filter(|index| asks[*index] > least) {
+            raise(&mut device.arena, parameters, index);
+            count += 1;
         }
-        self.count_missing();
-        Ok(())
+        count
     }
 
-    pub(super) fn count_missing(&mut self) {
-        let most = sh_coefficients(self.plan.sh_degree);
-        let geometry = &self.parameters.geometry(&self.arena)[..self.gaussians];
+    pub fn count_missing(&mut self, geometry: &[Geometry], plan: &Plan) {
+        let most = sh_coefficients(plan.sh_degree);
         let missing = |state: f32| (most - sh_coefficients(degree_of(state)).min(most)) as u64;
-        self.degrees.missing = geometry.iter().map(|g| missing(g.state)).sum();
-    }
-
-    /// Coefficients that a step does not touch, because no Gaussian has them.
-    pub(super) fn missing_coefficients(&self) -> u64 {
-        self.degrees.missing
+        self.missing = geometry.iter().map(|g| missing(g.state)).sum();
     }
 }
 
