@@ -12,7 +12,7 @@ mod scene;
 mod state;
 
 pub use amend::{BoundingBox, Fate, Trained};
-pub use contents::{LoadReport, Pieces};
+pub use kept::{LoadReport, Pieces};
 pub(crate) use parameters::{Geometry, clear};
 pub(crate) use scene::{Blocks, Choice};
 

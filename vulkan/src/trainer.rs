@@ -272,7 +272,7 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
     pub fn each(&mut self, within: &BoundingBox, see: impl FnMut(&Trained)) -> Result<(), TrainError> {
-        let unbias = self.second_unbias();
+        let unbias = self.schedule.second_unbias(self.settings.adam.beta2);
         self.model.each(&mut self.device, within, unbias, see)
     }
 
@@ -282,7 +282,7 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::Gpu`], [`TrainError::SceneFile`].
     pub fn revise(&mut self, within: &BoundingBox, fate: impl FnMut(&Trained) -> Fate) -> Result<usize, TrainError> {
-        let unbias = self.second_unbias();
+        let unbias = self.schedule.second_unbias(self.settings.adam.beta2);
         self.model.revise(&mut self.device, within, unbias, fate)
     }
 
@@ -350,11 +350,5 @@ impl Trainer {
     ) -> Result<(), TrainError> {
         let sh_degree = self.settings.sh.degree_at(1.0).min(self.plan().sh_degree);
         render::Drawing { device: &mut self.device, model: &mut self.model, into }.draw(size, sh_degree, look)
-    }
-
-    /// What Adam multiplies second moments by, which begin at zero.
-    fn second_unbias(&self) -> f32 {
-        let steps = self.schedule.taken().max(1) as i32;
-        (1.0 / (1.0 - f64::from(self.settings.adam.beta2).powi(steps))) as f32
     }
 }

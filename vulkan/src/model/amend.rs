@@ -1,7 +1,7 @@
 //! A scene that grows while it is trained: Gaussians of new ground come to those there are, and others move or go, while all that
 //! nobody touches keeps its place, its moments and its part of the schedule.
 
-use super::contents::LoadReport;
+use super::kept::LoadReport;
 use super::parameters::{Geometry, LEAST_LEFT, record_of};
 use super::{Model, common_degree, state};
 use crate::device::Device;

@@ -1,7 +1,7 @@
 //! A scene into the model and out of it: as a whole, or piece by piece, where it is larger than the host's memory.
 
 use super::Model;
-use super::kept::Kept;
+use super::kept::{Kept, LoadReport, Pieces};
 use super::parameters::{Held, blend_record, clear, push_record, record_of};
 use crate::device::Device;
 use crate::error::TrainError;
@@ -9,23 +9,8 @@ use config::plan::Plan;
 use config::training::TrainSettings;
 use models::cloud::{GaussianCloud, sh_coefficients};
 
-/// Reads a scene from its beginning to its end and gives it away in pieces, whole Gaussians each. It is called as often as the scene has
-/// to be visited and must give the same Gaussians in the same order every time.
-pub type Pieces<'a, E> = &'a dyn Fn(&mut dyn FnMut(&GaussianCloud) -> Result<(), E>) -> Result<(), E>;
-
 /// Gaussians of a piece.
 const PIECE: usize = 16 << 10;
-
-/// What became of a cloud's Gaussians.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct LoadReport {
-    /// Gaussians now trained.
-    pub loaded: usize,
-    /// Those with numbers that are not finite or a quaternion that cannot be normalised.
-    pub dropped_non_finite: usize,
-    /// Those beyond the plan's capacity; the least important (opacity × area) made way.
-    pub dropped_over_capacity: usize,
-}
 
 impl Model {
     /// Replaces the Gaussians by those of `pieces` that are finite, and of more than the plan has room for by the most important.

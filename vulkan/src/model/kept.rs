@@ -1,9 +1,23 @@
 //! Which Gaussians of a scene are kept: those that are finite, and of more than there is room for the most important ones. Found in a
 //! few readings of the scene, in memory that does not grow with it.
 
-use super::contents::{LoadReport, Pieces};
 use crate::error::TrainError;
 use models::cloud::GaussianCloud;
+
+/// Reads a scene from its beginning to its end and gives it away in pieces, whole Gaussians each. It is called as often as the scene has
+/// to be visited and must give the same Gaussians in the same order every time.
+pub type Pieces<'a, E> = &'a dyn Fn(&mut dyn FnMut(&GaussianCloud) -> Result<(), E>) -> Result<(), E>;
+
+/// What became of a cloud's Gaussians.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LoadReport {
+    /// Gaussians now trained.
+    pub loaded: usize,
+    /// Those with numbers that are not finite or a quaternion that cannot be normalised.
+    pub dropped_non_finite: usize,
+    /// Those beyond the plan's capacity; the least important (opacity × area) made way.
+    pub dropped_over_capacity: usize,
+}
 
 /// Rows of a piece that are visited together: bounds the lists of their visitors.
 const ROWS: usize = 16 << 10;

@@ -57,6 +57,18 @@ impl Schedule {
         self.visited as u32
     }
 
+    /// Number of the present update, by which Adam corrects the bias of its moments. Gaussians are updated as often in so many steps
+    /// whether pictures are visited whole or in parts.
+    pub(crate) fn adam_step(&self) -> u32 {
+        self.taken() + 1
+    }
+
+    /// What Adam multiplies second moments by, which begin at zero.
+    pub(crate) fn second_unbias(&self, beta2: f32) -> f32 {
+        let steps = self.taken().max(1) as i32;
+        (1.0 / (1.0 - f64::from(beta2).powi(steps))) as f32
+    }
+
     /// Seconds of training since the Gaussians were loaded.
     pub fn elapsed_s(&self) -> f64 {
         self.elapsed_s

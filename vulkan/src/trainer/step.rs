@@ -56,7 +56,7 @@ impl Trainer {
         self.device.differentiate(by)?;
         self.device.time_all();
         let decay = self.settings.rates.decay(visit.progress);
-        self.model.stepped(self.adam_step(), self.device.frame.mean_rate, decay);
+        self.model.stepped(self.schedule.adam_step(), self.device.frame.mean_rate, decay);
         self.schedule.spend(framed.share, start.elapsed().as_secs_f64());
         let mut report = self.learn(pictures, visit, by, counted);
         self.device.arena.failure()?;
@@ -130,7 +130,7 @@ impl Trainer {
         (lens.cx, lens.cy, lens.width, lens.height) = (lens.cx - x as f32, lens.cy - y as f32, width, height);
         // View dependence costs nothing where views are visited too seldom to be learnt by heart.
         let dependent = self.schedule.visits_each(pictures.len(), s.loss.view_dependence_visits);
-        let (t, extent) = (self.adam_step(), self.model.extent);
+        let (t, extent) = (self.schedule.adam_step(), self.model.extent);
         let plan = self.device.plan();
         let (sh_degree, moment_scale) = (s.sh.degree_at(progress).min(plan.sh_degree), plan.moment_scale());
         let f = &mut *self.device.frame;
@@ -172,12 +172,6 @@ impl Trainer {
         (f.l1_weight, f.ssim_weight) = (s.loss.l1 / (3.0 * whole), s.loss.ssim / (3.0 * whole));
         (f.source_width, f.depth_offset) = (source_width, depth_at);
         Framed { divisor, first_pixel: (y * source_width + x) * divisor, share: pixels_share }
-    }
-
-    /// Of the present update, as Adam corrects the bias of its moments by it. Gaussians are updated as often in so many steps whether
-    /// pictures are visited whole or in parts.
-    fn adam_step(&self) -> u32 {
-        self.schedule.taken() + 1
     }
 
     /// Sums the partial losses in a fixed order, moves pose and exposure, and makes the report.
