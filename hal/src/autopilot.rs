@@ -3,6 +3,7 @@
 
 pub mod landing;
 mod motion;
+mod mounts;
 mod timing;
 mod triggers;
 
@@ -27,6 +28,8 @@ use crate::trigger::Trigger;
 
 use landing::Landing;
 use motion::Motion;
+pub use mounts::Gimbal;
+use mounts::Mounts;
 use triggers::Announcements;
 
 /// Senders of one system whose sequence is watched: autopilot, gimbal, cameras.
@@ -83,6 +86,7 @@ pub struct Autopilot {
     unix: UnixMap,
     track: Track,
     motion: Motion,
+    mounts: Mounts,
     announcements: Announcements,
     asked_ns: Option<i64>,
     answers: Deque<TIMESYNC_DATA, ANSWERS>,
@@ -102,6 +106,7 @@ impl Autopilot {
             unix: UnixMap::default(),
             track: Track::default(),
             motion: Motion::default(),
+            mounts: Mounts::default(),
             announcements: Announcements::default(),
             asked_ns: None,
             answers: Deque::new(),
@@ -116,6 +121,17 @@ impl Autopilot {
     pub fn continued(mut self, standing_ns: u64) -> Self {
         self.landing = Landing::continued(standing_ns);
         self
+    }
+
+    /// Only the gimbal with this device id is believed; 0 takes the first one.
+    pub fn with_gimbal(mut self, device: u8) -> Self {
+        self.mounts = Mounts::of(device);
+        self
+    }
+
+    /// The gimbal that is believed, and those that are left out.
+    pub fn gimbals(&self) -> (Option<Gimbal>, &[Gimbal]) {
+        self.mounts.chosen()
     }
 
     /// Who is listened to; `system` is 0 until one was heard when it is to be learnt.
@@ -215,8 +231,12 @@ impl Autopilot {
         let sequence = frame.sequence();
         match self.sequences.get_mut(&frame.component()) {
             Some(last) => {
-                self.counters.lost += u64::from(sequence.wrapping_sub(*last).wrapping_sub(1));
-                *last = sequence;
+                // The same again, or one that was overtaken, is no loss of 250.
+                let step = sequence.wrapping_sub(*last);
+                if (1..=128).contains(&step) {
+                    self.counters.lost += u64::from(step - 1);
+                    *last = sequence;
+                }
             }
             // A ninth sender goes unwatched.
             None => drop(self.sequences.insert(frame.component(), sequence)),
@@ -225,8 +245,8 @@ impl Autopilot {
 
     /// What was taken so far came from somebody else.
     pub fn start_afresh(&mut self) {
-        let (ids, counters) = (self.ids, self.counters);
-        *self = Self { counters, ..Self::new(ids) };
+        let (ids, counters, mounts) = (self.ids, self.counters, self.mounts.forgotten());
+        *self = Self { counters, mounts, ..Self::new(ids) };
     }
 
     /// The boot clock restarted: what was known on the old one means nothing any more.

@@ -112,6 +112,7 @@ mod tests {
             cy: 1.0,
             distortion: [0.0; 4],
             exposure_delay_ms: 0.0,
+            index: None,
         };
         let error = AnyCamera::open(&CameraSource::V4l2("/dev/video0".into()), &lens, None).err().expect("refused");
         assert!(error.to_string().starts_with("camera /dev/video0: built without v4l2"), "{error}");

@@ -14,7 +14,7 @@ pub struct HalCounters {
     pub unknown: u64,
     /// Frames missing by the autopilot's sequence counter.
     pub lost: u64,
-    /// Frames of other systems.
+    /// Frames of other systems, and of gimbals and cameras that are not the one whose pictures come.
     pub foreign: u64,
     /// Frames of peers that are not the pinned autopilot.
     pub refused_peers: u64,

@@ -12,7 +12,7 @@ pub mod reconcile;
 use heapless::{Deque, HistoryBuf};
 
 use crate::traits::PictureClues;
-use crate::trigger::Trigger;
+use crate::trigger::{Source, Trigger};
 use clues::{Choice, Learnt, WITNESSES};
 
 /// Exposures waiting for their picture.
@@ -134,6 +134,25 @@ impl<P> Matcher<P> {
         let evicted = if self.triggers.is_full() { self.triggers.pop_front() } else { None };
         let _ = self.triggers.push_back(trigger);
         evicted.map(|trigger| Outcome::Trigger { trigger, reason: Reason::Overflow })
+    }
+
+    /// Takes out the exposures of all cameras but this one, and what was learnt from them.
+    pub fn keep_only(&mut self, source: Source) {
+        let others = self.triggers.iter().any(|t| t.source != source);
+        for _ in 0..self.triggers.len() {
+            if let Some(trigger) = self.triggers.pop_front().filter(|t| t.source == source) {
+                let _ = self.triggers.push_back(trigger);
+            }
+        }
+        if others {
+            self.learnt = Learnt::new(self.settings.latency_ns);
+            (self.newest_matched, self.given_up) = (None, None);
+        }
+    }
+
+    /// Whether this exposure waits for its picture.
+    pub fn awaits(&self, trigger: &Trigger) -> bool {
+        self.triggers.iter().any(|t| t == trigger)
     }
 
     /// Adds a complete picture; returns the oldest one when there is no more room.

@@ -2,6 +2,7 @@
 //! exposures and posed pictures in order, on the companion's clock, in East-North-Up metres; everything lost on the way is
 //! counted and named.
 
+mod cameras;
 mod event;
 mod exposures;
 pub mod mount;
@@ -29,6 +30,7 @@ use crate::mavlink::dialect::MavSeverity;
 use crate::peer::{Peers, Verdict};
 use crate::time::MonotonicClock;
 use crate::traits::{Camera, Clock, Link, LinkState, TriggerSource};
+use cameras::{Cameras, Passage};
 use exposures::{Exposures, PendingPicture};
 use mount::Mount;
 use service::Service;
@@ -118,9 +120,10 @@ where
             autopilot: match settings.pictures_since {
                 Some(_) => Autopilot::new(ids).continued(ns(settings.link.standing_limit_s)),
                 None => Autopilot::new(ids),
-            },
+            }
+            .with_gimbal(settings.mount.gimbal),
             matcher: Matcher::new(matching),
-            exposures: Exposures::default(),
+            exposures: Exposures::new(Cameras::new(settings.lens.index, matching.patience_ns)),
             pending: VecDeque::with_capacity(PENDING),
             mount: Mount::new(&settings.mount, EnuFrame::new(settings.origin)),
             service,
@@ -273,6 +276,7 @@ where
             replayed: wire.replayed,
             sent: wire.sent,
             send_failed: wire.send_failed,
+            foreign: heard.foreign + own.foreign,
             triggers_unmatched: heard.triggers_unmatched + own.triggers_unmatched,
             pictures: own.pictures,
             pictures_broken: own.pictures_broken,
@@ -362,6 +366,11 @@ where
     /// Announced exposures into the matcher and the list of poses to find.
     fn take_triggers(&mut self, now_ns: u64) {
         while let Some(trigger) = self.autopilot.next_trigger() {
+            let passage = self.exposures.cameras.take_trigger(trigger);
+            if passage == Passage::Other {
+                self.counters.foreign += 1;
+                continue;
+            }
             let delay_ns = (f64::from(self.settings.lens.exposure_delay_ms) * 1e6) as i64;
             let (mid_boot_ns, awaited) = (trigger.boot_ns.saturating_add_signed(delay_ns), !self.is_free_running());
             if let Some(oldest) = self.exposures.push(trigger, mid_boot_ns, now_ns, awaited) {
@@ -371,10 +380,13 @@ where
             self.emit(Event::Trigger(trigger));
             if self.is_free_running() {
                 self.service.make_due();
-            } else if let Some(outcome) = self.matcher.push_trigger(trigger) {
+            } else if passage == Passage::Through(trigger)
+                && let Some(outcome) = self.matcher.push_trigger(trigger)
+            {
                 self.take_outcome(outcome);
             }
         }
+        self.service.name_gimbals(&self.autopilot, self.settings.mount.gimbal);
     }
 }
 

@@ -124,7 +124,7 @@ proptest! {
         };
         for (i, t) in exposures.iter().enumerate() {
             let time_ns = t * S;
-            let trigger = Trigger { sequence: i as u32, boot_ns: time_ns, time_ns, sigma_ns: 1, kind: TriggerKind::Feedback };
+            let trigger = Trigger { source: Default::default(), sequence: i as u32, boot_ns: time_ns, time_ns, sigma_ns: 1, kind: TriggerKind::Feedback };
             matcher.push_trigger(trigger).map(&mut take);
             while let Some(at) = pictures.first().filter(|p| p.0 <= *t).map(|p| p.0) {
                 let (_, number, camera) = pictures.remove(0);

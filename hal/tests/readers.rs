@@ -221,6 +221,7 @@ fn pixels_of_pictures() {
         cy: 6.0,
         distortion: [0.01, 0.0, 0.0, 0.0],
         exposure_delay_ms: 0.0,
+        index: None,
     };
     let picture = image::RgbImage::from_fn(16, 12, |x, y| image::Rgb([(x * 16) as u8, (y * 20) as u8, 90]));
     let encoded = |format| {

@@ -99,6 +99,7 @@ fn settings(path: &Path) -> VehicleSettings {
             cy: 240.0,
             distortion: [0.0; 4],
             exposure_delay_ms: 0.0,
+            index: None,
         },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
         origin: ORIGIN,

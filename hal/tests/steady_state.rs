@@ -51,6 +51,7 @@ fn settings() -> VehicleSettings {
             cy: 240.0,
             distortion: [0.0; 4],
             exposure_delay_ms: 0.0,
+            index: None,
         },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
         origin: Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 },

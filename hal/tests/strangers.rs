@@ -187,6 +187,7 @@ fn settings() -> VehicleSettings {
         cy: 240.0,
         distortion: [0.0; 4],
         exposure_delay_ms: 0.0,
+        index: None,
     };
     VehicleSettings {
         address: LinkAddress::UdpIn("0.0.0.0:14550".into()),

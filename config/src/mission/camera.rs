@@ -30,6 +30,10 @@ record! {
         /// the end of a picture, so that it is negative there.
         #[serde(default)]
         pub exposure_delay_ms: f32 = 0.0, in Limits::within(-10_000.0, 10_000.0);
+        /// Which of the aircraft's cameras takes the pictures, as the autopilot numbers them (`cam_idx` of CAMERA_FEEDBACK, counted
+        /// from 0, `camera_id` of CAMERA_IMAGE_CAPTURED); not said = the one whose exposures fit the pictures.
+        #[serde(default)]
+        pub index: Option<u8> = None;
     }
 }
 
@@ -54,6 +58,8 @@ table! {
         pub rotation_deg: [f32; 3] = [0.0; 3];
         /// Camera centre in the body, forward, left, up of the position the autopilot reports.
         pub lever_arm_m: [f32; 3] = [0.0; 3];
+        /// Device id of the gimbal that carries the camera (1 to 6 on the autopilot, else its component); 0 = the lowest heard.
+        pub gimbal: u8 = 0, in Limits::within(0.0, 255.0);
         /// Exposures are left out when the optical axis is further than this from where the mount points it on a level airframe
         /// (ArduPilot's "trigger immediately" fires while the aircraft banks); 180 = never.
         pub max_tilt_deg: f32 = 50.0, in Limits::above(0.0).up_to(180.0),

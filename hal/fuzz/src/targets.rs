@@ -179,7 +179,14 @@ pub fn match_up(data: &[u8]) {
         given += 1;
         if event[9] & 1 == 0 {
             let (sequence, kind) = (u32::from(event[10]), TriggerKind::Feedback);
-            let trigger = Trigger { sequence, boot_ns: number(4) << 16, time_ns: about_ns, sigma_ns: 1, kind };
+            let trigger = Trigger {
+                source: Default::default(),
+                sequence,
+                boot_ns: number(4) << 16,
+                time_ns: about_ns,
+                sigma_ns: 1,
+                kind,
+            };
             matcher.push_trigger(trigger).map(&mut count);
         } else {
             let clues = PictureClues {
@@ -209,7 +216,14 @@ pub fn reconcile_all(data: &[u8]) {
         let wide = |at: usize| number(at) << (item[15] % 33);
         if item[14] & 1 == 0 {
             let (sequence, kind) = (number(0) as u32 >> (item[13] % 32), TriggerKind::Feedback);
-            exposures.push(Trigger { sequence, boot_ns: wide(4), time_ns: wide(8), sigma_ns: 1, kind });
+            exposures.push(Trigger {
+                source: Default::default(),
+                sequence,
+                boot_ns: wide(4),
+                time_ns: wide(8),
+                sigma_ns: 1,
+                kind,
+            });
         } else {
             pictures.push(PictureClues {
                 arrived_ns: wide(8) << 1,

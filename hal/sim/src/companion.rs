@@ -58,6 +58,7 @@ pub fn accompany<R: Send>(
                 cy: 24.0,
                 distortion: [0.0; 4],
                 exposure_delay_ms: 0.0,
+                index: None,
             },
             mount: MountSettings::default(),
             origin,

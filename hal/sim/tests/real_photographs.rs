@@ -31,6 +31,7 @@ const LENS: CameraSettings = CameraSettings {
     cy: 240.5,
     distortion: [0.0; 4],
     exposure_delay_ms: 0.0,
+    index: None,
 };
 
 /// The data set's folder, if the shared data is there.

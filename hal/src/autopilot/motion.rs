@@ -4,6 +4,7 @@
 use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DQuat, DVec3};
 
+use super::mounts::{Believed, Gimbal};
 use super::{Autopilot, Handled};
 use crate::frames::{euler_to_ned, ned_to_enu};
 use crate::mavlink::Frame;
@@ -161,6 +162,15 @@ impl Autopilot {
                 None => return,
             }
         };
+        let gimbal = Gimbal::new(frame.component(), m.gimbal_device_id, self.ids.autopilot);
+        match self.mounts.hear(gimbal) {
+            Believed::Yes => {}
+            Believed::Instead => self.track.clear_gimbals(),
+            Believed::No => {
+                self.counters.foreign += 1;
+                return;
+            }
+        }
         let has = |flag| m.flags.contains(flag);
         let yaw_in_vehicle_frame = if has(GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME) {
             true

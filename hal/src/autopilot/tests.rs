@@ -7,7 +7,7 @@ use super::*;
 use crate::frames::euler_to_ned;
 use crate::mavlink::dialect::{GimbalDeviceFlags, GpsFixType, MavBool, MavFrame};
 use crate::mavlink::{Encoder, Framer};
-use crate::trigger::TriggerKind;
+use crate::trigger::{Source, TriggerKind};
 
 const S: u64 = 1_000_000_000;
 const HOME: Geodetic = Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 200.0 };
@@ -258,4 +258,143 @@ fn other_systems_and_our_own_echo_are_ignored_and_a_timesync_is_answered() {
     assert_eq!((answer.ts1, answer.tc1), (77, h.now_ns as i64));
     h.handle(&TIMESYNC_DATA { tc1: 0, ts1: 78, target_system: 1, target_component: 50 });
     assert_eq!(h.autopilot.next_answer(), None);
+}
+
+fn announced(h: &mut Wire) -> std::vec::Vec<(u8, u32, u64)> {
+    let all = core::iter::from_fn(|| h.autopilot.next_trigger());
+    all.map(|t| (t.source.camera, t.sequence, t.boot_ns / 1_000_000)).collect()
+}
+
+#[test]
+fn two_cameras_of_one_autopilot_count_for_themselves() {
+    let mut h = Wire::new();
+    h.fly(10_000, 12_000);
+    for (cam_idx, img_idx, ms) in [(0, 1, 11_000), (1, 4, 11_000), (0, 2, 11_500), (1, 5, 11_500), (1, 6, 11_900)] {
+        h.handle(&CAMERA_FEEDBACK_DATA { cam_idx, img_idx, time_usec: ms * 1000, ..Default::default() });
+    }
+    let expected = [(0, 1, 11_000), (1, 4, 11_000), (0, 2, 11_500), (1, 5, 11_500), (1, 6, 11_900)];
+    assert_eq!(announced(&mut h), expected);
+    assert_eq!((h.counters().trigger_gaps, h.counters().trigger_duplicates), (0, 0));
+}
+
+#[test]
+fn a_duplicate_is_the_same_in_time_place_and_number_and_a_counter_may_stand_still_or_start_anew() {
+    let mut h = Wire::new();
+    h.fly(10_000, 16_000);
+    // Never counts; told twice; starts anew in mid-flight; overtaken on the way.
+    for (img_idx, ms) in [(0, 11_000), (0, 12_000), (0, 12_000), (7, 13_000), (8, 13_500), (1, 14_000), (2, 14_500)] {
+        h.handle(&CAMERA_FEEDBACK_DATA { img_idx, time_usec: ms * 1000, ..Default::default() });
+    }
+    h.handle(&CAMERA_FEEDBACK_DATA { img_idx: 4, time_usec: 15_500_000, ..Default::default() });
+    h.handle(&CAMERA_FEEDBACK_DATA { img_idx: 3, time_usec: 15_000_000, ..Default::default() });
+    let all = announced(&mut h);
+    let times: std::vec::Vec<u64> = all.iter().map(|t| t.2).collect();
+    assert_eq!(times, [11_000, 12_000, 13_000, 13_500, 14_000, 14_500, 15_500, 15_000]);
+    let mut numbers: std::vec::Vec<u32> = all.iter().map(|t| t.1).collect();
+    assert_eq!(numbers[7] + 1, numbers[6], "the one that was overtaken comes before");
+    numbers.sort_unstable();
+    numbers.dedup();
+    assert_eq!((numbers.len(), h.counters().trigger_duplicates), (8, 1), "no number twice");
+}
+
+#[test]
+fn exposures_without_any_time_are_counted_as_they_come() {
+    let mut h = Wire::new();
+    h.fly(10_000, 11_000);
+    for k in 0..5u16 {
+        h.fly(11_000 + u32::from(k) * 1000, 12_000 + u32::from(k) * 1000);
+        h.handle(&CAMERA_FEEDBACK_DATA { img_idx: 0, ..Default::default() });
+        h.handle(&CAMERA_FEEDBACK_DATA { img_idx: 0, ..Default::default() });
+    }
+    let all = announced(&mut h);
+    assert!(all.len() == 5 && all.windows(2).all(|w| w[1].2 - w[0].2 > 900 && w[1].1 > w[0].1), "{all:?}");
+    assert_eq!(h.counters().trigger_duplicates, 5, "each came twice");
+}
+
+#[test]
+fn doubled_and_reordered_frames_are_no_losses() {
+    let mut h = Wire::new();
+    let encoded: std::vec::Vec<std::vec::Vec<u8>> = (0..100)
+        .map(|ms| h.encoder.encode(&SYSTEM_TIME_DATA { time_boot_ms: ms, ..Default::default() }, None).to_vec())
+        .collect();
+    for k in 0..100usize {
+        // Each twice, neighbours exchanged, one of the hundred lost.
+        if k ^ 1 != 50 {
+            for _ in 0..2 {
+                let mut framer = Framer::new();
+                framer.push(&encoded[k ^ 1]);
+                h.autopilot.handle(&framer.next_frame().expect("a frame"), h.now_ns);
+            }
+        }
+    }
+    assert!(h.counters().lost <= 51, "{}", h.counters().lost);
+}
+
+/// What is said of a gimbal: sender, device, pitch.
+fn gimbal(h: &mut Wire, component: u8, gimbal_device_id: u8, time_boot_ms: u32, pitch: f64) {
+    let q = euler_to_ned(0.0, pitch, 0.0);
+    let own = core::mem::replace(&mut h.encoder, Encoder::new(1, component));
+    h.handle(&GIMBAL_DEVICE_ATTITUDE_STATUS_DATA {
+        time_boot_ms,
+        gimbal_device_id,
+        q: [q.w as f32, q.x as f32, q.y as f32, q.z as f32],
+        flags: GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_PITCH_LOCK,
+        delta_yaw: f32::NAN,
+        ..Default::default()
+    });
+    h.encoder = own;
+}
+
+#[test]
+fn two_mounts_are_never_interpolated_into_each_other() {
+    let down = -core::f64::consts::FRAC_PI_2;
+    for (wanted, order, expected) in [(0, [1, 2], down), (0, [2, 1], down), (2, [1, 2], 0.0), (1, [2, 1], down)] {
+        let mut h = Wire::new();
+        h.autopilot = Autopilot::new(h.autopilot.ids()).with_gimbal(wanted);
+        h.fly(10_000, 11_000);
+        for time_boot_ms in (11_000..12_000).step_by(100) {
+            h.fly(time_boot_ms, time_boot_ms + 100);
+            for (k, device) in order.into_iter().enumerate() {
+                gimbal(&mut h, 1, device, time_boot_ms + 60 + k as u32, if device == 1 { down } else { 0.0 });
+            }
+        }
+        let at = h.autopilot.pose_at(11_700 * 1_000_000).expect("a pose").gimbal.expect("reported") * DVec3::X;
+        assert!((at.z - expected.sin()).abs() < 1e-6, "mission {wanted}, heard {order:?}: {at}");
+        assert_eq!(h.autopilot.gimbals().1.len(), 1, "the other one is named");
+    }
+    // None is believed when the mission's is not heard.
+    let mut h = Wire::new();
+    h.autopilot = Autopilot::new(h.autopilot.ids()).with_gimbal(3);
+    gimbal(&mut h, 1, 1, 11_000, down);
+    assert_eq!((h.autopilot.gimbals().0, h.counters().gimbals, h.counters().foreign), (None, 0, 1));
+}
+
+#[test]
+fn a_mount_that_two_components_report_is_taken_from_one_of_them() {
+    let mut h = Wire::new();
+    h.fly(10_000, 11_000);
+    for time_boot_ms in (11_000..11_500).step_by(100) {
+        h.fly(time_boot_ms, time_boot_ms + 100);
+        gimbal(&mut h, 154, 0, 77_000 + time_boot_ms, -0.5);
+        gimbal(&mut h, 1, 154, time_boot_ms + 60, -0.5);
+    }
+    let (chosen, others) = h.autopilot.gimbals();
+    assert_eq!(chosen.map(|g| (g.device, g.component)), Some((154, 1)), "the autopilot's report has the track's clock");
+    assert_eq!(others.len(), 1);
+    assert_eq!(h.counters().gimbals, 6, "its first came before");
+}
+
+#[test]
+fn a_trigger_knows_its_component() {
+    let mut h = Wire::new();
+    h.fly(10_000, 11_000);
+    h.encoder = Encoder::new(1, 101);
+    h.handle(&CAMERA_IMAGE_CAPTURED_DATA {
+        image_index: 3,
+        camera_id: 2,
+        capture_result: MavBool::MAV_BOOL_TRUE,
+        ..Default::default()
+    });
+    let trigger = h.autopilot.next_trigger().expect("announced");
+    assert_eq!((trigger.source, trigger.sequence), (Source { component: 101, camera: 2 }, 3));
 }

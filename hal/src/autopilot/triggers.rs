@@ -1,11 +1,11 @@
 //! Announced exposures: three messages in three time bases, each exposure exactly once.
 
-use heapless::Deque;
+use heapless::{Deque, HistoryBuf, Vec};
 
 use super::Autopilot;
 use crate::mavlink::Frame;
 use crate::mavlink::dialect::{CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_TRIGGER_DATA, MavBool};
-use crate::trigger::{Trigger, TriggerKind};
+use crate::trigger::{Source, Trigger, TriggerKind};
 
 /// Announcements waiting to be fetched.
 const WAITING: usize = 32;
@@ -23,12 +23,39 @@ const ARRIVAL_SIGMA_NS: u64 = 50_000_000;
 /// Our own exposure waits this long for the autopilot's announcement of it.
 const OWN_WAIT_NS: u64 = 400_000_000;
 
+/// Cameras whose announcements are told apart, and announcements of each that are remembered to know one that is repeated.
+const SOURCES: usize = 8;
+const RECENT: usize = 8;
+/// An announcement without a time stamp is a repetition only when it comes this soon.
+const REPEATED_NS: u64 = 200_000_000;
+/// A counter that jumps by more than this was set anew, or is none.
+const LARGEST_GAP: i64 = 1000;
+
+/// What a message says of an exposure: the same twice is the same exposure.
+#[derive(Clone, Copy, PartialEq)]
+struct Said {
+    number: u32,
+    stamp: u64,
+    place: [i32; 3],
+}
+
+/// One camera's announcements.
+struct Heard {
+    source: Source,
+    last: Trigger,
+    last_number: u32,
+    recent: HistoryBuf<(Said, u64), RECENT>,
+}
+
 /// What is remembered between announcements.
 #[derive(Default)]
 pub(super) struct Announcements {
     waiting: Deque<Trigger, WAITING>,
+    /// The message by which the autopilot announces, and when it last did.
     believed: Option<(TriggerKind, u64)>,
-    last: Option<Trigger>,
+    /// When anybody last announced an exposure.
+    announced_ns: Option<u64>,
+    heard: Vec<Heard, SOURCES>,
     own: Option<(u32, u64)>,
 }
 
@@ -39,26 +66,30 @@ impl Announcements {
 
     /// The boot clock restarted: counters may go on, times do not compare.
     pub(super) fn clear_times(&mut self) {
-        self.last = None;
+        for heard in &mut self.heard {
+            heard.last.boot_ns = 0;
+        }
     }
 }
 
 impl Autopilot {
     pub(super) fn on_feedback(&mut self, frame: &Frame<'_>, now_ns: u64) {
         if let Some(m) = frame.message::<CAMERA_FEEDBACK_DATA>() {
-            // 16 bits on the wire; the matcher wants a counter that does not wrap.
-            let last = self.announcements.last.filter(|t| t.kind == TriggerKind::Feedback);
-            let sequence = last.map_or(m.img_idx.into(), |last| {
-                let step = m.img_idx.wrapping_sub(last.sequence as u16) as i16;
-                last.sequence.saturating_add_signed(step.into())
-            });
-            self.announce(TriggerKind::Feedback, sequence, self.place_us(m.time_usec), now_ns);
+            let said = Said {
+                number: m.img_idx.into(),
+                stamp: m.time_usec,
+                place: [m.lat, m.lng, m.alt_msl.to_bits() as i32],
+            };
+            let source = Source { component: frame.component(), camera: m.cam_idx };
+            self.announce(source, TriggerKind::Feedback, said, self.place_us(m.time_usec), now_ns);
         }
     }
 
     pub(super) fn on_camera_trigger(&mut self, frame: &Frame<'_>, now_ns: u64) {
         if let Some(m) = frame.message::<CAMERA_TRIGGER_DATA>() {
-            self.announce(TriggerKind::CameraTrigger, m.seq, self.place_us(m.time_usec), now_ns);
+            let said = Said { number: m.seq, stamp: m.time_usec, place: [0; 3] };
+            let source = Source { component: frame.component(), camera: 0 };
+            self.announce(source, TriggerKind::CameraTrigger, said, self.place_us(m.time_usec), now_ns);
         }
     }
 
@@ -68,12 +99,14 @@ impl Autopilot {
             return;
         }
         // A camera with a component of its own has a boot clock of its own, but knows Unix time.
-        let boot_ns = if frame.component() == self.ids.autopilot {
-            Some(self.stamp(m.time_boot_ms, now_ns))
+        let (stamp, boot_ns) = if frame.component() == self.ids.autopilot {
+            (m.time_boot_ms.into(), Some(self.stamp(m.time_boot_ms, now_ns)))
         } else {
-            self.place_us(m.time_utc)
+            (m.time_utc, self.place_us(m.time_utc))
         };
-        self.announce(TriggerKind::ImageCaptured, m.image_index.max(0).unsigned_abs(), boot_ns, now_ns);
+        let said = Said { number: m.image_index.max(0).unsigned_abs(), stamp, place: [m.lat, m.lon, m.alt] };
+        let source = Source { component: frame.component(), camera: m.camera_id };
+        self.announce(source, TriggerKind::ImageCaptured, said, boot_ns, now_ns);
     }
 
     /// An exposure that we made ourselves on command, at `now_ns`. The autopilot usually announces it as well, with a
@@ -90,17 +123,22 @@ impl Autopilot {
         }
         self.announcements.own = None;
         let boot_ns = self.clock.to_boot_ns(made_ns);
-        self.announce(TriggerKind::Command, sequence, boot_ns, now_ns);
+        let said = Said { number: sequence, stamp: made_ns, place: [0; 3] };
+        let source = Source { component: self.ids.autopilot, camera: 0 };
+        self.announce(source, TriggerKind::Command, said, boot_ns, now_ns);
     }
 
-    fn announce(&mut self, kind: TriggerKind, sequence: u32, boot_ns: Option<u64>, now_ns: u64) {
-        // A stamped announcement is always better than our own.
+    fn announce(&mut self, source: Source, kind: TriggerKind, said: Said, boot_ns: Option<u64>, now_ns: u64) {
+        let held = |at_ns: u64| now_ns.saturating_sub(at_ns) < HOLD_NS;
         let own = TriggerKind::Command;
-        let other = self
-            .announcements
-            .believed
-            .is_some_and(|(k, t)| k != kind && k != own && now_ns.saturating_sub(t) < HOLD_NS);
-        if other {
+        let of_autopilot = source.component == self.ids.autopilot;
+        // A stamped announcement is always better than our own.
+        let told = if kind == own {
+            self.announcements.announced_ns.is_some_and(held)
+        } else {
+            of_autopilot && self.announcements.believed.is_some_and(|(k, t)| k != kind && held(t))
+        };
+        if told {
             self.counters.trigger_duplicates += 1;
             return;
         }
@@ -108,32 +146,70 @@ impl Autopilot {
             let newest = self.boot.newest_ns().unwrap_or(*t);
             *t + MAX_PAST_NS > newest && *t < newest + MAX_FUTURE_NS
         };
-        let (boot_ns, sigma_ns) = match boot_ns.filter(plausible) {
+        let placed = boot_ns.filter(plausible);
+        let arrival = self.clock.to_boot_ns(now_ns).or(self.boot.newest_ns());
+        let (boot_ns, sigma_ns) = match placed {
             Some(boot_ns) => (boot_ns, STAMPED_SIGMA_NS),
-            None => {
-                self.counters.trigger_times_mended += 1;
-                let arrival = self.clock.to_boot_ns(now_ns).or(self.boot.newest_ns());
-                (arrival.unwrap_or(now_ns), ARRIVAL_SIGMA_NS)
-            }
+            None => (arrival.unwrap_or(now_ns), ARRIVAL_SIGMA_NS),
         };
-        if let Some(last) = self.announcements.last.filter(|t| t.kind == kind) {
-            // The counter decides; it may restart with the camera, which a later time stamp shows.
-            if sequence == last.sequence || (sequence < last.sequence && boot_ns <= last.boot_ns) {
-                self.counters.trigger_duplicates += 1;
-                return;
-            }
-            self.counters.trigger_gaps += u64::from(sequence.saturating_sub(last.sequence).saturating_sub(1).min(1000));
-        }
         let time_ns = self.clock.to_companion_ns(boot_ns).unwrap_or(now_ns);
-        let trigger = Trigger { sequence, boot_ns, time_ns, sigma_ns, kind };
-        self.announcements.believed = Some((kind, now_ns));
-        self.announcements.last = Some(trigger);
+        let mut trigger = Trigger { source, sequence: said.number, boot_ns, time_ns, sigma_ns, kind };
+        let announcements = &mut self.announcements;
+        match announcements.heard.iter_mut().find(|h| h.source == source && h.last.kind == kind) {
+            Some(heard) => {
+                let same = |(before, at): &(Said, u64)| {
+                    *before == said && (said.stamp != 0 || now_ns.saturating_sub(*at) < REPEATED_NS)
+                };
+                if heard.recent.as_slice().iter().any(same) {
+                    self.counters.trigger_duplicates += 1;
+                    return;
+                }
+                let step = if kind == TriggerKind::Feedback {
+                    // 16 bits on the wire; the matcher wants a counter that does not wrap.
+                    i64::from((said.number as u16).wrapping_sub(heard.last_number as u16) as i16)
+                } else {
+                    i64::from(said.number) - i64::from(heard.last_number)
+                };
+                let last = heard.last.sequence;
+                let earlier = placed.is_some() && boot_ns < heard.last.boot_ns;
+                let reordered = step < 0 && earlier && -step < LARGEST_GAP;
+                trigger.sequence = match step {
+                    // It was overtaken on the way.
+                    _ if reordered => last.saturating_sub(step.unsigned_abs() as u32),
+                    1..=LARGEST_GAP => last.saturating_add(step as u32),
+                    // It does not count, or counts anew: one more.
+                    _ => last.saturating_add(1),
+                };
+                heard.recent.write((said, now_ns));
+                if !reordered {
+                    self.counters.trigger_gaps += (step - 1).clamp(0, LARGEST_GAP).unsigned_abs();
+                    (heard.last, heard.last_number) = (trigger, said.number);
+                }
+            }
+            None => {
+                let mut recent = HistoryBuf::new();
+                recent.write((said, now_ns));
+                if announcements.heard.is_full() {
+                    announcements.heard.remove(0);
+                }
+                let _ = announcements.heard.push(Heard { source, last: trigger, last_number: said.number, recent });
+            }
+        }
+        if placed.is_none() {
+            self.counters.trigger_times_mended += 1;
+        }
+        if of_autopilot {
+            announcements.believed = Some((kind, now_ns));
+        }
+        if kind != own {
+            announcements.announced_ns = Some(now_ns);
+        }
         self.counters.triggers += 1;
         self.landing.on_exposure();
-        if self.announcements.waiting.is_full() {
-            self.announcements.waiting.pop_front();
+        if announcements.waiting.is_full() {
+            announcements.waiting.pop_front();
             self.counters.triggers_unmatched += 1;
         }
-        let _ = self.announcements.waiting.push_back(trigger);
+        let _ = announcements.waiting.push_back(trigger);
     }
 }

@@ -194,6 +194,7 @@ mod tests {
             cy: 4.0,
             distortion: [0.0; 4],
             exposure_delay_ms: 0.0,
+            index: None,
         };
         let mut jpeg = std::io::Cursor::new(Vec::new());
         RgbImage::new(16, 8).write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("encoded");

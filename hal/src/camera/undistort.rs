@@ -41,6 +41,7 @@ mod tests {
             cy: 50.5,
             distortion,
             exposure_delay_ms: 0.0,
+            index: None,
         };
         // p1 moves what lies right of the centre down: y = p1 r² = 0.1 · 0.25, two pixels.
         let mut image = RgbImage::new(side, side);

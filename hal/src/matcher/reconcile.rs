@@ -248,7 +248,7 @@ fn window(ballots: &[Ballot], width: i128, admitted: impl Fn(i128) -> bool) -> O
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trigger::TriggerKind;
+    use crate::trigger::{Source, TriggerKind};
 
     const S: u64 = 1_000_000_000;
 
@@ -257,6 +257,7 @@ mod tests {
         let at = |i: u32| (100 + 2 * u64::from(i) + 7 * u64::from(i / 8)) * S + u64::from(i % 3) * S / 20;
         (0..n)
             .map(|i| Trigger {
+                source: Source::default(),
                 sequence: i + 1,
                 boot_ns: at(i),
                 time_ns: at(i) - 90 * S,

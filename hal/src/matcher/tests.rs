@@ -3,14 +3,21 @@
 use std::vec::Vec;
 
 use super::*;
-use crate::trigger::TriggerKind;
+use crate::trigger::{Source, TriggerKind};
 
 const S: u64 = 1_000_000_000;
 const MS: u64 = 1_000_000;
 
 fn trigger(i: u32) -> Trigger {
     let boot_ns = (100 + 2 * u64::from(i)) * S;
-    Trigger { sequence: i, boot_ns, time_ns: boot_ns - 90 * S, sigma_ns: MS, kind: TriggerKind::Feedback }
+    Trigger {
+        sequence: i,
+        boot_ns,
+        time_ns: boot_ns - 90 * S,
+        sigma_ns: MS,
+        kind: TriggerKind::Feedback,
+        source: Source::default(),
+    }
 }
 
 /// One picture: of which exposure, at which delay, with which number.

@@ -22,6 +22,9 @@ const MAX_ATTITUDE_GAP_NS: u64 = 500_000_000;
 const MAX_GIMBAL_GAP_NS: u64 = 1_500_000_000;
 /// [`Track::pose_near`] goes this far beyond the newest sample.
 pub const MAX_EXTRAPOLATION_NS: u64 = 150_000_000;
+/// No mount turns faster (DJI's gimbals: 360°/s at most), rad/s, and what noise may add, rad: a faster change is not a movement.
+const MAX_GIMBAL_TURN: f64 = 6.5;
+const GIMBAL_TURN_SLACK: f64 = 0.1;
 /// Acceleration of a survey flight that interpolation does not know about, m/s²; and angular, rad/s².
 const UNKNOWN_ACCELERATION: f64 = 2.0;
 const UNKNOWN_ANGULAR_ACCELERATION: f64 = 2.0;
@@ -59,6 +62,15 @@ pub struct GimbalSample {
     pub attitude: DQuat,
     /// Yaw is relative to the vehicle's heading, not to north.
     pub yaw_in_vehicle_frame: bool,
+}
+
+impl GimbalSample {
+    /// Whether no mount turns from this attitude to `next` in the time between.
+    fn jumps_to(&self, next: &Self) -> bool {
+        let dt_s = next.boot_ns.saturating_sub(self.boot_ns) as f64 * 1e-9;
+        self.yaw_in_vehicle_frame == next.yaw_in_vehicle_frame
+            && self.attitude.angle_between(next.attitude) > MAX_GIMBAL_TURN * dt_s + GIMBAL_TURN_SLACK
+    }
 }
 
 macro_rules! stamped {
@@ -127,6 +139,11 @@ impl Track {
         self.gimbals.clear();
     }
 
+    /// Forgets the gimbal's attitudes: another one is believed.
+    pub fn clear_gimbals(&mut self) {
+        self.gimbals.clear();
+    }
+
     /// Forgets positions: the estimator stepped.
     pub fn clear_positions(&mut self) {
         self.positions.clear();
@@ -145,6 +162,7 @@ impl Track {
         let (p, q, f) = bracket(self.positions.around(boot_ns), MAX_POSITION_GAP_NS, reach_ns)?;
         let (a, b, g) = bracket(self.attitudes.around(boot_ns), MAX_ATTITUDE_GAP_NS, reach_ns)?;
         let gimbal = match bracket(self.gimbals.around(boot_ns), MAX_GIMBAL_GAP_NS, reach_ns) {
+            Ok((c, d, _)) if c.jumps_to(&d) => None,
             Ok((c, d, h)) if c.yaw_in_vehicle_frame == d.yaw_in_vehicle_frame => {
                 Some((c, c.attitude.slerp(d.attitude, h)))
             }
@@ -268,6 +286,19 @@ mod tests {
         position.boot_ns += S;
         track.push_position(position);
         assert_eq!(track.pose_at(2 * S + S / 2), Err(PoseError::Gap));
+    }
+
+    #[test]
+    fn nothing_is_interpolated_over_a_jump_that_no_mount_makes() {
+        let looks = |pitch: f64| euler_to_ned(0.0, pitch, 0.0);
+        for (pitch, expected) in [(-1.4, true), (0.0, false)] {
+            let mut track = track();
+            for (boot_ns, pitch) in [(S + S / 2, -1.57), (S + S / 2 + S / 20, pitch)] {
+                track.push_gimbal(GimbalSample { boot_ns, attitude: looks(pitch), yaw_in_vehicle_frame: true });
+            }
+            let pose = track.pose_at(S + S / 2 + S / 40).expect("a pose");
+            assert_eq!(pose.gimbal.is_some(), expected, "to {pitch} in 50 ms");
+        }
     }
 
     #[test]

@@ -3,13 +3,14 @@
 
 use std::path::PathBuf;
 
+use super::cameras::Passage;
 use super::{CameraPose, Event, PosedPicture, Unmatched, UnmatchedReason, Vehicle};
 use crate::camera::{Picture, exif_pose};
 use crate::error::{Error, ErrorKind, HalError};
 use crate::matcher::{Outcome, Reason};
 use crate::pose::PoseError;
 use crate::traits::{Camera, Clock, Link, PictureClues, PoseSource};
-use crate::trigger::{Trigger, TriggerKind};
+use crate::trigger::{Source, Trigger, TriggerKind};
 
 mod ledger;
 
@@ -57,7 +58,10 @@ where
                     self.pictureless = 0;
                     if self.is_free_running() {
                         self.take_free_running(&clues, picture, now_ns);
-                    } else if let Some(outcome) = self.matcher.push_picture(clues, picture) {
+                    } else if let Passage::Through((clues, picture)) =
+                        self.exposures.cameras.take_picture(clues, picture)
+                        && let Some(outcome) = self.matcher.push_picture(clues, picture)
+                    {
                         self.take_outcome(outcome);
                     }
                 }
@@ -89,8 +93,8 @@ where
             return;
         };
         let sequence = u32::try_from(self.counters.pictures).unwrap_or(u32::MAX);
-        let trigger =
-            Trigger { sequence, boot_ns, time_ns, sigma_ns: FREE_RUNNING_SIGMA_NS, kind: TriggerKind::Command };
+        let (source, kind) = (Source::default(), TriggerKind::Command);
+        let trigger = Trigger { source, sequence, boot_ns, time_ns, sigma_ns: FREE_RUNNING_SIGMA_NS, kind };
         self.exposures.push(trigger, boot_ns, now_ns, false);
         self.wait_for_pose(PendingPicture { trigger, picture, confidence: 1.0 });
     }
@@ -106,6 +110,9 @@ where
                 }
                 known => Some(known),
             };
+        }
+        for outcome in self.exposures.choose_camera(&mut self.matcher, false) {
+            self.take_outcome(outcome);
         }
         while let Some(outcome) = self.matcher.poll(now_ns) {
             self.take_outcome(outcome);
@@ -128,7 +135,7 @@ where
                 aside.picture.name().display()
             );
             self.counters.pictures_reconciled += 1;
-            self.found(trigger, aside.picture, aside.clues, confidence);
+            self.found(trigger, aside.picture, aside.clues, confidence.min(self.exposures.cameras.confidence()));
         }
     }
 
@@ -149,6 +156,9 @@ where
         self.settle(now_ns);
         for exposure in self.exposures.all.iter_mut().filter(|e| e.pose.is_none()) {
             exposure.pose = Some(self.autopilot.pose_near(exposure.mid_boot_ns));
+        }
+        for outcome in self.exposures.choose_camera(&mut self.matcher, true) {
+            self.take_outcome(outcome);
         }
         while let Some(outcome) = self.matcher.flush() {
             self.take_outcome(outcome);
@@ -176,7 +186,7 @@ where
         match outcome {
             Outcome::Matched { trigger, picture, clues, late } => {
                 self.counters.pictures_late += u64::from(late);
-                self.found(trigger, picture, clues, 1.0);
+                self.found(trigger, picture, clues, self.exposures.cameras.confidence());
             }
             Outcome::Picture { picture, reason: Reason::Duplicate, .. } => {
                 self.counters.picture_duplicates += 1;

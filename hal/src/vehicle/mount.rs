@@ -122,7 +122,7 @@ mod tests {
             attitude: MountAttitude::Fixed,
             rotation_deg: [0.0, -90.0, 0.0],
             lever_arm_m: [0.3, 0.1, -0.2],
-            max_tilt_deg: 50.0,
+            ..MountSettings::default()
         };
         let mount = Mount::new(&settings, EnuFrame::new(origin));
         let body = BodyPose {

@@ -4,6 +4,7 @@
 use geometry::geodesy::{EnuFrame, Geodetic};
 
 use super::{CameraPose, Event, Vehicle, VehicleSettings};
+use crate::autopilot::{Autopilot, Gimbal};
 use crate::camera::Picture;
 use crate::error::HalError;
 use crate::mavlink::channel::Channel;
@@ -33,6 +34,7 @@ pub(super) struct Service {
     next_warning_ns: u64,
     /// Restarts and steps of the autopilot's clock that were answered with fast TIMESYNC requests.
     clock_events: u64,
+    gimbals_named: usize,
     last_free_ns: Option<u64>,
 }
 
@@ -49,6 +51,7 @@ impl Service {
             requests: 0,
             next_warning_ns: 0,
             clock_events: 0,
+            gimbals_named: 0,
             last_free_ns: None,
         };
         Ok((service, signer))
@@ -68,6 +71,24 @@ impl Service {
             self.next_warning_ns = now_ns + WARN_EVERY_NS;
         }
         may
+    }
+
+    /// Says in the log which gimbal is believed when there are several; `wanted` is the mission's.
+    pub(super) fn name_gimbals(&mut self, autopilot: &Autopilot, wanted: u8) {
+        let (chosen, others) = autopilot.gimbals();
+        if others.len() == self.gimbals_named {
+            return;
+        }
+        self.gimbals_named = others.len();
+        let name = |g: &Gimbal| format!("{} (reported by component {})", g.device, g.component);
+        let others = others.iter().map(name).collect::<Vec<_>>().join(", ");
+        match chosen {
+            Some(chosen) => tracing::warn!(
+                "several gimbals: {} carries the camera, {others} left out ([mount] gimbal says which)",
+                name(&chosen)
+            ),
+            None => tracing::warn!("gimbals {others} are heard, [mount] gimbal = {wanted} is not"),
+        }
     }
 
     /// An exposure was announced or asked for: the next free-running picture is due whatever its time.

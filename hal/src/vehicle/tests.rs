@@ -28,6 +28,7 @@ const LENS: CameraSettings = CameraSettings {
     cy: 12.0,
     distortion: [0.0; 4],
     exposure_delay_ms: 0.0,
+    index: None,
 };
 
 fn settings() -> VehicleSettings {

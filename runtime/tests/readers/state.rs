@@ -31,6 +31,7 @@ const CAMERA: CameraSettings = CameraSettings {
     cy: 3.0,
     distortion: [0.0; 4],
     exposure_delay_ms: 0.0,
+    index: None,
 };
 
 /// The refusal of a file that was set aside, with the name it got; the next input finds the place empty.

@@ -106,6 +106,7 @@ fn opened(device: &str) -> HalError {
         cy: 1.0,
         distortion: [0.0; 4],
         exposure_delay_ms: 0.0,
+        index: None,
     };
     AnyCamera::open(&CameraSource::V4l2(device.into()), &lens, None).err().expect("no camera")
 }

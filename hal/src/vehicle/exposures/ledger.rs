@@ -3,12 +3,13 @@
 use std::collections::VecDeque;
 
 use crate::camera::Picture;
-use crate::matcher::Reason;
 use crate::matcher::reconcile::{Pairing, reconcile};
+use crate::matcher::{Matcher, Outcome, Reason};
 use crate::pose::{BodyPose, PoseError};
 use crate::traits::PictureClues;
 use crate::trigger::Trigger;
 use crate::vehicle::Event;
+use crate::vehicle::cameras::{Cameras, Decision};
 
 /// Exposures of one flight that are kept with their pose, and pictures put aside: an hour at one a second.
 pub(super) const EXPOSURES: usize = 4096;
@@ -47,19 +48,27 @@ pub(in crate::vehicle) struct Exposures {
     pub(super) all: VecDeque<Exposure>,
     pub(super) aside: Vec<PutAside>,
     pub(super) next_reconcile_ns: u64,
+    /// Whose they are.
+    pub(in crate::vehicle) cameras: Cameras,
     /// Decided at the end of the flight and not reported yet.
     pub(super) closing: VecDeque<Event>,
 }
 
-impl Default for Exposures {
-    fn default() -> Self {
+impl Exposures {
+    /// None yet.
+    pub(in crate::vehicle) fn new(cameras: Cameras) -> Self {
         Self {
+            cameras,
             all: VecDeque::with_capacity(EXPOSURES),
             aside: Vec::with_capacity(PUT_ASIDE),
             next_reconcile_ns: 0,
             closing: VecDeque::new(),
         }
     }
+}
+
+fn is_same(a: &Trigger, b: &Trigger) -> bool {
+    (a.source, a.sequence, a.boot_ns) == (b.source, b.sequence, b.boot_ns)
 }
 
 impl Exposures {
@@ -78,8 +87,45 @@ impl Exposures {
     }
 
     pub(super) fn find(&mut self, trigger: &Trigger) -> Option<&mut Exposure> {
-        let same = |e: &&mut Exposure| e.trigger.sequence == trigger.sequence && e.trigger.boot_ns == trigger.boot_ns;
-        self.all.iter_mut().rev().find(same)
+        self.all.iter_mut().rev().find(|e| is_same(&e.trigger, trigger))
+    }
+
+    /// Whether this exposure waits for its picture.
+    fn awaits(&self, trigger: &Trigger) -> bool {
+        self.awaited().any(|e| is_same(&e.trigger, trigger))
+    }
+
+    /// Several cameras are heard: what waited goes to the matcher as soon as it is known whose pictures come. Returned is what
+    /// the matcher had no room for.
+    pub(in crate::vehicle) fn choose_camera(
+        &mut self,
+        matcher: &mut Matcher<Picture>,
+        at_end: bool,
+    ) -> Vec<Outcome<Picture>> {
+        let mut crowded_out = Vec::new();
+        let Some(Decision { source, confidence }) = self.cameras.decide(at_end) else { return crowded_out };
+        let others = self.cameras.heard().iter().filter(|s| **s != source);
+        let others = others.map(ToString::to_string).collect::<Vec<_>>().join(", ");
+        if confidence < 1.0 {
+            tracing::warn!(
+                "pictures fit {source} as well as {others}; they are posed by the first with confidence {confidence:.1} \
+                 ([camera] index says which)"
+            );
+        } else {
+            tracing::info!("pictures are those of {source}; exposures of {others} are left out");
+        }
+        matcher.keep_only(source);
+        let other = |e: &&mut Exposure| e.trigger.source != source && e.partner == Partner::Awaited;
+        self.all.iter_mut().filter(other).for_each(|e| e.partner = Partner::Unneeded);
+        while let Some(trigger) = self.cameras.next_trigger() {
+            if trigger.source == source && self.awaits(&trigger) && !matcher.awaits(&trigger) {
+                crowded_out.extend(matcher.push_trigger(trigger));
+            }
+        }
+        while let Some((clues, picture)) = self.cameras.next_picture() {
+            crowded_out.extend(matcher.push_picture(clues, picture));
+        }
+        crowded_out
     }
 
     pub(super) fn awaited(&self) -> impl Iterator<Item = &Exposure> {

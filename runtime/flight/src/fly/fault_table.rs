@@ -68,6 +68,7 @@ fn script(row: &Row) -> Script {
             cy: 24.0,
             distortion: [0.0; 4],
             exposure_delay_ms: 60.0,
+            index: None,
         },
         mount: MountSettings::default(),
         origin: ORIGIN,

@@ -35,6 +35,7 @@ const LENS: CameraSettings = CameraSettings {
     cy: 36.0,
     distortion: [0.0; 4],
     exposure_delay_ms: 0.0,
+    index: None,
 };
 
 fn frame(i: usize) -> KeyFrame {

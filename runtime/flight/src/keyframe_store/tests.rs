@@ -20,6 +20,7 @@ const CAMERA: CameraSettings = CameraSettings {
     cy: 1.5,
     distortion: [0.0; 4],
     exposure_delay_ms: 0.0,
+    index: None,
 };
 const LENS: Intrinsics = Intrinsics { width: 4, height: 3, fx: 3.0, fy: 3.0, cx: 2.0, cy: 1.5 };
 
