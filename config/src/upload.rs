@@ -43,6 +43,9 @@ table! {
         pub keys: PathBuf = PathBuf::from("keys");
         /// The ground takes models that an earlier session has received, too, as `dgtr serve --again` does.
         pub again: bool = false;
+        /// A word for this day's flights, such as `"2026-11-29"`: the ground takes models made under the same word only. Absent = the
+        /// ground draws a number and tells the aircraft over the network or on the stick.
+        pub session: Option<String> = None;
         /// Endpoints beyond this machine are used although nothing is signed (anybody there can replace any model) or encrypted
         /// (anybody there can read it, and slow down what is sent).
         pub insecure: bool = false;

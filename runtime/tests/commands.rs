@@ -16,6 +16,8 @@ use models::formats::transforms::pose_to_opengl;
 
 #[path = "commands/begun.rs"]
 mod begun;
+#[path = "commands/earlier.rs"]
+mod earlier;
 #[path = "commands/first_steps.rs"]
 mod first_steps;
 #[path = "commands/ground.rs"]

@@ -1,9 +1,10 @@
 //! `dgtr serve --mission FILE --out DIR`: receives the models of all aircraft, merges them, writes the report.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use config::error::Error;
 use config::mission::Mission;
 use disk::Disk;
 
@@ -12,9 +13,10 @@ use ground::jobs::serve::{self, Board, Joining, Reception, ServeError};
 use ground::jobs::summary;
 use job::console::Progress;
 use job::interrupt::Interrupt;
+use job::run_json::RunReport;
 use job::service::Supervisor;
 use job::session::{Owner, Session};
-use pages::report::{ReportData, Timing, bytes};
+use pages::report::{REPORT, ReportData, Timing, bytes};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};
@@ -60,7 +62,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let _server = args.http.serve(&mission.http, board.watch())?;
     let owner = Owner {
         command: "serve".into(),
-        mission: mission.name.clone(),
+        // Another word is another day's session.
+        mission: [Some(mission.name.clone()), mission.upload.session.clone()]
+            .into_iter()
+            .flatten()
+            .collect::<Vec<_>>()
+            .join(", session "),
         aircraft: String::new(),
         origin: [mission.origin.lat_deg, mission.origin.lon_deg, mission.origin.alt_m],
         picture: [0; 2],
@@ -100,16 +107,15 @@ pub fn run(args: Args) -> Result<(), CliError> {
         true
     };
     let joined = joining.finish(&at_work);
-    let (outcome, left_out) = serve::merge(&mission, &reception, &args.out, &at_work)?;
+    let merged = serve::merge(&mission, &reception, &args.out, &at_work);
+    let (outcome, left_out) = match merged {
+        Err(e @ ServeError::Nothing(_)) => return nothing(&args.out, &mission, &reception, e),
+        merged => merged?,
+    };
     let mut run = summary::run_report("serve", &outcome, mission.ground.seed);
-    run.wall_s += reception.seconds;
-    run.stage_ms.insert("receive".into(), reception.seconds * 1e3);
-    let counters = serde_json::to_value(reception.counters).unwrap_or_default();
-    run.more.insert("received".into(), counters);
+    note_reception(&mut run, &reception);
     run.more.insert("joined_s".into(), joined.seconds.into());
     run.more.insert("joined_fits".into(), joined.fits.into());
-    run.more.insert("refused".into(), serde_json::to_value(&reception.refusals).unwrap_or_default());
-    run.more.insert("missing".into(), reception.missing.clone().into());
     let mut data = summary::report(&outcome);
     add_reception(&mut data, &reception);
     let readable = reception.received.iter().filter(|r| left_out.iter().all(|u| u.0 != r.path));
@@ -130,18 +136,47 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let seen = board.watch().freeze();
     (data.aircraft, data.ground) = (seen.aircraft, seen.ground);
-    let missing = reception.missing;
-    if !missing.is_empty() {
+    if !reception.missing.is_empty() {
         run.outcome = "interrupted".into();
     }
     finish(&args.out, run, data, outcome)?;
-    match missing.is_empty() {
+    match reception.missing.is_empty() {
         true => Ok(()),
         false => Err(CliError::interrupted(format!(
-            "merged without the final model of {}; run the same command again to continue receiving",
-            missing.join(", ")
+            "merged without the final model of {}; run the same command again to continue receiving{}",
+            reception.missing.join(", "),
+            shown_instead(&reception)
         ))),
     }
+}
+
+/// What is known when nothing arrived that counts: written down all the same, with what was refused.
+fn nothing(out: &Path, mission: &Mission, reception: &Reception, error: ServeError) -> Result<(), CliError> {
+    let mut run = RunReport::new("serve");
+    run.outcome = "interrupted".into();
+    note_reception(&mut run, reception);
+    let title = format!("Mission {}", mission.name);
+    let mut data = ReportData { title, subtitle: "nothing was merged".into(), ..ReportData::default() };
+    add_reception(&mut data, reception);
+    data.files.push(("figures".into(), run.write(out)?));
+    data.write(&out.join(REPORT))?;
+    data.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
+    Err(CliError::new(error.kind(), format!("{error}{}", shown_instead(reception))))
+}
+
+/// The last models of other sessions that were shown in the place of this one's, as the end of a line.
+fn shown_instead(reception: &Reception) -> String {
+    reception.stale.iter().map(|(_, why)| format!("; {why}")).collect()
+}
+
+fn note_reception(run: &mut RunReport, reception: &Reception) {
+    run.wall_s += reception.seconds;
+    run.stage_ms.insert("receive".into(), reception.seconds * 1e3);
+    run.more.insert("received".into(), serde_json::to_value(reception.counters).unwrap_or_default());
+    run.more.insert("refused".into(), serde_json::to_value(&reception.refusals).unwrap_or_default());
+    run.more.insert("missing".into(), reception.missing.clone().into());
+    run.more.insert("stale".into(), reception.stale.iter().map(|s| s.0.as_str()).collect::<Vec<_>>().into());
+    run.more.insert("unbound".into(), reception.unbound().collect::<Vec<_>>().into());
 }
 
 fn add_reception(data: &mut ReportData, reception: &Reception) {
@@ -153,6 +188,12 @@ fn add_reception(data: &mut ReportData, reception: &Reception) {
     data.timings.insert(0, Timing { name: "receive".into(), of: String::new(), seconds: reception.seconds });
     for aircraft in &reception.missing {
         data.warnings.push(format!("The final model of {aircraft} has not arrived."));
+    }
+    for id in reception.unbound() {
+        data.warnings.push(format!(
+            "The model of {id} is not bound to this session: only its flight number says that it is not an earlier one's. Run `dgtr \
+             serve` with the stick before the flight, or set [upload] session."
+        ));
     }
     for (why, times) in reception.refusals.iter() {
         data.warnings.push(format!("Refused {times} times: {why}."));

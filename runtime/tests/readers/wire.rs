@@ -12,6 +12,7 @@ use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use uplink::Source;
+use uplink::admission::Admission;
 use uplink::folder::{FolderInlet, FolderOutlet};
 use uplink::keys::Identity;
 use uplink::offer::{Offer, OfferedModel, Order, hex};
@@ -42,9 +43,16 @@ fn source() -> Source {
         aircraft,
         identity: Identity::unsigned(),
         flight_number: None,
+        session: None,
         disk: Default::default(),
         territory: None,
     }
+}
+
+/// A ground that believes everybody.
+fn ground() -> Admission {
+    let (mission, aircraft, memory) = ("park".into(), vec!["west".into()], Default::default());
+    Admission { mission, aircraft, identity: Identity::unsigned(), check: Box::new(|_, _| Ok(())), memory }
 }
 
 /// A model file of so many bytes, on offer.
@@ -79,6 +87,8 @@ fn offers() {
             offered(40_000).offer.encode(),
             offered_in_cells(9000).offer.encode(),
             offered(1).offer.encode(),
+            offered(40_000).offer.bound_to(&[9; 32], &Identity::unsigned()).encode(),
+            offered_in_cells(9000).offer.bound_to(&[8; 32], &Identity::unsigned()).encode(),
             signed,
         ],
         text: false,
@@ -125,7 +135,7 @@ fn chunks() {
     outlet
         .offer(&Arc::new(model.renumbered(model.offer.order, &Identity::unsigned()).expect("open")))
         .expect("offered");
-    let inlet = FolderInlet::new(&folder.path().join("stick"), "park", Offer::max_encoded(&settings()));
+    let inlet = FolderInlet::of(&folder.path().join("stick"), &ground(), &settings());
     let whole = model.chunk(0).expect("a chunk");
     let path = folder.path().join("stick/park/west/chunk").join(hex(&model.offer.chunks[0]));
     let stop = AtomicBool::new(false);

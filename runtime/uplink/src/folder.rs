@@ -1,7 +1,7 @@
 //! The folder transport: a USB stick carried over after landing, or a directory both ends mount.
 //!
 //! `<folder>/<mission>/<aircraft>/offer`, `…/chunk/<blake3>` and the ground's `…/receipt`: the same names and bytes as on the
-//! network. Every file is written aside, synced and renamed; chunks come before the offer that names them, so a reader
+//! network. The ground's `<folder>/<mission>/ground.session` says what offers are to be bound to. Every file is written aside, synced and renamed; chunks come before the offer that names them, so a reader
 //! never sees an offer whose chunks were not yet complete when it was written.
 
 use std::fs::File;
@@ -11,16 +11,23 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use config::mission::MAX_AIRCRAFT;
+use config::upload::UploadSettings;
 use disk::Disk;
 
 use super::Source;
+use super::admission::Admission;
+use super::binding;
 use super::medium::Medium;
 use super::offer::{Hash, Offer, OfferedModel, hex, is_safe_name};
 use super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::transport::{Inlet, Outlet, Patience, TransportError};
+use crate::keys::Domain;
 
 /// Most aircraft folders looked at; more than any mission has.
 const MAX_ENTRIES: usize = 4 * MAX_AIRCRAFT;
+
+/// The ground's word on its session, beside the aircraft's folders, none of which can have this name.
+const SESSION: &str = "ground.session";
 
 /// Writes a file so that it is either absent, old, or complete.
 pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
@@ -73,6 +80,8 @@ pub struct FolderOutlet {
     /// Chunks of the offer before the current one, kept for a ground station that is just reading them.
     previous: Vec<Hash>,
     current: Option<(Hash, Vec<Hash>)>,
+    /// The ground's session that it is bound to.
+    session: Option<Hash>,
     /// Bytes written to it.
     sent: u64,
 }
@@ -81,7 +90,28 @@ impl FolderOutlet {
     /// Offers below `root`; nothing is touched before the first offer.
     pub fn new(root: &Path, source: Source) -> Self {
         let dir = root.join(&source.mission).join(&source.aircraft);
-        Self { root: root.into(), medium: Medium::of(root), dir, source, previous: Vec::new(), current: None, sent: 0 }
+        let (root, medium) = (root.into(), Medium::of(root));
+        Self { root, medium, dir, source, previous: Vec::new(), current: None, session: None, sent: 0 }
+    }
+
+    /// The session that the ground has written down here.
+    fn session(&self) -> Option<Hash> {
+        let path = self.dir.with_file_name(SESSION);
+        let bytes = read_bounded(&path, binding::MAX_SEALED).ok()?;
+        let Source { identity, mission, .. } = &self.source;
+        let session = binding::open(&bytes, mission, Domain::Session, identity);
+        if session.is_none() {
+            tracing::debug!("upload: {}: not signed by the ground; not used", path.display());
+        }
+        session
+    }
+
+    fn write_offer(&mut self, offer: &Offer, session: Option<Hash>) -> Result<(), TransportError> {
+        let (path, bytes) = (self.dir.join("offer"), self.source.bind(offer, session).encode());
+        write_whole(&path, &bytes).map_err(TransportError::io(&path))?;
+        self.sent += bytes.len() as u64;
+        self.session = session;
+        Ok(())
     }
 
     fn drop_stale_chunks(&self, offer: &Offer) {
@@ -124,9 +154,8 @@ impl Outlet for FolderOutlet {
                 self.sent += bytes.len() as u64;
             }
         }
-        let (path, offer) = (self.dir.join("offer"), model.offer.encode());
-        write_whole(&path, &offer).map_err(TransportError::io(&path))?;
-        self.sent += offer.len() as u64;
+        let session = self.session();
+        self.write_offer(&model.offer, session)?;
         if let Some((_, chunks)) = self.current.replace((model.offer.model, model.offer.chunks.clone())) {
             self.previous = chunks;
         }
@@ -140,6 +169,16 @@ impl Outlet for FolderOutlet {
         let Source { identity, mission, aircraft, .. } = &self.source;
         let told = Receipt::open(&bytes, identity, mission, aircraft).and_then(|r| r.bearing(offer));
         let here = self.current.as_ref().is_some_and(|c| c.0 == offer.model);
+        // A ground that came later has a session of its own.
+        let session = self.session();
+        if here
+            && session.is_some()
+            && session != self.session
+            && let Err(e) = self.write_offer(offer, session)
+        {
+            tracing::debug!("upload: {e}");
+            return Delivery::Waiting;
+        }
         told.unwrap_or(if here { Delivery::Delivered } else { Delivery::Waiting })
     }
 
@@ -150,14 +189,33 @@ impl Outlet for FolderOutlet {
 
 /// The ground's end.
 pub struct FolderInlet {
+    root: PathBuf,
     dir: PathBuf,
+    /// What says which session it is, as it lies there.
+    session: Vec<u8>,
     max_offer: u64,
 }
 
 impl FolderInlet {
-    /// Reads offers of `mission` below `root`.
-    pub fn new(root: &Path, mission: &str, max_offer: u64) -> Self {
-        Self { dir: root.join(mission), max_offer }
+    /// Reads offers below `root`, and says there which session they are to be bound to.
+    pub fn of(root: &Path, admission: &Admission, settings: &UploadSettings) -> Self {
+        let Admission { mission, identity, memory, .. } = admission;
+        let session = binding::seal(memory.session(), mission, Domain::Session, identity);
+        Self { root: root.into(), dir: root.join(mission), session, max_offer: Offer::max_encoded(settings) }
+    }
+
+    /// Writes the session where aircraft read it. A medium that cannot be written to, or is not there, brings models all the same.
+    fn say_session(&self) -> Result<(), TransportError> {
+        let path = self.dir.join(SESSION);
+        if read_bounded(&path, binding::MAX_SEALED).is_ok_and(|bytes| bytes == self.session) {
+            return Ok(());
+        }
+        let parent = self.root.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        std::fs::metadata(parent).map_err(TransportError::io(parent))?;
+        Medium::of(&self.root).check().map_err(TransportError::io(&self.root))?;
+        without_links(&self.root, &path).map_err(TransportError::io(&path))?;
+        std::fs::create_dir_all(&self.dir).map_err(TransportError::io(&self.dir))?;
+        write_whole(&path, &self.session).map_err(TransportError::io(&path))
     }
 }
 
@@ -167,6 +225,9 @@ impl Inlet for FolderInlet {
     }
 
     fn offers(&self, _: Patience, see: &mut dyn FnMut(&[u8])) -> Result<(), TransportError> {
+        if let Err(e) = self.say_session() {
+            tracing::debug!("serve: {e}");
+        }
         let entries = match std::fs::read_dir(&self.dir) {
             Ok(entries) => entries,
             // Nobody has offered anything yet, or the stick is not plugged in yet.
@@ -223,6 +284,16 @@ impl Inlet for FolderInlet {
             tracing::debug!("serve: {}: {e}", path.display());
         }
         Ok(())
+    }
+
+    fn end_session(&self) {
+        let path = self.dir.join(SESSION);
+        if without_links(&self.root, &path).is_ok()
+            && read_bounded(&path, binding::MAX_SEALED).is_ok_and(|bytes| bytes == self.session)
+            && let Err(e) = std::fs::remove_file(&path)
+        {
+            tracing::debug!("serve: {}: {e}", path.display());
+        }
     }
 }
 

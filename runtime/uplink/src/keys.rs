@@ -134,6 +134,8 @@ pub enum Domain {
     Acknowledgement,
     /// The ground asks an aircraft.
     Request,
+    /// The ground names its session.
+    Session,
 }
 
 impl Domain {
@@ -143,6 +145,7 @@ impl Domain {
             Self::Receipt => b"dgtr receipt\0",
             Self::Acknowledgement => b"dgtr acknowledgement\0",
             Self::Request => b"dgtr request\0",
+            Self::Session => b"dgtr session\0",
         };
         [domain, bytes].concat()
     }

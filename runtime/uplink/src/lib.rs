@@ -12,6 +12,7 @@ use disk::Disk;
 use crate::keys::{Identity, KeyError};
 
 pub mod admission;
+pub mod binding;
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
 mod chaos;
@@ -59,6 +60,8 @@ pub struct Source {
     pub identity: Identity,
     /// Where the number of the last flight is kept; None = every start is flight 1.
     pub flight_number: Option<PathBuf>,
+    /// The session that the mission names; `None`: the ground says which.
+    pub session: Option<offer::Hash>,
     /// Where what is made for delivery is written.
     pub disk: Disk,
     /// The ground it answers for; `None`: all.
@@ -84,9 +87,16 @@ impl Source {
             aircraft: aircraft.into(),
             identity,
             flight_number,
+            session: mission.upload.session.as_deref().map(binding::named),
             disk: Disk::default(),
             territory: Territory::of(mission, aircraft),
         })
+    }
+
+    /// The offer as it is shown to a ground whose session is `session`, if that is known.
+    pub(crate) fn bind(&self, offer: &offer::Offer, session: Option<offer::Hash>) -> offer::Offer {
+        let session = self.session.or(session);
+        session.map_or_else(|| offer.clone(), |session| offer.bound_to(&session, &self.identity))
     }
 
     /// For tests of what does not depend on keys.
@@ -97,6 +107,7 @@ impl Source {
             aircraft: aircraft.into(),
             identity: Identity::unsigned(),
             flight_number: None,
+            session: None,
             disk: Disk::default(),
             territory: None,
         }
@@ -124,6 +135,9 @@ pub enum UploadError {
     /// The ground's disk.
     #[error(transparent)]
     Store(#[from] store::StoreError),
+    /// The system has no random numbers.
+    #[error("drawing the session's number: {0}")]
+    Random(std::io::Error),
     /// The background thread could not be started.
     #[error("upload thread: {0}")]
     Thread(std::io::Error),
@@ -136,7 +150,7 @@ impl Error for UploadError {
             Self::Transport(e) => e.kind(),
             Self::Keys(e) => e.kind(),
             Self::Store(e) => e.kind(),
-            Self::Thread(_) => ErrorKind::Failed,
+            Self::Random(_) | Self::Thread(_) => ErrorKind::Failed,
         }
     }
 }

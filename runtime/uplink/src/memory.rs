@@ -1,5 +1,5 @@
-//! What earlier sessions of the ground have received of each aircraft. A model of theirs that is shown again, by a stick that
-//! nobody cleared or by somebody who kept it, is not this session's.
+//! Which offers are not of the ground's present session: those bound to another one, and those no newer than what an earlier one
+//! has received. They come from a stick that nobody cleared, or from somebody who kept them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -8,10 +8,11 @@ use std::sync::{Mutex, PoisonError};
 use disk::Disk;
 use serde::{Deserialize, Serialize};
 
+use crate::binding;
 use crate::disk_error::{DiskError, io};
 use crate::folder::read_bounded;
 use crate::keys::random;
-use crate::offer::{Offer, Order, hex};
+use crate::offer::{Hash, Offer, Order, hex};
 
 /// Bound on the file: a few hundred bytes for each aircraft that a mission may have.
 const LIMIT: u64 = 4 << 20;
@@ -29,23 +30,44 @@ struct Last {
     session: String,
 }
 
+/// Why an offer is not of this session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stale {
+    /// An earlier session has received this order of the aircraft.
+    Received(Order),
+    /// It was made for another session.
+    OtherSession,
+    /// It was made for none, where the mission names one.
+    NoSession,
+}
+
 /// The last models of a mission's aircraft, over all sessions.
 #[derive(Debug, Default)]
 pub struct Memory {
     path: Option<PathBuf>,
     session: String,
+    /// What this session's offers are bound to.
+    number: Hash,
+    /// The mission says what it is, so that every aircraft knows.
+    named: bool,
     /// What earlier sessions have is taken, too.
     again: bool,
     last: Mutex<BTreeMap<String, Last>>,
 }
 
 impl Memory {
-    /// The memory of `mission` in the folder `state`, for the session whose folder is `received`. With `again` nothing counts
-    /// as an earlier session's.
+    /// The memory of `mission` in the folder `state`, for the session whose folder is `received`, or which the mission calls `word`.
+    /// With `again` nothing counts as an earlier session's.
     ///
     /// # Errors
     /// It cannot be read back or written.
-    pub fn open(state: &Path, mission: &str, received: &Path, again: bool) -> Result<Self, DiskError> {
+    pub fn open(
+        state: &Path,
+        mission: &str,
+        received: &Path,
+        word: Option<&str>,
+        again: bool,
+    ) -> Result<Self, DiskError> {
         let path = state.join(format!("{mission}.received.json"));
         let read = |p: &Path| {
             let bytes = read_bounded(p, LIMIT).map_err(|e| e.to_string())?;
@@ -54,21 +76,42 @@ impl Memory {
         let newest = Disk::default().newest(&path, read).map_err(io(&path))?;
         newest.damaged.iter().for_each(|d| tracing::warn!("{d}; what earlier sessions received is not known"));
         let session = session_of(received)?;
-        let memory = Self { path: Some(path), session, again, last: Mutex::new(newest.found.unwrap_or_default()) };
+        let number = word.map_or_else(|| binding::named(&session), binding::named);
+        let (named, last) = (word.is_some(), Mutex::new(newest.found.unwrap_or_default()));
+        let memory = Self { path: Some(path), session, number, named, again, last };
         // Better now than after the first model.
         memory.write()?;
         Ok(memory)
     }
 
-    /// The order that an earlier session has of this aircraft, if the offer is not newer.
-    pub fn is_stale(&self, offer: &Offer, key: &str) -> Option<Order> {
+    /// Of a session that nothing is remembered for.
+    ///
+    /// # Errors
+    /// The system has no random numbers.
+    pub fn forgetful(word: Option<&str>, again: bool) -> std::io::Result<Self> {
+        let number = word.map_or_else(random, |word| Ok(binding::named(word)))?;
+        Ok(Self { number, named: word.is_some(), again, ..Self::default() })
+    }
+
+    /// What offers of this session are bound to.
+    pub fn session(&self) -> &Hash {
+        &self.number
+    }
+
+    /// Why an offer is not of this session.
+    pub fn is_stale(&self, offer: &Offer, key: &str) -> Option<Stale> {
         if self.again {
             return None;
+        }
+        match offer.session {
+            Some(session) if session != self.number => return Some(Stale::OtherSession),
+            None if self.named => return Some(Stale::NoSession),
+            _ => {}
         }
         let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
         let last = last.get(&offer.aircraft).filter(|l| l.key == key && l.session != self.session)?;
         let order = Order { flight: last.flight, counter: last.counter };
-        (offer.order <= order).then_some(order)
+        (offer.order <= order).then_some(Stale::Received(order))
     }
 
     /// Remembers a model that is here.
@@ -118,17 +161,42 @@ mod tests {
     #[test]
     fn what_an_earlier_session_received_is_stale_in_a_later_one_and_not_in_its_own() {
         let dir = tempfile::tempdir().expect("a folder");
-        let open =
-            |session: &str, again| Memory::open(dir.path(), "m", &dir.path().join(session), again).expect("opens");
+        let open = |session: &str, again| {
+            Memory::open(dir.path(), "m", &dir.path().join(session), None, again).expect("opens")
+        };
         let (second, third) = (offer("m", "a1", 2), offer("m", "a1", 3));
         open("yesterday", false).note(&second, "k").expect("written");
         assert_eq!(open("yesterday", false).is_stale(&second, "k"), None, "the same session, started again");
         let today = open("today", false);
-        assert_eq!(today.is_stale(&second, "k"), Some(second.order));
-        assert_eq!(today.is_stale(&offer("m", "a1", 1), "k"), Some(second.order));
+        assert_eq!(today.is_stale(&second, "k"), Some(Stale::Received(second.order)));
+        assert_eq!(today.is_stale(&offer("m", "a1", 1), "k"), Some(Stale::Received(second.order)));
         assert_eq!(today.is_stale(&third, "k"), None);
         assert_eq!(today.is_stale(&second, "another key"), None, "numbers begin anew with a key");
         assert_eq!(today.is_stale(&offer("m", "a2", 1), "k"), None);
         assert_eq!(open("today", true).is_stale(&second, "k"), None, "asked for");
+    }
+
+    #[test]
+    fn an_offer_for_another_session_is_stale_however_new_its_number_and_whatever_is_remembered() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let open = |session: &str, word: Option<&str>, again| {
+            let state = dir.path().join(format!("state of {session}"));
+            std::fs::create_dir_all(&state).expect("made");
+            Memory::open(&state, "m", &dir.path().join(session), word, again).expect("opens")
+        };
+        let nobody = crate::keys::Identity::unsigned();
+        let (yesterday, today) = (open("yesterday", None, false), open("today", None, false));
+        assert_eq!(yesterday.session(), open("yesterday", None, false).session(), "the same after a restart");
+        let unbound = offer("m", "a1", 2);
+        let old = offer("m", "a1", u64::MAX).bound_to(yesterday.session(), &nobody);
+        assert_eq!(today.is_stale(&old, "k"), Some(Stale::OtherSession));
+        assert_eq!(today.is_stale(&unbound.bound_to(today.session(), &nobody), "k"), None);
+        assert_eq!(today.is_stale(&unbound, "k"), None, "the aircraft could not know");
+        assert_eq!(open("today", None, true).is_stale(&old, "k"), None, "asked for");
+        // One that the mission names is the same on every ground, and no aircraft can miss it.
+        let named = open("today", Some("monday"), false);
+        assert_eq!(named.is_stale(&unbound, "k"), Some(Stale::NoSession));
+        assert_eq!(named.session(), open("elsewhere", Some("monday"), false).session());
+        assert_eq!(named.is_stale(&unbound.bound_to(&binding::named("monday"), &nobody), "k"), None);
     }
 }

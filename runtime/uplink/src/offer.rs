@@ -5,12 +5,14 @@
 //!
 //! ```text
 //! version u8 · mission · aircraft · flight · counter · finished · size · chunk bytes · model · chunks   (postcard)
-//! version 3: bytes of each chunk (postcard)
+//! versions 3, 5: bytes of each chunk (postcard)
+//! versions 4, 5: number of the ground's session (32)
 //! Ed25519 signature of "dgtr offer\0" and everything before (64; absent in missions without keys)
 //! ```
 //!
 //! A model in cells is cut where its cells end (version 3), so that a cell that did not change is a chunk the ground has; its
 //! first chunk is its index, coarse layers and cells follow by importance, small ones together. Any other file is cut evenly (version 2).
+//! Where the aircraft knows the ground's session, the offer is bound to it (versions 4 and 5).
 
 use std::fs::File;
 use std::io::Read;
@@ -29,6 +31,9 @@ use crate::keys::{Domain, Identity, SignatureBytes, SignatureError};
 const EVEN: u8 = 2;
 /// With chunks of different lengths.
 const PIECES: u8 = 3;
+/// The same, bound to a session of the ground.
+const EVEN_BOUND: u8 = 4;
+const PIECES_BOUND: u8 = 5;
 /// A chunk's length takes so many bytes at most.
 const MAX_SIZE: u64 = 3;
 /// Longest mission or aircraft name on the wire (the mission file allows 32).
@@ -74,6 +79,9 @@ pub struct Offer {
     /// Bytes of each chunk where they differ.
     #[serde(skip)]
     sizes: Vec<u32>,
+    /// The session of the ground that it was made for, if the aircraft knew it.
+    #[serde(skip)]
+    pub session: Option<Hash>,
     /// The aircraft's signature of all the above.
     #[serde(skip)]
     pub signature: Option<SignatureBytes>,
@@ -86,7 +94,7 @@ pub enum OfferError {
     #[error("offer is damaged: {0}")]
     Damaged(String),
     /// Made by a different version of this program.
-    #[error("offer has format {0}, this program reads {EVEN} and {PIECES}; update the older side")]
+    #[error("offer has format {0}, this program reads {EVEN} to {PIECES_BOUND}; update the older side")]
     Version(u8),
     /// Another mission on the same link.
     #[error("offer belongs to mission {0:?}")]
@@ -122,17 +130,26 @@ pub fn is_safe_name(name: &str) -> bool {
 impl Offer {
     /// Most bytes an encoded offer can have under these settings.
     pub fn max_encoded(settings: &UploadSettings) -> u64 {
-        320 + 2 * MAX_NAME as u64 + (32 + MAX_SIZE) * settings.max_chunks()
+        352 + 2 * MAX_NAME as u64 + (32 + MAX_SIZE) * settings.max_chunks()
     }
 
     /// What is signed.
     fn signed_bytes(&self) -> Vec<u8> {
         // Plain integers, strings and byte arrays: serialising into a growing vector has no way to fail.
         let mut bytes = postcard::to_allocvec(self).unwrap_or_default();
-        if self.version == PIECES {
+        if self.is_in_pieces() {
             bytes.extend(postcard::to_allocvec(&self.sizes).unwrap_or_default());
         }
+        bytes.extend(self.session.iter().flatten());
         bytes
+    }
+
+    /// The same offer for a session of the ground, signed anew.
+    pub fn bound_to(&self, session: &Hash, identity: &Identity) -> Self {
+        let version = if self.is_in_pieces() { PIECES_BOUND } else { EVEN_BOUND };
+        let mut bound = Self { version, session: Some(*session), ..self.clone() };
+        bound.signature = identity.sign(Domain::Offer, &bound.signed_bytes());
+        bound
     }
 
     /// Wire bytes.
@@ -157,14 +174,18 @@ impl Offer {
             return damaged("longer than any valid one");
         }
         match bytes.first() {
-            Some(&(EVEN | PIECES)) => {}
+            Some(&(EVEN..=PIECES_BOUND)) => {}
             Some(&other) => return Err(OfferError::Version(other)),
             None => return damaged("empty"),
         }
         let unreadable = |e: postcard::Error| OfferError::Damaged(e.to_string());
         let (mut offer, mut rest): (Self, _) = postcard::take_from_bytes(bytes).map_err(unreadable)?;
-        if offer.version == PIECES {
+        if offer.is_in_pieces() {
             (offer.sizes, rest) = postcard::take_from_bytes(rest).map_err(unreadable)?;
+        }
+        if matches!(offer.version, EVEN_BOUND | PIECES_BOUND) {
+            let Some((session, behind)) = rest.split_first_chunk() else { return damaged("ends before its session") };
+            (offer.session, rest) = (Some(*session), behind);
         }
         match SignatureBytes::try_from(rest) {
             Ok(signature) => offer.signature = Some(signature),
@@ -182,9 +203,9 @@ impl Offer {
         if offer.size == 0 || !(kib.start() * 1024..=kib.end() * 1024).contains(&offer.chunk_bytes) {
             return damaged("size of model or chunk");
         }
-        let adds_up = match offer.version {
-            EVEN => offer.chunks.len() as u64 == offer.size.div_ceil(u64::from(offer.chunk_bytes)),
-            _ => {
+        let adds_up = match offer.is_in_pieces() {
+            false => offer.chunks.len() as u64 == offer.size.div_ceil(u64::from(offer.chunk_bytes)),
+            true => {
                 offer.sizes.len() == offer.chunks.len()
                     && offer.chunks.len() as u64 <= settings.max_chunks()
                     && offer.sizes.iter().all(|n| (1..=offer.chunk_bytes).contains(n))
@@ -213,12 +234,12 @@ impl Offer {
 
     /// Whether its chunks are the pieces of a model in cells.
     pub fn is_in_pieces(&self) -> bool {
-        self.version == PIECES
+        matches!(self.version, PIECES | PIECES_BOUND)
     }
 
     /// Bytes of chunk `index`.
     pub fn chunk_len(&self, index: usize) -> u64 {
-        if self.version == PIECES {
+        if self.is_in_pieces() {
             return self.sizes.get(index).copied().unwrap_or(0).into();
         }
         let chunk = u64::from(self.chunk_bytes);
@@ -227,7 +248,7 @@ impl Offer {
 
     /// Where chunk `index` begins in the file.
     pub fn chunk_start(&self, index: usize) -> u64 {
-        if self.version == PIECES {
+        if self.is_in_pieces() {
             return self.sizes.iter().take(index).map(|n| u64::from(*n)).sum();
         }
         index as u64 * u64::from(self.chunk_bytes)
@@ -293,6 +314,7 @@ impl OfferedModel {
             model: *whole.finalize().as_bytes(),
             chunks,
             sizes: if version == PIECES { sizes } else { Vec::new() },
+            session: None,
             signature: None,
         };
         Ok(Self { offer, file }.signed(&source.identity))
@@ -349,6 +371,7 @@ pub(super) mod testing {
             model,
             chunks,
             sizes: Vec::new(),
+            session: None,
             signature: None,
         }
     }

@@ -1,11 +1,11 @@
 //! The ground's side of a transfer: look at what is offered, decide what to fetch, fetch it chunk by chunk, verify,
 //! resume, and give up on nothing.
 //!
-//! One round asks every inlet for offers and then lets each aircraft's transfer advance for a bounded time, all at once.
-//! Whoever waits for a chunk at its end goes on waiting in the next round, so that neither a slow link nor a vanished
-//! aircraft holds up the others.
+//! One round asks every inlet for offers and lets each aircraft's transfer advance for a bounded time, all at once. Whoever waits
+//! for a chunk or an answer at its end goes on waiting in the next round, so that neither a slow link, a vanished aircraft nor
+//! somebody who never answers holds up the others.
 
-use std::collections::VecDeque;
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,11 +20,13 @@ use config::upload::UploadSettings;
 use super::UploadError;
 use super::admission::{Admission, Refusals};
 use super::folder::FolderInlet;
-use super::offer::{Offer, OfferError};
-use super::transport::{Inlet, Patience};
+use super::offer::OfferError;
+use super::transport::Inlet;
+use lookout::{Lookout, QUIET};
 use sight::Sight;
 use slot::{Advance, Link, Slot};
 
+mod lookout;
 mod sight;
 mod slot;
 
@@ -85,6 +87,8 @@ pub struct Received {
     pub finished: bool,
     /// Bytes.
     pub size: u64,
+    /// The aircraft knew which session of the ground it was for, and said so.
+    pub bound: bool,
 }
 
 /// One aircraft's place: its transfer, here or at work in a thread of its own.
@@ -96,6 +100,12 @@ struct Seat {
     progress: (usize, usize),
     is_over: bool,
     is_told: bool,
+    /// A last model that it was shown and that is not of this session.
+    stale: Option<String>,
+    /// What is shown of it has changed since it chose.
+    is_to_choose: bool,
+    /// It was at work in this round.
+    has_worked: bool,
 }
 
 enum Place {
@@ -109,7 +119,17 @@ impl Seat {
     fn new(slot: Slot) -> Self {
         let id = slot.id.clone();
         let place = Place::Between;
-        let mut seat = Self { id, place, received: None, progress: (0, 0), is_over: false, is_told: false };
+        let mut seat = Self {
+            id,
+            place,
+            received: None,
+            progress: (0, 0),
+            is_over: false,
+            is_told: false,
+            stale: None,
+            is_to_choose: false,
+            has_worked: false,
+        };
         seat.put_back(Box::new(slot));
         seat
     }
@@ -135,9 +155,9 @@ pub struct Receiver {
     link: Arc<Link>,
     dir: PathBuf,
     seats: Vec<Seat>,
-    /// What the last look saw, and how long it took.
+    /// What is shown.
     sight: Sight,
-    looked: Duration,
+    lookout: Lookout,
     /// Whose turn it is when not all can be at work at once.
     turn: usize,
     wake: Wake<()>,
@@ -158,14 +178,11 @@ impl Receiver {
         let (sender, wake) = sync_channel(1);
         let mut inlets: Vec<Box<dyn Inlet>> = Vec::new();
         if let Some(folder) = &settings.folder {
-            inlets.push(Box::new(FolderInlet::new(folder, &admission.mission, Offer::max_encoded(settings))));
+            inlets.push(Box::new(FolderInlet::of(folder, &admission, settings)));
         }
         #[cfg(feature = "zenoh")]
         if !settings.listen.is_empty() {
-            let (mission, aircraft) = (&admission.mission, &admission.aircraft);
-            let inlet =
-                super::network::NetworkInlet::open(settings, mission, aircraft, &admission.identity, sender.clone())?;
-            inlets.push(Box::new(inlet));
+            inlets.push(Box::new(super::network::NetworkInlet::open(settings, &admission, sender.clone())?));
         }
         #[cfg(not(feature = "zenoh"))]
         if !settings.listen.is_empty() {
@@ -192,7 +209,7 @@ impl Receiver {
             dir: dir.into(),
             seats,
             sight: Sight::default(),
-            looked: Duration::ZERO,
+            lookout: Lookout::default(),
             turn: 0,
             wake,
             _waker: waker,
@@ -209,6 +226,17 @@ impl Receiver {
     /// Whether the last word of every aircraft is here: its last model, or one that may not count.
     pub fn all_finished(&self) -> bool {
         self.seats.iter().all(|s| !s.is_at_work() && s.is_over)
+    }
+
+    /// What of an aircraft is shown in the place of this session's last model, in words.
+    pub fn stale(&self) -> Vec<(String, String)> {
+        let lacks = |s: &&Seat| s.received.as_ref().is_none_or(|r| !r.finished);
+        self.seats.iter().filter(lacks).filter_map(|s| Some((s.id.clone(), s.stale.clone()?))).collect()
+    }
+
+    /// Takes the session's number off the media: nothing more is to be bound to it.
+    pub fn end_session(&self) {
+        self.link.inlets.iter().for_each(|inlet| inlet.end_session());
     }
 
     /// Whether every aircraft whose model is here has signed for the receipt.
@@ -232,22 +260,36 @@ impl Receiver {
     /// # Errors
     /// None at present: whatever fails, one aircraft's disk included, is counted, said and tried again.
     pub fn round(&mut self, stop: &AtomicBool) -> Result<bool, UploadError> {
-        self.look();
-        let until = Instant::now() + Duration::from_secs_f64(self.link.settings.poll_s);
-        // Each seat has one turn in a round.
-        let mut waiting: VecDeque<usize> = self.in_turn().filter(|i| self.seats[*i].wants_work()).collect();
+        self.begin_look();
+        let begun = Instant::now();
+        let until = begun + Duration::from_secs_f64(self.link.settings.poll_s);
+        self.seats.iter_mut().for_each(|seat| seat.has_worked = false);
         loop {
-            self.put_to_work(&mut waiting, until);
+            self.collect();
+            self.take_in();
+            // What is shown now may be better than what was chosen last.
+            let has_looked = !self.lookout.is_waiting() || begun.elapsed() >= QUIET;
+            if has_looked {
+                self.put_to_work(until);
+            }
             if stop.load(Ordering::Relaxed) {
                 self.link.stop.store(true, Ordering::Relaxed);
             }
-            self.collect();
-            if Instant::now() >= until || (waiting.is_empty() && !self.seats.iter().any(Seat::is_at_work)) {
+            let is_busy = self.lookout.is_waiting() || self.seats.iter().any(Seat::is_at_work);
+            if Instant::now() >= until || (!is_busy && self.waiting().next().is_none()) {
                 break;
+            }
+            if self.wake.try_recv().is_ok() {
+                self.begin_look();
             }
             std::thread::sleep(LOOK_UP);
         }
-        Ok(self.seats.iter().any(|s| s.is_at_work() || s.wants_work()))
+        Ok(self.lookout.is_waiting() || self.seats.iter().any(|s| s.is_at_work() || s.wants_work()))
+    }
+
+    /// Those who wait for their turn: each has one in a round.
+    fn waiting(&self) -> impl Iterator<Item = usize> {
+        self.in_turn().filter(|i| !self.seats[*i].has_worked && self.seats[*i].wants_work())
     }
 
     /// All seats, beginning with the one whose turn it is.
@@ -256,17 +298,17 @@ impl Receiver {
         (0..n).map(move |i| (turn + i) % n)
     }
 
-    /// Lets those at the front of the queue advance, as many as may be at work at once.
-    fn put_to_work(&mut self, waiting: &mut VecDeque<usize>, until: Instant) {
-        let mut at_work = self.seats.iter().filter(|s| s.is_at_work()).count();
-        while at_work < AT_WORK
-            && let Some(i) = waiting.pop_front()
-        {
+    /// Lets those whose turn it is advance, as many as may be at work at once.
+    fn put_to_work(&mut self, until: Instant) {
+        let at_work = self.seats.iter().filter(|s| s.is_at_work()).count();
+        let waiting: Vec<usize> = self.waiting().collect();
+        // Where nobody waits for a turn it goes on beside the next look.
+        let until = if waiting.len() + at_work <= AT_WORK { until + QUIET } else { until };
+        for i in waiting.into_iter().take(AT_WORK.saturating_sub(at_work)) {
             let seat = &mut self.seats[i];
             let Place::Here(mut slot) = std::mem::replace(&mut seat.place, Place::Between) else { continue };
+            seat.has_worked = true;
             let link = self.link.clone();
-            // Where nobody waits for a turn it goes on beside the next look, which somebody who never answers makes long.
-            let until = if waiting.is_empty() { until + self.looked } else { until };
             let work = move || {
                 let advance = slot.advance(&link, until);
                 (slot, advance)
@@ -282,7 +324,6 @@ impl Receiver {
                 }
             }
             self.turn = (i + 1) % self.seats.len();
-            at_work += 1;
         }
     }
 
@@ -316,29 +357,32 @@ impl Receiver {
         }
     }
 
-    /// Reads the offers of every inlet and chooses a target for each aircraft that is not at work.
-    fn look(&mut self) {
-        let (before, begun) = (std::mem::take(&mut self.sight), Instant::now());
-        let Link { settings, admission, inlets, stop } = &*self.link;
-        for (index, inlet) in inlets.iter().enumerate() {
-            let outcome = inlet.offers(Patience { limit: ANSWER, stop }, &mut |bytes| {
-                let let_in = |bytes: &[u8]| admission.offer(bytes, settings);
-                if let Err(e) = self.sight.see(&before, bytes, index, let_in) {
-                    self.counters.count_refusal(&e);
-                    self.refusals.count(e.to_string());
-                }
-            });
-            if let Err(e) = outcome {
-                self.counters.retries += 1;
-                tracing::debug!("serve: {}: {e}", inlet.name());
+    /// Begins to ask every inlet for offers.
+    fn begin_look(&mut self) {
+        if let Err(e) = self.lookout.begin(&self.link) {
+            tracing::debug!("serve: no thread to look for offers: {e}");
+            self.counters.retries += 1;
+        }
+    }
+
+    /// Takes in what is shown, and lets each aircraft that is not at work choose anew where that has changed.
+    fn take_in(&mut self) {
+        let Self { link, lookout, sight, seats, counters, refusals, .. } = self;
+        for news in lookout.news(link, sight, counters, refusals) {
+            let shown: HashSet<&str> = news.sight.aircraft().collect();
+            seats.iter_mut().for_each(|s| s.is_to_choose |= news.is_over || shown.contains(s.id.as_str()));
+            match news.is_over {
+                true => *sight = news.sight,
+                false => sight.update(news.sight),
             }
         }
-        self.looked = begun.elapsed();
-        for seat in &mut self.seats {
+        for seat in seats.iter_mut().filter(|s| s.is_to_choose) {
             if let Place::Here(slot) = &mut seat.place {
-                slot.choose(self.sight.of(&seat.id), admission, &mut self.counters, &mut self.refusals);
+                slot.choose(sight.of(&seat.id), &link.admission, counters, refusals);
+                seat.stale = slot.stale();
                 seat.progress = slot.progress();
                 (seat.is_over, seat.is_told) = (slot.is_over(), slot.is_told());
+                seat.is_to_choose = false;
             }
         }
     }
@@ -348,6 +392,7 @@ impl Receiver {
 impl Drop for Receiver {
     fn drop(&mut self) {
         self.link.stop.store(true, Ordering::Relaxed);
+        self.lookout.finish();
         for seat in &mut self.seats {
             if let Place::AtWork(worker) = std::mem::replace(&mut seat.place, Place::Between) {
                 // What it fetched is on disk.

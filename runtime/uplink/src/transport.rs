@@ -123,4 +123,7 @@ pub trait Inlet: Send + Sync {
         patience: Patience,
         accept: &mut dyn FnMut(&[u8]) -> bool,
     ) -> Result<(), TransportError>;
+
+    /// Forgets the session where aircraft would read of it after its end.
+    fn end_session(&self) {}
 }

@@ -52,7 +52,7 @@ const MOST_TURNS: u32 = 30_000;
 /// An aircraft without keys, every start of which is its first flight.
 pub(super) fn unsigned(mission: &str, aircraft: &str) -> Source {
     let (mission, aircraft, identity) = (mission.into(), aircraft.into(), Identity::unsigned());
-    Source { mission, aircraft, identity, flight_number: None, disk: Disk::default(), territory: None }
+    Source { mission, aircraft, identity, flight_number: None, session: None, disk: Disk::default(), territory: None }
 }
 
 /// What would have been reconstructed. Key frames and checkpoints are kept on disk as the real one keeps them.

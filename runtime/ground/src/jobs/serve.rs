@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use config::error::{Error, ErrorKind};
 use config::mission::Mission;
+use config::upload::UploadSettings;
 use uplink::UploadError;
 use uplink::admission::{Admission, ModelRefusal, Refusals};
 use uplink::keys::{GROUND, Identity};
@@ -76,12 +77,21 @@ pub struct Reception {
     pub received: Vec<Received>,
     /// Aircraft without a final model.
     pub missing: Vec<String>,
+    /// Those of them whose final model of an earlier session was shown instead, and what it is.
+    pub stale: Vec<(String, String)>,
     /// What happened on the way.
     pub counters: ReceiveCounters,
     /// What was not let in, and why.
     pub refusals: Refusals,
     /// Seconds.
     pub seconds: f64,
+}
+
+impl Reception {
+    /// The aircraft whose model does not say which session of the ground it was made for.
+    pub fn unbound(&self) -> impl Iterator<Item = &str> {
+        self.received.iter().filter(|r| !r.bound).map(|r| r.aircraft.as_str())
+    }
 }
 
 /// Receives until the last model of every aircraft is here, `timeout`, or `stop`.
@@ -124,10 +134,14 @@ pub fn receive(
             receiver.wait();
         }
     }
+    if receiver.all_finished() {
+        receiver.end_session();
+    }
     let received = receiver.received();
     let is_here = |id: &String| received.iter().any(|r| r.finished && r.aircraft == *id);
     Ok(Reception {
         missing: ids.iter().filter(|id| !is_here(id)).cloned().collect(),
+        stale: receiver.stale(),
         counters: receiver.counters,
         refusals: std::mem::take(&mut receiver.refusals),
         seconds: start.elapsed().as_secs_f64(),
@@ -138,13 +152,14 @@ pub fn receive(
 /// What the ground of this mission lets in.
 fn admission(mission: &Mission, received: &Path) -> Result<Admission, UploadError> {
     let identity = Identity::of(mission, GROUND)?;
-    let (state, again) = (config::state::folder(&mission.upload.keys), mission.upload.again);
-    let memory = match Memory::open(&state, &mission.name, received, again) {
+    let UploadSettings { keys, again, session, .. } = &mission.upload;
+    let (state, word) = (config::state::folder(keys), session.as_deref());
+    let memory = match Memory::open(&state, &mission.name, received, word, *again) {
         Ok(memory) => memory,
         Err(e) if identity.is_signed() => return Err(uplink::store::StoreError::from(e).into()),
         Err(e) => {
             tracing::warn!("serve: {e}; models that this session receives are not known to later ones");
-            Memory::default()
+            Memory::forgetful(word, *again).map_err(UploadError::Random)?
         }
     };
     let (name, aircraft) = (mission.name.clone(), mission.aircraft.iter().map(|a| a.id.clone()).collect());

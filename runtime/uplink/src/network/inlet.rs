@@ -10,9 +10,11 @@ use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Session, Wait};
 
-use super::super::offer::{Offer, hex};
+use super::super::offer::{Hash, Offer, hex};
 use super::super::transport::{Inlet, Patience, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
+use crate::admission::Admission;
+use crate::binding;
 use crate::keys::{Domain, GROUND, Identity};
 
 /// What zenoh lets pass on the ground: from each aircraft, known by its certificate's common name, what lies under its own
@@ -46,6 +48,7 @@ pub struct NetworkInlet {
     mission: String,
     endpoints: String,
     identity: Identity,
+    session_number: Hash,
     max_offer: u64,
 }
 
@@ -56,11 +59,10 @@ impl NetworkInlet {
     /// An endpoint that cannot be listened on (in use, not ours), or unreadable certificates.
     pub fn open(
         settings: &UploadSettings,
-        mission: &str,
-        aircraft: &[String],
-        identity: &Identity,
+        admission: &Admission,
         wake: SyncSender<()>,
     ) -> Result<Self, TransportError> {
+        let Admission { mission, aircraft, identity, .. } = admission;
         let session = open(
             settings,
             &settings.listen,
@@ -77,8 +79,14 @@ impl NetworkInlet {
             .background()
             .wait()
             .map_err(network)?;
-        let (mission, endpoints) = (mission.into(), settings.listen.join(", "));
-        Ok(Self { session, mission, endpoints, identity: identity.clone(), max_offer: Offer::max_encoded(settings) })
+        Ok(Self {
+            session,
+            mission: mission.clone(),
+            endpoints: settings.listen.join(", "),
+            identity: identity.clone(),
+            session_number: *admission.memory.session(),
+            max_offer: Offer::max_encoded(settings),
+        })
     }
 
     /// Shows every answer to one query until `take` is content; an answer above `limit` is shown as an empty one. Returns
@@ -101,13 +109,9 @@ impl NetworkInlet {
             .consolidation(ConsolidationMode::None)
             .with(FifoChannel::new(4));
         // A receipt is signed itself.
-        let signed = self.identity.sign(Domain::Request, key.as_bytes());
-        let replies = match (payload, signed) {
-            (Some(payload), _) => query.payload(payload).wait(),
-            (None, Some(signature)) => query.payload(signature.to_vec()).wait(),
-            (None, None) => query.wait(),
-        };
-        let replies = replies.map_err(network)?;
+        let question = || binding::seal(&self.session_number, key, Domain::Request, &self.identity);
+        let payload = payload.map_or_else(question, <[u8]>::to_vec);
+        let replies = query.payload(payload).wait().map_err(network)?;
         let (until, mut not_held) = (Instant::now() + patience.limit, false);
         while Instant::now() < until && !patience.stop.load(Ordering::Relaxed) {
             let reply = match replies.recv_timeout(LOOK_UP) {

@@ -13,11 +13,12 @@ use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
 use super::super::Source;
-use super::super::offer::{Offer, OfferedModel};
+use super::super::offer::{Hash, Offer, OfferedModel};
 use super::super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::super::transport::{Outlet, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
-use crate::keys::{Domain, GROUND, SignatureBytes};
+use crate::binding;
+use crate::keys::Domain;
 
 /// A model under way is let go when nobody has asked for it for so long: longer than the ground ever waits for a chunk.
 const KEPT_FOR: Duration = Duration::from_secs(900);
@@ -127,11 +128,15 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
     let Some(rest) = asked.strip_prefix("dgtr/") else { return };
     let Some((_, rest)) = rest.split_once('/') else { return };
     let Some((_, what)) = rest.split_once('/') else { return };
-    if what != "receipt" && !is_asked_by_the_ground(shared, asked, query) {
+    let session = session_of(shared, asked, query);
+    if what != "receipt" && session.is_none() {
         return;
     }
     let payload = match what.split_once('/') {
-        None if what == "offer" => locked(&shared.models).front().map(|k| k.model.offer.encode()),
+        None if what == "offer" => {
+            let newest = locked(&shared.models).front().map(|kept| kept.model.clone());
+            newest.map(|model| shared.source.bind(&model.offer, session).encode())
+        }
         None if what == "receipt" => acknowledge(shared, query),
         Some(("chunk", name)) => match find(shared, name) {
             Some((model, index)) => match model.chunk(index) {
@@ -163,11 +168,11 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
     }
 }
 
-/// Whether the ground signed the question, where anything is signed: others would take the link from it.
-fn is_asked_by_the_ground(shared: &Shared, asked: &str, query: &Query) -> bool {
-    let payload = query.payload().filter(|p| p.len() <= size_of::<SignatureBytes>()).map(|p| p.to_bytes());
-    let signature = payload.and_then(|p| SignatureBytes::try_from(&*p).ok());
-    shared.source.identity.verify(GROUND, Domain::Request, asked.as_bytes(), signature.as_ref()).is_ok()
+/// The session that the ground asks for. None unless it signed the question, where anything is signed: others would take the
+/// link from it.
+fn session_of(shared: &Shared, asked: &str, query: &Query) -> Option<Hash> {
+    let payload = query.payload().filter(|p| p.len() as u64 <= binding::MAX_SEALED)?.to_bytes();
+    binding::open(&payload, asked, Domain::Request, &shared.source.identity)
 }
 
 /// Takes a receipt that is really the ground's, and signs for it.

@@ -6,8 +6,10 @@ use std::time::Instant;
 
 use super::*;
 use crate::admission::Admission;
+use crate::binding;
 use crate::keys::testing::identities;
 use crate::keys::{Domain, Identity};
+use crate::memory::Memory;
 use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::receive::Receiver;
@@ -73,8 +75,8 @@ fn a_false_receipt_over_the_network_is_not_believed() {
     let until = Instant::now() + LIMIT;
     let asks = |who: &Identity| {
         let key = "dgtr/m/a1/offer";
-        let signature = who.sign(Domain::Request, key.as_bytes()).map_or(Vec::new(), |s| s.to_vec());
-        stranger.get(key).payload(signature).timeout(LOOK_UP * 5).wait().expect("asked").into_iter().count()
+        let question = binding::seal(&[3; 32], key, Domain::Request, who);
+        stranger.get(key).payload(question).timeout(LOOK_UP * 5).wait().expect("asked").into_iter().count()
     };
     while asks(&ids[2]) == 0 {
         assert!(Instant::now() < until, "no connection");
@@ -208,4 +210,35 @@ fn the_keys_of_the_mission_are_all_that_tls_needs_and_keep_strangers_out() {
     a2.offer_final(&path);
     assert!(receive(&mut r, LIMIT, |r| r.all_finished() && r.all_told()), "{:?}", r.counters);
     assert!(!stranger.status().delivered);
+}
+
+/// Whoever kept yesterday's answer gives it today, to a ground that remembers nothing.
+#[test]
+fn an_answer_kept_from_another_session_is_refused_and_todays_is_bound_to_todays() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = settings(&format!("tcp/127.0.0.1:{}", free_port()));
+    let ids = identities(["a1"]);
+    let memory = |day: &str| Memory::open(dir.path(), "m", &dir.path().join(day), None, false).expect("memory");
+    let admission = |memory| Admission {
+        mission: "m".into(),
+        aircraft: vec!["a1".into()],
+        identity: ids[1].clone(),
+        check: Box::new(|_, _| Ok(())),
+        memory,
+    };
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 6)).expect("write");
+    let order = Order { flight: u64::MAX, counter: 1 };
+    let old = OfferedModel::open(&path, &settings, &source("a1", &ids[0]), order, true).expect("offer").offer;
+    let kept = old.bound_to(memory("yesterday").session(), &ids[0]).encode();
+    let mut r = Receiver::open(&settings, admission(memory("today")), &dir.path().join("today")).expect("receiver");
+    let replay = open_client(&settings, "dgtr/m/a1/**", kept);
+    assert!(receive(&mut r, LIMIT, |r| !r.stale().is_empty()), "{:?}", r.counters);
+    assert!(r.received().is_empty() && r.stale()[0].1.contains("it was made for another one"), "{:?}", r.stale());
+    std::fs::write(&path, noise(100_000, 7)).expect("write");
+    let a1 = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
+    a1.offer_final(&path);
+    assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?} {:?}", r.counters, a1.status());
+    assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(100_000, 7) && r.received()[0].bound);
+    drop(replay);
 }

@@ -4,7 +4,9 @@ use super::*;
 
 #[test]
 fn the_page_on_formats_states_this_version() {
-    let row = format!("| offer of a model | {EVEN}; {PIECES} for models in cells |");
+    let row = format!(
+        "| offer of a model | {EVEN}; {PIECES} for models in cells; {EVEN_BOUND} and {PIECES_BOUND} where bound to a session |"
+    );
     assert!(include_str!("../../../../models/FORMATS.md").contains(&row), "{row}");
 }
 

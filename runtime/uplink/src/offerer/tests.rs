@@ -296,7 +296,8 @@ fn yesterdays_final_model_on_the_stick_is_named_and_not_taken_for_todays() {
     };
     let session = |name: &str, again: bool| {
         let received = dir.path().join(name);
-        let memory = crate::memory::Memory::open(&dir.path().join("state"), "m", &received, again).expect("memory");
+        let memory =
+            crate::memory::Memory::open(&dir.path().join("state"), "m", &received, None, again).expect("memory");
         Receiver::open(&settings, Admission { memory, ..admission(&["a1"], ids[1].clone()) }, &received)
             .expect("receiver")
     };
@@ -330,7 +331,8 @@ fn an_aircraft_whose_numbers_fell_behind_an_earlier_session_is_told_and_goes_on_
     };
     for (day, seed) in [("first", 1), ("second", 2)] {
         let received = dir.path().join(day);
-        let memory = crate::memory::Memory::open(&dir.path().join("state"), "m", &received, false).expect("memory");
+        let memory =
+            crate::memory::Memory::open(&dir.path().join("state"), "m", &received, None, false).expect("memory");
         let admission = Admission { memory, ..admission(&["a1"], ids[1].clone()) };
         let mut r = Receiver::open(&settings, admission, &received).expect("receiver");
         let path = dir.path().join("m.dgtr");
@@ -341,4 +343,52 @@ fn an_aircraft_whose_numbers_fell_behind_an_earlier_session_is_told_and_goes_on_
         assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{day}: {:?}", r.counters);
         assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(100_000, seed));
     }
+}
+
+/// Another computer at the ground has no memory; what an offer was made for is in the offer.
+#[test]
+fn a_model_made_for_another_session_is_refused_by_a_ground_that_remembers_nothing() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let ids = crate::keys::testing::identities(["a1"]);
+    let settings = UploadSettings {
+        folder: Some(dir.path().join("stick")),
+        retry_min_s: 0.05,
+        poll_s: 0.05,
+        ..Default::default()
+    };
+    let fly = |seed: u8| {
+        let path = dir.path().join("m.dgtr");
+        std::fs::write(&path, noise(100_000, seed)).expect("write");
+        let numbers = Some(dir.path().join("a1.flight"));
+        let source = Source { identity: ids[0].clone(), flight_number: numbers, ..Source::unsigned("m", "a1") };
+        let o = Offerer::start(&settings, source).expect("offerer");
+        o.offer_final(&path);
+        assert!(o.wait_delivered(LIMIT, || true));
+    };
+    let session = |computer: &str| {
+        let (state, received) = (dir.path().join(format!("state of {computer}")), dir.path().join(computer));
+        std::fs::create_dir_all(&state).expect("made");
+        let memory = crate::memory::Memory::open(&state, "m", &received, None, false).expect("memory");
+        let admission = Admission { memory, ..admission(&["a1"], ids[1].clone()) };
+        Receiver::open(&settings, admission, &received).expect("receiver")
+    };
+    // The stick is in the ground's computer before the flight.
+    let mut yesterday = session("yesterday's");
+    assert!(
+        !receive(&mut yesterday, Duration::ZERO, |_| false)
+            && !yesterday.round(&AtomicBool::new(false)).expect("round")
+    );
+    fly(1);
+    assert!(receive(&mut yesterday, LIMIT, |r| r.all_finished()) && yesterday.received()[0].bound);
+    let mut today = session("today's");
+    assert!(!receive(&mut today, Duration::from_secs(1), |r| r.all_finished()), "yesterday's was taken");
+    let [(id, why)] = &today.stale()[..] else { panic!("{:?}", today.stale()) };
+    assert!(id == "a1" && why.contains("a1's final model of flight 1 is not of this session"), "{why}");
+    fly(2);
+    assert!(receive(&mut today, LIMIT, |r| r.all_finished()), "{:?}", today.counters);
+    assert!(std::fs::read(&today.received()[0].path).expect("read") == noise(100_000, 2));
+    assert!(today.received()[0].bound && today.stale().is_empty());
+    // Between two sessions the stick names none.
+    today.end_session();
+    assert!(!dir.path().join("stick/m/ground.session").exists());
 }

@@ -16,7 +16,7 @@ const PER_AIRCRAFT: usize = 4;
 const MOST: usize = 4 * PER_AIRCRAFT * MAX_AIRCRAFT;
 
 /// What is shown now.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct Sight {
     /// By the hash of their bytes.
     offers: HashMap<blake3::Hash, Arc<Offer>>,
@@ -27,6 +27,17 @@ impl Sight {
     /// Of one aircraft, in the order they were seen.
     pub fn of(&self, aircraft: &str) -> &[Shown] {
         self.by_aircraft.get(aircraft).map_or(&[], Vec::as_slice)
+    }
+
+    /// Takes over what `newer` shows of the aircraft in it.
+    pub fn update(&mut self, newer: Self) {
+        self.by_aircraft.extend(newer.by_aircraft);
+        self.offers = newer.offers;
+    }
+
+    /// The aircraft that are shown.
+    pub fn aircraft(&self) -> impl Iterator<Item = &str> {
+        self.by_aircraft.keys().map(String::as_str)
     }
 
     /// Takes in what `inlet` shows; `let_in` is asked where neither this nor the look before has these bytes.

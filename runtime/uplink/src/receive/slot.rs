@@ -11,6 +11,7 @@ use super::sight::Shown;
 use super::{ANSWER, ReceiveCounters, Received};
 use crate::admission::{Admission, ModelRefusal, Refusals};
 use crate::keys::{Domain, SignatureBytes};
+use crate::memory::Stale;
 use crate::offer::{Hash, Offer, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::store::{Store, StoreError};
@@ -60,6 +61,8 @@ pub(super) struct Slot {
     remembered: Option<Offer>,
     /// The order it was told about.
     told_behind: Option<Order>,
+    /// A last model that is shown and is not of this session, in words.
+    stale: Option<String>,
     /// Failures in a row.
     failures: u32,
     /// Which of `Target::from` to use; moves on with every failure, as the stick may have what the radio cannot bring.
@@ -86,6 +89,7 @@ impl Slot {
             behind: Vec::new(),
             remembered: None,
             told_behind: None,
+            stale: None,
             failures: 0,
             source: 0,
             not_before: Instant::now(),
@@ -100,7 +104,8 @@ impl Slot {
     pub(super) fn received(&self) -> Option<Received> {
         let offer = self.store.complete()?;
         let path = self.store.model_path();
-        Some(Received { aircraft: self.id.clone(), path, finished: offer.finished, size: offer.size })
+        let bound = offer.session.is_some();
+        Some(Received { aircraft: self.id.clone(), path, finished: offer.finished, size: offer.size, bound })
     }
 
     pub(super) fn progress(&self) -> (usize, usize) {
@@ -121,6 +126,10 @@ impl Slot {
         self.last_word_refused || self.store.complete().is_none_or(|o| self.confirmed == Some(o.digest()))
     }
 
+    pub(super) fn stale(&self) -> Option<String> {
+        self.stale.clone()
+    }
+
     pub(super) fn wants_work(&self) -> bool {
         (self.target.is_some() || !self.behind.is_empty()) && Instant::now() >= self.not_before
     }
@@ -139,14 +148,22 @@ impl Slot {
             offers.iter().partition(|(o, _)| admission.memory.is_stale(o, &key).is_some());
         counters.stale += stale.len() as u64;
         for (offer, inlet) in &stale {
-            let Some(order) = admission.memory.is_stale(offer, &key) else { continue };
+            let Some(stale) = admission.memory.is_stale(offer, &key) else { continue };
             let kind = if offer.finished { "final model" } else { "checkpoint" };
-            refusals.count(format!(
-                "{}'s {kind} of flight {} is not of this session: an earlier one has received flight {} of it; clear the \
-                 stick, or give --again to take it once more",
-                self.id, offer.order.flight, order.flight
-            ));
-            if self.told_behind != Some(offer.order) {
+            let why = match stale {
+                Stale::Received(order) => format!("an earlier one has received flight {} of it", order.flight),
+                Stale::OtherSession => "it was made for another one".into(),
+                Stale::NoSession => "it was made for none, and the mission names one".into(),
+            };
+            let why = format!(
+                "{}'s {kind} of flight {} is not of this session: {why}; clear the stick, or give --again to take it all the same",
+                self.id, offer.order.flight
+            );
+            self.stale = offer.finished.then(|| why.clone()).or(self.stale.take());
+            refusals.count(why);
+            if let Stale::Received(order) = stale
+                && self.told_behind != Some(offer.order)
+            {
                 // Its numbers may have fallen behind; then it should know.
                 let mut known = Offer::clone(offer);
                 known.order = order;

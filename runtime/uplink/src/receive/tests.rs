@@ -9,10 +9,10 @@ use crate::admission::ModelRefusal;
 use crate::keys::Domain;
 use crate::keys::Identity;
 use crate::keys::testing::identities;
-use crate::offer::{OfferedModel, Order};
+use crate::offer::{Offer, OfferedModel, Order};
 use crate::receipt::{Delivery, Receipt};
 use crate::testing::noise;
-use crate::transport::TransportError;
+use crate::transport::{Patience, TransportError};
 
 mod aircraft;
 mod cells;
@@ -307,4 +307,63 @@ fn one_aircraft_that_cannot_be_written_costs_the_others_nothing_and_is_tried_aga
     std::fs::remove_file(dir.join("a1")).expect("out of the way");
     b.rounds(&mut r, 3);
     assert!(r.all_finished(), "it goes on by itself");
+}
+
+/// One who never answered made every look last ten seconds, and each transfer wait for it.
+#[test]
+fn whoever_never_answers_delays_neither_offers_nor_transfers_nor_the_end() {
+    let b = Bench::new();
+    struct Silent(Arc<Fake>);
+    impl Inlet for Silent {
+        fn name(&self) -> String {
+            "somebody who never answers, among others".into()
+        }
+
+        fn offers(&self, patience: Patience, see: &mut dyn FnMut(&[u8])) -> Result<(), TransportError> {
+            self.0.offers(patience, see)?;
+            while !patience.stop.load(Ordering::Relaxed) {
+                std::thread::sleep(LOOK_UP);
+            }
+            Ok(())
+        }
+
+        fn chunk(
+            &self,
+            offer: &Offer,
+            index: usize,
+            patience: Patience,
+            accept: &mut dyn FnMut(&[u8]) -> bool,
+        ) -> Result<Vec<u8>, TransportError> {
+            self.0.chunk(offer, index, patience, accept)
+        }
+
+        fn deliver_receipt(
+            &self,
+            aircraft: &str,
+            receipt: &[u8],
+            patience: Patience,
+            accept: &mut dyn FnMut(&[u8]) -> bool,
+        ) -> Result<(), TransportError> {
+            self.0.deliver_receipt(aircraft, receipt, patience, accept)
+        }
+    }
+    let settings = UploadSettings { poll_s: 0.3, ..b.settings.clone() };
+    let inlets: Vec<Box<dyn Inlet>> = vec![Box::new(Silent(b.fake.clone()))];
+    let dir = b.dir.path().join("received");
+    let (mission, aircraft, memory) = ("m".into(), vec!["a1".into()], Default::default());
+    let identity = Identity::unsigned();
+    let admission = Admission { mission, aircraft, identity, check: Box::new(|_, _| Ok(())), memory };
+    let mut r = Receiver::with_inlets(&settings, admission, &dir, inlets, sync_channel(1)).expect("receiver");
+    b.publish(b.model(&noise(100_000, 40), 1, false));
+    b.rounds(&mut r, 2);
+    assert_eq!(bytes_here(&r), noise(100_000, 40));
+    // The last model is found although the first looks still wait.
+    b.publish(b.model(&noise(60_000, 41), 2, true));
+    let mut rounds = 0;
+    while !r.all_finished() && rounds < 40 {
+        b.rounds(&mut r, 1);
+        rounds += 1;
+    }
+    assert_eq!(bytes_here(&r), noise(60_000, 41));
+    assert_eq!((r.counters.models, r.counters.retries), (2, 0));
 }

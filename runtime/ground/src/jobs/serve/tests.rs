@@ -8,7 +8,15 @@ use crate::testing::{carpet, model};
 /// An aircraft without keys, every start of which is its first flight.
 pub(super) fn unsigned(mission: &str, aircraft: &str) -> Source {
     let (mission, aircraft, identity) = (mission.into(), aircraft.into(), Identity::unsigned());
-    Source { mission, aircraft, identity, flight_number: None, disk: Default::default(), territory: None }
+    Source {
+        mission,
+        aircraft,
+        identity,
+        flight_number: None,
+        session: None,
+        disk: Default::default(),
+        territory: None,
+    }
 }
 
 pub(super) fn mission(dir: &Path) -> Mission {
