@@ -278,6 +278,7 @@ impl Aircraft {
             aircraft,
             identity: Identity::unsigned(),
             flight_number,
+            session: None,
             disk,
             territory: None,
         };
