@@ -12,7 +12,6 @@ use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use uplink::Source;
-use uplink::admission::Admission;
 use uplink::folder::{FolderInlet, FolderOutlet};
 use uplink::keys::Identity;
 use uplink::offer::{Offer, OfferedModel, Order, hex};
@@ -47,12 +46,6 @@ fn source() -> Source {
         disk: Default::default(),
         territory: None,
     }
-}
-
-/// A ground that believes everybody.
-fn ground() -> Admission {
-    let (mission, aircraft, memory) = ("park".into(), vec!["west".into()], Default::default());
-    Admission { mission, aircraft, identity: Identity::unsigned(), check: Box::new(|_, _| Ok(())), memory }
 }
 
 /// A model file of so many bytes, on offer.
@@ -135,7 +128,7 @@ fn chunks() {
     outlet
         .offer(&Arc::new(model.renumbered(model.offer.order, &Identity::unsigned()).expect("open")))
         .expect("offered");
-    let inlet = FolderInlet::of(&folder.path().join("stick"), &ground(), &settings());
+    let inlet = FolderInlet::new(&folder.path().join("stick"), "park", &[1; 32], &Identity::unsigned(), 4096);
     let whole = model.chunk(0).expect("a chunk");
     let path = folder.path().join("stick/park/west/chunk").join(hex(&model.offer.chunks[0]));
     let stop = AtomicBool::new(false);

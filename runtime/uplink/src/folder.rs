@@ -11,17 +11,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use config::mission::MAX_AIRCRAFT;
-use config::upload::UploadSettings;
 use disk::Disk;
 
 use super::Source;
-use super::admission::Admission;
 use super::binding;
 use super::medium::Medium;
 use super::offer::{Hash, Offer, OfferedModel, hex, is_safe_name};
 use super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::transport::{Inlet, Outlet, Patience, TransportError};
-use crate::keys::Domain;
+use crate::keys::{Domain, Identity};
 
 /// Most aircraft folders looked at; more than any mission has.
 const MAX_ENTRIES: usize = 4 * MAX_AIRCRAFT;
@@ -197,11 +195,10 @@ pub struct FolderInlet {
 }
 
 impl FolderInlet {
-    /// Reads offers below `root`, and says there which session they are to be bound to.
-    pub fn of(root: &Path, admission: &Admission, settings: &UploadSettings) -> Self {
-        let Admission { mission, identity, memory, .. } = admission;
-        let session = binding::seal(memory.session(), mission, Domain::Session, identity);
-        Self { root: root.into(), dir: root.join(mission), session, max_offer: Offer::max_encoded(settings) }
+    /// Reads offers of `mission` below `root`, and says there that they are to be bound to `session`.
+    pub fn new(root: &Path, mission: &str, session: &Hash, ground: &Identity, max_offer: u64) -> Self {
+        let session = binding::seal(session, mission, Domain::Session, ground);
+        Self { root: root.into(), dir: root.join(mission), session, max_offer }
     }
 
     /// Writes the session where aircraft read it. A medium that cannot be written to, or is not there, brings models all the same.

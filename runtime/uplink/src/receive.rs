@@ -20,7 +20,7 @@ use config::upload::UploadSettings;
 use super::UploadError;
 use super::admission::{Admission, Refusals};
 use super::folder::FolderInlet;
-use super::offer::OfferError;
+use super::offer::{Offer, OfferError};
 use super::transport::Inlet;
 use lookout::{Lookout, QUIET};
 use sight::Sight;
@@ -178,7 +178,9 @@ impl Receiver {
         let (sender, wake) = sync_channel(1);
         let mut inlets: Vec<Box<dyn Inlet>> = Vec::new();
         if let Some(folder) = &settings.folder {
-            inlets.push(Box::new(FolderInlet::of(folder, &admission, settings)));
+            let Admission { mission, identity, memory, .. } = &admission;
+            let most = Offer::max_encoded(settings);
+            inlets.push(Box::new(FolderInlet::new(folder, mission, memory.session(), identity, most)));
         }
         #[cfg(feature = "zenoh")]
         if !settings.listen.is_empty() {

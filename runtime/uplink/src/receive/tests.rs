@@ -9,7 +9,7 @@ use crate::admission::ModelRefusal;
 use crate::keys::Domain;
 use crate::keys::Identity;
 use crate::keys::testing::identities;
-use crate::offer::{Offer, OfferedModel, Order};
+use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Delivery, Receipt};
 use crate::testing::noise;
 use crate::transport::{Patience, TransportError};
