@@ -1,10 +1,9 @@
 //! How many Gaussians a piece of ground gets while the flight goes on: its share of the plan, so that what is flown last finds the
 //! room that what was flown first found.
 
+use config::plan::Plan;
 use geometry::polygon::{perimeter, signed_area};
 use glam::DVec2;
-
-use super::Reconstruction;
 
 /// Pictures of a survey show each place so often at least; where no region says how much ground there is, as many as were planned
 /// for show this much less than their number.
@@ -41,6 +40,12 @@ impl Share {
         Self { capacity, per_m2: capacity as f64 / ground_m2.max(1e-6) }
     }
 
+    /// The share of a flight over `region`, whose pictures show `footprint_m` of the ground: all of the plan before that is known.
+    pub fn of_flight(plan: &Plan, region: &[[f64; 2]], footprint_m: Option<[f64; 2]>) -> Self {
+        let per_m2 = footprint_m.map_or(f64::INFINITY, |f| per_m2(plan.scene, region, f, plan.views));
+        Self { capacity: plan.scene, per_m2 }
+    }
+
     /// Side of the squares that hold a few dozen Gaussians each, metres, and how many those are at most.
     pub fn square(&self) -> (f64, u32) {
         let side = (f64::from(IN_A_SQUARE) / self.per_m2).sqrt();
@@ -53,16 +58,6 @@ impl Share {
             true => ((self.per_m2 * ground_m2) as usize).clamp(FEWEST.min(self.capacity), self.capacity),
             false => self.capacity,
         }
-    }
-}
-
-impl Reconstruction {
-    /// How ground is shared out while pictures still come.
-    pub(super) fn share(&self) -> Share {
-        let (capacity, views) = (self.trainer.plan().scene, self.trainer.plan().views);
-        let footprint = self.initialiser.as_ref().and_then(|i| (0..self.initialised).find_map(|k| i.footprint_m(k)));
-        let density = footprint.map_or(f64::INFINITY, |f| per_m2(capacity, &self.header.region, f, views));
-        Share { capacity, per_m2: density }
     }
 }
 

@@ -3,27 +3,27 @@
 //! and colours alone are trained on top of them: what the rounding breaks, they mend.
 
 use std::cmp::Ordering;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
 
+use config::map::MapSettings;
 use config::training::RateSettings;
+use disk::Disk;
+use job::run_json::RunReport;
 use models::formats::FormatError;
-use models::formats::delivery;
+use models::formats::delivery::{self, Rounding};
+use models::formats::model::ModelHeader;
 use vulkan::trainer::{BoundingBox, Fate, StepReport, Trained};
 
-use super::Reconstruction;
-use super::average::Average;
+use super::poses::Poses;
+use super::training::Training;
+use super::{map, model_path};
 use crate::error::EngineError;
 
 /// Rates of the colours beside those at the end of the schedule: they have something to mend.
 const COLOR_FACTOR: f32 = 2.0;
-/// How often each view is looked at before it is known what the loss hangs on.
+/// How often each view is visited before it is known what the loss hangs on.
 const PASSES: usize = 2;
-
-/// What has been done to the model since it was built.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Delivery {
-    thinned: bool,
-    pub rounded: bool,
-}
 
 /// What is done next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,88 +52,81 @@ impl Due {
     }
 }
 
-impl Reconstruction {
-    /// What is yet to be done to a model that is delivered rounded; nothing while pictures come.
-    pub(super) fn delivery_due(&self) -> Due {
-        let t = &self.settings.training;
-        let delivers = self.settings.delivers.is_some() && !self.flying;
-        let thins = delivers && !self.delivery.thinned && t.thinned_share > 0.0;
-        Due {
-            thin: thins.then_some((t.thinned_at, self.least_steps())),
-            round: (delivers && !self.delivery.rounded && t.rounded_share > 0.0).then_some(1.0 - t.rounded_share),
-        }
+/// The model as it is delivered: its file, its map, and what has been done to it since it was built.
+pub(super) struct Delivery {
+    pub(super) disk: Disk,
+    /// To what the model is rounded, if it is.
+    rounding: Option<Rounding>,
+    map: Option<MapSettings>,
+    /// The build that the last map shows.
+    mapped: u32,
+    thinned: bool,
+    rounded: bool,
+    /// What the model file says of itself, as of the last checkpoint.
+    pub(super) header: ModelHeader,
+}
+
+impl Delivery {
+    pub fn new(disk: Disk, rounding: Option<Rounding>, map: Option<MapSettings>, header: ModelHeader) -> Self {
+        Self { disk, rounding, map, mapped: 0, thinned: false, rounded: false, header }
     }
 
-    /// Steps after which every view has been looked at [`PASSES`] times.
-    fn least_steps(&self) -> u32 {
-        (PASSES * self.views.len()) as u32
+    /// Shapes are rounded, and colours alone are trained.
+    pub fn is_rounded(&self) -> bool {
+        self.rounded
+    }
+
+    pub fn count_steps(&mut self, steps: u32) {
+        self.header.steps += u64::from(steps);
+    }
+
+    /// Goes on where the model of an earlier run ended.
+    pub fn continue_from(&mut self, earlier: &ModelHeader) {
+        (self.header.steps, self.header.thinned) = (earlier.steps, earlier.thinned);
+    }
+
+    /// What is yet to be done to a model that is delivered rounded; nothing while pictures come.
+    pub fn due(&self, training: &Training) -> Due {
+        let t = &training.settings;
+        let delivers = self.rounding.is_some() && !training.flying;
+        let thins = delivers && !self.thinned && t.thinned_share > 0.0;
+        Due {
+            thin: thins.then_some((t.thinned_at, least_steps(training))),
+            round: (delivers && !self.rounded && t.rounded_share > 0.0).then_some(1.0 - t.rounded_share),
+        }
     }
 
     /// Does what is due. The schedule goes on.
-    pub(super) fn prepare_delivery(&mut self, next: Next) -> Result<(), EngineError> {
+    pub fn prepare(&mut self, next: Next, training: &mut Training, report: &mut RunReport) -> Result<(), EngineError> {
         match next {
             Next::Thin => {
-                (self.delivery.thinned, self.header.thinned) = (true, true);
-                let t = &self.settings.training;
-                let gone = self.thin(t.thinned_share, t.thinned_loss * self.pictures.store.mean_loss())?;
-                self.trainer.keep_number();
-                self.report.skip("gaussians_thinned", gone as u64);
-                tracing::info!("thinned for delivery by {gone} Gaussians, {} remain", self.trainer.gaussians());
+                (self.thinned, self.header.thinned) = (true, true);
+                let t = &training.settings;
+                let (share, most_loss) = (t.thinned_share, t.thinned_loss * training.pictures.store.mean_loss());
+                let gone = thin(training, share, most_loss)?;
+                training.trainer.keep_number();
+                report.skip("gaussians_thinned", gone as u64);
+                tracing::info!("thinned for delivery by {gone} Gaussians, {} remain", training.trainer.gaussians());
                 Ok(())
             }
-            Next::Round => self.round(),
+            Next::Round => self.round(training),
         }
-    }
-
-    /// Takes Gaussians out, those of the least [sensitivity](Trained::sensitivity), and leaves all else as it is: `share` of them, or as
-    /// many as have sensitivities of no more than `most_loss` together. How many those were. The least opaque ones where too few steps
-    /// were taken to tell.
-    pub(super) fn thin(&mut self, share: f32, most_loss: f32) -> Result<usize, EngineError> {
-        let told = self.trainer.schedule().taken() >= self.least_steps();
-        let worth = |g: &Trained| if told { g.sensitivity } else { g.opacity_logit };
-        let mut all = Vec::with_capacity(self.trainer.gaussians());
-        self.trainer.each(&BoundingBox::ALL, |g| all.push(worth(g)))?;
-        all.sort_unstable_by(f32::total_cmp);
-        let mut leave = (f64::from(share) * all.len() as f64) as usize;
-        if told {
-            let mut lost = 0.0f64;
-            let cheap = all.iter().take_while(|v| {
-                lost += f64::from(**v);
-                lost <= f64::from(most_loss)
-            });
-            leave = leave.min(cheap.count());
-        }
-        let Some(most) = leave.checked_sub(1).map(|last| all[last]) else { return Ok(0) };
-        // Of those that are worth the same the first ones.
-        let below = all.partition_point(|v| v.total_cmp(&most).is_lt());
-        let mut ties = leave - below;
-        Ok(self.trainer.revise(&BoundingBox::ALL, |g| {
-            let goes = match worth(g).total_cmp(&most) {
-                Ordering::Less => true,
-                Ordering::Equal if ties > 0 => {
-                    ties -= 1;
-                    true
-                }
-                _ => false,
-            };
-            if goes { Fate::Goes } else { Fate::Stays }
-        })?)
     }
 
     /// Rounds what gives a Gaussian its shape, as its delivery will, and trains colours alone from here on.
-    fn round(&mut self) -> Result<(), EngineError> {
-        match self.is_average() {
-            true => self.average()?,
-            false => self.trainer.snapshot(&mut self.cloud)?,
+    fn round(&mut self, training: &mut Training) -> Result<(), EngineError> {
+        match training.is_average() {
+            true => training.average()?,
+            false => training.trainer.snapshot(&mut training.cloud)?,
         }
-        let rounded = delivery::round_shapes(&self.cloud, &self.settings.delivers.unwrap_or_default())
+        let rounded = delivery::round_shapes(&training.cloud, &self.rounding.unwrap_or_default())
             .map_err(|e| FormatError::Invalid { path: "the model".into(), what: format!("not rounded: {e}") })?;
-        self.cloud.clone_from(&rounded);
+        training.cloud.clone_from(&rounded);
         drop(rounded);
-        self.average = Average::default();
-        self.reload()?;
-        let rates = self.settings.training.rates;
-        self.trainer.set_rates(&RateSettings {
+        training.average = Default::default();
+        training.reload()?;
+        let rates = training.settings.rates;
+        training.trainer.set_rates(&RateSettings {
             mean_start: 0.0,
             mean_end: 0.0,
             log_scale: 0.0,
@@ -143,21 +136,88 @@ impl Reconstruction {
             sh_rest: COLOR_FACTOR * rates.sh_rest,
             ..rates
         })?;
-        self.delivery.rounded = true;
+        self.rounded = true;
         tracing::info!("rounded for delivery: colours go on");
         Ok(())
     }
 
-    /// A model that is built anew is trained as a whole. One that is continued is not thinned a second time.
-    pub(super) fn begin_delivery(&mut self) -> Result<(), EngineError> {
-        self.average = Average::default();
-        let thinned = self.is_continued() && self.header.thinned;
-        let was = std::mem::replace(&mut self.delivery, Delivery { thinned, rounded: false });
-        if was.rounded {
-            self.trainer.set_rates(&self.settings.training.rates)?;
+    /// A model that is built anew is trained as a whole. One that is `continued` is not thinned a second time.
+    pub fn begin(&mut self, continued: bool, training: &mut Training) -> Result<(), EngineError> {
+        training.average = Default::default();
+        self.thinned = continued && self.header.thinned;
+        if std::mem::take(&mut self.rounded) {
+            let rates = training.settings.rates;
+            training.trainer.set_rates(&rates)?;
         }
         Ok(())
     }
+
+    /// Writes the model as it is now to `out`, and a map of it after each build; its path and how many Gaussians it has.
+    pub fn write(
+        &mut self,
+        poses: &Poses,
+        training: &mut Training,
+        (out, finished): (&Path, bool),
+        report: &mut RunReport,
+    ) -> Result<(PathBuf, usize), EngineError> {
+        let _span = tracing::info_span!("checkpoint").entered();
+        let from = Instant::now();
+        self.header.finished = finished;
+        let views = poses.views().iter().enumerate().take(training.built.views.len());
+        let view = |i: usize| training.pictures.store.view(i);
+        self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), view(i)?))).collect();
+        self.header.lights = training.pictures.lights(self.header.views.len());
+        let path = model_path(out);
+        let gaussians = training.write(&self.disk, &path, &self.header)?;
+        report.stage("checkpoint", from);
+        let wants_map = training.has_model() && (finished || self.mapped < training.built.times);
+        if let Some(settings) = self.map.filter(|_| wants_map) {
+            self.mapped = training.built.times;
+            map::draw(training, &self.header, settings, (&self.disk, &out.join("map")), report);
+        }
+        Ok((path, gaussians))
+    }
+}
+
+/// Steps after which every view has been visited [`PASSES`] times.
+fn least_steps(training: &Training) -> u32 {
+    (PASSES * training.views()) as u32
+}
+
+/// Takes Gaussians out, those of the least [sensitivity](Trained::sensitivity), and leaves all else as it is: `share` of them, or as
+/// many as have sensitivities of no more than `most_loss` together. How many those were. The least opaque ones where too few steps
+/// were taken to tell.
+pub(super) fn thin(training: &mut Training, share: f32, most_loss: f32) -> Result<usize, EngineError> {
+    let (least_steps, trainer) = (least_steps(training), &mut training.trainer);
+    let told = trainer.schedule().taken() >= least_steps;
+    let worth = |g: &Trained| if told { g.sensitivity } else { g.opacity_logit };
+    let mut all = Vec::with_capacity(trainer.gaussians());
+    trainer.each(&BoundingBox::ALL, |g| all.push(worth(g)))?;
+    all.sort_unstable_by(f32::total_cmp);
+    let mut leave = (f64::from(share) * all.len() as f64) as usize;
+    if told {
+        let mut lost = 0.0f64;
+        let cheap = all.iter().take_while(|v| {
+            lost += f64::from(**v);
+            lost <= f64::from(most_loss)
+        });
+        leave = leave.min(cheap.count());
+    }
+    let Some(most) = leave.checked_sub(1).map(|last| all[last]) else { return Ok(0) };
+    // Of those that are worth the same the first ones.
+    let below = all.partition_point(|v| v.total_cmp(&most).is_lt());
+    let mut ties = leave - below;
+    Ok(trainer.revise(&BoundingBox::ALL, |g| {
+        let goes = match worth(g).total_cmp(&most) {
+            Ordering::Less => true,
+            Ordering::Equal if ties > 0 => {
+                ties -= 1;
+                true
+            }
+            _ => false,
+        };
+        if goes { Fate::Goes } else { Fate::Stays }
+    })?)
 }
 
 #[cfg(test)]

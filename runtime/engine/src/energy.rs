@@ -3,7 +3,6 @@
 use config::training::TrainSettings;
 use job::health::power::Power;
 
-use super::Reconstruction;
 use crate::error::EngineError;
 
 /// Power is read this often, seconds of training.
@@ -68,16 +67,6 @@ pub fn shorter(a: Option<f64>, b: Option<f64>) -> Option<f64> {
     a.into_iter().chain(b).reduce(f64::min)
 }
 
-impl Reconstruction {
-    /// Reads the power, where energy ends the schedule, and sets its seconds by it.
-    pub(super) fn read_power(&mut self) {
-        let Some(meter) = &mut self.meter else { return };
-        let by_energy = meter.read(self.trainer.schedule().spent().1);
-        self.report.more.insert("energy_wh".into(), meter.used_wh().into());
-        self.trainer.schedule_mut().set_seconds(shorter(self.settings.training.seconds, Some(by_energy)));
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::ops::ControlFlow;
@@ -88,7 +77,7 @@ mod tests {
 
     use super::*;
     use crate::testing::{picture, settings};
-    use crate::{EngineSettings, Reconstruct};
+    use crate::{EngineSettings, Reconstruct, Reconstruction};
 
     /// A board whose power monitor can be set.
     fn board() -> (tempfile::TempDir, impl Fn(&Path, f64)) {

@@ -1,15 +1,24 @@
-//! The first Gaussians: of the feed-forward network, of sparse points, or at random.
+//! The first Gaussians: of the feed-forward network, of sparse points, or at random. And the depths that training is held to, which the same
+//! networks make.
 
 use std::collections::HashSet;
+use std::time::Instant;
 
+use config::init::InitSettings;
+use config::mission::NetworkSettings;
+use config::training::TrainSettings;
 use glam::DVec3;
+use image::RgbImage;
 use job::console::Progress;
-use models::camera::{DepthPrior, Pinhole, View};
+use job::run_json::RunReport;
+use models::camera::{DepthPrior, Pinhole, PoseSigma, PosedImage, View};
 use models::cloud::GaussianCloud;
-use models::init::{InitReport, Initialiser, from_sfm, random};
+use models::init::{Growth, Initialisation, Initialiser, from_sfm, random};
 use models::light::Light;
+use models::onnx::depth::DepthNetwork;
 
-use super::Reconstruction;
+use super::poses::{Placed, Point, Poses};
+use super::training::{Fresh, Training};
 use crate::error::EngineError;
 
 /// Points of a random start (3DGS: 100,000).
@@ -26,39 +35,232 @@ pub enum InitKind {
     SparsePoints,
     /// Points at random in what the cameras see.
     Random,
-    /// Those of a model ([`Reconstruction::begin_with`]).
+    /// Those of a model ([`crate::Reconstruction::begin_with`]).
     Model,
 }
 
-/// A triangulated point: ENU metres, 8-bit sRGB.
-pub type Point = ([f64; 3], [u8; 3]);
-
-/// What training starts from.
+/// What makes first Gaussians and depths.
 pub(super) struct FirstGaussians {
-    pub cloud: GaussianCloud,
-    /// Pictures that have a depth.
-    pub with_depth: HashSet<String>,
-    /// The pictures' light, where it is uneven.
-    pub light: Option<Light>,
-    /// Of the feed-forward network.
-    pub report: Option<InitReport>,
+    kind: InitKind,
+    settings: InitSettings,
+    seed: u64,
+    /// The feed-forward network, and what it keeps of pictures.
+    initialiser: Option<Initialiser>,
+    /// The user's own network for the depth loss.
+    depth: Option<DepthNetwork>,
+    /// How many key frames the initialiser has.
+    taken: usize,
+    /// Points of the scene known beforehand.
+    points: Vec<Point>,
 }
 
-impl From<GaussianCloud> for FirstGaussians {
-    fn from(cloud: GaussianCloud) -> Self {
-        Self { cloud, with_depth: HashSet::new(), light: None, report: None }
+impl FirstGaussians {
+    /// Opens the networks that training needs, for so many pictures of at most `size`.
+    pub fn open(
+        kind: InitKind,
+        init: &InitSettings,
+        network: &NetworkSettings,
+        training: &TrainSettings,
+        (size, views): ((u32, u32), usize),
+    ) -> Result<Self, EngineError> {
+        let depth = network.depth.as_deref().filter(|_| training.loss.depth > 0.0);
+        let depth = depth.map(|path| DepthNetwork::open(path, size, init.max_side, init.threads)).transpose()?;
+        let settings = InitSettings { max_pictures: init.max_pictures.max(views), ..init.clone() };
+        // Another start asks the network for depths only.
+        let wants_depths = init.depth_priors && depth.is_none() && training.loss.depth > 0.0;
+        let initialiser = match kind {
+            InitKind::SparsePoints | InitKind::Random | InitKind::Model if !wants_depths => None,
+            _ => Some(Initialiser::open(&settings, network.pair.as_deref())?),
+        };
+        Ok(Self { kind, settings, seed: training.seed, initialiser, depth, taken: 0, points: Vec::new() })
     }
-}
 
-impl Reconstruction {
+    pub fn initialiser_mut(&mut self) -> Option<&mut Initialiser> {
+        self.initialiser.as_mut()
+    }
+
+    /// The Gaussians are there already: what is left to make are depths, where training wants any and the user's network makes none.
+    pub fn only_depths(&mut self, training: &TrainSettings) {
+        if training.loss.depth <= 0.0 || self.depth.is_some() {
+            self.initialiser = None;
+        }
+    }
+
+    pub fn set_points(&mut self, points: Vec<Point>) {
+        self.points = points;
+    }
+
+    /// Whether Gaussians of new key frames can be added to those of earlier ones.
+    pub fn grow(&self) -> bool {
+        self.initialiser.as_ref().is_some_and(Initialiser::grows)
+    }
+
+    /// Ground that the pictures show, square metres.
+    pub fn ground_m2(&self) -> Option<f64> {
+        self.initialiser.as_ref().map(Initialiser::ground_m2)
+    }
+
+    /// Width and height of what a picture shows of the ground, metres.
+    pub fn footprint_m(&self) -> Option<[f64; 2]> {
+        let initialiser = self.initialiser.as_ref()?;
+        (0..self.taken).find_map(|k| initialiser.footprint_m(k))
+    }
+
+    /// The common light of all pictures, as the depths tell it by now.
+    pub fn survey_light(&mut self) -> Result<Option<Light>, EngineError> {
+        let Some(initialiser) = &mut self.initialiser else { return Ok(None) };
+        Ok(initialiser.survey_light()?.cloned())
+    }
+
+    /// Depth of a picture by the user's own network.
+    pub fn own_depth(&mut self, picture: &RgbImage) -> Result<Option<DepthPrior>, EngineError> {
+        Ok(self.depth.as_mut().map(|network| network.estimate(picture)).transpose()?)
+    }
+
+    pub fn has_own_network(&self) -> bool {
+        self.depth.is_some()
+    }
+
+    /// Name of the network that made the depths.
+    pub fn network(&self, fresh: &Fresh) -> Option<String> {
+        let own = self.depth.as_ref().map(|network| network.name().to_owned());
+        own.or(fresh.report.as_ref().map(|report| report.network.clone()))
+    }
+
+    /// All depths are made: the user's network gives its memory back.
+    pub fn close_own_network(&mut self) {
+        if let Some(network) = &mut self.depth {
+            network.close();
+        }
+    }
+
+    /// Key frames of `poses` that wait to be taken.
+    pub fn waiting(&self, poses: &Poses) -> usize {
+        poses.len() - self.taken
+    }
+
+    /// Takes over what refinement knows.
+    pub fn follow(&mut self, poses: &Poses, placed: &Placed) {
+        let Some(initialiser) = &mut self.initialiser else { return };
+        for &i in &placed.views {
+            let (name, view) = &poses.views()[i];
+            initialiser.update_pose(name, &view.pose);
+        }
+        initialiser.hint_points(placed.points.iter().copied());
+    }
+
+    /// Takes the newest key frame, and those before it that waited for their pose. With `at_once` the network begins: it runs on a
+    /// picture once its neighbours are there, and doing it now spreads the work over the flight.
+    pub fn take_newest(
+        &mut self,
+        mut picture: PosedImage,
+        poses: &Poses,
+        training: &mut Training,
+        at_once: bool,
+        report: &mut RunReport,
+    ) -> Result<(), EngineError> {
+        let Some(newest) = poses.len().checked_sub(1).filter(|_| self.initialiser.is_some()) else { return Ok(()) };
+        let from = Instant::now();
+        self.take_waiting(newest, poses, training)?;
+        let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
+        picture.view.pose = poses.view(newest).pose;
+        initialiser.add(&picture)?;
+        self.taken = poses.len();
+        if at_once {
+            initialiser.advance(1)?;
+        }
+        report.stage("init", from);
+        Ok(())
+    }
+
+    /// Takes the first `until` key frames, with the pixels that training keeps of them.
+    pub fn take_waiting(&mut self, until: usize, poses: &Poses, training: &mut Training) -> Result<(), EngineError> {
+        let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
+        for i in self.taken..until {
+            if let Some((view, image, mask)) = training.picture(i)? {
+                let (name, View { pose, .. }) = poses.views()[i].clone();
+                let view = View { pose, ..view };
+                let sigma = PoseSigma { position_m: [0.0; 3], rotation_rad: [0.0; 3] };
+                initialiser.add(&PosedImage { name, time_ns: 0, image, mask, view, sigma })?;
+            }
+        }
+        self.taken = self.taken.max(until);
+        Ok(())
+    }
+
+    /// Takes all key frames, and the points that refinement triangulated, which bound the depths.
+    pub fn take_all(&mut self, poses: &Poses, training: &mut Training) -> Result<(), EngineError> {
+        if let Some(points) = poses.points() {
+            self.points = points;
+            if let Some(initialiser) = &mut self.initialiser {
+                initialiser.hint_points(self.points.iter().map(|p| p.0.map(|v| v as f32)));
+            }
+        }
+        self.take_waiting(poses.len(), poses, training)
+    }
+
+    /// Gaussians of all key frames, at most `capacity` of them for the ground that they show, and their depths, which training takes;
+    /// `None` when `go_on` said no. Where a model is `continued`, its Gaussians are the first.
+    pub fn make(
+        &mut self,
+        poses: &Poses,
+        training: &mut Training,
+        capacity: &dyn Fn(f64) -> usize,
+        continued: bool,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Option<Fresh>, EngineError> {
+        let Some(initialiser) = &mut self.initialiser else {
+            return Ok(Some(self.without_network(poses, capacity(0.0), continued)?.into()));
+        };
+        let capacity = capacity(initialiser.ground_m2());
+        let (own_network, mut failed) = (self.depth.is_some(), Ok(()));
+        let at_once = !training.is_incremental();
+        let mut prior = |name: &str, depth: DepthPrior| {
+            if let (Some(i), Ok(()), false) = (poses.index_of(name), &failed, own_network) {
+                failed = training.set_prior(i, Some(&depth));
+            }
+        };
+        let made = feed_forward(initialiser, poses.len(), capacity, at_once, &mut prior, go_on)?;
+        failed?;
+        // Another start wants of them the depths alone: neither the Gaussians nor the light.
+        Ok(match made {
+            Some(made) if self.kind != InitKind::FeedForward => {
+                Some(Fresh { cloud: self.without_network(poses, capacity, continued)?, light: None, ..made })
+            }
+            made => made,
+        })
+    }
+
+    /// Depths and Gaussians of the new key frames, `share` of them for so many square metres; training takes the depths.
+    pub fn make_new(
+        &mut self,
+        poses: &Poses,
+        training: &mut Training,
+        share: &dyn Fn(f64) -> usize,
+        report: &mut RunReport,
+    ) -> Result<Option<(Initialisation, Growth)>, EngineError> {
+        let Some(initialiser) = &mut self.initialiser else { return Ok(None) };
+        let from = Instant::now();
+        let (own_network, mut failed) = (self.depth.is_some(), Ok(()));
+        let mut prior = |name: &str, depth: DepthPrior| {
+            if let (Some(i), Ok(()), false) = (poses.index_of(name), &failed, own_network) {
+                failed = training.set_prior(i, Some(&depth));
+            }
+        };
+        let made = initialiser.grow(share, &mut prior);
+        failed?;
+        report.stage("init", from);
+        Ok(made?)
+    }
+
     /// The Gaussians of a start that is not the network's: at most `capacity`, none where a model is continued.
-    pub(super) fn other_start(&self, capacity: usize) -> Result<GaussianCloud, EngineError> {
-        let views: Vec<View> = self.views.iter().map(|v| v.1).collect();
-        match self.settings.start {
-            _ if self.is_continued() => Ok(GaussianCloud::default()),
+    fn without_network(&self, poses: &Poses, capacity: usize, continued: bool) -> Result<GaussianCloud, EngineError> {
+        match self.kind {
+            _ if continued => Ok(GaussianCloud::default()),
             InitKind::Model => Ok(GaussianCloud::default()),
             InitKind::Random => {
-                at_random(&views, &self.points, self.settings.init.depth_m, capacity, self.settings.training.seed)
+                let views: Vec<View> = poses.views().iter().map(|v| v.1).collect();
+                at_random(&views, &self.points, self.settings.depth_m, capacity, self.seed)
             }
             InitKind::FeedForward | InitKind::SparsePoints => sparse(&self.points, capacity),
         }
@@ -67,14 +269,14 @@ impl Reconstruction {
 
 /// All pictures of `initialiser` into at most `capacity` Gaussians; `None` when `go_on` said no. With `at_once` no picture
 /// is still to come, and every depth is made once, from its best partners, on all threads. `prior` takes the depths one by one.
-pub(super) fn feed_forward(
+fn feed_forward(
     initialiser: &mut Initialiser,
     pictures: usize,
     capacity: usize,
     at_once: bool,
     prior: &mut dyn FnMut(&str, DepthPrior),
     go_on: &dyn Fn() -> bool,
-) -> Result<Option<FirstGaussians>, EngineError> {
+) -> Result<Option<Fresh>, EngineError> {
     let mut progress = Progress::new("initialising", pictures as u64);
     let (mut done, mut more) = (0, usize::from(at_once));
     while more > 0 {
@@ -92,7 +294,7 @@ pub(super) fn feed_forward(
     })?;
     let (gaussians, maps) = (made.cloud.len(), with_depth.len());
     progress.finish(&format!("{gaussians} Gaussians of {maps} depth maps by {}", made.report.network));
-    Ok(Some(FirstGaussians { cloud: made.cloud, with_depth, light: made.light, report: Some(made.report) }))
+    Ok(Some(Fresh { cloud: made.cloud, with_depth, light: made.light, report: Some(made.report) }))
 }
 
 /// The points themselves.

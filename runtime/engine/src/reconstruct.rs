@@ -1,17 +1,26 @@
 //! What a job asks of the engine, in the order in which it asks.
 
+use std::collections::HashMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use image::imageops::{FilterType, resize};
-use models::camera::{Pose, PosedImage};
-use models::formats::model;
+use job::run_json::RunReport;
+use models::camera::{Pose, PosedImage, View};
+use models::formats::model::{Chunks, ModelHeader};
 use survey::dataset::scaled;
-use vulkan::trainer::{RunBudget, StepReport, StopReason, Validated};
+use vulkan::trainer::{RunBudget, StepReport, StopReason, Trainer};
 
-use super::energy::EVERY_S;
-use super::{PictureSource, Reconstruction, model_path};
+use super::budget::Share;
+use super::delivery::{Delivery, thin};
+use super::energy::{EVERY_S, Meter};
+use super::first_gaussians::FirstGaussians;
+use super::host::{HostPlan, HostRequest};
+use super::poses::{Point, Poses};
+use super::resumed::Resumed;
+use super::training::{Earlier, Fresh, Rebuild, Training, crops, growth};
+use super::{EngineSettings, InitKind, PictureSource, model_path, waiting};
 use crate::error::EngineError;
 
 /// Fewer key frames than this say too little about the ground.
@@ -21,8 +30,8 @@ const PLACED_AT_ONCE: usize = 4;
 /// A model is rebuilt when the key frames have grown by this share since the last build: often enough that new ground
 /// is trained on soon, seldom enough that building does not eat the time of training.
 const REBUILD_GROWTH: f64 = 0.34;
-/// Share of the Gaussians that is given up where memory or time is short.
-const GIVEN_UP: f32 = 1.0 / 3.0;
+/// Share of the Gaussians that is pruned where memory or time is short.
+const PRUNED: f32 = 1.0 / 3.0;
 
 /// What makes a model out of key frames: the seam at which a rehearsal stands in for networks, device and disk.
 pub trait Reconstruct {
@@ -80,8 +89,8 @@ pub trait Reconstruct {
     ) -> Result<StopReason, EngineError>;
     /// Trains at half the size, or as scheduled again.
     fn halve_resolution(&mut self, on: bool);
-    /// Gives up the third of the Gaussians that the loss hangs on least, or that is least opaque where not all are on the device: less memory
-    /// moved, less to blend.
+    /// Prunes the third of the Gaussians that the loss hangs on least, or that is least opaque where not all are on the device: less
+    /// memory moved, less to blend.
     ///
     /// # Errors
     /// The device fails.
@@ -95,75 +104,215 @@ pub trait Reconstruct {
     fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), EngineError>;
 }
 
+/// One model in the making: key frames with their poses, first Gaussians, training and delivery, one after the other.
+pub struct Reconstruction {
+    pub(crate) poses: Poses,
+    pub(crate) first: FirstGaussians,
+    pub(crate) training: Training,
+    pub(crate) delivery: Delivery,
+    /// The model of an earlier run, which is continued.
+    resumed: Resumed,
+    /// What was added to the model since it was built.
+    pub(crate) grown: growth::Totals,
+    /// Pictures are trained at this fraction of the size they come in.
+    scale: f64,
+    /// What was done and what it took.
+    pub report: RunReport,
+}
+
+impl Reconstruction {
+    /// Opens networks and device. What the user names is checked before anything slow begins.
+    ///
+    /// # Errors
+    /// Anything missing that the job cannot do without: ONNX Runtime, a Vulkan device, memory.
+    pub fn open(mut settings: EngineSettings, header: ModelHeader, command: &str) -> Result<Self, EngineError> {
+        let _span = tracing::info_span!("open").entered();
+        if let Some(rounding) = &settings.delivers {
+            settings.training.loss.view_dependence_visits = 0;
+            settings.training.loss.view_dependence *= rounding.view_dependence;
+        }
+        let (t, device) = (&settings.training, &settings.device);
+        let meter = Meter::of(t)?;
+        let sizes = (device.size, device.views);
+        let mut first = FirstGaussians::open(settings.start, &settings.init, &settings.network, t, sizes)?;
+        // What a flight builds anew, and what is rounded as a whole, is in memory.
+        let in_memory = settings.incremental || settings.delivers.is_some();
+        let training = Training::open(device, t, meter, settings.incremental, in_memory)?;
+        let mut poses = Poses::open(settings.refine.as_ref(), device.views)?;
+        let trainer = &training.trainer;
+        let on_host = match trainer.device().gpu().info().is_cpu {
+            true => trainer.device().bytes(),
+            false => trainer.device().mirror_bytes(),
+        };
+        let plan = |initialiser: u64, refine_in_file: bool| {
+            HostPlan::new(&HostRequest {
+                plan: trainer.plan(),
+                on_host,
+                initialiser,
+                refine: settings.refine.as_ref(),
+                refine_in_file,
+                camera_pixels: settings.camera_pixels,
+                ahead: settings.ahead as u64,
+                ahead_in_memory: settings.ahead_in_memory,
+                delivers: settings.delivers.is_some(),
+                from_file: training.in_pieces && settings.start == InitKind::Model,
+                map: settings.map.map_or(0, |m| m.host_bytes()),
+            })
+        };
+        let host = waiting::place(&settings, trainer.plan(), first.initialiser_mut(), poses.refiner_mut(), &plan)?;
+        let mut report = RunReport::new(command);
+        report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
+        report.device = trainer.device().gpu().info().name.clone();
+        report.seed = header.seed;
+        (report.device_bytes_planned, report.device_bytes_peak) =
+            (trainer.plan().total_bytes, trainer.device().bytes());
+        Ok(Self {
+            poses,
+            first,
+            training,
+            delivery: Delivery::new(settings.disk, settings.delivers, settings.map, header),
+            resumed: Resumed::default(),
+            grown: growth::Totals::default(),
+            scale: settings.scale,
+            report,
+        })
+    }
+
+    /// Takes up the model of an earlier run in `out`, when there is one of the same mission and aircraft that holds
+    /// Gaussians; its views.
+    ///
+    /// # Errors
+    /// A damaged model file that cannot be set aside.
+    pub fn resume(&mut self, out: &Path) -> Result<Option<&HashMap<String, View>>, EngineError> {
+        let path = model_path(out);
+        let Some(earlier) = self.training.earlier(&self.delivery.disk, &path)? else { return Ok(None) };
+        let (header, gaussians) = (earlier.header().clone(), earlier.gaussians());
+        let ours = &self.delivery.header;
+        let same = header.mission == ours.mission && header.aircraft == ours.aircraft;
+        if !same || gaussians == 0 {
+            return Ok(None);
+        }
+        tracing::info!("continuing {} ({gaussians} Gaussians) after {} steps", path.display(), header.steps);
+        // Models of earlier versions say it themselves.
+        let told = RunReport::read(out).ok().and_then(|run| run.more.get("train_seconds")?.as_f64());
+        self.training.train_s = told.unwrap_or(header.train_seconds);
+        self.delivery.continue_from(&header);
+        self.training.begin_with(earlier);
+        self.resumed = Resumed::of(header);
+        if !self.training.incremental {
+            // Poses are those of the last checkpoint, and Gaussians are there.
+            self.poses.keep();
+            self.first.only_depths(&self.training.settings);
+        }
+        Ok(Some(&self.resumed.views))
+    }
+
+    /// Training begins with the Gaussians of this model, as they are.
+    pub fn begin_with(&mut self, model: Chunks) {
+        self.training.begin_with(Earlier::Pieces(model));
+    }
+
+    /// Points of the scene that came with the pictures.
+    pub fn hint_points(&mut self, points: Vec<Point>) {
+        self.first.set_points(points);
+    }
+
+    /// The trainer, for its counters and for rendering.
+    pub fn trainer(&mut self) -> &mut Trainer {
+        &mut self.training.trainer
+    }
+
+    /// What the model file says of itself, as of the last checkpoint.
+    pub fn header(&self) -> &ModelHeader {
+        &self.delivery.header
+    }
+
+    /// Seconds of training over all continuations.
+    pub fn train_seconds(&self) -> f64 {
+        self.training.train_s
+    }
+
+    /// Means of the model as of the last checkpoint; of one that the host's memory does not hold, every so many, at most `most`.
+    ///
+    /// # Errors
+    /// The device cannot be read, or the file of the cells.
+    pub fn means(&mut self, most: usize) -> Result<Vec<[f32; 3]>, EngineError> {
+        self.training.means(most)
+    }
+
+    /// Whether new key frames can be added to the model as it is.
+    fn can_grow(&self) -> bool {
+        self.training.flying && self.first.grow()
+    }
+
+    /// How ground is shared out while pictures still come.
+    fn share(&self) -> Share {
+        Share::of_flight(self.training.trainer.plan(), &self.delivery.header.region, self.first.footprint_m())
+    }
+
+    /// Says where the depths came from, how well poses fit, and what initialisation left out.
+    fn note_built(&mut self, fresh: &Fresh, with_prior: usize) -> Result<(), EngineError> {
+        if with_prior > 0 {
+            let prior = serde_json::json!({ "name": self.first.network(fresh), "views": with_prior });
+            self.report.more.insert("depth_prior".into(), prior);
+        }
+        self.poses.note(&mut self.report)?;
+        if let Some(made) = &fresh.report {
+            self.report.skipped.insert("pairs".into(), made.skipped.total() as u64);
+            self.report.skipped.insert("depth_samples_inconsistent".into(), made.removed as u64);
+            self.report.more.insert("init".into(), serde_json::to_value(made)?);
+        }
+        self.report.views = self.poses.len() as u64;
+        self.report.more.insert("builds".into(), self.training.built.times.into());
+        Ok(())
+    }
+}
+
 impl Reconstruct for Reconstruction {
     fn add(&mut self, mut picture: PosedImage, more: bool) -> Result<(), EngineError> {
-        if !self.settings.incremental
-            && let Some(view) = self.resumed.get(&picture.name)
-        {
+        let incremental = self.training.incremental;
+        if let Some(view) = self.resumed.views.get(&picture.name).filter(|_| !incremental) {
             picture.view.pose = view.pose;
         }
-        let from = Instant::now();
-        if let Some(refiner) = &mut self.refiner {
-            match refiner.add(&picture) {
-                Ok(report) => {
-                    self.unsolved = true;
-                    tracing::debug!("{}: {} features, {} pairs", picture.name, report.features, report.pairs_verified);
-                }
-                Err(e) => {
-                    tracing::warn!("pose refinement: {e}");
-                    self.report.skip("pictures_not_refined", 1);
-                }
-            }
-            self.report.stage("refine", from);
-        }
-        let lens = scaled(&picture.view.intrinsics, self.settings.scale)?;
+        // 1. Features of the whole picture tie it to those before it.
+        self.poses.tie(&picture, &mut self.report);
+        // 2. Training keeps it in its own size, with a depth by the user's network.
+        let lens = scaled(&picture.view.intrinsics, self.scale)?;
         if (lens.width, lens.height) != picture.image.dimensions() {
             picture.image = resize(&picture.image, lens.width, lens.height, FilterType::Lanczos3);
             picture.mask = picture.mask.map(|mask| mask.resized(lens.width, lens.height));
         }
         picture.view.intrinsics = lens;
-        let prior = self.depth.as_mut().map(|network| network.estimate(&picture.image)).transpose()?;
-        self.pictures.store.add(self.trainer.device_mut(), &picture, prior.as_ref())?;
-        self.index.insert(picture.name.clone(), self.views.len());
-        self.views.push((picture.name.clone(), picture.view));
-        let waiting = self.views.len() - self.initialised;
-        if self.settings.incremental && more && waiting < PLACED_AT_ONCE {
+        let prior = self.first.own_depth(&picture.image)?;
+        self.training.add(&picture, prior.as_ref())?;
+        self.poses.push(&picture.name, picture.view);
+        if incremental && more && self.first.waiting(&self.poses) < PLACED_AT_ONCE {
             return Ok(());
         }
-        if self.settings.incremental && std::mem::take(&mut self.unsolved) {
-            self.place()?;
+        // 3. While pictures come, it is placed among its neighbours.
+        if incremental {
+            let placed = self.poses.place(&mut self.report)?;
+            self.grown.count_placed(&placed);
+            self.first.follow(&self.poses, &placed);
         }
-        // Without refinement, or while pictures come, the pose is as good as it will be for now.
-        if (self.settings.incremental || self.refiner.is_none())
-            && let Some((_, view)) = self.views.last().cloned()
-            && self.initialiser.is_some()
-        {
-            let from = Instant::now();
-            self.initialise_waiting(self.views.len() - 1)?;
-            let first = !self.has_model();
-            let Some(initialiser) = &mut self.initialiser else { return Ok(()) };
-            picture.view.pose = view.pose;
-            initialiser.add(&picture)?;
-            self.initialised = self.views.len();
-            if self.settings.incremental && first {
-                // The network runs on a picture once its neighbours are there; doing it now spreads the work over the flight.
-                initialiser.advance(1)?;
-            }
-            self.report.stage("init", from);
+        // 4. Depths are made of it once its pose is as good as it will be for now.
+        if incremental || !self.poses.are_refined() {
+            let at_once = incremental && !self.has_model();
+            self.first.take_newest(picture, &self.poses, &mut self.training, at_once, &mut self.report)?;
         }
         Ok(())
     }
 
     fn keyframes(&self) -> usize {
-        self.views.len()
+        self.poses.len()
     }
 
     fn pose(&self, name: &str) -> Option<Pose> {
-        self.index.get(name).map(|i| self.views[*i].1.pose)
+        self.poses.pose(name)
     }
 
     fn wants_build(&self, last: bool) -> bool {
-        let (now, then) = (self.views.len(), self.growing.built);
+        let (now, then) = (self.poses.len(), self.training.built.key_frames);
         match last {
             _ if now < FIRST_BUILD => false,
             true => now > then,
@@ -173,97 +322,125 @@ impl Reconstruct for Reconstruction {
     }
 
     fn wants_growth(&self) -> bool {
-        self.has_model() && self.can_grow() && !self.unsolved && self.views.len() > self.built.len()
+        self.has_model() && self.can_grow() && !self.poses.wait() && self.poses.len() > self.training.built.views.len()
     }
 
     fn grow(&mut self) -> Result<bool, EngineError> {
-        self.grow_model()
+        let _span = tracing::info_span!("grow").entered();
+        let (clock, first_new) = (Instant::now(), self.training.built.views.len());
+        // 1. Pictures that waited for their pose.
+        self.first.take_waiting(self.poses.len(), &self.poses, &mut self.training)?;
+        let moved = self.poses.follow(first_new);
+        // 2. Where all poses were solved, the light of all pictures is compared anew.
+        if moved.whole {
+            let light = self.first.survey_light()?;
+            self.training.even_light(&self.poses, light.as_ref(), &self.resumed, 0)?;
+        }
+        // 3. Depths and Gaussians of the new pictures.
+        let share = self.share();
+        let of = |m2| share.of(m2);
+        let made = self.first.make_new(&self.poses, &mut self.training, &of, &mut self.report)?;
+        if let Some((made, _)) = &made {
+            self.training.built.depth_m = 0.5 * (made.report.depth_m[0] + made.report.depth_m[1]);
+        }
+        // 4. What is trained moves with its key frames.
+        let followed = growth::follow(&mut self.training, &self.poses, &moved.views, &mut self.report)?;
+        // 5. New Gaussians where none stand.
+        let mut new = 0;
+        if let Some((made, growth)) = &made {
+            self.training.even_light(&self.poses, made.light.as_ref(), &self.resumed, first_new)?;
+            let (edge_m, share) = (2.0 * made.report.voxel_m, self.share());
+            new = growth::take_in(&mut self.training, &made.cloud, edge_m, &share, &mut self.grown)?;
+            self.grown.depths += growth.depths as u64;
+            self.grown.compared += growth.compared as u64;
+            self.grown.gaussians += new as u64;
+        }
+        // 6. The schedule goes on with the new views.
+        self.training.renew_moved(&self.poses, &moved.views, first_new)?;
+        self.grown.growths += 1;
+        self.grown.pictures += (self.poses.len() - first_new) as u64;
+        self.report.views = self.poses.len() as u64;
+        self.report.more.insert("growth".into(), serde_json::to_value(&self.grown)?);
+        self.report.stage("grow", clock);
+        tracing::info!(
+            "grown to {} key frames: {new} Gaussians more, {followed} moved along, {} in all, {:.2} s",
+            self.poses.len(),
+            self.training.gaussians(),
+            clock.elapsed().as_secs_f64()
+        );
+        Ok(moved.whole)
     }
 
     fn land(&mut self) {
-        self.flying = false;
+        self.training.flying = false;
     }
 
     fn has_model(&self) -> bool {
-        !self.built.is_empty()
+        self.training.has_model()
     }
 
     fn build(&mut self, go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
         let clock = Instant::now();
-        self.refine()?;
+        // 1. Poses and lenses of all key frames.
+        let placed = self.poses.solve(&mut self.report)?;
+        self.grown.count_placed(&placed);
+        self.first.follow(&self.poses, &placed);
+        // 2. Depths and first Gaussians of all key frames. Where a model's Gaussians are the first, those that come with the depths are
+        // thrown away.
         let from = Instant::now();
-        let Some(mut fresh) = self.initialise(go_on)? else { return Ok(false) };
+        self.first.take_all(&self.poses, &mut self.training)?;
+        let plan = self.training.trainer.plan();
+        let most = if self.training.first.is_some() { plan.gaussians } else { plan.scene };
+        let share = self.can_grow().then(|| self.share());
+        let capacity = |ground_m2: f64| share.map_or(most, |share| share.of(ground_m2));
+        let continued = self.training.is_continued(&self.resumed, &self.poses);
+        let made = self.first.make(&self.poses, &mut self.training, &capacity, continued, go_on)?;
+        let Some(mut fresh) = made else { return Ok(false) };
         self.report.stage("init", from);
-        self.even_light(fresh.light.take(), 0)?;
-        let new = self.take_over(&fresh)?;
-        let loaded = self.load_first()?;
-        self.begin_delivery()?;
-        self.fly_on();
-        self.begin_after_landing(loaded.loaded, new);
-        self.report.skip("gaussians_not_finite", loaded.dropped_non_finite as u64);
-        self.report.skip("gaussians_over_capacity", loaded.dropped_over_capacity as u64);
-        let mut with_prior = 0;
-        for (i, (name, view)) in self.views.iter().enumerate() {
-            self.pictures.store.renew(i, *view)?;
-            let has_depth = fresh.with_depth.contains(name);
-            if self.depth.is_none() && !has_depth {
-                self.pictures.store.set_prior(self.trainer.device_mut(), i, None)?;
-            }
-            with_prior += u64::from(self.depth.is_some() || has_depth);
+        // 3. All pictures in one light.
+        let light = fresh.light.take();
+        self.training.even_light(&self.poses, light.as_ref(), &self.resumed, 0)?;
+        // 4. What is trained already, and fresh Gaussians where it is not, go to the device.
+        let (steps, ground_m2) = (self.delivery.header.steps, self.first.ground_m2());
+        let rebuild = Rebuild { poses: &self.poses, resumed: &self.resumed, steps, ground_m2 };
+        let new = self.training.take_over(&fresh, &rebuild, &mut self.report)?;
+        let loaded = self.training.load_first(&mut self.report)?;
+        // 5. The schedule begins.
+        self.delivery.begin(continued, &mut self.training)?;
+        if self.can_grow() {
+            // The newest pictures are trained on first, and their Gaussians are the only new ones.
+            self.training.trainer.while_views_come();
         }
-        self.built = self.views.iter().map(|v| v.1).collect();
-        self.growing.all_built(self.views.len());
-        self.depth_m = fresh.report.as_ref().map_or(0.0, |made| 0.5 * (made.depth_m[0] + made.depth_m[1]));
-        let network = self.depth.as_ref().map(|network| network.name().to_owned());
-        let network = network.or(fresh.report.as_ref().map(|report| report.network.clone()));
-        if with_prior > 0 {
-            let prior = serde_json::json!({ "name": network, "views": with_prior });
-            self.report.more.insert("depth_prior".into(), prior);
+        self.training.begin_after_landing(loaded, new);
+        let own_depths = self.first.has_own_network();
+        let with_prior = self.training.renew_views(&self.poses, &fresh, own_depths)?;
+        self.poses.follow(0);
+        if continued && !self.training.incremental {
+            let steps = u32::try_from(steps).unwrap_or(u32::MAX);
+            self.training.trainer.schedule_mut().continue_from(steps, self.training.train_s);
         }
-        if let Some(network) = &mut self.depth {
-            network.close();
-        }
-        if let Some(refined) = &self.refined {
-            self.report.more.insert("reprojection_rms_px".into(), refined.reprojection_rms_px.into());
-            self.report.more.insert("refine".into(), serde_json::to_value(refined)?);
-        }
-        if let Some(made) = &fresh.report {
-            self.report.skipped.insert("pairs".into(), made.skipped.total() as u64);
-            self.report.skipped.insert("depth_samples_inconsistent".into(), made.removed as u64);
-            self.report.more.insert("init".into(), serde_json::to_value(made)?);
-        }
-        if self.is_continued() && !self.settings.incremental {
-            let steps = u32::try_from(self.header.steps).unwrap_or(u32::MAX);
-            self.trainer.schedule_mut().continue_from(steps, self.train_s);
-        }
-        self.builds += 1;
-        self.report.views = self.views.len() as u64;
-        self.report.more.insert("builds".into(), self.builds.into());
-        self.report.more.insert("gaussians_kept".into(), loaded.loaded.saturating_sub(new).into());
+        self.training.set_built(&self.poses, &fresh);
+        self.note_built(&fresh, with_prior)?;
+        self.first.close_own_network();
+        self.report.more.insert("gaussians_kept".into(), loaded.saturating_sub(new).into());
         tracing::info!(
-            "built from {} key frames: {} Gaussians ({} of them new) in {:.1} s",
-            self.views.len(),
-            loaded.loaded,
-            new,
+            "built from {} key frames: {loaded} Gaussians ({new} of them new) in {:.1} s",
+            self.poses.len(),
             clock.elapsed().as_secs_f64()
         );
         Ok(true)
     }
 
     fn look_closer(&mut self, source: &mut dyn PictureSource, go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
-        self.cut_crops(source, go_on)
+        crops::cut(&mut self.training, self.poses.views(), source, go_on, &mut self.report)
     }
 
     fn set_seconds(&mut self, seconds: Option<f64>) {
-        self.settings.training.seconds = seconds;
-        self.trainer.schedule_mut().set_seconds(seconds);
+        self.training.set_seconds(seconds);
     }
 
     fn is_done(&self, budget: &RunBudget) -> bool {
-        let (steps, seconds) = self.trainer.schedule().spent();
-        let by_steps = budget.steps.is_some_and(|s| steps >= s);
-        let by_time = budget.seconds.is_some_and(|s| seconds >= s);
-        by_steps || by_time
+        self.training.is_done(budget)
     }
 
     fn train(
@@ -272,15 +449,18 @@ impl Reconstruct for Reconstruction {
         each: &mut dyn FnMut(&StepReport) -> ControlFlow<()>,
     ) -> Result<StopReason, EngineError> {
         let _span = tracing::info_span!("train").entered();
+        let (training, delivery, report) = (&mut self.training, &mut self.delivery, &mut self.report);
         let from = Instant::now();
         let mut last = None;
         let summary = loop {
-            self.read_power();
-            let (due, before, mut next) = (self.delivery_due(), self.trainer.schedule().elapsed_s(), None);
-            let read_s = if self.meter.is_some() { before + EVERY_S } else { f64::INFINITY };
-            let (mut asked_to_stop, mut reads, mut counts) = (false, false, false);
-            let average = self.average_due();
-            let summary = self.trainer.run(&mut self.pictures.store, budget, &mut |step| {
+            // 1. The seconds that energy leaves.
+            training.read_power(report);
+            let (due, average) = (delivery.due(training), training.average_due(delivery.is_rounded()));
+            let before = training.trainer.schedule().elapsed_s();
+            let read_s = if training.meter.is_some() { before + EVERY_S } else { f64::INFINITY };
+            let (mut next, mut asked_to_stop, mut reads, mut counts) = (None, false, false, false);
+            // 2. Steps, until something else is due.
+            let summary = training.trainer.run(&mut training.pictures.store, budget, &mut |step| {
                 next = due.after(step);
                 reads = step.elapsed_s >= read_s;
                 counts = average.is_some_and(|due| due.after(step));
@@ -289,98 +469,48 @@ impl Reconstruct for Reconstruction {
                 if goes_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             })?;
             last = summary.last.or(last);
-            self.header.steps += u64::from(summary.steps);
-            self.report.steps += u64::from(summary.steps);
-            self.train_s += self.trainer.schedule().elapsed_s() - before;
+            delivery.count_steps(summary.steps);
+            report.steps += u64::from(summary.steps);
+            training.train_s += training.trainer.schedule().elapsed_s() - before;
+            // 3. The end of an epoch counts in the mean of the last ones.
             if counts {
-                self.end_epoch()?;
+                training.end_epoch()?;
             }
-            next.map_or(Ok(()), |next| self.prepare_delivery(next))?;
+            // 4. What the model goes through before it is delivered.
+            if let Some(next) = next {
+                delivery.prepare(next, training, report)?;
+            }
             if (next.is_none() && !reads && !counts) || asked_to_stop {
                 break summary;
             }
         };
-        self.read_power();
-        self.report.stage("train", from);
-        let c = summary.counters;
-        for (name, count) in [
-            ("culled", c.culled),
-            ("behind_opaque", c.behind_opaque),
-            ("gradients_not_finite", c.non_finite_gradients),
-            ("sh_coefficients", c.sh_missing),
-        ] {
-            // The counters run on since `load`.
-            self.report.skipped.insert(name.to_owned(), count);
-        }
-        let work = serde_json::json!({ "instances": c.instances, "evaluations": c.evaluations });
-        self.report.more.insert("work".into(), work);
-        if let (cells @ 1.., _) = self.trainer.cells() {
-            let windows = serde_json::json!({ "cells": cells, "windows": c.windows, "paged_bytes": c.paged_bytes });
-            self.report.more.insert("cells".into(), windows);
-        }
-        if let Some(Validated { views, holds, drop }) = self.trainer.validated() {
-            let validation = serde_json::json!({ "views": views, "holds": holds, "drop": drop });
-            if self.report.more.insert("validation".into(), validation).is_none() {
-                let (holds, drop) = (100.0 * holds, 100.0 * drop);
-                tracing::info!(
-                    "of what is learnt of the other pictures {holds:.0} % holds for {views} that were kept back: \
-                     {drop:.0} % of the Gaussians are left out of each step by the end"
-                );
-            }
-        }
-        self.report.more.insert("views_read_back".into(), self.pictures.store.read_back().into());
-        if let Some(last) = last.filter(|last| last.loss.is_finite()) {
-            self.report.more.insert("loss".into(), f64::from(last.loss).into());
-        }
-        for (name, ms) in self.trainer.device().stage_ms() {
-            self.report.stage_ms.insert(format!("device_{name}"), ms);
-        }
-        self.report.gaussians = self.trainer.gaussians() as u64;
+        training.read_power(report);
+        report.stage("train", from);
+        training.note_trained(&summary, last, report);
+        // 5. A schedule that is over ends with the mean.
         if summary.reason != StopReason::Caller {
-            self.settle_average()?;
+            training.settle_average(report)?;
         }
         Ok(summary.reason)
     }
 
     fn halve_resolution(&mut self, on: bool) {
-        self.trainer.set_least_divisor(if on { 2 } else { 1 });
+        self.training.trainer.set_least_divisor(if on { 2 } else { 1 });
     }
 
     fn shrink(&mut self) -> Result<(), EngineError> {
-        let gone = self.thin(GIVEN_UP, f32::INFINITY)?;
-        self.trainer.keep_number();
-        tracing::warn!("gave up {gone} Gaussians, {} remain", self.trainer.gaussians());
+        let gone = thin(&mut self.training, PRUNED, f32::INFINITY)?;
+        self.training.trainer.keep_number();
+        tracing::warn!("pruned {gone} Gaussians, {} remain", self.training.trainer.gaussians());
         Ok(())
     }
 
     fn gaussians(&self) -> usize {
-        if self.has_model() { self.trainer.gaussians() } else { self.cloud.len() }
+        self.training.gaussians()
     }
 
     fn checkpoint(&mut self, out: &Path, finished: bool) -> Result<(PathBuf, usize), EngineError> {
-        let _span = tracing::info_span!("checkpoint").entered();
-        let from = Instant::now();
-        let in_pieces = self.in_pieces && self.has_model();
-        if self.has_model() && !in_pieces && !self.is_average() {
-            self.trainer.snapshot(&mut self.cloud)?;
-        }
-        self.header.finished = finished;
-        let views = self.views.iter().enumerate().take(self.built.len());
-        self.header.views = views.filter_map(|(i, v)| Some((v.0.clone(), self.pictures.store.view(i)?))).collect();
-        self.header.lights = self.lights(self.header.views.len());
-        let path = model_path(out);
-        let gaussians = match in_pieces {
-            true => self.write_pieces(&path)?,
-            false => {
-                model::write_checkpoint(&self.settings.disk, &path, &self.header, &self.cloud)?;
-                self.cloud.len()
-            }
-        };
-        self.report.stage("checkpoint", from);
-        if let Some(map) = self.settings.map.filter(|_| self.has_model() && (finished || self.mapped < self.builds)) {
-            self.draw_map(map, &out.join("map"));
-        }
-        Ok((path, gaussians))
+        self.delivery.write(&self.poses, &mut self.training, (out, finished), &mut self.report)
     }
 }
 

@@ -10,11 +10,15 @@ use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::*;
 use crate::testing::{picture, settings};
-use crate::{EngineSettings, Reconstruct};
+use crate::{EngineSettings, Reconstruct, Reconstruction};
 
 /// An engine that has built its model from three pictures.
 fn built(delivers: bool) -> Option<Reconstruction> {
     built_as(delivers.then(Rounding::default), false)
+}
+
+fn settings_for(delivers: Option<Rounding>, incremental: bool) -> EngineSettings {
+    EngineSettings { delivers, incremental, ..settings() }
 }
 
 /// The same; with `incremental`, as a flight does it after its landing.
@@ -23,8 +27,8 @@ fn built_as(delivers: Option<Rounding>, incremental: bool) -> Option<Reconstruct
         println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
         return None;
     }
-    let settings = EngineSettings { delivers, incremental, ..settings() };
-    let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
+    let mut engine =
+        Reconstruction::open(settings_for(delivers, incremental), ModelHeader::default(), "train").expect("opens");
     engine.land();
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
     assert!(engine.build(&|| true).expect("built"));
@@ -43,7 +47,7 @@ fn train(engine: &mut Reconstruction, steps: u32) -> StopReason {
 
 fn sensitivities(engine: &mut Reconstruction) -> Vec<u32> {
     let mut all = Vec::new();
-    engine.trainer.each(&BoundingBox::ALL, |g| all.push(g.sensitivity)).expect("the device works");
+    engine.training.trainer.each(&BoundingBox::ALL, |g| all.push(g.sensitivity)).expect("the device works");
     all.sort_by(f32::total_cmp);
     all.into_iter().map(f32::to_bits).collect()
 }
@@ -52,11 +56,11 @@ fn sensitivities(engine: &mut Reconstruction) -> Vec<u32> {
 fn those_leave_that_the_loss_hangs_on_least_and_the_others_stay_as_they_are() {
     let Some(mut engine) = built(false) else { return };
     train(&mut engine, 9);
-    let (before, steps) = (sensitivities(&mut engine), engine.trainer.schedule().taken());
+    let (before, steps) = (sensitivities(&mut engine), engine.training.trainer.schedule().taken());
     assert!(f32::from_bits(before[before.len() / 2]) > 0.0 && before[0] < before[before.len() - 1]);
-    let gone = engine.thin(0.25, f32::INFINITY).expect("the device works");
+    let gone = thin(&mut engine.training, 0.25, f32::INFINITY).expect("the device works");
     assert_eq!(gone, before.len() / 4);
-    assert!(sensitivities(&mut engine) == before[gone..] && engine.trainer.schedule().taken() == steps);
+    assert!(sensitivities(&mut engine) == before[gone..] && engine.training.trainer.schedule().taken() == steps);
 }
 
 #[test]
@@ -65,11 +69,15 @@ fn no_more_leave_than_what_they_may_cost_together() {
     train(&mut engine, 9);
     let before = sensitivities(&mut engine);
     let cost = |n: usize| before[..n].iter().map(|v| f64::from(f32::from_bits(*v))).sum::<f64>() as f32;
-    let (few, loss) = (before.len() / 10, engine.pictures.store.mean_loss());
+    let (few, loss) = (before.len() / 10, engine.training.pictures.store.mean_loss());
     assert!(loss > 0.0 && loss < 1.0 && cost(before.len() / 2) > cost(few + 1), "{loss}");
     let between = 0.5 * (cost(few) + cost(few + 1));
-    assert_eq!(engine.thin(0.5, between).expect("the device works"), few);
-    assert_eq!(engine.thin(0.5, 0.0).expect("the device works"), 0, "those that are left are all of use");
+    assert_eq!(thin(&mut engine.training, 0.5, between).expect("the device works"), few);
+    assert_eq!(
+        thin(&mut engine.training, 0.5, 0.0).expect("the device works"),
+        0,
+        "those that are left are all of use"
+    );
 }
 
 #[test]
@@ -77,13 +85,13 @@ fn before_every_picture_was_looked_at_the_least_opaque_ones_leave() {
     let Some(mut engine) = built(false) else { return };
     let opacities = |engine: &mut Reconstruction| {
         let mut all = Vec::new();
-        engine.trainer.each(&BoundingBox::ALL, |g| all.push(g.opacity_logit)).expect("the device works");
+        engine.training.trainer.each(&BoundingBox::ALL, |g| all.push(g.opacity_logit)).expect("the device works");
         all.sort_by(f32::total_cmp);
         all
     };
     train(&mut engine, 1);
     let before = opacities(&mut engine);
-    let gone = engine.thin(0.5, 0.0).expect("the device works");
+    let gone = thin(&mut engine.training, 0.5, 0.0).expect("the device works");
     assert!(gone > 0 && opacities(&mut engine) == before[gone..]);
 }
 
@@ -91,7 +99,7 @@ fn before_every_picture_was_looked_at_the_least_opaque_ones_leave() {
 fn a_model_for_delivery_is_thinned_once_and_one_that_is_not_never() {
     for (delivers, share) in [(true, 0.3), (false, 0.0)] {
         let Some(mut engine) = built(delivers) else { return };
-        (engine.settings.training.thinned_share, engine.settings.training.thinned_loss) = (0.3, 1e6);
+        (engine.training.settings.thinned_share, engine.training.settings.thinned_loss) = (0.3, 1e6);
         let whole = engine.gaussians();
         train(&mut engine, 9);
         assert_eq!(engine.gaussians(), whole, "not before its time");
@@ -105,12 +113,14 @@ fn a_model_that_is_continued_after_it_had_been_thinned_is_not_thinned_again() {
     for incremental in [false, true] {
         let Some(mut engine) = built_as(Some(Rounding::default()), incremental) else { return };
         assert!(!engine.delivery.thinned);
-        engine.settings.training.thinned_loss = 1e6;
+        engine.training.settings.thinned_loss = 1e6;
         train(&mut engine, u32::MAX);
         assert!(engine.delivery.thinned);
         let (dir, left) = (tempfile::tempdir().expect("a folder"), engine.gaussians());
         engine.checkpoint(dir.path(), true).expect("written");
-        let mut again = Reconstruction::open(engine.settings.clone(), ModelHeader::default(), "train").expect("opens");
+        let mut settings = settings_for(Some(Rounding::default()), incremental);
+        settings.training.thinned_loss = 1e6;
+        let mut again = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
         assert!(again.resume(dir.path()).expect("read").is_some());
         again.land();
         (0..3).for_each(|i| again.add(picture(i), i < 2).expect("taken"));
@@ -123,13 +133,13 @@ fn a_model_that_is_continued_after_it_had_been_thinned_is_not_thinned_again() {
 #[test]
 fn a_schedule_that_the_clock_ends_is_thinned_and_rounded_too() {
     let Some(mut engine) = built(true) else { return };
-    engine.settings.training.thinned_loss = 1e6;
+    engine.training.settings.thinned_loss = 1e6;
     let whole = engine.gaussians();
     // Long enough for a few dozen steps on a machine that does other work as well.
     let budget = RunBudget { steps: None, seconds: Some(5.0) };
     let mut go_on = |_: &StepReport| ControlFlow::Continue(());
     assert_eq!(engine.train(&budget, &mut go_on).expect("trains"), StopReason::Schedule);
-    assert!(engine.delivery.rounded && engine.delivery.thinned && engine.gaussians() < whole);
+    assert!(engine.delivery.is_rounded() && engine.delivery.thinned && engine.gaussians() < whole);
 }
 
 #[test]
@@ -143,8 +153,8 @@ fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colou
             ControlFlow::Continue(())
         };
         assert_eq!(engine.train(&budget, &mut each).expect("trains"), StopReason::Schedule);
-        engine.trainer.snapshot(&mut engine.cloud).expect("read");
-        Some((steps, engine.header.steps, engine.cloud))
+        engine.training.trainer.snapshot(&mut engine.training.cloud).expect("read");
+        Some((steps, engine.delivery.header.steps, engine.training.cloud))
     };
     let places = |cloud: &GaussianCloud| {
         let mut places: Vec<_> = cloud.means.iter().map(|m| m.map(f32::to_bits)).collect();
@@ -166,7 +176,7 @@ fn what_is_delivered_rounded_ends_its_training_with_rounded_shapes_and_new_colou
 fn what_is_delivered_rounded_pays_for_view_dependence_in_any_schedule_and_finely_for_a_share_of_it() {
     let Some(exact) = built_as(None, false) else { return };
     let loss = |engine: &Reconstruction| {
-        let loss = &engine.settings.training.loss;
+        let loss = &engine.training.settings.loss;
         (loss.view_dependence, loss.view_dependence_visits > 0)
     };
     let (weight, waits) = loss(&exact);

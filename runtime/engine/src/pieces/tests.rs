@@ -6,7 +6,7 @@ use vulkan::trainer::RunBudget;
 
 use super::*;
 use crate::testing::{picture, settings};
-use crate::{InitKind, Reconstruct};
+use crate::{EngineSettings, InitKind, Reconstruct, Reconstruction};
 
 /// Of 300 Gaussians so many are on the device at once.
 fn engine(on_device: usize, start: InitKind) -> Reconstruction {
@@ -24,13 +24,13 @@ fn take(engine: &mut Reconstruction) {
 
 /// Looks at so many pictures, in parts.
 fn train(engine: &mut Reconstruction, steps: u32) {
-    let budget = RunBudget { steps: Some(engine.trainer.schedule().spent().0 + steps), seconds: None };
+    let budget = RunBudget { steps: Some(engine.training.trainer.schedule().spent().0 + steps), seconds: None };
     engine.train(&budget, &mut |_| ControlFlow::Continue(())).expect("trains");
 }
 
 fn trained(engine: &mut Reconstruction) -> GaussianCloud {
     let mut cloud = GaussianCloud::default();
-    engine.trainer.snapshot(&mut cloud).expect("read");
+    engine.training.trainer.snapshot(&mut cloud).expect("read");
     cloud
 }
 
@@ -57,7 +57,7 @@ fn a_checkpoint_in_pieces_is_the_file_of_the_whole_and_is_continued_as_it_was() 
     let dir = tempfile::tempdir().expect("folder");
     let mut first = engine(120, InitKind::Random);
     take(&mut first);
-    assert!(first.in_pieces && first.cloud.is_empty());
+    assert!(first.training.in_pieces && first.training.cloud.is_empty());
     train(&mut first, 5);
     let (path, gaussians) = first.checkpoint(dir.path(), false).expect("written");
     let cloud = trained(&mut first);
@@ -74,12 +74,12 @@ fn a_checkpoint_in_pieces_is_the_file_of_the_whole_and_is_continued_as_it_was() 
     assert_eq!(second.resume(dir.path()).expect("read").map(|views| views.len()), Some(3));
     take(&mut second);
     assert!(sorted(&trained(&mut second)) == sorted(&cloud), "other Gaussians than were saved");
-    assert_eq!(second.trainer.schedule().spent().0, 5);
+    assert_eq!(second.training.trainer.schedule().spent().0, 5);
     let mut third = engine(120, InitKind::Model);
     third.begin_with(Chunks::open(&path).expect("a model"));
     take(&mut third);
     assert!(
-        sorted(&trained(&mut third)) == sorted(&cloud) && third.trainer.schedule().spent().0 == 0,
+        sorted(&trained(&mut third)) == sorted(&cloud) && third.training.trainer.schedule().spent().0 == 0,
         "a schedule of its own"
     );
     train(&mut third, 3);
@@ -95,7 +95,7 @@ fn giving_up_gaussians_of_a_scene_in_pieces_leaves_none_of_it_in_memory() {
     train(&mut engine, 4);
     let before = engine.gaussians();
     engine.shrink().expect("the device works");
-    assert!(engine.gaussians() < before && engine.cloud.is_empty());
+    assert!(engine.gaussians() < before && engine.training.cloud.is_empty());
     train(&mut engine, 2);
 }
 
@@ -110,7 +110,10 @@ fn a_model_that_fails_on_its_way_out_leaves_the_one_saved_before() {
     let (path, _) = engine.checkpoint(dir.path(), false).expect("written");
     let before = std::fs::read(&path).expect("read");
     // The cells cannot be read any more.
-    engine.trainer.keep_scene_in(std::fs::File::options().read(true).write(true).open("/dev/null").expect("opens"));
+    engine
+        .training
+        .trainer
+        .keep_scene_in(std::fs::File::options().read(true).write(true).open("/dev/null").expect("opens"));
     let error = engine.checkpoint(dir.path(), false).expect_err("nothing to read");
     assert!(matches!(error, EngineError::Train(TrainError::SceneFile(_))), "{error}");
     assert!(!error.to_string().contains('\n'), "{error}");
@@ -142,7 +145,7 @@ fn a_damaged_or_short_model_is_one_line_and_what_is_there_stays() {
     std::fs::write(&bad, &whole).expect("written");
     let opened = Chunks::open(&bad).expect("a model");
     std::fs::write(&bad, &whole[..whole.len() / 2]).expect("written");
-    let mut trainer = engine(120, InitKind::Model).trainer;
+    let mut trainer = engine(120, InitKind::Model).training.trainer;
     trainer.load(&before).expect("loaded");
     let error = load(&mut trainer, &opened).expect_err("short").to_string();
     assert!(error.contains("bad.dgtr") && !error.contains('\n'), "{error}");

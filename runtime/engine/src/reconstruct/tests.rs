@@ -19,7 +19,7 @@ fn giving_up_gaussians_does_not_start_the_schedule_anew() {
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
     assert!(engine.build(&|| true).expect("built"));
     // As after a landing.
-    engine.trainer.schedule_mut().begin_at(0.25);
+    engine.training.trainer.schedule_mut().begin_at(0.25);
     let budget = RunBudget { steps: Some(20), seconds: None };
     let mut steps = 0;
     let mut until = |engine: &mut Reconstruction, last: u32| {
@@ -34,7 +34,7 @@ fn giving_up_gaussians_does_not_start_the_schedule_anew() {
     engine.shrink().expect("the device works");
     let after = engine.gaussians();
     assert!(after < before && !engine.is_done(&budget));
-    assert_eq!(engine.trainer.schedule().progress(), 0.25 + 0.75 * 0.2);
+    assert_eq!(engine.training.trainer.schedule().progress(), 0.25 + 0.75 * 0.2);
     assert_eq!(until(&mut engine, u32::MAX), StopReason::Schedule);
     assert_eq!(steps, 20);
     assert!(engine.is_done(&budget));

@@ -10,7 +10,7 @@ use vulkan::trainer::{RunBudget, StopReason};
 
 use super::*;
 use crate::testing::{picture, settings};
-use crate::{EngineSettings, Reconstruct};
+use crate::{EngineSettings, Reconstruct, Reconstruction};
 
 /// An engine that has built its model from three pictures and averages from progress 0.5 on where a schedule has so many looks at each.
 fn built(visits: u32) -> Option<Reconstruction> {
@@ -41,7 +41,7 @@ fn train(engine: &mut Reconstruction, until: u32) -> (GaussianCloud, StopReason)
     };
     let reason = engine.train(&RunBudget { steps: Some(20), seconds: None }, each).expect("trains");
     let mut now = GaussianCloud::default();
-    engine.trainer.snapshot(&mut now).expect("the device works");
+    engine.training.trainer.snapshot(&mut now).expect("the device works");
     (now, reason)
 }
 
@@ -80,7 +80,7 @@ fn a_long_schedule_ends_with_the_mean_of_what_its_epochs_end_with() {
     let (got, reason) = train(&mut engine, 21);
     assert!(reason == StopReason::Schedule && got == mean(&ends) && got != ends[3]);
     assert_eq!(engine.report.more.get("averaged_epochs"), Some(&4.into()));
-    assert!(!engine.is_average() && engine.is_done(&RunBudget { steps: Some(20), seconds: None }));
+    assert!(!engine.training.is_average() && engine.is_done(&RunBudget { steps: Some(20), seconds: None }));
 }
 
 #[test]
@@ -106,7 +106,7 @@ fn what_is_rounded_for_delivery_is_the_mean_and_colours_go_on_from_there() {
     let Some(ends) = built_with(1_000, never_rounds).map(|engine| at(engine, [11, 14, 17, 18])) else { return };
     let Some(mut engine) = built_with(1, delivers) else { return };
     let (got, reason) = train(&mut engine, 21);
-    assert!(reason == StopReason::Schedule && engine.delivery.rounded && !engine.is_average());
+    assert!(reason == StopReason::Schedule && engine.delivery.is_rounded() && !engine.training.is_average());
     let rounded = |cloud: &GaussianCloud| round_shapes(cloud, &Rounding::default()).expect("rounded");
     let (expected, last) = (rounded(&mean(&ends)), rounded(&ends[3]));
     let shape = |c: &GaussianCloud| (c.means.clone(), c.log_scales.clone(), c.opacity_logits.clone());
@@ -125,7 +125,7 @@ fn a_schedule_that_ends_early_is_over_at_the_same_step_and_ends_with_the_mean_of
     let Some(mut engine) = built_with(1, stops) else { return };
     for engine in [&mut uninterrupted, &mut engine] {
         let (_, reason) = train(engine, 21);
-        assert_eq!((reason, engine.trainer.schedule().spent().0), (StopReason::Converged, 19));
+        assert_eq!((reason, engine.training.trainer.schedule().spent().0), (StopReason::Converged, 19));
     }
     // Steps 11, 14, 17 and the last one.
     assert_eq!(uninterrupted.report.more.get("averaged_epochs"), None);
@@ -136,9 +136,9 @@ fn a_schedule_that_ends_early_is_over_at_the_same_step_and_ends_with_the_mean_of
 fn gaussians_that_are_no_longer_as_many_are_no_part_of_a_mean() {
     let Some(mut engine) = built(1) else { return };
     train(&mut engine, 14);
-    assert!(engine.is_average());
+    assert!(engine.training.is_average());
     engine.shrink().expect("the device works");
-    assert!(!engine.is_average());
+    assert!(!engine.training.is_average());
     let (got, reason) = train(&mut engine, 21);
     assert!(reason == StopReason::Schedule && got.len() == engine.gaussians());
     // Steps 17 and 20.

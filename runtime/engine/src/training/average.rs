@@ -1,14 +1,15 @@
 //! The mean of what the last epochs of a long schedule end with (`[training.average]`), in the memory of the cloud that checkpoints are
 //! written from. Near its end a schedule goes round the best model that it can find; the mean of where it was lies nearer to that.
 
+use job::run_json::RunReport;
 use vulkan::trainer::StepReport;
 
-use super::Reconstruction;
+use super::Training;
 use crate::error::EngineError;
 
 /// What the cloud is the mean of.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Average {
+pub(crate) struct Average {
     /// So many ends of epochs; 0: it is no mean.
     epochs: u32,
     /// Steps at the last of them.
@@ -17,7 +18,7 @@ pub(super) struct Average {
 
 /// When the next end of an epoch counts.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Due {
+pub(crate) struct Due {
     from: f32,
     step: u32,
 }
@@ -28,20 +29,18 @@ impl Due {
     }
 }
 
-impl Reconstruction {
+impl Training {
     /// When the present parameters are to be counted in, if they are.
-    pub(super) fn average_due(&self) -> Option<Due> {
-        let t = &self.settings.training;
+    pub(crate) fn average_due(&self, rounded: bool) -> Option<Due> {
+        let t = &self.settings;
         let whole = !self.in_pieces && self.trainer.cells().0 == 0;
-        (whole && !self.flying && !self.delivery.rounded).then(|| Due {
-            from: t.average.from.max(t.density.until),
-            step: self.average.step + self.views.len() as u32,
-        })
+        (whole && !self.flying && !rounded)
+            .then(|| Due { from: t.average.from.max(t.density.until), step: self.average.step + self.views() as u32 })
     }
 
     /// An epoch is over: its end counts where the schedule is long enough.
-    pub(super) fn end_epoch(&mut self) -> Result<(), EngineError> {
-        let looks = u64::from(self.settings.training.average.visits) * self.views.len() as u64;
+    pub(crate) fn end_epoch(&mut self) -> Result<(), EngineError> {
+        let looks = u64::from(self.settings.average.visits) * self.views() as u64;
         if u64::from(self.trainer.schedule().expected_steps()) >= looks {
             return self.average();
         }
@@ -50,12 +49,12 @@ impl Reconstruction {
     }
 
     /// Whether the cloud is the mean of epochs of the present Gaussians.
-    pub(super) fn is_average(&self) -> bool {
+    pub(crate) fn is_average(&self) -> bool {
         self.average.epochs > 0 && self.cloud.len() == self.trainer.gaussians()
     }
 
     /// Counts the present parameters in.
-    pub(super) fn average(&mut self) -> Result<(), EngineError> {
+    pub(crate) fn average(&mut self) -> Result<(), EngineError> {
         let before = if self.is_average() { self.average.epochs } else { 0 };
         match before {
             0 => self.trainer.snapshot(&mut self.cloud)?,
@@ -66,7 +65,7 @@ impl Reconstruction {
     }
 
     /// The schedule is over: its model is the mean.
-    pub(super) fn settle_average(&mut self) -> Result<(), EngineError> {
+    pub(crate) fn settle_average(&mut self, report: &mut RunReport) -> Result<(), EngineError> {
         if !self.is_average() {
             return Ok(());
         }
@@ -75,13 +74,13 @@ impl Reconstruction {
         }
         self.reload()?;
         tracing::info!("the mean of {} epochs", self.average.epochs);
-        self.report.more.insert("averaged_epochs".into(), self.average.epochs.into());
+        report.more.insert("averaged_epochs".into(), self.average.epochs.into());
         self.average = Average::default();
         Ok(())
     }
 
     /// Loads the cloud in place of the Gaussians that it was made of; the schedule goes on where it was.
-    pub(super) fn reload(&mut self) -> Result<(), EngineError> {
+    pub(crate) fn reload(&mut self) -> Result<(), EngineError> {
         let ((steps, seconds), begun_at) = (self.trainer.schedule().spent(), self.trainer.schedule().begun_at());
         let validated = self.trainer.validated();
         self.trainer.load(&self.cloud)?;

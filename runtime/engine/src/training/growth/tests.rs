@@ -14,7 +14,7 @@ use vulkan::trainer::{RunBudget, StepReport};
 use super::*;
 use crate::device::DeviceRequest;
 use crate::testing::settings;
-use crate::{EngineSettings, InitKind, Reconstruct};
+use crate::{EngineSettings, InitKind, Reconstruct, Reconstruction};
 
 const LENS: Intrinsics = Intrinsics { width: 240, height: 180, fx: 195.0, fy: 195.0, cx: 120.0, cy: 90.0 };
 /// Pictures of a line, and lines.
@@ -108,7 +108,7 @@ struct Done {
 fn take(engine: &mut Reconstruction, picture: PosedImage) -> Option<Done> {
     engine.add(picture, false).expect("taken");
     let counts = |e: &Reconstruction| {
-        let t = &e.growing.totals;
+        let t = &e.grown;
         [t.depths, t.adjusted_frames, t.adjusted_observations]
     };
     let mut done = None;
@@ -134,7 +134,7 @@ fn take(engine: &mut Reconstruction, picture: PosedImage) -> Option<Done> {
 
 fn snapshot(engine: &mut Reconstruction) -> GaussianCloud {
     let mut cloud = GaussianCloud::default();
-    engine.trainer.snapshot(&mut cloud).expect("read");
+    engine.training.trainer.snapshot(&mut cloud).expect("read");
     cloud
 }
 
@@ -144,7 +144,7 @@ fn every_picture_is_in_the_model_at_once_at_a_cost_that_does_not_grow_with_the_f
     let mut grown: Vec<Done> = Vec::new();
     for (i, picture) in pictures.into_iter().enumerate() {
         grown.extend(take(&mut engine, picture));
-        assert!(i < 2 || engine.built.len() == i + 1, "picture {i} waits for nothing");
+        assert!(i < 2 || engine.training.built.views.len() == i + 1, "picture {i} waits for nothing");
     }
     assert_eq!(grown.len(), LINE * LINES - 3, "built once, of three");
     // What placing took is counted before the growth: of each, the difference to the next.
@@ -172,15 +172,15 @@ fn a_flight_over_more_than_the_device_holds_grows_as_well() {
     let mut grown = 0;
     for (i, picture) in pictures.into_iter().take(2 * LINE).enumerate() {
         grown += usize::from(take(&mut engine, picture).is_some());
-        assert!(i < 2 || engine.built.len() == i + 1, "picture {i} waits for nothing");
+        assert!(i < 2 || engine.training.built.views.len() == i + 1, "picture {i} waits for nothing");
     }
-    assert_eq!((grown, engine.builds), (2 * LINE - 3, 1), "built once, of three");
-    let (cells, on_device) = engine.trainer.cells();
+    assert_eq!((grown, engine.training.built.times), (2 * LINE - 3, 1), "built once, of three");
+    let (cells, on_device) = engine.training.trainer.cells();
     assert!(cells > on_device && on_device > 0, "{on_device} of {cells} cells");
     let model = snapshot(&mut engine);
     assert!(model.len() > 6_000 && model.len() == engine.gaussians(), "{} {}", model.len(), engine.gaussians());
     // To make room and to give up is done in cells, too.
-    engine.make_room(1_000).expect("made");
+    make_room(&mut engine.training, 1_000).expect("made");
     assert_eq!(engine.gaussians(), model.len() - 1_000);
     engine.shrink().expect("shrinks");
     assert!(engine.gaussians() < model.len() - 2_000);
@@ -196,7 +196,7 @@ fn new_ground_gets_gaussians_and_what_is_far_from_it_stays_to_the_bit() {
     };
     let mut looked_at = 0;
     for picture in pictures.into_iter().take(LINE) {
-        let (there, first) = (picture.view.pose.center.x as f32, engine.views.len());
+        let (there, first) = (picture.view.pose.center.x as f32, engine.poses.len());
         if first < 6 {
             take(&mut engine, picture);
             continue;
@@ -225,12 +225,12 @@ fn landed(pictures: &[PosedImage], share: f64) -> Option<(GaussianCloud, usize, 
     pictures.iter().for_each(|p| _ = take(&mut engine, p.clone()));
     let in_flight = snapshot(&mut engine);
     assert!(!engine.wants_build(false));
-    engine.header.steps = (share * f64::from(engine.settings.training.steps)) as u64;
+    engine.delivery.header.steps = (share * f64::from(engine.training.settings.steps)) as u64;
     engine.land();
     assert!(engine.wants_build(true) && engine.build(&|| true).expect("built") && !engine.wants_build(true));
     assert!(!engine.wants_growth());
     let kept = engine.report.more["gaussians_kept"].as_u64().expect("a number") as usize;
-    let progress = engine.trainer.schedule().progress();
+    let progress = engine.training.trainer.schedule().progress();
     Some((in_flight, kept, snapshot(&mut engine), progress))
 }
 
