@@ -206,7 +206,7 @@ pub fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
 pub fn knows_localhost() -> bool {
     let known = std::net::ToSocketAddrs::to_socket_addrs(&("localhost", 0)).is_ok();
     if !known {
-        println!("skipped: this machine does not know the name localhost (no /etc/hosts?)");
+        needs::missing(needs::Need::Localhost, "this machine does not know the name localhost (no /etc/hosts?)");
     }
     known
 }

@@ -39,7 +39,10 @@ fn python() -> Option<PathBuf> {
     {
         Some(python)
     } else {
-        println!("skipped: pymavlink cannot be installed here (needs python3 with venv, and a package index)");
+        needs::missing(
+            needs::Need::PythonPackages,
+            "pymavlink cannot be installed here (needs python3 with venv, and a package index)",
+        );
         None
     }
 }

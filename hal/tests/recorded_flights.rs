@@ -21,10 +21,7 @@ use hal::time::MonotonicClock;
 use hal::traits::{Camera, Link, PictureClues};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 
-#[path = "../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 /// SITL's home.
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84265, lon_deg: -91.99390, alt_m: 158.6 };

@@ -8,10 +8,7 @@ use std::time::Instant;
 
 use models::picture::decode_at_least;
 
-#[path = "../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 /// Rounds over all pictures, of which the best counts.
 const ROUNDS: usize = 5;

@@ -64,7 +64,7 @@ fn peaks(settings: &InitSettings, network: Option<&Path>, pictures: usize, size:
 #[test]
 fn the_whole_initialisation_stays_below_its_planned_bytes() {
     if find_library().is_err() {
-        println!("skipped: no ONNX Runtime");
+        needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
         return;
     }
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);

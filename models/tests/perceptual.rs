@@ -7,15 +7,12 @@ use models::onnx::depth::DepthNetwork;
 use models::onnx::metric::PerceptualMetric;
 use models::onnx::session::find_library;
 
-#[path = "../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 fn no_runtime() -> bool {
     let missing = find_library().is_err();
     if missing {
-        println!("skipped: no ONNX Runtime");
+        needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
     }
     missing
 }

@@ -17,10 +17,7 @@ use survey::dataset::{Dataset, PoseSource};
 #[path = "support/pose_errors.rs"]
 mod pose_errors;
 
-#[path = "../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 /// As `dgtr train` settles a card, with time enough on a busy machine.
 fn settle(set: &Dataset, side: u32) -> Option<(Refiner, RefineReport)> {
@@ -42,7 +39,7 @@ fn settle(set: &Dataset, side: u32) -> Option<(Refiner, RefineReport)> {
     let mut refiner = match Refiner::open(&settings) {
         Ok(r) => r,
         Err(e) => {
-            println!("skipped: {e}");
+            needs::missing(needs::Need::OnnxRuntime, e);
             return None;
         }
     };

@@ -13,17 +13,14 @@ use survey::dataset::{Dataset, PoseSource};
 #[path = "support/pose_errors.rs"]
 mod pose_errors;
 
-#[path = "../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 fn refine(name: &str, split: &str, settings: &RefineSettings) -> Option<(PoseErrors, PoseErrors, RefineReport)> {
     let dataset = Dataset::open(&shared(&format!("data/{name}"))?).unwrap();
     let mut refiner = match Refiner::open(settings) {
         Ok(r) => r,
         Err(e) => {
-            println!("skipped: {e}");
+            needs::missing(needs::Need::OnnxRuntime, e);
             return None;
         }
     };

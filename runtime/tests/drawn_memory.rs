@@ -60,7 +60,7 @@ fn drawn(trainer: &mut Trainer) -> Vec<f32> {
 fn a_file_is_drawn_and_mapped_as_if_it_were_read_whole_in_the_memory_of_a_piece() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     if Gpu::list().is_err() {
-        return println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        return needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
     }
     let dir = tempfile::tempdir().expect("temp dir");
     let path = dir.path().join("m.dgtr");
@@ -91,7 +91,7 @@ fn a_file_is_drawn_and_mapped_as_if_it_were_read_whole_in_the_memory_of_a_piece(
 fn of_a_file_that_is_cut_short_what_is_there_is_drawn() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     if Gpu::list().is_err() {
-        return println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        return needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
     }
     let dir = tempfile::tempdir().expect("temp dir");
     let path = dir.path().join("m.dgtr");

@@ -2,8 +2,6 @@
 //! are left as they are.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
-#[path = "../shared_data.rs"]
-mod shared_data;
 mod support;
 
 use std::path::Path;
@@ -67,7 +65,7 @@ fn trained(dir: &Path, pictures: &str, light: bool) -> (String, Vec<u8>, f64) {
 
 #[test]
 fn pictures_of_uneven_light_cost_little_and_those_of_even_light_nothing() {
-    let Some(from) = shared_data::shared("data/sheffield_cross") else { return };
+    let Some(from) = needs::shared("data/sheffield_cross") else { return };
     let set = Dataset::open(&from).expect("the data set");
     let dir = tempfile::tempdir().expect("a folder");
     write(&set, &from, &dir.path().join("even"), false);

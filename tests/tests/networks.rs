@@ -9,10 +9,7 @@ use serde_json::Value;
 use support::plane::plane_dataset;
 use support::{refused, run};
 
-#[path = "../shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 fn network(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/networks").join(name)

@@ -22,10 +22,7 @@ use support::hub::Hub;
 use support::{Running, run, wait_until};
 use survey::dataset::Dataset;
 
-#[path = "../shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 const PATIENCE: Duration = Duration::from_secs(180);
 

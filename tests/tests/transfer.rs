@@ -7,10 +7,7 @@ use models::camera::View;
 use models::refine::Refiner;
 use survey::dataset::{Dataset, PoseSource};
 
-#[path = "../shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 /// Mean distance of a few ground points' projections, pixels.
 fn apart_px(a: &View, b: &View, depth: f64) -> f64 {
@@ -37,7 +34,7 @@ const Y: [f64; 3] = [0.0, 1.0, 0.0];
 fn a_held_out_pose_lands_within_a_pixel_of_where_refinement_would_have_put_it() {
     let Some(folder) = shared("data/sheffield_cross") else { return };
     if models::onnx::session::find_library().is_err() {
-        println!("skipped: ONNX Runtime is not there");
+        needs::missing(needs::Need::OnnxRuntime, "ONNX Runtime is not there");
         return;
     }
     let set = Dataset::open(&folder).expect("data set");

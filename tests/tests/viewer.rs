@@ -77,7 +77,7 @@ fn the_page_opens_offline_without_webgpu_north_is_north_and_measures_are_right()
     let (Some(chromium), Some(node)) =
         (program(&["chromium", "chromium-browser", "google-chrome"]), program(&["node"]))
     else {
-        println!("skipped: chromium and node are needed (apt-get install chromium nodejs)");
+        needs::missing(needs::Need::Chromium, "chromium and node are needed (apt-get install chromium nodejs)");
         return;
     };
     let out = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("../viewer");
@@ -87,7 +87,7 @@ fn the_page_opens_offline_without_webgpu_north_is_north_and_measures_are_right()
     let export = run(&out, &["export", "lawn.dgtr", "--to", "html"]);
     let said = String::from_utf8_lossy(&export.stderr);
     if export.status.code() == Some(3) {
-        println!("skipped: {said}");
+        needs::missing(needs::Need::Viewer, said);
         return;
     }
     assert!(export.status.success(), "{said}");

@@ -222,7 +222,7 @@ mod tests {
             Plan::with_capacities(&PlanRequest { width: 64, height: 48, views: 1, ..Default::default() }, 300, 1000);
         // 256: what V3DV adds.
         for (padding, fits) in [(0, true), (256, true), (DRIVER_ROOM, true), (DRIVER_ROOM + (1 << 20), false)] {
-            let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+            let Ok(gpu) = Gpu::open(None) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
             let gpu = gpu.forced(Forced { padding, ..Forced::default() });
             let made = Arena::new(&gpu, &plan);
             assert_eq!(Arena::check(&gpu, &plan).err(), made.as_ref().err().cloned());

@@ -45,7 +45,7 @@ fn train(gpu: &Gpu, instances: usize) -> (Rendering, GaussianCloud, usize) {
 fn instances_beyond_the_plan_are_blended_in_bands_with_identical_bits() {
     let gpu = match Gpu::open(None) {
         Ok(gpu) => gpu,
-        Err(e) => return println!("skipped: {e}"),
+        Err(e) => return needs::missing(needs::Need::Vulkan, e),
     };
     let (picture, trained, bands) = train(&gpu, 1 << 20);
     assert_eq!(bands, 1);

@@ -21,7 +21,7 @@ use vulkan::trainer::{CropPlace, TrainError};
 /// A trainer for two views of 64 × 48 and four crops, with so many slots on the device.
 fn trainer(crops: CropSettings, slots: u32) -> Option<Fixture> {
     let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device");
         return None;
     };
     let request = PlanRequest {

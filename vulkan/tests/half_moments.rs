@@ -13,7 +13,7 @@ use vulkan::fixture::Fixture;
 use vulkan::gpu::Gpu;
 
 fn open() -> Option<Gpu> {
-    Gpu::open(None).map_err(|e| println!("skipped: {e}")).ok()
+    Gpu::open(None).map_err(|e| needs::missing(needs::Need::Vulkan, e)).ok()
 }
 
 #[test]

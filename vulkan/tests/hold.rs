@@ -13,7 +13,7 @@ use vulkan::gpu::Gpu;
 
 #[test]
 fn what_is_held_stays_to_the_seventh_digit_and_the_rest_learns() {
-    let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+    let Ok(gpu) = Gpu::open(None) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
     let v = view(64, 48);
     let start = cloud(8, 300, 3);
     // Sixteen bits hold smaller moments.

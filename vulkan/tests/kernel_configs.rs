@@ -19,7 +19,7 @@ use vulkan::trainer::Rendering;
 fn gpu() -> Option<Gpu> {
     let gpu = Gpu::open(None);
     if let Err(e) = &gpu {
-        println!("skipped: {e}");
+        needs::missing(needs::Need::Vulkan, e);
     }
     gpu.ok()
 }

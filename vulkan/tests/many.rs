@@ -27,7 +27,7 @@ fn carpet(columns: usize, rows: usize) -> GaussianCloud {
 #[test]
 fn a_view_of_a_hundred_and_twenty_thousand_gaussians_has_no_holes() {
     let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         return;
     };
     let cloud = carpet(400, 300);

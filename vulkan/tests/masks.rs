@@ -18,7 +18,7 @@ fn dark(x: u32, y: u32) -> bool {
 #[test]
 fn what_lies_under_a_mask_changes_no_bit_of_the_model_at_any_resolution() {
     if Gpu::open(None).is_err() {
-        return println!("skipped: no Vulkan device");
+        return needs::missing(needs::Need::Vulkan, "no Vulkan device");
     }
     let v = view(64, 48);
     let honest = posed(&v, &photo(1, &v));
@@ -60,7 +60,7 @@ fn what_lies_under_a_mask_changes_no_bit_of_the_model_at_any_resolution() {
 #[test]
 fn a_new_depth_prior_leaves_the_mask_in_place_and_a_picture_keeps_its_own_colours() {
     if Gpu::open(None).is_err() {
-        return println!("skipped: no Vulkan device");
+        return needs::missing(needs::Need::Vulkan, "no Vulkan device");
     }
     let v = view(64, 48);
     let mask = Mask::from_fn(64, 48, |x, y| !dark(x, y));

@@ -8,7 +8,7 @@ use vulkan::gpu::Gpu;
 fn on_device(case: impl Fn(&Gpu) -> Outcome) {
     match Gpu::open(None) {
         Ok(gpu) => println!("{}", case(&gpu).unwrap_or_else(|e| panic!("{e}"))),
-        Err(e) => println!("skipped: {e}"),
+        Err(e) => needs::missing(needs::Need::Vulkan, e),
     }
 }
 

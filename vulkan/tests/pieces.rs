@@ -23,7 +23,7 @@ static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
 /// A trainer of `on_device` Gaussians at once, of a scene of so many, with a view of 64 × 48.
 fn trainer(on_device: usize, scene: usize) -> Option<Fixture> {
     let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device");
         return None;
     };
     let request = PlanRequest {

@@ -8,7 +8,7 @@ use vulkan::roofline::measure;
 fn a_device_copies_and_computes_at_rates_that_can_be_divided_by() {
     let gpu = match Gpu::open(None) {
         Ok(gpu) => gpu,
-        Err(e) => return println!("skipped: {e}"),
+        Err(e) => return needs::missing(needs::Need::Vulkan, e),
     };
     let roofline = measure(&gpu).unwrap();
     println!("{roofline:?}");

@@ -27,8 +27,11 @@ fn the_validation_layer_has_nothing_to_say() {
     let present = ["/usr/share/vulkan/explicit_layer.d", "/etc/vulkan/explicit_layer.d"]
         .iter()
         .any(|d| std::path::Path::new(d).join("VkLayer_khronos_validation.json").exists());
-    if !present || Gpu::open(None).is_err() {
-        return println!("skipped: needs a Vulkan device and {layer}");
+    if let Err(e) = Gpu::open(None) {
+        return needs::missing(needs::Need::Vulkan, e);
+    }
+    if !present {
+        return needs::missing(needs::Need::ValidationLayer, format!("{layer} is not there (vulkan-validationlayers)"));
     }
     let child = Command::new(std::env::current_exe().unwrap())
         .args(["the_validation_layer_has_nothing_to_say", "--exact", "--nocapture"])

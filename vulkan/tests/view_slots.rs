@@ -20,7 +20,7 @@ const VIEWS: u32 = 5;
 /// A trainer for views of `view`'s size with so many slots on the device and the others in a file.
 fn trainer(view: &View, slots: u32) -> Option<Fixture> {
     let Ok(gpu) = Gpu::open(None) else {
-        println!("skipped: no Vulkan device");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device");
         return None;
     };
     let k = view.intrinsics;

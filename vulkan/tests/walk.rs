@@ -14,7 +14,7 @@ use vulkan::gpu::Gpu;
 fn every_tile_of_every_giant_is_counted_and_emitted() {
     let gpu = match Gpu::open(None) {
         Ok(gpu) => gpu,
-        Err(e) => return println!("skipped: {e}"),
+        Err(e) => return needs::missing(needs::Need::Vulkan, e),
     };
     // 3,000 Gaussians that cover all 800 tiles: 75,000 instances per sorting lane.
     let (side, count) = (160, 3000);

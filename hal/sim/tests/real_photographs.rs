@@ -17,10 +17,7 @@ use hal::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use sim::replay::{Playlist, PlaylistItem, ReplaySettings, play};
 
-#[path = "../../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 const LENS: CameraSettings = CameraSettings {
     width: 640,

@@ -35,7 +35,7 @@ fn picture(i: usize, x: f64, y: f64) -> PosedImage {
 fn no_runtime() -> bool {
     let missing = crate::onnx::session::find_library().is_err();
     if missing {
-        println!("skipped: no ONNX Runtime");
+        needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
     }
     missing
 }

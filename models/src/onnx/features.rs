@@ -216,7 +216,7 @@ mod tests {
     #[test]
     fn a_shifted_picture_gives_matches_at_the_shift() {
         if super::super::session::find_library().is_err() {
-            println!("skipped: no ONNX Runtime");
+            needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
             return;
         }
         let mut network = FeatureNetwork::open(None, 1).unwrap();
@@ -244,7 +244,7 @@ mod tests {
     #[test]
     fn a_picture_too_small_for_the_network_has_no_features() {
         if super::super::session::find_library().is_err() {
-            println!("skipped: no ONNX Runtime");
+            needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
             return;
         }
         let mut network = FeatureNetwork::open(None, 1).unwrap();

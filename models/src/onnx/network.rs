@@ -335,7 +335,7 @@ mod tests {
     #[test]
     fn a_network_under_the_wrong_contract_is_refused_before_it_runs() {
         if find_library().is_err() {
-            println!("skipped: no ONNX Runtime");
+            needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
             return;
         }
         assert!(checked(manifest("features", ""), XFEAT).is_ok());
@@ -349,7 +349,7 @@ mod tests {
     #[test]
     fn bytes_that_are_no_network_are_one_clear_line() {
         if find_library().is_err() {
-            println!("skipped: no ONNX Runtime");
+            needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
             return;
         }
         for bytes in [&b""[..], b"not onnx at all", &XFEAT[..1000]] {

@@ -180,7 +180,7 @@ mod tests {
     #[test]
     fn no_key_point_is_taken_from_what_a_mask_leaves_out() {
         if crate::onnx::session::find_library().is_err() {
-            return println!("skipped: no ONNX Runtime");
+            return needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
         }
         let cell = |x: u32, y: u32| (x / 9).wrapping_mul(0x9E37_79B9) ^ (y / 9).wrapping_mul(0x85EB_CA6B);
         let image =

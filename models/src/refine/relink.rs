@@ -190,7 +190,7 @@ mod tests {
     #[test]
     fn a_picture_that_chance_linked_a_quarter_turn_off_is_turned_back_and_tied() {
         if crate::onnx::session::find_library().is_err() {
-            return println!("skipped: no ONNX Runtime");
+            return needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
         }
         let mut refiner = Refiner::open(&RefineSettings { solve_seconds: 120.0, ..RefineSettings::default() }).unwrap();
         for x in 0..7 {

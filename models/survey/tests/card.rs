@@ -11,10 +11,7 @@ use survey::card::write::{DJI, PIX4D, Tags};
 use survey::card::{AttitudeSource, Card, CardError, CardOptions, CardPicture, Exposure, Fix};
 use survey::dataset::{Dataset, PoseSource};
 
-#[path = "../../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 const HOME: Geodetic = Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 158.5 };
 const START_NS: u64 = 1_466_699_519_000_000_000;

@@ -9,10 +9,7 @@ use models::camera::Pose;
 use models::formats::transforms::{opengl_to_pose, pose_to_opengl};
 use survey::dataset::{Dataset, DatasetError, PoseSource};
 
-#[path = "../../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 fn picture(path: &Path, w: u32, h: u32) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();

@@ -87,7 +87,7 @@ mod tests {
     #[test]
     fn what_is_measured_is_kept_for_this_number_of_threads_and_found_again() {
         let Ok(gpu) = Gpu::open(None) else {
-            println!("skipped: no Vulkan device");
+            needs::missing(needs::Need::Vulkan, "no Vulkan device");
             return;
         };
         let dir = tempfile::tempdir().unwrap();

@@ -125,7 +125,7 @@ mod tests {
     #[test]
     fn training_ends_with_its_energy() {
         if Gpu::list().is_err() {
-            println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+            needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
             return;
         }
         let mut settings = EngineSettings { ..settings() };

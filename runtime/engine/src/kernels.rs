@@ -133,7 +133,7 @@ mod tests {
     #[test]
     fn what_is_measured_is_kept_and_found_again() {
         let Ok(gpu) = Gpu::open(None) else {
-            println!("skipped: no Vulkan device");
+            needs::missing(needs::Need::Vulkan, "no Vulkan device");
             return;
         };
         let dir = tempfile::tempdir().unwrap();

@@ -71,9 +71,6 @@ fn exposure(f: &CAMERA_FEEDBACK_DATA) -> Option<Exposure> {
 }
 
 #[cfg(test)]
-#[path = "../../../tests/shared_data.rs"]
-mod shared_data;
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -90,7 +87,7 @@ mod tests {
 
     #[test]
     fn a_recorded_survey_reports_its_forty_exposures() {
-        let Some(log) = super::shared_data::shared("data/sitl/run8/survey.tlog") else { return };
+        let Some(log) = needs::shared("data/sitl/run8/survey.tlog") else { return };
         let found = exposures(&log).expect("a log");
         assert_eq!(found.len(), 40);
         assert!(found.windows(2).all(|w| w[0].time_s < w[1].time_s));

@@ -5,7 +5,7 @@ use super::dgtr;
 #[test]
 fn a_device_s_report_says_who_it_is_and_that_it_computes_what_the_reference_does() {
     if vulkan::gpu::Gpu::list().is_err() {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         return;
     }
     let dir = tempfile::tempdir().unwrap();

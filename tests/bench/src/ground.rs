@@ -221,7 +221,7 @@ mod tests {
         for (a, b) in FIELD.neighbours() {
             let found = match fitter.fit(&member(a), &member(b)) {
                 Ok(found) => found.expect("they share a fifth of their ground"),
-                Err(e) => return eprintln!("skipped: {e}"),
+                Err(e) => return needs::missing(needs::Need::Vulkan, e),
             };
             let border = 0.5 * (FIELD.corner(a) + FIELD.corner(b) + FIELD.pitch()).extend(0.0);
             let (first, second) = (FIELD.error(a).point(border), FIELD.error(b).point(border));

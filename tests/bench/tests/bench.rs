@@ -26,7 +26,7 @@ fn json(path: &Path) -> Value {
 fn has_device() -> bool {
     let found = vulkan::gpu::Gpu::list().is_ok();
     if !found {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
     }
     found
 }

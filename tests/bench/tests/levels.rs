@@ -7,7 +7,7 @@ use vulkan::gpu::Gpu;
 #[test]
 fn every_level_shows_the_scene_from_the_distance_where_its_voxels_are_pixels() {
     if Gpu::open(None).is_err() {
-        println!("skipped: no Vulkan device");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device");
         return;
     }
     let folder = tempfile::tempdir().unwrap();

@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn a_card_s_model_is_the_same_to_the_bit_and_its_mirror_as_large_as_planned() {
-        let Some(mapped) = trained(false) else { return println!("skipped: no Vulkan device") };
+        let Some(mapped) = trained(false) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
         let Some(mirrored) = trained(true) else { return };
         assert!(mapped.0.len() > 300, "nothing grew");
         assert!((&mapped.0, &mapped.1, &mapped.2) == (&mirrored.0, &mirrored.1, &mirrored.2));

@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn a_device_whose_kernels_have_no_effect_is_named_instead_of_counted_on_for_ever() {
-        let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+        let Ok(gpu) = Gpu::open(None) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
         let gpu = gpu.forced(Forced { computes_nothing: true, ..Forced::default() });
         let v = view(32, 24);
         let request = PlanRequest { width: 32, height: 24, views: 1, sh_degree: 0, ..Default::default() };

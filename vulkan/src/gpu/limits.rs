@@ -53,7 +53,7 @@ mod tests {
     /// A trainer of 10,000 Gaussians on this machine's device, were its limits these.
     fn under(limits: DeviceLimits) -> Option<Result<Fixture, TrainError>> {
         let Ok(gpu) = Gpu::open(None) else {
-            println!("skipped: no Vulkan device");
+            needs::missing(needs::Need::Vulkan, "no Vulkan device");
             return None;
         };
         let request = PlanRequest {

@@ -238,7 +238,7 @@ mod tests {
 
     fn trainer(views: u32) -> Option<Fixture> {
         let Ok(gpu) = Gpu::open(None) else {
-            println!("skipped: no Vulkan device");
+            needs::missing(needs::Need::Vulkan, "no Vulkan device");
             return None;
         };
         let request = PlanRequest { width: 48, height: 32, views, max_gaussians: Some(200), ..Default::default() };

@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn a_device_is_compared_with_its_reference_and_one_without_effect_is_named() {
-        let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+        let Ok(gpu) = Gpu::open(None) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
         let agreed = check_device(&gpu).unwrap();
         println!("{agreed} of {TRIED} agree");
         let Ok(gpu) = Gpu::open(None) else { return };
@@ -155,7 +155,7 @@ mod tests {
             Some(check_plan(&gpu.forced(Forced { padding, ..Forced::default() }), &plan))
         };
         let limits = DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 };
-        let Some(whole) = refusing(limits, 256) else { return println!("skipped: no Vulkan device") };
+        let Some(whole) = refusing(limits, 256) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
         assert_eq!(whole, Ok(PlanFit::Whole));
         let few = DeviceLimits { texel_elements: 1 << 16, ..limits };
         assert!(matches!(refusing(few, 0), Some(Err(GpuError::ViewTooLarge { .. }))));

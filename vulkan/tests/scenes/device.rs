@@ -31,7 +31,7 @@ pub fn open() -> Option<Gpu> {
     match Gpu::open(None) {
         Ok(gpu) => Some(gpu),
         Err(e) => {
-            println!("skipped: {e}");
+            needs::missing(needs::Need::Vulkan, e);
             None
         }
     }

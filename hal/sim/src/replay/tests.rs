@@ -12,10 +12,7 @@ use crate::companion::accompany;
 use crate::reference::Lens;
 use crate::world::WorldSettings;
 
-#[path = "../../../../tests/shared_data.rs"]
-mod shared_data;
-
-use shared_data::shared;
+use needs::shared;
 
 const HOME: Geodetic = Geodetic { lat_deg: 28.04, lon_deg: -82.7, alt_m: -69.7 };
 

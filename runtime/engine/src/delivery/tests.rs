@@ -24,7 +24,7 @@ fn settings_for(delivers: Option<Rounding>, incremental: bool) -> EngineSettings
 /// The same; with `incremental`, as a flight does it after its landing.
 fn built_as(delivers: Option<Rounding>, incremental: bool) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         return None;
     }
     let mut engine =

@@ -150,7 +150,7 @@ mod tests {
     #[test]
     fn points_on_the_ground_of_a_model_are_found_where_they_were_surveyed_and_others_are_told() {
         if Gpu::list().is_err() {
-            return println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+            return needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         }
         // Ground at a height of nothing, seen from 30 m above.
         let cloud = carpet([0.0, 0.0], [40.0, 40.0], 0.25);

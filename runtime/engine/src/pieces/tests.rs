@@ -44,7 +44,7 @@ fn sorted(cloud: &GaussianCloud) -> GaussianCloud {
 fn has_device() -> bool {
     let found = Gpu::list().is_ok();
     if !found {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
     }
     found
 }

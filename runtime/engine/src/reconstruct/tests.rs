@@ -10,7 +10,7 @@ use crate::testing::{picture, settings};
 #[test]
 fn giving_up_gaussians_does_not_start_the_schedule_anew() {
     if Gpu::list().is_err() {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         return;
     }
     let mut settings = settings();

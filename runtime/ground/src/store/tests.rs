@@ -6,7 +6,7 @@ fn stores(dir: &Path) -> Vec<Store> {
     let mut all = vec![Store::folder(&dir.join("store"))];
     match std::env::var("DGTR_S3_TEST") {
         Ok(place) => all.push(Store::open(&place).expect("a bucket")),
-        Err(_) => println!("buckets skipped: DGTR_S3_TEST names none"),
+        Err(_) => needs::missing(needs::Need::Bucket, "DGTR_S3_TEST names no bucket"),
     }
     all
 }

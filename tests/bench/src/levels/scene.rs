@@ -191,7 +191,7 @@ mod tests {
             cloud.push([x, y, 0.3 * x.sin()], [-1.9, -1.6, -3.0], [1.0, 0.1, 0.0, 0.2], 2.0, &colour);
         }
         let Ok(mut painter) = Painter::open(None, 0, [96, 64]) else {
-            return println!("skipped: no Vulkan device");
+            return needs::missing(needs::Need::Vulkan, "no Vulkan device");
         };
         let folder = tempfile::tempdir().expect("a folder");
         let mut scene = Scene::create(folder.path(), 0).expect("a file");

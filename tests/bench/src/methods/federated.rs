@@ -201,7 +201,7 @@ mod tests {
     #[test]
     fn only_opacities_differ_after_merging_and_what_both_saw_is_opaque_again() {
         if vulkan::gpu::Gpu::list().is_err() {
-            return println!("skipped: no Vulkan device");
+            return needs::missing(needs::Need::Vulkan, "no Vulkan device");
         }
         let dir = tempfile::tempdir().expect("temp dir");
         let mut clients = Vec::new();

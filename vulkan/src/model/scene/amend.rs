@@ -161,7 +161,7 @@ mod tests {
     /// A trainer of 256 Gaussians at once, in which 240 were trained for some steps while 40 pictures came, and 200 more have come since.
     fn grown() -> Option<Fixture> {
         let Ok(gpu) = Gpu::open(None) else {
-            println!("skipped: no Vulkan device");
+            needs::missing(needs::Need::Vulkan, "no Vulkan device");
             return None;
         };
         let request = PlanRequest {

@@ -300,7 +300,7 @@ mod tests {
 
     #[test]
     fn a_part_of_a_picture_is_compared_with_that_part_of_it_at_every_resolution() {
-        let Ok(gpu) = Gpu::open(None) else { return println!("skipped: no Vulkan device") };
+        let Ok(gpu) = Gpu::open(None) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
         let (v, part) = (view(70, 49), Blocks { x: [3, 6], y: [2, 7] });
         let picture = posed(&v, &photo(1, &v));
         for (divisor, half_until) in [(1, 0.0), (2, 1.0)] {

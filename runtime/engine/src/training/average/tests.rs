@@ -20,7 +20,7 @@ fn built(visits: u32) -> Option<Reconstruction> {
 /// The same with other settings.
 fn built_with(visits: u32, change: impl Fn(&mut EngineSettings)) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers)");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         return None;
     }
     let mut settings = settings();

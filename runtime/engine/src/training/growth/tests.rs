@@ -60,8 +60,12 @@ fn engine() -> Option<Reconstruction> {
 
 /// The same in so much of the host's memory, MiB, on a device that holds so many Gaussians of them all.
 fn engine_in(host_mib: Option<u32>, on_device: Option<usize>) -> Option<Result<Reconstruction, EngineError>> {
-    if Gpu::list().is_err() || models::onnx::session::find_library().is_err() {
-        println!("skipped: no Vulkan device (install mesa-vulkan-drivers), or no ONNX Runtime");
+    if Gpu::list().is_err() {
+        needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
+        return None;
+    }
+    if models::onnx::session::find_library().is_err() {
+        needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime (sh runtime/setup.sh)");
         return None;
     }
     let mut settings = EngineSettings {

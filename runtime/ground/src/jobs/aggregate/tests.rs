@@ -58,7 +58,7 @@ fn settings() -> GroundSettings {
 fn skipped(outcome: &Outcome) -> bool {
     let skip = outcome.not_distilled.as_ref().is_some_and(|e| e.kind() == ErrorKind::Device);
     if skip {
-        eprintln!("skipped: no Vulkan device to distil on");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device to distil on");
     }
     skip
 }

@@ -56,7 +56,7 @@ fn joined(store: &Store, plan: &plan::Plan, out: &Path) -> Result<Vec<u8>, Aggre
 fn has_device() -> bool {
     let found = vulkan::gpu::Gpu::list().is_ok();
     if !found {
-        eprintln!("skipped: no Vulkan device to distil on");
+        needs::missing(needs::Need::Vulkan, "no Vulkan device to distil on");
     }
     found
 }
