@@ -32,6 +32,7 @@ use survey::dataset::{Dataset, PoseSource};
 use vulkan::trainer::RunBudget;
 
 use crate::error::JobError;
+pub use card::take_settled;
 use scale::largest;
 use slices::{REST, Slices};
 

@@ -22,12 +22,14 @@ mod ahead;
 mod error;
 mod frame;
 mod masks;
+mod names;
 mod points;
 mod selection;
 mod sources;
 
 pub use error::DatasetError;
 pub use frame::DatasetFrame;
+pub use names::PictureNames;
 pub use points::SparsePoint;
 pub use selection::{Region, Split};
 use sources::{frames, reconstruction};
@@ -183,6 +185,11 @@ impl Dataset {
             Shot { path: whole(&f.path), lens, pose, mask: f.mask.as_deref().map(whole) }
         });
         Reconstruction { shots: shots.collect(), origin: self.origin }
+    }
+
+    /// Its pictures by name.
+    pub fn names(&self) -> PictureNames {
+        PictureNames::of(self.frames.iter().map(|f| f.name.as_str()))
     }
 
     fn frame(&self, i: usize) -> Result<&DatasetFrame, DatasetError> {

@@ -164,6 +164,32 @@ fn a_colmap_model_alone_is_a_data_set_with_points_and_tracks() {
 }
 
 #[test]
+fn like_named_pictures_of_two_folders_keep_their_tracks_and_their_lists() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("sparse/0");
+    std::fs::create_dir_all(&model).unwrap();
+    std::fs::write(model.join("cameras.txt"), "1 PINHOLE 16 12 14 15 8 6.5\n").unwrap();
+    let mut images = String::new();
+    for (i, name) in ["test/r_0.png", "train/r_0.png", "train/r_1.png"].iter().enumerate() {
+        picture(&dir.path().join("images").join(name), 16, 12);
+        images += &format!("{} 0 1 0 0 {i} 0 30 1 {name}\n1 1 1\n", i + 1);
+    }
+    std::fs::write(model.join("images.txt"), images).unwrap();
+    std::fs::write(model.join("points3D.txt"), "1 0 0 0 9 8 7 0.5 1 0 2 0\n2 1 0 0 9 8 7 0.5 2 0 3 0\n").unwrap();
+    std::fs::write(
+        dir.path().join("split.json"),
+        r#"{"train":["train/r_0.png","train/r_1.png"],"test":["test/r_0.png"]}"#,
+    )
+    .unwrap();
+    let set = Dataset::open(dir.path()).unwrap();
+    assert_eq!(set.select("test", None).unwrap(), [0]);
+    let tracks: Vec<Vec<u32>> = set.sparse_points().unwrap().into_iter().map(|p| p.frames).collect();
+    assert_eq!(tracks, [vec![0, 1], vec![1, 2]]);
+    // What a held-out picture saw with one other is not known to training.
+    assert_eq!(set.sparse_points_of(&set.select("train", None).unwrap()).unwrap().len(), 1);
+}
+
+#[test]
 fn damaged_colmap_files_are_errors_at_every_length() {
     let dir = tempfile::tempdir().unwrap();
     write_colmap(dir.path(), &[nadir(0.0, 20.0), nadir(1.0, 20.0)]);

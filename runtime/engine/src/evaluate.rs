@@ -1,6 +1,6 @@
 //! Held-out quality of a model: renders the pictures of a split and compares, next to the two naive baselines.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 pub mod heights;
 pub mod surveyed;
@@ -17,7 +17,8 @@ use survey::dataset::Dataset;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::error::EngineError;
-use crate::transfer::{PoseTransfer, stem};
+use crate::renderings;
+use crate::transfer::PoseTransfer;
 
 /// PSNR of equal pictures; JSON has no infinity.
 const PSNR_CAP: f64 = 100.0;
@@ -124,7 +125,7 @@ impl IntoModel {
 /// Renders and scores `frames` of `set`.
 ///
 /// Poses are the data set's, carried into the model's frame. The rendering is put into the light that is
-/// expected there and rounded to 8 bits first, so that the figures are those of the pictures that `save` receives (`<stem>.png`).
+/// expected there and rounded to 8 bits first, so that the figures are those of the pictures that `save` receives (see [`saved`]).
 /// `metric` is asked too, when given.
 ///
 /// # Errors
@@ -140,7 +141,8 @@ pub fn evaluate(
 ) -> Result<Scores, EngineError> {
     let mut rendering = Rendering::default();
     let mut scores = Vec::with_capacity(frames.len());
-    for &i in frames {
+    let files = saved(set, frames)?;
+    for (&i, file) in frames.iter().zip(&files) {
         let truth = set.load(i, scale)?;
         let view = View { intrinsics: truth.view.intrinsics, pose: into.transfer.apply(&truth.view.pose) };
         trainer.render(&view, &mut rendering)?;
@@ -149,7 +151,7 @@ pub fn evaluate(
         };
         PictureLight::default().change(&into.light(&view), &mut picture, &view.intrinsics);
         if let Some(dir) = save {
-            save_png(&picture, &dir.join(stem(&truth.name)).with_extension("png"))?;
+            save_png(&picture, &dir.join(file))?;
         }
         let mut view = score(&truth, &to_f32(&picture));
         // A metric that knows no masks is shown the truth where nothing is compared.
@@ -163,6 +165,15 @@ pub fn evaluate(
         scores.push(view);
     }
     Ok(Scores::of(scores).with_metric(metric.as_deref()))
+}
+
+/// Where below its folder [`evaluate`] saves the renderings of `frames`.
+///
+/// # Errors
+/// Two pictures have one name.
+pub fn saved(set: &Dataset, frames: &[usize]) -> Result<Vec<PathBuf>, EngineError> {
+    let names: Vec<&str> = frames.iter().map(|&i| set.frames[i].name.as_str()).collect();
+    Ok(renderings::places(&names, &[".png"])?.into_iter().flatten().collect())
 }
 
 /// Scores both baselines on the same pictures. `training` are the frames that a guess may use.

@@ -37,6 +37,7 @@ pub mod pieces;
 mod poses;
 pub mod preset;
 mod reconstruct;
+pub mod renderings;
 mod resumed;
 pub mod source;
 #[cfg(test)]

@@ -15,7 +15,6 @@ use super::region::Region;
 use engine::device::renderer;
 use engine::error::EngineError;
 use engine::evaluate::{IntoModel, Perceptual, Scores, evaluate, open_metric};
-use engine::transfer::stem;
 use pages::report::{Comparison, ReportData};
 
 /// A global model this much worse than a local one on its own ground is worth a warning, dB.
@@ -122,11 +121,11 @@ fn by_nearest_training_view(
     frames: &[usize],
     locals: &[(String, PathBuf)],
 ) -> Result<Vec<Vec<usize>>, EngineError> {
-    let mut centers = Vec::new();
+    let (known, mut centers) = (set.names(), Vec::new());
     for (m, (_, path)) in locals.iter().enumerate() {
-        let names: Vec<String> = model::read_header(path)?.0.views.iter().map(|(n, _)| stem(n)).collect();
-        let trained = set.frames.iter().filter(|f| names.contains(&stem(&f.name)));
-        centers.extend(trained.map(|f| (m, f.view.pose.center)));
+        let header = model::read_header(path)?.0;
+        let trained = known.pair(header.views.iter().map(|(name, _)| name.as_str()));
+        centers.extend(trained.into_iter().flatten().map(|i| (m, set.frames[i].view.pose.center)));
     }
     let mut owned = vec![Vec::new(); locals.len()];
     for &i in frames {

@@ -1,13 +1,11 @@
 //! `dgtr eval MODEL DATASET --split test`: PSNR and SSIM on pictures the model has not seen. `dgtr eval MODEL --heights
 //! REFERENCE`: its heights against points.
 
-use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use engine::device::{file_renderer, map_renderer};
 use engine::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
 use engine::ortho::{Map, MapRequest};
-use engine::transfer::stem;
 use models::formats::model::{Chunks, ModelHeader};
 use serde::Serialize;
 use survey::dataset::Dataset;
@@ -15,6 +13,7 @@ use survey::dataset::Dataset;
 use super::CliError;
 use super::plan::largest;
 use crate::cli::output::outln;
+use crate::train_job::take_settled;
 
 /// Arguments of `dgtr eval`.
 #[derive(Debug, clap::Args)]
@@ -40,7 +39,7 @@ pub struct Args {
     /// One JSON object on standard output.
     #[arg(long)]
     pub json: bool,
-    /// Save each rendering as DIR/<image stem>.png.
+    /// Save each rendering below DIR as a PNG of the picture's name, in folders where the pictures lie in several.
     #[arg(long, value_name = "DIR")]
     pub save: Option<PathBuf>,
     /// Also score the two naive guesses: nearest training picture over flat ground, mean colour.
@@ -77,7 +76,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return compare_heights(&args, reference);
     }
     let dataset = args.dataset.clone().unwrap_or_default();
-    let set = Dataset::open(&dataset)?;
+    let mut set = Dataset::open(&dataset)?;
+    take_settled(&mut set, &args.model)?;
     let frames = set.select(&args.split, args.region.as_deref())?;
     if frames.is_empty() {
         return Err(CliError::input(format!("{}: split {:?} holds no pictures", dataset.display(), args.split)));
@@ -152,8 +152,9 @@ fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
 /// What a naive guess may use: the pictures the model was trained on, where this data set has them, else the split
 /// `train`; never an evaluated one.
 fn training_frames(set: &Dataset, header: &ModelHeader, held_out: &[usize]) -> Result<Vec<usize>, CliError> {
-    let used: HashSet<String> = header.views.iter().map(|(name, _)| stem(name)).collect();
-    let mut frames: Vec<usize> = (0..set.frames.len()).filter(|&i| used.contains(&stem(&set.frames[i].name))).collect();
+    let used = set.names().pair(header.views.iter().map(|(name, _)| name.as_str()));
+    let mut frames: Vec<usize> = used.into_iter().flatten().collect();
+    frames.sort_unstable();
     if frames.is_empty() {
         frames = set.select("train", None)?;
     }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use engine::device::file_renderer;
 use engine::evaluate::save_png;
+use engine::renderings;
 use image::{ImageBuffer, Luma};
 use job::console;
 use job::interrupt;
@@ -26,7 +27,7 @@ pub struct Args {
     /// Cameras as a transforms.json of nerfstudio (the pictures it names need not exist).
     #[arg(long)]
     pub cameras: PathBuf,
-    /// Where to write <stem>.png (colour) and <stem>_depth.png (16 bit).
+    /// Where to write NAME.png (colour) and NAME_depth.png (16 bit), in folders where the cameras' pictures lie in several.
     #[arg(long)]
     pub out: PathBuf,
     /// Metres per unit of the depth pictures; 0 means nothing is there, 65535 this far or farther.
@@ -35,18 +36,6 @@ pub struct Args {
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
-}
-
-/// What a camera's picture is called in the output folder.
-///
-/// # Errors
-/// The camera's name ends in no file name, and would lead out of the folder.
-fn picture_name(cameras: &Path, name: &str) -> Result<String, CliError> {
-    let file = Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned());
-    file.ok_or_else(|| {
-        let said = format!("{name:?} is no name of a picture; end file_path in one, such as images/0001.jpg");
-        CliError::input(format!("{}: {said}", cameras.display()))
-    })
 }
 
 /// Runs `dgtr render`.
@@ -58,11 +47,16 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Err(CliError::input(format!("--depth-unit {} must be a positive number of metres", args.depth_unit)));
     }
     let cameras = transforms::read(&args.cameras)?;
-    let views: Vec<(String, View)> = cameras
-        .shots
-        .iter()
-        .map(|s| Ok((picture_name(&args.cameras, &s.path)?, view(&args.cameras, s)?)))
-        .collect::<Result<_, CliError>>()?;
+    let views: Vec<(String, View)> =
+        cameras.shots.iter().map(|s| Ok((s.path.clone(), view(&args.cameras, s)?))).collect::<Result<_, CliError>>()?;
+    let bent = cameras.shots.iter().filter(|s| !s.lens.distortion.is_none()).count();
+    if bent > 0 {
+        tracing::info!(
+            "{bent} cameras have a distorted lens; their pictures are rendered as training saw them, undistorted"
+        );
+    }
+    let names: Vec<&str> = views.iter().map(|v| v.0.as_str()).collect();
+    let files = renderings::places(&names, &[".png", "_depth.png"])?;
     let width = views.iter().map(|v| v.1.intrinsics.width).max().unwrap_or(1);
     let height = views.iter().map(|v| v.1.intrinsics.height).max().unwrap_or(1);
     let (_, mut trainer) = file_renderer(args.device.as_deref(), &args.model, (width, height))?;
@@ -81,8 +75,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         let Some(color) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
             return Err(CliError::failed(format!("{name}: the rendering has another size than its camera")));
         };
-        save_png(&color, &args.out.join(format!("{name}.png")))?;
-        save_depth(&rendering, args.depth_unit, &args.out.join(format!("{name}_depth.png")))?;
+        save_png(&color, &args.out.join(&files[i][0]))?;
+        save_depth(&rendering, args.depth_unit, &args.out.join(&files[i][1]))?;
         progress.set(i as u64 + 1, || name.clone());
     }
     progress.finish(&format!("{} pictures in {}", views.len(), args.out.display()));
@@ -94,9 +88,6 @@ fn view(file: &Path, shot: &Shot) -> Result<View, CliError> {
         CliError::from(FormatError::Invalid { path: file.to_owned(), what: format!("frame {:?}: {what}", shot.path) })
     };
     let Some(size) = shot.lens.size else { return Err(bad("w and h are needed")) };
-    if !shot.lens.distortion.is_none() {
-        return Err(bad("only pinhole cameras can be rendered; leave k1, k2, p1, p2 out"));
-    }
     Ok(View { intrinsics: shot.lens.intrinsics(size), pose: shot.pose })
 }
 
@@ -113,19 +104,4 @@ fn save_depth(rendering: &Rendering, unit: f32, path: &Path) -> Result<(), CliEr
     let mut bytes = std::io::Cursor::new(Vec::new());
     picture.write_to(&mut bytes, image::ImageFormat::Png).map_err(|e| bad(format!("cannot be encoded: {e}")))?;
     Ok(write_atomic(path, |out| out.write_all(bytes.get_ref()))?)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn no_name_of_a_camera_leads_out_of_the_output_folder() {
-        let named = |name| picture_name(Path::new("cameras.json"), name).ok();
-        assert_eq!(named("/etc/images/0001.jpg").as_deref(), Some("0001"));
-        assert_eq!(named("../../a").as_deref(), Some("a"));
-        for out in ["../../up/..", "/tmp/esc/..", "..", "/", ""] {
-            assert_eq!(named(out), None, "{out}");
-        }
-    }
 }

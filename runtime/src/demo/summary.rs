@@ -4,7 +4,6 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use engine::transfer::stem;
 use job::run_json::RunReport;
 use models::formats::model;
 use pages::report::ground::{Ortho, Shot};
@@ -199,7 +198,7 @@ fn comparisons(figure: &Figures) -> Vec<Comparison> {
     let open = |path: PathBuf| image::open(path).ok().map(image::DynamicImage::into_rgb8);
     let mut out = Vec::with_capacity(SHOWN);
     for (view, word) in shown.iter().filter_map(|i| views.get(*i)).zip(["best", "worst"]) {
-        let png = format!("{}.png", stem(&view.name));
+        let png = Path::new(&view.name).with_extension("png");
         let pictures = [
             ("ray-cast truth", open(figure.truth.join("images").join(&view.name))),
             ("own model", open(figure.renderings[0].join(&png))),

@@ -12,6 +12,7 @@ use engine::{matching_file_bytes, waiting_file};
 use geometry::geodesy::Geodetic;
 use job::console::Progress;
 use models::camera::View;
+use models::formats::reconstruction::Shot;
 use models::formats::transforms;
 use models::refine::Refiner;
 use survey::card::name_list;
@@ -112,16 +113,55 @@ fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, Settled>>,
     let mut settled = HashMap::with_capacity(set.frames.len());
     for (frame, shot) in set.frames.iter().zip(&now.shots) {
         // A picture that could not be decoded then is not asked again.
-        let (Some(before), Some(size)) = (of_path.get(shot.path.as_str()), shot.lens.size) else { continue };
-        let lens = frame.orientation.of_lens(&before.lens);
-        let turned = lens.size.unwrap_or(size);
-        let mut pose = before.pose;
-        pose.rotation = frame.orientation.of_rotation(pose.rotation);
-        let view = View { intrinsics: lens.intrinsics(turned), pose };
-        settled.insert(frame.name.clone(), Settled { view, distortion: lens.distortion });
+        let Some(before) = of_path.get(shot.path.as_str()) else { continue };
+        settled.insert(frame.name.clone(), of_shot(frame, before));
     }
     // Pictures that came since want poses, too.
     Ok((settled.len() == earlier.shots.len()).then_some(settled))
+}
+
+/// Gives a card the poses that the training of `model` settled on, its held-out pictures' too; says so where there are none.
+///
+/// # Errors
+/// The file beside the model is damaged.
+pub fn take_settled(set: &mut Dataset, model: &Path) -> Result<(), JobError> {
+    if set.card.is_none() {
+        return Ok(());
+    }
+    let file = model.with_file_name(FILE);
+    let earlier = if file.is_file() { transforms::read(&file)?.shots } else { Vec::new() };
+    // The card may be mounted elsewhere now.
+    let pairs = set.names().pair(earlier.iter().map(|s| s.path.as_str()));
+    let settled: HashMap<_, _> = pairs
+        .into_iter()
+        .zip(&earlier)
+        .filter_map(|(i, shot)| Some((set.frames[i?].name.clone(), of_shot(&set.frames[i?], shot))))
+        .collect();
+    let (all, with) = (set.frames.len(), settled.len());
+    match with {
+        0 => tracing::warn!(
+            "{}: no poses that a training settled on are beside the model ({}); its pictures are scored at the poses that they state",
+            set.root.display(),
+            file.display()
+        ),
+        _ if with < all => {
+            tracing::warn!("{}: {} of {all} pictures have no settled pose; left out", set.root.display(), all - with)
+        }
+        _ => {}
+    }
+    if with > 0 {
+        set.settle(&settled);
+    }
+    Ok(())
+}
+
+/// Lens and pose of a picture as it is loaded, of what is known of it as it is stored.
+fn of_shot(frame: &DatasetFrame, shot: &Shot) -> Settled {
+    let lens = frame.orientation.of_lens(&shot.lens);
+    let size = lens.size.unwrap_or((frame.view.intrinsics.width, frame.view.intrinsics.height));
+    let mut pose = shot.pose;
+    pose.rotation = frame.orientation.of_rotation(pose.rotation);
+    Settled { view: View { intrinsics: lens.intrinsics(size), pose }, distortion: lens.distortion }
 }
 
 /// What the pictures say, as far as the refiner knows now.

@@ -2,7 +2,6 @@
 
 use std::collections::{HashMap, HashSet};
 
-use super::sources::file_name;
 use super::{Dataset, DatasetError};
 use models::formats::{colmap, opensfm};
 
@@ -65,11 +64,9 @@ impl Dataset {
             seen += 1;
         };
         if let Some(model) = colmap::Model::find(&self.root) {
-            let by_name: HashMap<&str, u32> =
-                self.frames.iter().enumerate().map(|(i, f)| (f.name.as_str(), i as u32)).collect();
-            let number = |name: &str| by_name.get(name).or_else(|| by_name.get(file_name(name))).copied();
+            let names = self.names();
             let by_id: HashMap<u32, u32> =
-                model.images()?.iter().filter_map(|m| Some((m.id, number(&m.name)?))).collect();
+                model.images()?.iter().filter_map(|m| Some((m.id, names.find(&m.name)? as u32))).collect();
             let dropped = model.points(&mut |p| {
                 let mut frames: Vec<u32> = p.images.iter().filter_map(|id| by_id.get(id).copied()).collect();
                 frames.sort_unstable();

@@ -1,9 +1,8 @@
 //! Which frames are for what: `split.json`, what the description holds out, or every eighth held out.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::sources::file_name;
 use super::{Dataset, DatasetError};
 use models::formats::{FormatError, split};
 
@@ -95,13 +94,13 @@ impl Dataset {
 
     fn resolve(&self, path: &Path) -> Result<Split, DatasetError> {
         let file = split::read(path)?;
-        let by_name: HashMap<&str, usize> = self.frames.iter().enumerate().map(|(i, f)| (f.name.as_str(), i)).collect();
+        let known = self.names();
         let lists = |lists: BTreeMap<String, Vec<String>>| -> Result<BTreeMap<String, Vec<usize>>, DatasetError> {
             lists
                 .into_iter()
                 .map(|(list, names)| {
                     let numbers = names.iter().map(|n| {
-                        by_name.get(n.as_str()).or_else(|| by_name.get(file_name(n))).copied().ok_or_else(|| {
+                        known.find(n).ok_or_else(|| {
                             FormatError::invalid(
                                 path,
                                 format!("list {list:?} names {n:?}, which is not a picture of this data set"),
