@@ -21,6 +21,11 @@ pub const fn sh_coefficients(degree: u8) -> usize {
 /// Y₀₀, the constant SH basis function.
 pub const SH_C0: f32 = 0.282_094_79;
 
+/// Logarithm of an extent that is none: two nanometres of a scene in metres.
+const FLAT: f32 = -20.0;
+/// Logit of an opacity that differs from 1 by less than any renderer shows.
+const SOLID: f32 = 16.0;
+
 /// The real SH basis functions above degree 0 at a unit vector, in 3DGS's order and signs.
 pub fn sh_basis([x, y, z]: [f64; 3]) -> [f64; 15] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -240,6 +245,16 @@ impl GaussianCloud {
         let both = own.min(theirs);
         self.sh[i * own..i * own + both].copy_from_slice(&other.sh[from * theirs..from * theirs + both]);
         self.sh[i * own + both..(i + 1) * own].fill(0.0);
+    }
+
+    /// Gives numbers to what other programs write as infinite: no extent at all, wholly opaque or wholly transparent.
+    pub fn bring_in_limits(&mut self) {
+        for v in self.log_scales.iter_mut().flatten().filter(|v| **v == f32::NEG_INFINITY) {
+            *v = FLAT;
+        }
+        for v in self.opacity_logits.iter_mut().filter(|v| v.is_infinite()) {
+            *v = SOLID.copysign(*v);
+        }
     }
 
     /// Drops every row that is not [valid](Self::is_valid); returns how many.

@@ -1,6 +1,7 @@
 //! Files this project reads and writes. Everything that comes from outside is bounded before memory is taken
 //! for it, and every error is one line: which file, what is wrong with it, how to mend it.
 
+use std::cmp::Ordering;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
@@ -17,6 +18,8 @@ pub mod opensfm;
 pub mod ply;
 pub mod reconstruction;
 pub mod sog;
+pub mod splat;
+pub mod splats;
 pub mod split;
 pub mod spz;
 mod stream;
@@ -137,6 +140,36 @@ pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     Ok(bytes)
 }
 
+/// Names in the order in which people count: `_9` before `_20`, capitals beside small letters.
+pub fn natural(a: &str, b: &str) -> Ordering {
+    fn next<'t>(rest: &mut &'t str) -> Option<(bool, &'t str)> {
+        let is_digit = rest.chars().next()?.is_ascii_digit();
+        let end = rest.find(|c: char| c.is_ascii_digit() != is_digit).unwrap_or(rest.len());
+        let (part, after) = rest.split_at(end);
+        *rest = after;
+        Some((is_digit, part))
+    }
+    let (mut x, mut y) = (a, b);
+    loop {
+        let order = match (next(&mut x), next(&mut y)) {
+            (None, None) => return a.cmp(b),
+            (Some((true, m)), Some((true, n))) => {
+                let (m, n) = (m.trim_start_matches('0'), n.trim_start_matches('0'));
+                m.len().cmp(&n.len()).then_with(|| m.cmp(n))
+            }
+            (m, n) => m.map(|m| m.1.to_lowercase()).cmp(&n.map(|n| n.1.to_lowercase())),
+        };
+        if order != Ordering::Equal {
+            return order;
+        }
+    }
+}
+
+/// The bytes of a text without the byte order mark that some editors put before it.
+pub fn without_mark(bytes: &[u8]) -> &[u8] {
+    bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes)
+}
+
 /// What another library says, on one line: decoders' and ONNX Runtime's messages span several.
 pub fn one_line(error: impl std::fmt::Display) -> String {
     error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
@@ -148,4 +181,16 @@ pub fn one_line(error: impl std::fmt::Display) -> String {
 /// [`FormatError::Io`] with the step that failed; what the file held before stays.
 pub fn write_atomic(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>) -> Result<(), FormatError> {
     Disk::default().replace(path, fill).map_err(|e| FormatError::disk(path, e))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_ordered_as_people_count() {
+        let mut names = ["a_20.jpg", "a_9.jpg", "A_10.JPG", "b", "a_09.jpg", "a", "2/x", "10/x", ""];
+        names.sort_by(|a, b| natural(a, b));
+        assert_eq!(names, ["", "2/x", "10/x", "a", "a_09.jpg", "a_9.jpg", "A_10.JPG", "a_20.jpg", "b"]);
+    }
 }

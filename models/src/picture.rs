@@ -8,6 +8,8 @@
 pub mod crops;
 pub mod mask;
 pub mod tiff;
+pub mod values;
+pub mod webp;
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
@@ -20,6 +22,8 @@ use jpeg_decoder::{Decoder, PixelFormat};
 
 use crate::formats::one_line;
 use crate::formats::reconstruction::{Focal, LensDescription};
+use mask::Mask;
+use values::ValueRange;
 
 /// Largest picture edge taken; 16384² × 3 bytes is also what a decoder may allocate at most.
 const MAX_EDGE: u32 = 16_384;
@@ -136,6 +140,9 @@ fn bad(path: &Path, what: impl Into<String>) -> PictureError {
 /// # Errors
 /// As [`decode`].
 pub fn dimensions(path: &Path) -> Result<(u32, u32), PictureError> {
+    if let Some(decoder) = webp::open(path)? {
+        return Ok(decoder.dimensions());
+    }
     open(path)?.into_dimensions().map_err(|e| bad(path, format!("cannot be decoded ({})", one_line(e))))
 }
 
@@ -157,7 +164,7 @@ fn limits() -> Limits {
     limits
 }
 
-/// A JPEG, PNG or TIFF as 8-bit RGB, refused before decoding when it is too large.
+/// A JPEG, PNG, TIFF or WebP as 8-bit RGB, refused before decoding when it is too large.
 ///
 /// # Errors
 /// The file cannot be opened, is damaged, or is no picture.
@@ -171,24 +178,62 @@ pub fn decode(path: &Path) -> Result<RgbImage, PictureError> {
 /// # Errors
 /// As [`decode`].
 pub fn decode_at_least(path: &Path, wanted: (u32, u32)) -> Result<RgbImage, PictureError> {
-    let undecoded = |e: image::ImageError| bad(path, format!("cannot be decoded ({}); copy it again", one_line(e)));
-    let image = if let Some(bytes) = jpeg(path)? {
-        if let Some(image) = scaled_jpeg(path, &bytes, wanted)? {
-            return Ok(image);
-        }
-        let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg);
-        reader.limits(limits());
-        reader.decode()
-    } else {
-        let mut reader = open(path)?;
-        reader.limits(limits());
-        reader.decode()
-    };
-    let image = image.map_err(undecoded)?;
-    if matches!(image, DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) | DynamicImage::ImageLuma16(_)) {
-        tracing::info!("{}: 16 bits a colour, of which 8 are used", path.display());
+    decode_shown(path, wanted, None).map(|(image, _)| image)
+}
+
+/// As [`decode_at_least`], with values of 16 bits shown in `range` (where it is given), and a mask of what is transparent, if anything is.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_shown(
+    path: &Path,
+    wanted: (u32, u32),
+    range: Option<ValueRange>,
+) -> Result<(RgbImage, Option<Mask>), PictureError> {
+    if let Some(bytes) = jpeg(path)? {
+        let image = match scaled_jpeg(path, &bytes, wanted)? {
+            Some(image) => image,
+            None => {
+                let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg);
+                reader.limits(limits());
+                reader.decode().map_err(|e| undecoded(path, e))?.into_rgb8()
+            }
+        };
+        return Ok((image, None));
     }
-    Ok(image.into_rgb8())
+    let image = decode_stored(path)?;
+    let mask = match &image {
+        DynamicImage::ImageRgba8(p) => transparent(p.dimensions(), |x, y| p.get_pixel(x, y).0[3] >= HALF),
+        DynamicImage::ImageLumaA8(p) => transparent(p.dimensions(), |x, y| p.get_pixel(x, y).0[1] >= HALF),
+        DynamicImage::ImageRgba16(p) => transparent(p.dimensions(), |x, y| p.get_pixel(x, y).0[3] >> 8 >= HALF.into()),
+        DynamicImage::ImageLumaA16(p) => transparent(p.dimensions(), |x, y| p.get_pixel(x, y).0[1] >> 8 >= HALF.into()),
+        _ => None,
+    };
+    let shown = range.unwrap_or(ValueRange::FULL).shown(&image);
+    Ok((shown.unwrap_or_else(|| image.into_rgb8()), mask))
+}
+
+/// Pixels less opaque than this are left out.
+const HALF: u8 = 128;
+
+/// A mask of the pixels that are not `opaque`, where there is any.
+fn transparent((width, height): (u32, u32), opaque: impl Fn(u32, u32) -> bool) -> Option<Mask> {
+    let mask = Mask::from_fn(width, height, opaque);
+    (mask.count() < width as usize * height as usize).then_some(mask)
+}
+
+fn undecoded(path: &Path, e: image::ImageError) -> PictureError {
+    bad(path, format!("cannot be decoded ({}); copy it again", one_line(e)))
+}
+
+/// A picture that is no JPEG, with all of its values.
+fn decode_stored(path: &Path) -> Result<DynamicImage, PictureError> {
+    if let Some(mut decoder) = webp::open(path)? {
+        return webp::decode(path, &mut decoder);
+    }
+    let mut reader = open(path)?;
+    reader.limits(limits());
+    reader.decode().map_err(|e| undecoded(path, e))
 }
 
 /// The picture at another size, each pixel the mean of those it covers; one of that size already is returned as it is.
@@ -285,9 +330,10 @@ fn scaled_jpeg(path: &Path, bytes: &[u8], (width, height): (u32, u32)) -> Result
         PixelFormat::L8 => pixels.iter().flat_map(|v| [*v; 3]).collect(),
         PixelFormat::L16 => pixels.chunks_exact(2).flat_map(|v| [v[1]; 3]).collect(),
         PixelFormat::CMYK32 => {
-            tracing::info!("{}: a picture for print (CMYK), converted", path.display());
-            // Adobe's are inverted, as everybody's are in practice; the decoder leaves them as stored.
-            let ink = |c: u8, k: u8| (u16::from(c) * u16::from(k) / 255) as u8;
+            static SAID: std::sync::Once = std::sync::Once::new();
+            SAID.call_once(|| tracing::info!("{}: a picture for print (CMYK), converted", path.display()));
+            // The decoder undoes Adobe's inversion, which everybody's have in practice: 0 is no ink.
+            let ink = |c: u8, k: u8| (u16::from(255 - c) * u16::from(255 - k) / 255) as u8;
             pixels.chunks_exact(4).flat_map(|p| [ink(p[0], p[3]), ink(p[1], p[3]), ink(p[2], p[3])]).collect()
         }
     };
@@ -386,5 +432,59 @@ mod tests {
         });
         let said: Vec<String> = said.collect();
         assert!(said.len() > 300 && said.iter().all(|e| e.contains("a.jpg") && !e.contains('\n')), "{said:?}");
+    }
+
+    /// A picture of four inks in one colour, as Adobe's programs store it: inverted, 255 being no ink. Baseline, every value in the first
+    /// coefficient of its block.
+    fn four_inks(side: u16, inks: [u8; 4]) -> Vec<u8> {
+        let segment =
+            |marker: u8, body: &[u8]| [&[0xFF, marker][..], &(body.len() as u16 + 2).to_be_bytes(), body].concat();
+        let quantisers = [&[0u8][..], &[1; 64]].concat();
+        let [high, low] = side.to_be_bytes();
+        let frame: Vec<u8> =
+            [8, high, low, high, low, 4].into_iter().chain((1..=4).flat_map(|id| [id, 0x11, 0])).collect();
+        // Twelve sizes of a first coefficient in codes of four bits; of the others the end of the block alone.
+        let first: Vec<u8> = [0, 0, 0, 0, 12].into_iter().chain([0; 12]).chain(0..12).collect();
+        let others: Vec<u8> = [0x10, 1].into_iter().chain([0; 15]).chain([0]).collect();
+        let scan: Vec<u8> = std::iter::once(4).chain((1..=4).flat_map(|id| [id, 0])).chain([0, 63, 0]).collect();
+        let (mut bits, mut before) = (Vec::new(), [0i32; 4]);
+        for _ in 0..(usize::from(side) / 8).pow(2) {
+            for (ink, before) in inks.iter().zip(&mut before) {
+                let now = 8 * (i32::from(*ink) - 128);
+                let step = now - *before;
+                *before = now;
+                let size = 32 - step.unsigned_abs().leading_zeros();
+                let value = if step < 0 { step + (1 << size) - 1 } else { step };
+                bits.extend((0..4).rev().map(|k| size >> k & 1 == 1));
+                bits.extend((0..size).rev().map(|k| value >> k & 1 == 1));
+                bits.push(false);
+            }
+        }
+        bits.resize(bits.len().next_multiple_of(8), true);
+        let mut data = Vec::new();
+        for byte in bits.chunks(8) {
+            data.push(byte.iter().fold(0u8, |byte, bit| byte << 1 | u8::from(*bit)));
+            if data.last() == Some(&0xFF) {
+                data.push(0);
+            }
+        }
+        let adobe = b"Adobe\0\x64\0\0\0\0\0";
+        let parts = [segment(0xEE, adobe), segment(0xDB, &quantisers), segment(0xC0, &frame)];
+        let tables = [segment(0xC4, &first), segment(0xC4, &others), segment(0xDA, &scan)];
+        [&[0xFF, 0xD8][..], &parts.concat(), &tables.concat(), &data, &[0xFF, 0xD9]].concat()
+    }
+
+    #[test]
+    fn a_picture_for_print_has_its_colours_at_every_size() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.jpg");
+        // No cyan, all magenta, half of the yellow, no black.
+        std::fs::write(&path, four_inks(64, [255, 0, 128, 255])).unwrap();
+        for wanted in [64, 32, 16, 8] {
+            let image = decode_at_least(&path, (wanted, wanted)).unwrap();
+            assert_eq!(image.dimensions(), (wanted, wanted));
+            let [r, g, b] = image.get_pixel(3, 3).0;
+            assert!(r > 250 && g < 5 && b.abs_diff(128) < 6, "{wanted}: {r} {g} {b}");
+        }
     }
 }

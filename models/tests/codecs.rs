@@ -66,9 +66,15 @@ fn bytes_of_a_gaussian_and_milliseconds_to_write_and_read_it() {
         };
         report(file, &mut write, &mut read_model);
     }
-    report("ours.spz", &mut |path| our_spz::write(path, &cloud).unwrap(), &mut |path| {
-        count(our_spz::read(path).unwrap().cloud.len());
-    });
+    report(
+        "ours.spz",
+        &mut |path| {
+            our_spz::write(path, &cloud, Default::default()).unwrap();
+        },
+        &mut |path| {
+            count(our_spz::read(path, Default::default()).unwrap().cloud.len());
+        },
+    );
     let theirs = as_the_crate_has_it(&cloud);
     report(
         "crate.spz",

@@ -124,12 +124,53 @@ fn a_model_is_found_where_colmap_nerfstudio_and_others_leave_it() {
 }
 
 #[test]
+fn the_largest_of_several_models_is_taken_and_half_of_one_is_no_card() {
+    let dir = tempfile::tempdir().unwrap();
+    let small = Reconstruction { shots: survey().shots[..2].to_vec(), ..survey() };
+    colmap::write(&dir.path().join("sparse/0"), &small, &[]).unwrap();
+    colmap::write(&dir.path().join("sparse/1"), &survey(), &[]).unwrap();
+    assert_eq!(Dataset::open(dir.path()).unwrap().frames.len(), 5);
+    let said = colmap::Model::find(dir.path()).unwrap().unwrap().said().unwrap();
+    assert!(said.contains("sparse/1 of 5") && said.contains("sparse/0 of 2") && !said.contains('\n'), "{said}");
+    // A broken one is named, whichever it is.
+    std::fs::write(dir.path().join("sparse/1/images.bin"), [9; 20]).unwrap();
+    let model = colmap::Model::find(dir.path()).unwrap().unwrap();
+    assert!(model.file("images").ends_with("sparse/0/images.bin"));
+    assert!(model.said().unwrap().contains("sparse/1/images.bin"));
+    std::fs::remove_dir_all(dir.path().join("sparse/1")).unwrap();
+    std::fs::remove_file(dir.path().join("sparse/0/images.bin")).unwrap();
+    image::RgbImage::new(16, 16).save(dir.path().join("a.png")).unwrap();
+    let error = Dataset::open(dir.path()).unwrap_err().to_string();
+    assert!(error.contains("sparse/0") && error.contains("images") && !error.contains('\n'), "{error}");
+}
+
+#[test]
+fn images_without_lines_of_keypoints_and_marks_before_the_text_lose_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    colmap_text(dir.path());
+    let bare = "\u{feff}1 1 0 0 0 0 0 30 7 a b.jpg\n2 1 0 0 0 1 0 30 7 2.jpg\n3 1 0 0 0 2 0 30 7 c.jpg\n";
+    let spaced = bare.replace(".jpg\n", ".jpg\n\n");
+    let full = bare.replace(".jpg\n", ".jpg\n10.5 20.5 -1 3 4 7\n");
+    for text in [bare, &spaced, &full] {
+        std::fs::write(dir.path().join("images.txt"), text).unwrap();
+        let names: Vec<String> =
+            colmap::read_images(&dir.path().join("images.txt")).unwrap().into_iter().map(|i| i.name).collect();
+        assert_eq!(names, ["a b.jpg", "2.jpg", "c.jpg"], "{text}");
+    }
+    let file = dir.path().join("transforms.json");
+    transforms::write(&file, &survey()).unwrap();
+    let marked = [b"\xEF\xBB\xBF".to_vec(), std::fs::read(&file).unwrap()].concat();
+    std::fs::write(&file, marked).unwrap();
+    assert_eq!(transforms::read(&file).unwrap().shots.len(), 5);
+}
+
+#[test]
 fn what_is_written_for_colmap_nerfstudio_and_opensfm_is_read_back() {
     let dir = tempfile::tempdir().unwrap();
     let survey = survey();
     let points = [colmap::Point { position: [1.0, 2.0, 3.0], color: [4, 5, 6] }];
     colmap::write(&dir.path().join("c"), &survey, &points).unwrap();
-    let model = colmap::Model::find(&dir.path().join("c")).unwrap();
+    let model = colmap::Model::find(&dir.path().join("c")).unwrap().unwrap();
     assert_same(&model.read().unwrap(), &survey, 1e-12);
     let mut read = Vec::new();
     assert_eq!(model.points(&mut |p| read.push((p.position.to_array(), p.color))).unwrap(), 0);

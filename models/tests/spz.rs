@@ -7,7 +7,8 @@ use std::path::Path;
 
 use flate2::write::GzEncoder;
 use models::cloud::GaussianCloud;
-use models::formats::spz::{read, write};
+use models::formats::FormatError;
+use models::formats::spz::{self as format, Axes, SpzModel, SpzOptions, SpzWritten};
 use rand::{Rng, SeedableRng};
 
 fn cloud(degree: u8, n: usize, extent: f32) -> GaussianCloud {
@@ -54,6 +55,15 @@ fn differences(a: &GaussianCloud, b: &GaussianCloud) -> [f32; 6] {
 /// Half a step of every column: 12 bits of a metre, 1/16, nine bits of 1/√2, 1/255, 1/(0.15 · 255), eighths after 128ths.
 const ROUNDING: [f32; 6] = [1.23e-4, 0.0313, 0.004, 0.002, 0.0132, 0.0665];
 
+/// In the model's own axes, so that numbers can be compared.
+fn write(path: &Path, cloud: &GaussianCloud) -> Result<SpzWritten, FormatError> {
+    format::write(path, cloud, SpzOptions { axes: Axes::Own, is_latest: false })
+}
+
+fn read(path: &Path) -> Result<SpzModel, FormatError> {
+    format::read(path, Axes::Own)
+}
+
 fn within_rounding(a: &GaussianCloud, b: &GaussianCloud) {
     let d = differences(a, b);
     assert!(d.iter().zip(ROUNDING).all(|(d, limit)| *d <= limit), "{d:?}");
@@ -69,6 +79,12 @@ fn what_is_written_comes_back_within_the_rounding_of_the_format() {
         let back = read(&path).unwrap();
         assert_eq!(back.dropped, 0);
         within_rounding(&cloud, &back.cloud);
+        for options in [SpzOptions::default(), SpzOptions { axes: Axes::Rub, is_latest: true }] {
+            assert_eq!(format::write(&path, &cloud, options).unwrap(), SpzWritten::default());
+            within_rounding(&cloud, &format::read(&path, Axes::Rub).unwrap().cloud);
+            let turned = format::read(&path, Axes::Own).unwrap().cloud;
+            assert!((turned.means[7][1] + cloud.means[7][1]).abs() < 2e-4, "y points the other way");
+        }
     }
     let empty = dir.path().join("none.spz");
     write(&empty, &GaussianCloud::with_capacity(2, 0)).unwrap();
@@ -111,6 +127,28 @@ fn a_scene_wider_than_two_kilometres_gives_up_precision_not_gaussians() {
     let said = write(&dir.path().join("no.spz"), &beyond).unwrap_err().to_string();
     assert!(said.contains("no.spz") && said.contains("ply"), "{said}");
     assert!(!dir.path().join("no.spz").exists());
+}
+
+#[test]
+fn a_stray_gaussian_and_a_far_origin_cost_nobody_any_precision() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.spz");
+    let mut scene = cloud(1, 300, 10.0);
+    scene.means[5] = [2e5, -8e4, 1.6e5];
+    let written = write(&path, &scene).unwrap();
+    let near: Vec<u32> = (0..300).filter(|i| *i != 5).collect();
+    let mut moved = read(&path).unwrap().cloud;
+    moved.means.iter_mut().flatten().zip(written.shift.iter().cycle()).for_each(|(v, s)| *v += s);
+    assert_eq!(written.strays, 1);
+    within_rounding(&scene.rows(&near), &moved);
+    // A map's easting and northing; single precision has them to 0.25 m.
+    let mut far = cloud(1, 300, 10.0);
+    far.means.iter_mut().for_each(|m| *m = [m[0] + 500_000.0, m[1] + 4_000_000.0, m[2] + 100.0]);
+    let written = write(&path, &far).unwrap();
+    assert!(written.strays == 0 && written.shift[1] > 3.9e6, "{written:?}");
+    let back = read(&path).unwrap().cloud;
+    let off = |i: usize, k: usize| (back.means[i][k] + written.shift[k] - far.means[i][k]).abs();
+    assert!((0..300).all(|i| off(i, 0) < 0.04 && off(i, 1) < 0.3 && off(i, 2) < 2e-4));
 }
 
 fn packed(path: &Path, bytes: &[u8]) {

@@ -33,13 +33,17 @@ use vulkan::trainer::RunBudget;
 
 use crate::error::JobError;
 pub use card::take_settled;
-use scale::largest;
+use identity::Identity;
+pub use scale::PictureScale;
+use scale::{large_enough, largest};
 use slices::{REST, Slices};
 
 mod card;
+mod cause;
 mod choose;
 mod first;
 mod ground;
+mod identity;
 pub mod log;
 mod scale;
 mod slices;
@@ -87,8 +91,8 @@ pub struct TrainJob {
     pub scene_gaussians: Option<usize>,
     /// Views on the device at once; `None`: as [`config::plan::PlanRequest::slots`] says.
     pub view_slots: Option<u32>,
-    /// Image scale; `None`: as large as the plan holds.
-    pub scale: Option<f64>,
+    /// Image scale.
+    pub scale: PictureScale,
     /// Part of the Vulkan device's name.
     pub device: Option<String>,
     /// `[network]`: manifests of the user's own networks.
@@ -135,6 +139,7 @@ impl TrainJob {
     pub fn run(&self) -> Result<Outcome, JobError> {
         let began = Instant::now();
         let stop = Interrupt::install()?;
+        let _held = identity::hold(&self.out)?;
         let set = match self.folders.as_slice() {
             [folder] if self.card == CardOptions::default() => Dataset::open(folder)?,
             folders => Dataset::open_card(folders, &self.card)?,
@@ -156,6 +161,7 @@ impl TrainJob {
         let go_on = || !stop.requested();
         let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
         from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
+        Identity::of(self, &set)?.claim(&self.out, &self.model_path(), self.fresh)?;
         let is_card = set.card.is_some();
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
         let poses = if is_card { PoseSource::Dataset } else { self.poses };
@@ -174,10 +180,11 @@ impl TrainJob {
             Some(rule) => capture::choose(&set, frames, poses, rule)?,
             None => (frames, KeyframeCounters::default()),
         };
-        let mut source = Folder::new(&set, frames.clone(), load_scale, poses);
         if frames.is_empty() {
             return Err(JobError::Request(format!("{}: split {:?} holds no pictures", set.root.display(), self.split)));
         }
+        let frames = large_enough(&set, frames, picture_scale)?;
+        let mut source = Folder::new(&set, frames.clone(), load_scale, poses);
         let size = largest(&set, &frames, picture_scale)?;
         let crops = self.crops(&set, &frames, picture_scale)?;
         let metric = self.network.metric.as_deref().filter(|_| self.evaluate);
@@ -211,6 +218,7 @@ impl TrainJob {
         };
         let header = ModelHeader {
             origin: set.origin,
+            local: set.local,
             region: self.region.as_deref().and_then(|r| set.region(r)).map(|r| r.polygon.clone()).unwrap_or_default(),
             seed: self.training.seed,
             ..Default::default()
@@ -230,7 +238,8 @@ impl TrainJob {
             // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
             engine.checkpoint(&self.out, false)?;
         }
-        let built = self.take(&mut engine, &mut source, &go_on)? && engine.build(&go_on)?;
+        let built = self.take(&mut engine, &mut source, &go_on)?
+            && engine.build(&go_on).map_err(|e| cause::of(e, &set, &frames))?;
         let ready = built && engine.look_closer(&mut source, &go_on)?;
         let finished = ready && self.optimise(&mut engine, frames.len(), stop)?;
         if finished && self.evaluate {

@@ -14,6 +14,8 @@ use models::formats::flight_plan::{FlightPlan, Waypoint};
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms::pose_to_opengl;
 
+#[path = "commands/again.rs"]
+mod again;
 #[path = "commands/begun.rs"]
 mod begun;
 #[path = "commands/earlier.rs"]

@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use super::FormatError;
+use super::natural;
 use super::reconstruction::{LensDescription, Reconstruction, Shot};
 
 mod binary;
@@ -18,6 +19,9 @@ pub use write::{Point, write};
 
 /// Where a model lies below the folder of a data set, the usual place first.
 const PLACES: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."];
+/// Folders looked at beside a numbered model.
+const MOST_MODELS: usize = 4096;
+
 /// The files of a model.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Model {
@@ -27,14 +31,94 @@ pub struct Model {
 
 impl Model {
     /// The model that belongs to the data set in `root`: in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap/sparse` or
-    /// `root` itself, binary before text.
-    pub fn find(root: &Path) -> Option<Self> {
-        PLACES.iter().find_map(|place| {
-            let folder = if *place == "." { root.to_owned() } else { root.join(place) };
-            let there = |e: &&str| ["cameras", "images"].iter().all(|f| folder.join(f).with_extension(e).is_file());
-            let extension = ["bin", "txt"].into_iter().find(there)?;
-            Some(Self { folder, extension })
-        })
+    /// `root` itself, binary before text. Where COLMAP left several (`sparse/0`, `sparse/1`, …), that of the most images.
+    ///
+    /// # Errors
+    /// What lies there is a part of a model only, or none of several can be read.
+    pub fn find(root: &Path) -> Result<Option<Self>, FormatError> {
+        let mut broken = None;
+        for place in PLACES {
+            let folder = if place == "." { root.to_owned() } else { root.join(place) };
+            match Self::at(&folder) {
+                Ok(Some(first)) => return first.largest_beside(),
+                Ok(None) => {}
+                // Another of them may be whole.
+                Err(e) => {
+                    match folder.file_name().is_some_and(|name| name == "0").then(|| Self::beside(&folder)).flatten() {
+                        Some(model) => return model.largest_beside(),
+                        None => broken = broken.or(Some(e)),
+                    }
+                }
+            }
+        }
+        broken.map_or(Ok(None), Err)
+    }
+
+    /// The model in `folder`.
+    fn at(folder: &Path) -> Result<Option<Self>, FormatError> {
+        let there = |name: &str, e: &str| folder.join(name).with_extension(e).is_file();
+        let both = |e: &&str| ["cameras", "images"].iter().all(|name| there(name, e));
+        if let Some(extension) = ["bin", "txt"].into_iter().find(both) {
+            return Ok(Some(Self { folder: folder.to_owned(), extension }));
+        }
+        // In the folder itself a file of such a name may be anybody's.
+        if !folder.ancestors().take(2).any(|f| f.file_name().is_some_and(|name| name == "sparse")) {
+            return Ok(None);
+        }
+        let parts = ["cameras", "images", "points3D"].iter().flat_map(|name| [("bin", *name), ("txt", *name)]);
+        let found: Vec<String> =
+            parts.filter(|(e, name)| there(name, e)).map(|(e, name)| format!("{name}.{e}")).collect();
+        match found.is_empty() {
+            true => Ok(None),
+            false => Err(FormatError::invalid(
+                folder,
+                format!("a COLMAP model needs cameras and images, binary or text; only {} is there", found.join(", ")),
+            )),
+        }
+    }
+
+    /// Whole models in the folders beside `folder` that COLMAP numbers.
+    fn siblings(folder: &Path) -> Vec<Self> {
+        let entries = folder.parent().and_then(|above| std::fs::read_dir(above).ok()).into_iter().flatten().flatten();
+        let is_number =
+            |path: &PathBuf| path.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.parse::<u32>().is_ok());
+        let mut folders: Vec<PathBuf> = entries.take(MOST_MODELS).map(|e| e.path()).filter(is_number).collect();
+        folders.sort();
+        folders.iter().filter_map(|folder| Self::at(folder).ok().flatten()).collect()
+    }
+
+    fn beside(folder: &Path) -> Option<Self> {
+        Self::siblings(folder).into_iter().next()
+    }
+
+    /// The one of the most images of those that lie beside it; itself, where it is the only one.
+    fn largest_beside(self) -> Result<Option<Self>, FormatError> {
+        if self.folder.file_name().and_then(|n| n.to_str()).is_none_or(|n| n.parse::<u32>().is_err()) {
+            return Ok(Some(self));
+        }
+        let all = Self::siblings(&self.folder);
+        if all.len() < 2 {
+            return Ok(Some(self));
+        }
+        let counted = all.into_iter().map(|model| (model.images().map(|images| images.len()), model));
+        let (whole, broken): (Vec<_>, Vec<_>) = counted.partition(|(count, _)| count.is_ok());
+        let largest = whole.into_iter().rev().max_by_key(|(count, _)| count.as_ref().map_or(0, |n| *n));
+        match (largest, broken.into_iter().next()) {
+            (Some((_, model)), _) => Ok(Some(model)),
+            (None, Some((Err(e), _))) => Err(e),
+            (None, _) => Ok(Some(self)),
+        }
+    }
+
+    /// One line where others lie beside it, whole or not.
+    pub fn said(&self) -> Option<String> {
+        let others: Vec<Self> = Self::siblings(&self.folder).into_iter().filter(|m| m.folder != self.folder).collect();
+        let of = |model: &Self| match model.images() {
+            Ok(images) => format!("{} of {} images", model.folder.display(), images.len()),
+            Err(e) => format!("{e}"),
+        };
+        let other: Vec<String> = others.iter().map(of).collect();
+        (!other.is_empty()).then(|| format!("{} is taken, the largest; not used: {}", of(self), other.join(", ")))
     }
 
     /// One of its files: `cameras`, `images` or `points3D`.
@@ -75,7 +159,7 @@ impl Model {
     pub fn read(&self) -> Result<Reconstruction, FormatError> {
         let cameras = self.cameras()?;
         let mut images = self.images()?;
-        images.sort_by(|a, b| a.name.cmp(&b.name));
+        images.sort_by(|a, b| natural(&a.name, &b.name));
         let mut shots = Vec::with_capacity(images.len());
         for image in images {
             let Some(lens) = cameras.get(&image.camera_id) else {

@@ -26,6 +26,7 @@ use geometry::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
 use super::delivery::{self, Form, Rounding};
+use super::reconstruction::LocalFrame;
 use super::{FormatError, write_atomic};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, sh_coefficients};
@@ -89,6 +90,8 @@ pub struct ModelHeader {
     pub lights: Vec<PictureLight>,
     /// Whether Gaussians have been taken out of it for delivery; such a model is not thinned a second time when it is continued.
     pub thinned: bool,
+    /// How the coordinates that the pictures' poses came in became those of the Gaussians; `None`: they are the same.
+    pub local: Option<LocalFrame>,
 }
 
 /// Writes a model whole or not at all.
@@ -283,10 +286,10 @@ fn exact_bytes(sh_degree: u8) -> u64 {
 /// # Errors
 /// [`FormatError::Invalid`]: it cannot be decoded, or a later stage could not work with it.
 pub fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
-    // Files of earlier versions end before the last field, or the one before it, too: an empty list and "no" are one byte each.
+    // Files of earlier versions end before one of the last three fields: an empty list, "no" and nothing are one byte each.
     let earlier = |missing: &[u8]| postcard::from_bytes(&[bytes, missing].concat());
     let header: ModelHeader = postcard::from_bytes(bytes)
-        .or_else(|e| earlier(&[0]).or_else(|_| earlier(&[0, 0])).map_err(|_| e))
+        .or_else(|e| earlier(&[0]).or_else(|_| earlier(&[0; 2])).or_else(|_| earlier(&[0; 3])).map_err(|_| e))
         .map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))?;
     check_header(path, &header)?;
     Ok(header)
@@ -308,6 +311,9 @@ fn check_header(path: &Path, header: &ModelHeader) -> Result<(), FormatError> {
     }
     if header.origin.is_some_and(|o| !o.is_valid()) {
         return bad("its origin is no place on the earth".to_owned());
+    }
+    if header.local.is_some_and(|local| !local.is_usable()) {
+        return bad("its frame is no shift and scale".to_owned());
     }
     if !header.train_seconds.is_finite() {
         return bad("its training time is not a number".to_owned());

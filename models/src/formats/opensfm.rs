@@ -15,7 +15,7 @@ use serde_json::{Map, Value, json};
 
 use super::reconstruction::{Focal, LensDescription, Reconstruction, Shot, check_count, origin, picture_size};
 use super::transforms::write_json;
-use super::{FormatError, read_bounded};
+use super::{FormatError, read_bounded, without_mark};
 use crate::camera::Pose;
 
 /// Where the file lies below the folder of a data set.
@@ -255,7 +255,8 @@ fn beside(path: &Path) -> Result<Option<Geodetic>, FormatError> {
         return Ok(None);
     }
     let bytes = read_bounded(&path, 1 << 16)?;
-    let r: RawReference = serde_json::from_slice(&bytes).map_err(|e| FormatError::invalid(&path, e.to_string()))?;
+    let r: RawReference =
+        serde_json::from_slice(without_mark(&bytes)).map_err(|e| FormatError::invalid(&path, e.to_string()))?;
     origin(&path, "its position", r.latitude, r.longitude, r.altitude).map(Some)
 }
 

@@ -1,7 +1,7 @@
 //! The 3DGS point cloud PLY that every viewer reads: log scales, logit opacities, w x y z quaternions, and the SH
 //! rest channel by channel (all red, all green, all blue), which is the transpose of [`GaussianCloud::sh`].
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufReader, Read};
 use std::path::Path;
 
 use geometry::geodesy::Geodetic;
@@ -9,10 +9,11 @@ use geometry::geodesy::Geodetic;
 use super::{FormatError, write_atomic};
 use crate::cloud::{GaussianCloud, sh_coefficients};
 
-/// Longest header taken; a 3DGS one has 1.5 KiB.
-const MAX_HEADER: u64 = 64 << 10;
-/// Most properties of a vertex taken.
-const MAX_PROPERTIES: usize = 256;
+mod compressed;
+mod header;
+
+use header::{Header, Kind, Rows};
+
 const ORIGIN: &str = "dgtr enu_origin_wgs84";
 
 /// What a PLY file held.
@@ -24,6 +25,8 @@ pub struct PlyModel {
     pub origin: Option<Geodetic>,
     /// Rows left out because they hold a number that is not finite or no rotation.
     pub dropped: usize,
+    /// Trained for a renderer that makes Gaussians fainter where it widens them to a pixel (Mip-Splatting).
+    pub is_antialiased: bool,
 }
 
 /// Writes `cloud`, atomically, with its georeference as a comment.
@@ -67,7 +70,8 @@ pub fn write(path: &Path, cloud: &GaussianCloud, origin: Option<Geodetic>) -> Re
     })
 }
 
-/// Reads a 3DGS PLY (binary, little-endian; properties in any order, unknown ones skipped).
+/// Reads a 3DGS PLY: binary of either order or text, properties in any order, unknown ones skipped, two scales (2DGS) as a flat
+/// Gaussian, or PlayCanvas' compressed form.
 ///
 /// # Errors
 /// As [`FormatError`] says; what is allocated is bounded by the file's own size.
@@ -75,22 +79,38 @@ pub fn read(path: &Path) -> Result<PlyModel, FormatError> {
     let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
     let mut input = BufReader::with_capacity(1 << 16, file);
-    let header = read_header(path, &mut input)?;
-    let find = |name: &str| header.properties.iter().find(|p| p.name == name).cloned();
+    let header = header::read(path, &mut input)?;
+    header.check_size(path, size)?;
+    let mut cloud = match compressed::is_compressed(&header) {
+        true => compressed::read(path, &header, &mut input)?,
+        false => plain(path, &header, &mut input)?,
+    };
+    cloud.bring_in_limits();
+    let dropped = cloud.drop_invalid();
+    // Brush's word for models that were trained with the filter of Mip-Splatting.
+    let is_antialiased = header.comments.iter().any(|c| c.to_lowercase().replace(' ', "") == "splatrendermode:mip");
+    Ok(PlyModel { cloud, origin: header.origin(ORIGIN), dropped, is_antialiased })
+}
+
+fn plain(path: &Path, header: &Header, input: &mut dyn Read) -> Result<GaussianCloud, FormatError> {
+    let Some(vertices) = header.vertices() else {
+        return Err(FormatError::invalid(path, "has no vertices; give a 3DGS .ply"));
+    };
+    let find = |name: &str| vertices.properties.iter().position(|p| p.name == name);
     let need = |name: &str| {
-        let property = find(name).ok_or_else(|| {
+        let at = find(name).ok_or_else(|| {
             let hint = if name.starts_with("f_dc") { " (a plain point cloud is not a Gaussian model)" } else { "" };
             FormatError::invalid(path, format!("has no vertex property {name:?}{hint}; give a 3DGS .ply"))
         })?;
-        match property.kind {
+        match vertices.properties[at].kind {
             // A byte for each number would make the cloud four times the file.
-            Kind::Other(_) => {
+            Kind::Whole(..) => {
                 Err(FormatError::invalid(path, format!("vertex property {name:?} is no float or double")))
             }
-            _ => Ok(property),
+            _ => Ok(at),
         }
     };
-    let rest = header.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
+    let rest = vertices.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
     let Some(degree) = (0..=3u8).find(|&d| 3 * (sh_coefficients(d) - 1) == rest) else {
         return Err(FormatError::invalid(
             path,
@@ -98,152 +118,67 @@ pub fn read(path: &Path) -> Result<PlyModel, FormatError> {
         ));
     };
     let d = sh_coefficients(degree);
+    let is_flat = find("scale_2").is_none() && find("scale_1").is_some();
     let fixed = ["x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity"];
-    let mut columns: Vec<Property> = fixed.iter().map(|n| need(n)).collect::<Result<_, _>>()?;
+    let columns = fixed.iter().map(|n| if is_flat && *n == "scale_2" { Ok(usize::MAX) } else { need(n) });
+    let mut columns: Vec<usize> = columns.collect::<Result<_, _>>()?;
     for k in 0..d {
         for channel in 0..3 {
             let name = if k == 0 { format!("f_dc_{channel}") } else { format!("f_rest_{}", channel * (d - 1) + k - 1) };
             columns.push(need(&name)?);
         }
     }
-    let stride = header.properties.last().map_or(0, |p| p.offset + p.kind.bytes()) as u64;
-    let body = header.count.checked_mul(stride).and_then(|b| b.checked_add(header.bytes));
-    if body.is_none_or(|b| b > size) {
-        return Err(FormatError::Truncated { path: path.to_owned(), at: size, what: "its vertices" });
-    }
-    let mut cloud = GaussianCloud::with_capacity(degree, header.count as usize);
-    let mut row = vec![0; stride as usize];
+    let mut cloud = GaussianCloud::with_capacity(degree, vertices.count as usize);
     let mut values = vec![0.0; columns.len()];
-    for _ in 0..header.count {
-        input.read_exact(&mut row).map_err(|e| FormatError::io(path, "reading", e))?;
-        for (value, column) in values.iter_mut().zip(&columns) {
-            *value = column.value(&row);
+    for element in &header.elements {
+        let mut rows = Rows::new(path, header, element, input)?;
+        let is_vertex = element.name == "vertex";
+        while let Some(row) = rows.next()? {
+            if !is_vertex {
+                continue;
+            }
+            for (value, column) in values.iter_mut().zip(&columns) {
+                *value = if *column == usize::MAX { f32::NEG_INFINITY } else { row.float(*column) };
+            }
+            let v = &values;
+            cloud.push([v[0], v[1], v[2]], [v[3], v[4], v[5]], [v[6], v[7], v[8], v[9]], v[10], &v[11..]);
         }
-        let v = &values;
-        cloud.push([v[0], v[1], v[2]], [v[3], v[4], v[5]], [v[6], v[7], v[8], v[9]], v[10], &v[11..]);
-    }
-    let dropped = cloud.drop_invalid();
-    Ok(PlyModel { cloud, origin: header.origin, dropped })
-}
-
-#[derive(Clone, Copy)]
-enum Kind {
-    F32,
-    F64,
-    /// Only skipped over.
-    Other(usize),
-}
-
-impl Kind {
-    fn parse(name: &str) -> Option<Self> {
-        Some(match name {
-            "float" | "float32" => Self::F32,
-            "double" | "float64" => Self::F64,
-            "char" | "uchar" | "int8" | "uint8" => Self::Other(1),
-            "short" | "ushort" | "int16" | "uint16" => Self::Other(2),
-            "int" | "uint" | "int32" | "uint32" => Self::Other(4),
-            _ => return None,
-        })
-    }
-
-    fn bytes(self) -> usize {
-        match self {
-            Self::F32 => 4,
-            Self::F64 => 8,
-            Self::Other(n) => n,
+        // What follows the vertices is left unread.
+        if is_vertex {
+            break;
         }
     }
+    Ok(cloud)
 }
 
-#[derive(Clone)]
-struct Property {
-    name: String,
-    kind: Kind,
-    offset: usize,
-}
-
-impl Property {
-    fn value(&self, row: &[u8]) -> f32 {
-        let bytes = &row[self.offset..];
-        match self.kind {
-            Kind::F32 => bytes.first_chunk().map_or(f32::NAN, |b| f32::from_le_bytes(*b)),
-            Kind::F64 => bytes.first_chunk().map_or(f32::NAN, |b| f64::from_le_bytes(*b) as f32),
-            Kind::Other(_) => f32::NAN,
-        }
-    }
-}
-
-struct Header {
-    count: u64,
-    properties: Vec<Property>,
-    origin: Option<Geodetic>,
-    bytes: u64,
-}
-
-fn read_header(path: &Path, input: &mut impl BufRead) -> Result<Header, FormatError> {
-    let bad = |what: String| FormatError::invalid(path, what);
-    let mut header = Header { count: 0, properties: Vec::new(), origin: None, bytes: 0 };
-    let (mut elements, mut offset) = (0, 0);
-    let mut line = Vec::new();
-    for number in 1.. {
-        line.clear();
-        let left = MAX_HEADER - header.bytes;
-        let n =
-            input.by_ref().take(left).read_until(b'\n', &mut line).map_err(|e| FormatError::io(path, "reading", e))?;
-        header.bytes += n as u64;
-        if number == 1 && line.trim_ascii_end() != b"ply" {
-            return Err(bad("is not a PLY file (its first line is not \"ply\")".into()));
-        }
-        if line.last() != Some(&b'\n') {
-            return Err(if header.bytes >= MAX_HEADER {
-                FormatError::TooLarge {
-                    path: path.to_owned(),
-                    what: "its header",
-                    size: header.bytes,
-                    limit: MAX_HEADER,
+/// Gives place and colour of every vertex of a plain point cloud to `take`; vertices without colours are grey.
+///
+/// # Errors
+/// As [`read`]; the vertices have no x, y and z.
+pub fn points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3])) -> Result<(), FormatError> {
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
+    let mut input = BufReader::with_capacity(1 << 16, file);
+    let header = header::read(path, &mut input)?;
+    header.check_size(path, size)?;
+    for element in &header.elements {
+        let find = |name: &str| element.properties.iter().position(|p| p.name == name);
+        let place = ["x", "y", "z"].map(find);
+        let color = ["red", "green", "blue"].map(find);
+        let is_vertex = element.name == "vertex";
+        let mut rows = Rows::new(path, &header, element, &mut input)?;
+        while let Some(row) = rows.next()? {
+            match (is_vertex, place) {
+                (false, _) => {}
+                (true, [Some(x), Some(y), Some(z)]) => {
+                    take([x, y, z].map(|at| row.number(at)), color.map(|at| at.map_or(128, |at| row.word(at) as u8)));
                 }
-            } else {
-                FormatError::Truncated { path: path.to_owned(), at: header.bytes, what: "its header" }
-            });
+                (true, _) => return Err(FormatError::invalid(path, "its vertices have no x, y and z")),
+            }
         }
-        let text = String::from_utf8_lossy(&line);
-        let words: Vec<&str> = text.split_ascii_whitespace().collect();
-        match words.as_slice() {
-            ["end_header"] => break,
-            ["format", "binary_little_endian", _] => {}
-            ["format", other, ..] => {
-                return Err(bad(format!("PLY format {other} is not supported; write binary_little_endian")));
-            }
-            ["element", "vertex", n] if elements == 0 => {
-                elements = 1;
-                header.count = n.parse().map_err(|_| bad(format!("line {number}: {n:?} is no number of vertices")))?;
-            }
-            // What follows the vertices is left unread.
-            ["element", ..] if elements > 0 => elements += 1,
-            ["element", other, ..] => {
-                return Err(bad(format!("element {other} comes before the vertices; write the vertices first")));
-            }
-            ["property", kind, name] if elements == 1 => {
-                let Some(kind) = Kind::parse(kind) else {
-                    return Err(bad(format!("line {number}: property type {kind} is not supported")));
-                };
-                if header.properties.len() == MAX_PROPERTIES {
-                    return Err(bad(format!("has more than {MAX_PROPERTIES} vertex properties")));
-                }
-                header.properties.push(Property { name: (*name).to_owned(), kind, offset });
-                offset += kind.bytes();
-            }
-            ["property", ..] if elements == 1 => {
-                return Err(bad(format!("line {number}: list properties are not supported")));
-            }
-            ["comment", "dgtr", "enu_origin_wgs84", lat, lon, alt] => header.origin = origin(lat, lon, alt),
-            _ => {}
+        if is_vertex {
+            return Ok(());
         }
     }
-    Ok(header)
-}
-
-fn origin(lat: &str, lon: &str, alt: &str) -> Option<Geodetic> {
-    let o = Geodetic { lat_deg: lat.parse().ok()?, lon_deg: lon.parse().ok()?, alt_m: alt.parse().ok()? };
-    o.is_valid().then_some(o)
+    Err(FormatError::invalid(path, "has no vertices"))
 }

@@ -5,6 +5,9 @@ use std::path::Path;
 
 use geometry::geodesy::Geodetic;
 use geometry::lens::{Distortion, Lens};
+use geometry::median;
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
 
 use super::FormatError;
 use crate::camera::{Intrinsics, Pose};
@@ -34,6 +37,62 @@ pub struct Shot {
     pub pose: Pose,
     /// Path of the picture's mask, where the file names one.
     pub mask: Option<String>,
+}
+
+/// How the coordinates of a scene that is nowhere on Earth were brought near those that 32 bits hold well and that training's lengths are
+/// made for: `own = (theirs - shift) · scale`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LocalFrame {
+    /// Taken off their coordinates.
+    pub shift: [f64; 3],
+    /// Own units to one of theirs.
+    pub scale: f64,
+}
+
+/// A scene farther from its origin than this many times its own extent is moved: 32 bits would have it to a ten-thousandth of the extent.
+const FAR: f64 = 500.0;
+/// Half of the cameras lie within this of their middle in scenes as they come; others are brought to between 1 and 10.
+const EXTENTS: std::ops::Range<f64> = 0.3..5000.0;
+
+impl LocalFrame {
+    /// For a scene whose cameras stand here; `None` where its coordinates are good as they are.
+    pub fn of(places: &[DVec3]) -> Option<Self> {
+        let axis = |k: usize| median(&mut places.iter().map(|p| p[k]).collect::<Vec<_>>());
+        let middle = DVec3::new(axis(0)?, axis(1)?, axis(2)?);
+        let extent = median(&mut places.iter().map(|p| p.distance(middle)).collect::<Vec<_>>())?;
+        if !(extent > 0.0 && extent.is_finite()) {
+            return None;
+        }
+        let step = 10f64.powf(extent.log10().floor());
+        let scale = if EXTENTS.contains(&extent) { 1.0 } else { 1.0 / step };
+        // Whole numbers of a round length, so that nobody reads meaning into digits.
+        let moved = middle.length() > FAR * extent;
+        let shift = if moved { middle.map(|v| (v / step).round() * step + 0.0) } else { DVec3::ZERO };
+        (moved || scale != 1.0).then(|| Self { shift: shift.to_array(), scale })
+    }
+
+    /// Their coordinates in ours.
+    pub fn into_own(&self, theirs: DVec3) -> DVec3 {
+        (theirs - DVec3::from_array(self.shift)) * self.scale
+    }
+
+    /// Ours in theirs.
+    pub fn into_theirs(&self, own: DVec3) -> DVec3 {
+        own / self.scale + DVec3::from_array(self.shift)
+    }
+
+    /// Whether numbers and factor are those of a scene.
+    pub fn is_usable(&self) -> bool {
+        self.shift.iter().all(|v| v.is_finite()) && self.scale.is_finite() && self.scale > 0.0
+    }
+}
+
+impl std::fmt::Display for LocalFrame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let [x, y, z] = self.shift;
+        write!(f, "({x}, {y}, {z}) taken off")?;
+        if self.scale == 1.0 { Ok(()) } else { write!(f, ", times {}", self.scale) }
+    }
 }
 
 /// A lens as a file describes it; picture size and principal point may have to be taken from the picture.
@@ -270,5 +329,34 @@ pub(crate) fn check_count(path: &Path, count: u64) -> Result<(), FormatError> {
             limit: MAX_SHOTS,
         }),
         false => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ring(scale: f64, shift: DVec3) -> Vec<DVec3> {
+        (0..12)
+            .map(|i| shift + DVec3::new((0.5 * f64::from(i)).cos(), (0.5 * f64::from(i)).sin(), 0.1) * scale)
+            .collect()
+    }
+
+    #[test]
+    fn far_and_odd_sized_scenes_are_brought_near_and_others_stay_as_they_are() {
+        for scale in [0.5, 3.1, 50.0, 4000.0] {
+            assert_eq!(LocalFrame::of(&ring(scale, DVec3::splat(20.0 * scale))), None, "{scale}");
+        }
+        let utm = DVec3::new(500_000.0, 4_000_000.0, 100.0);
+        for (scale, shift) in [(40.0, utm), (1e-4, DVec3::ZERO), (1e6, DVec3::ONE), (1e-4, utm), (0.03, DVec3::X)] {
+            let places = ring(scale, shift);
+            let frame = LocalFrame::of(&places).expect("moved");
+            let own: Vec<DVec3> = places.iter().map(|p| frame.into_own(*p)).collect();
+            assert!(own.iter().all(|p| p.length() < 1000.0) && own[0].distance(own[6]) > 0.5, "{scale}: {own:?}");
+            let back = |(own, theirs): (&DVec3, &DVec3)| frame.into_theirs(*own).distance(*theirs);
+            assert!(own.iter().zip(&places).map(back).all(|d| d <= 1e-9 * (scale + shift.length())), "{scale}");
+            assert!(frame.is_usable() && !format!("{frame}").contains('\n'));
+        }
+        assert_eq!((LocalFrame::of(&[]), LocalFrame::of(&[utm, utm])), (None, None), "one place has no extent");
     }
 }

@@ -25,6 +25,9 @@ use palette::Palette;
 mod codebook;
 mod palette;
 pub mod streamed;
+mod unpack;
+
+pub use unpack::read;
 
 const VERSION: u32 = 2;
 const GENERATOR: &str = concat!("dgtr ", env!("CARGO_PKG_VERSION"));

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{FormatError, read_bounded};
+use super::{FormatError, read_bounded, without_mark};
 
 const LIMIT: u64 = 64 << 20;
 
@@ -55,8 +55,8 @@ struct RawFile {
 /// The file cannot be read or is no split.
 pub fn read(path: &Path) -> Result<SplitFile, FormatError> {
     let bytes = read_bounded(path, LIMIT)?;
-    let raw: RawFile =
-        serde_json::from_slice(&bytes).map_err(|e| FormatError::invalid(path, format!("not a split.json: {e}")))?;
+    let raw: RawFile = serde_json::from_slice(without_mark(&bytes))
+        .map_err(|e| FormatError::invalid(path, format!("not a split.json: {e}")))?;
     let mut regions = Vec::with_capacity(raw.regions.len());
     for r in raw.regions {
         let name = match r.id {

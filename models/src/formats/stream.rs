@@ -148,7 +148,8 @@ impl<'p> Lines<'p> {
                 return Err(FormatError::invalid(self.path, format!("line {} is not UTF-8 text", self.number)));
             }
         };
-        Ok(Some(std::str::from_utf8(&self.line[..valid]).unwrap_or_default().trim_end_matches('\r')))
+        let line = std::str::from_utf8(&self.line[..valid]).unwrap_or_default();
+        Ok(Some(line.trim_start_matches('\u{feff}').trim_end_matches('\r')))
     }
 
     /// The next line that is neither empty nor a comment.

@@ -2,6 +2,7 @@
 //! along −z), converted here and nowhere else to OpenCV axes. Lens fields stand once for all frames or in each; the
 //! camera model is the file's, or the frame's own.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use geometry::lens::Distortion;
@@ -10,7 +11,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::reconstruction::{Focal, LensDescription, Reconstruction, Shot, check_count, origin, picture_size};
-use super::{FormatError, read_bounded, write_atomic};
+use super::{FormatError, read_bounded, without_mark, write_atomic};
 use crate::camera::Pose;
 
 /// A hundred thousand frames at 2 KiB of JSON each.
@@ -42,7 +43,7 @@ struct RawLens {
 #[derive(Deserialize)]
 struct RawFrame {
     file_path: String,
-    transform_matrix: Vec<Vec<f64>>,
+    transform_matrix: Vec<Vec<Option<f64>>>,
     mask_path: Option<String>,
     #[serde(flatten)]
     lens: RawLens,
@@ -59,8 +60,76 @@ struct RawOrigin {
 struct RawFile {
     frames: Vec<RawFrame>,
     enu_origin_wgs84: Option<RawOrigin>,
+    ply_file_path: Option<String>,
+    applied_transform: Option<Vec<Vec<Option<f64>>>>,
+    applied_scale: Option<f64>,
     #[serde(flatten)]
     lens: RawLens,
+}
+
+fn parse(path: &Path) -> Result<RawFile, FormatError> {
+    let bytes = read_bounded(path, LIMIT)?;
+    serde_json::from_slice(&without_nan(without_mark(&bytes)))
+        .map_err(|e| FormatError::invalid(path, format!("not a transforms.json of nerfstudio: {e}")))
+}
+
+/// Python writes numbers that are none as words that JSON does not have; they become `null`, which is named where a number is needed.
+fn without_nan(json: &[u8]) -> Cow<'_, [u8]> {
+    const WORDS: [&[u8]; 3] = [b"-Infinity", b"Infinity", b"NaN"];
+    let mut mended: Option<Vec<u8>> = None;
+    let (mut at, mut quoted) = (0, false);
+    while at < json.len() {
+        let word = WORDS.iter().find(|word| !quoted && json[at..].starts_with(word));
+        match (json[at], word) {
+            (_, Some(word)) => {
+                let mended = mended.get_or_insert_with(|| json[..at].to_vec());
+                mended.extend(b"null");
+                at += word.len();
+                continue;
+            }
+            (b'\\', None) if quoted && at + 1 < json.len() => {
+                if let Some(mended) = &mut mended {
+                    mended.push(json[at]);
+                }
+                at += 1;
+            }
+            (b'"', None) => quoted = !quoted,
+            _ => {}
+        }
+        if let Some(mended) = &mut mended {
+            mended.push(json[at]);
+        }
+        at += 1;
+    }
+    mended.map_or(Cow::Borrowed(json), Cow::Owned)
+}
+
+/// What stands in a file beside its frames about the points that belong to it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointsOf {
+    /// Path of a PLY of points in the frame of the poses, as the file names it.
+    pub ply: Option<String>,
+    /// What leads from the frame of the COLMAP model that the poses were made of into theirs: a matrix and a shift.
+    pub applied: Option<(DMat3, DVec3)>,
+}
+
+/// What a file says of its points.
+///
+/// # Errors
+/// The file cannot be read, or its `applied_transform` is no matrix.
+pub fn points_of(path: &Path) -> Result<PointsOf, FormatError> {
+    let raw = parse(path)?;
+    let scale = raw.applied_scale.unwrap_or(1.0);
+    let applied = match raw.applied_transform {
+        None if scale == 1.0 => None,
+        None => Some((DMat3::from_diagonal(DVec3::splat(scale)), DVec3::ZERO)),
+        Some(rows) => {
+            let m = matrix(&rows).map_err(|_| FormatError::invalid(path, "its applied_transform is no matrix"))?;
+            let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]) * scale;
+            Some((DMat3::from_cols(column(0), column(1), column(2)), column(3)))
+        }
+    };
+    Ok(PointsOf { ply: raw.ply_file_path, applied })
 }
 
 /// Reads `transforms.json`.
@@ -68,15 +137,13 @@ struct RawFile {
 /// # Errors
 /// The file cannot be read, is no such file, or says something impossible of a frame.
 pub fn read(path: &Path) -> Result<Reconstruction, FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let raw: RawFile = serde_json::from_slice(&bytes)
-        .map_err(|e| FormatError::invalid(path, format!("not a transforms.json of nerfstudio: {e}")))?;
+    let raw = parse(path)?;
     check_count(path, raw.frames.len() as u64)?;
     let origin = raw.enu_origin_wgs84.map(|o| origin(path, "enu_origin_wgs84", o.lat, o.lon, o.alt)).transpose()?;
     let mut shots = Vec::with_capacity(raw.frames.len());
     for frame in raw.frames {
         let bad = |what: String| FormatError::invalid(path, format!("frame {:?}: {what}", frame.file_path));
-        let pose = opengl_to_pose(&frame.transform_matrix).map_err(|e| bad(e.to_owned()))?;
+        let pose = matrix(&frame.transform_matrix).and_then(|m| opengl_to_pose(&m)).map_err(|e| bad(e.to_owned()))?;
         let lens = lens(&frame.lens, &raw.lens).map_err(bad)?;
         shots.push(Shot { path: frame.file_path, lens, pose, mask: frame.mask_path });
     }
@@ -202,6 +269,15 @@ pub(super) fn write_json(path: &Path, value: &Value) -> Result<(), FormatError> 
     write_atomic(path, |w| serde_json::to_writer_pretty(w, value).map_err(std::io::Error::other))
 }
 
+/// Three rows of four numbers; what is no number is NaN.
+fn matrix(rows: &[Vec<Option<f64>>]) -> Result<Vec<Vec<f64>>, &'static str> {
+    let number = |v: &Option<f64>| v.unwrap_or(f64::NAN);
+    match rows.len() >= 3 && rows.iter().take(3).all(|row| row.len() == 4) {
+        true => Ok(rows.iter().take(3).map(|row| row.iter().map(number).collect()).collect()),
+        false => Err("transform_matrix must have 3 or 4 rows of 4 numbers"),
+    }
+}
+
 /// A 3×4 or 4×4 camera-to-world matrix with OpenGL axes → pose with OpenCV axes: y and z change sign.
 ///
 /// # Errors
@@ -211,7 +287,7 @@ pub fn opengl_to_pose(rows: &[Vec<f64>]) -> Result<Pose, &'static str> {
         return Err("transform_matrix must have 3 or 4 rows of 4 numbers");
     }
     if rows.iter().take(3).flatten().any(|v| !v.is_finite()) {
-        return Err("transform_matrix holds a number that is not finite");
+        return Err("transform_matrix holds NaN, null or an infinite number");
     }
     let column = |j: usize| DVec3::new(rows[0][j], rows[1][j], rows[2][j]);
     let m = DMat3::from_cols(column(0), -column(1), -column(2));

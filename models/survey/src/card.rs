@@ -25,12 +25,16 @@ mod error;
 mod exif;
 pub mod exposures;
 pub mod geotags;
+mod groups;
 mod lens;
 mod maker_note;
 mod notes;
 mod priors;
 mod record;
 mod scan;
+mod sources;
+mod subtitles;
+mod unread;
 mod vote;
 pub mod write;
 mod xmp;
@@ -55,6 +59,8 @@ pub struct Card {
     pub check: Vec<control::SurveyedPoint>,
     /// One line per thing a user should know: what was left out and why, what contradicts the rest.
     pub notes: Vec<String>,
+    /// One line per file of positions or surveyed points all of which was used, and per choice among pictures of several kinds.
+    pub read: Vec<String>,
     /// Names with the extension of a picture that were found.
     pub found: usize,
 }
@@ -71,12 +77,14 @@ pub struct CardOptions {
     pub check: Option<PathBuf>,
     /// Exposures out of a flight log, in order.
     pub exposures: Vec<Exposure>,
+    /// The band or lens whose pictures are taken, where a camera has several.
+    pub band: Option<String>,
 }
 
 impl Card {
-    /// True when there is a file with the extension of a picture below `folder`.
+    /// True when there is a file with the extension of a picture or a film below `folder`.
     pub fn has_pictures(folder: &Path) -> bool {
-        scan::pictures(&[folder.to_owned()]).is_ok_and(|found| !found.files.is_empty())
+        scan::pictures(&[folder.to_owned()]).is_ok_and(|found| !found.files.is_empty() || !found.unread.is_empty())
     }
 
     /// Reads what the pictures below `folders` say of themselves; of no picture more than its head is read.
@@ -84,34 +92,51 @@ impl Card {
     /// # Errors
     /// A folder cannot be read, nothing in it is a picture, or a file of positions is bad.
     pub fn open(folders: &[PathBuf], options: &CardOptions) -> Result<Self, CardError> {
-        let scan::Scanned { files, notes: mut lines, geotags, control: marked, .. } = scan::pictures(folders)?;
+        let scanned = scan::pictures(folders)?;
+        let scan::Scanned { files, notes: mut lines, geotags, control: marked, subtitles, unread, .. } = scanned;
         let first = folders.first().cloned().unwrap_or_default();
         let found = files.len();
+        let unread = unread.lines(&files);
         let mut notes = notes::Notes::default();
         let mut records = record::read_all(files, &mut notes);
         if records.is_empty() {
-            let why = notes.summary().unwrap_or_else(|| "there is none".to_owned());
+            let why: Vec<String> = notes.summary().into_iter().chain(unread).collect();
+            let why = if why.is_empty() { "there is none".to_owned() } else { why.join("; ") };
             return Err(CardError::NoPictures { path: first, why });
         }
+        lines.extend(unread);
+        let mut read = Vec::new();
+        groups::choose(&first, &mut records, options.band.as_deref(), &mut read)?;
+        for file in &subtitles {
+            // Subtitles of a film that nobody took pictures of are nobody's business.
+            lines.extend(subtitles::read(file).ok().and_then(|tags| geotags::apply_to_some(file, &tags, &mut records)));
+        }
         for file in options.geotags.iter().chain(&geotags) {
-            let tags = geotags::read(file)?;
-            lines.push(geotags::apply(file, &tags, &mut records));
+            let is_film = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("srt"));
+            let tags = if is_film { subtitles::read(file)? } else { geotags::read(file)? };
+            let (line, is_whole) = geotags::apply(file, &tags, &mut records)?;
+            if is_whole { &mut read } else { &mut lines }.push(line);
         }
         if !options.exposures.is_empty() {
             lines.push(exposures::apply(&options.exposures, &mut records));
         }
+        record::in_order(&mut records);
+        sources::standing_still(&mut records, &mut lines, &mut notes);
         let mut control = Vec::new();
         for file in options.control.iter().chain(&marked) {
-            let points = control::read(file)?;
-            lines.push(control::summary(file, &points, &records));
+            let mut points = control::read(file)?;
+            let (line, is_whole) = control::summary(file, &points, &records);
+            if is_whole { &mut read } else { &mut lines }.push(line);
+            sources::judge_points(file, &mut points, &records, &mut lines)?;
             control.extend(points);
         }
         let mut check = Vec::new();
         if let Some(file) = &options.check {
             check = control::read(file)?;
-            lines.push(control::summary(file, &check, &records));
+            let (line, is_whole) = control::summary(file, &check, &records);
+            if is_whole { &mut read } else { &mut lines }.push(line);
+            sources::judge_points(file, &mut check, &records, &mut lines)?;
         }
-        record::in_order(&mut records);
         if !records.iter().any(|r| r.fix.is_some()) {
             lines.push(format!(
                 "none of {} pictures says where it was taken (no GPS in EXIF or XMP, no geotags): the scene has no place, no north and no scale (neighbours are 1 apart); --geotags or --log would give them",
@@ -119,12 +144,12 @@ impl Card {
             ));
             let pictures = priors::without_positions(&records);
             lines.extend(notes.lines());
-            return Ok(Self { pictures, origin: None, control, check, notes: lines, found });
+            return Ok(Self { pictures, origin: None, control, check, notes: lines, read, found });
         }
         vote::settle(&mut records, &mut notes);
         let origin = priors::origin(&records);
         let pictures = priors::of(&records, &EnuFrame::new(origin), &mut notes);
         lines.extend(notes.lines());
-        Ok(Self { pictures, origin: Some(origin), control, check, notes: lines, found })
+        Ok(Self { pictures, origin: Some(origin), control, check, notes: lines, read, found })
     }
 }

@@ -8,28 +8,30 @@ use std::path::{Path, PathBuf};
 
 use geometry::geodesy::Geodetic;
 use geometry::lens::Distortion;
+use glam::DVec3;
 use image::imageops;
 
 use crate::card::control::SurveyedPoint;
 use crate::card::{Card, CardOptions};
+use crate::names::PictureNames;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
-use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
+use models::formats::reconstruction::{LensDescription, LocalFrame, Reconstruction, Shot};
 use models::formats::telemetry;
-use models::picture::{PictureError, decode_at_least};
+use models::picture::{PictureError, decode_shown};
 use models::undistort::undistort;
 
 mod ahead;
 mod error;
+mod facing;
 mod frame;
 mod masks;
-mod names;
 mod points;
 mod selection;
 mod sources;
+mod values;
 
 pub use error::DatasetError;
 pub use frame::DatasetFrame;
-pub use names::PictureNames;
 pub use points::SparsePoint;
 pub use selection::{Region, Split};
 use sources::{frames, reconstruction};
@@ -57,6 +59,8 @@ pub struct Dataset {
     pub split: Split,
     /// WGS-84 origin of the world frame, when known.
     pub origin: Option<Geodetic>,
+    /// How the description's coordinates became those of the frames; `None`: they are the same.
+    pub local: Option<LocalFrame>,
     /// What is to be known about a card: its poses are priors only, which the pictures must settle. `None` for a
     /// reconstruction.
     pub card: Option<CardNotes>,
@@ -67,6 +71,8 @@ pub struct Dataset {
 pub struct CardNotes {
     /// One line each: what was left out or changed, and why.
     pub lines: Vec<String>,
+    /// One line each: what was used as it is.
+    pub read: Vec<String>,
     /// Relative standard deviation of the focal lengths that the pictures state (the largest of the cameras').
     pub focal_sigma: f64,
     /// True when no picture states a distortion, so that it is for the pictures to tell.
@@ -108,6 +114,13 @@ impl Dataset {
             return Err(DatasetError::Request(format!("{}: describes no pictures", root.display())));
         }
         let gps = root.join("gps.csv");
+        let centers: Vec<DVec3> = frames.iter().map(|f| f.view.pose.center).collect();
+        // What GPS is compared with is in metres, and where it is.
+        let local = LocalFrame::of(&centers).filter(|_| origin.is_none() && !gps.is_file());
+        if let Some(local) = local {
+            tracing::info!("{}: coordinates are brought near their origin ({local})", root.display());
+            frames.iter_mut().for_each(|f| f.view.pose.center = local.into_own(f.view.pose.center));
+        }
         if gps.is_file() {
             let mut rows = telemetry::read(&gps, origin)?;
             for frame in &mut frames {
@@ -115,9 +128,12 @@ impl Dataset {
                 frame.prior = frame.telemetry.map(|t| t.prior);
             }
         }
-        Self { root: root.to_owned(), frames, split: Split::default(), origin, card: None }
-            .with_split(held_out)?
-            .with_masks()
+        let set = Self { root: root.to_owned(), frames, split: Split::default(), origin, local, card: None };
+        facing::check(&set)?;
+        let mut set = set.with_split(held_out)?;
+        masks::find(&mut set)?;
+        values::find(&mut set);
+        Ok(set)
     }
 
     /// Reads the pictures below `folders` by what they say of themselves, whatever reconstruction lies beside them.
@@ -130,6 +146,7 @@ impl Dataset {
         let distortion_unknown = card.pictures.iter().all(|p| p.lens.distortion.is_none());
         let notes = CardNotes {
             lines: card.notes,
+            read: card.read,
             focal_sigma,
             distortion_unknown,
             found: card.found,
@@ -148,21 +165,24 @@ impl Dataset {
                 distortion,
                 orientation,
                 mask: None,
+                values: None,
                 prior: Some(p.prior),
                 telemetry: None,
             }
         });
         let root = folders.first().cloned().unwrap_or_default();
         let frames = frames.collect();
-        Self { root, frames, split: Split::default(), origin: card.origin, card: Some(notes) }
-            .with_split(None)?
-            .with_masks()
+        let set = Self { root, frames, split: Split::default(), origin: card.origin, local: None, card: Some(notes) };
+        let mut set = set.with_split(None)?;
+        masks::find(&mut set)?;
+        values::find(&mut set);
+        Ok(set)
     }
 
     /// Takes poses and lenses that the pictures have settled on in place of a card's priors; pictures that are not among them
     /// (they could not be decoded) are left out of the set.
     pub fn settle(&mut self, settled: &HashMap<String, Settled>) {
-        self.retain(|frame| settled.contains_key(&frame.name));
+        masks::retain(self, |frame| settled.contains_key(&frame.name));
         for frame in &mut self.frames {
             let Some(Settled { view, distortion }) = settled.get(&frame.name) else { continue };
             frame.distortion = *distortion;
@@ -178,18 +198,15 @@ impl Dataset {
         let shots = self.frames.iter().map(|f| {
             let back = f.orientation.inverse();
             let lens = back.of_lens(&LensDescription::new(&f.view.intrinsics, f.distortion));
-            let pose = Pose { rotation: back.of_rotation(f.view.pose.rotation), center: f.view.pose.center };
+            let center = f.view.pose.center;
+            let center = self.local.map_or(center, |local| local.into_theirs(center));
+            let pose = Pose { rotation: back.of_rotation(f.view.pose.rotation), center };
             let whole = |path: &Path| {
                 std::path::absolute(path).unwrap_or_else(|_| path.to_owned()).to_string_lossy().into_owned()
             };
             Shot { path: whole(&f.path), lens, pose, mask: f.mask.as_deref().map(whole) }
         });
         Reconstruction { shots: shots.collect(), origin: self.origin }
-    }
-
-    /// Its pictures by name.
-    pub fn names(&self) -> PictureNames {
-        PictureNames::of(self.frames.iter().map(|f| f.name.as_str()))
     }
 
     fn frame(&self, i: usize) -> Result<&DatasetFrame, DatasetError> {
@@ -241,7 +258,8 @@ impl Dataset {
         let intrinsics = scaled(&frame.view.intrinsics, scale)?;
         let (pose, sigma) = self.pose(i, source)?;
         let (w, h) = (intrinsics.width, intrinsics.height);
-        let stored = decode_at_least(&frame.path, if frame.orientation.swaps() { (h, w) } else { (w, h) })?;
+        let wanted = if frame.orientation.swaps() { (h, w) } else { (w, h) };
+        let (stored, opaque) = decode_shown(&frame.path, wanted, frame.values)?;
         let mut image = frame.orientation.apply(stored);
         let full = &frame.view.intrinsics;
         // A description may speak of the full size while the folder holds a copy scaled down evenly.
@@ -265,9 +283,14 @@ impl Dataset {
             image = imageops::resize(&image, intrinsics.width, intrinsics.height, imageops::FilterType::Lanczos3);
         }
         let time_ns = frame.prior.map_or(0, |p| p.time_ns);
-        let mask = frame.mask_at(&intrinsics)?;
+        let mask = frame.mask_at(&intrinsics, opaque)?;
         Ok(PosedImage { name: frame.name.clone(), time_ns, image, mask, view: View { intrinsics, pose }, sigma })
     }
+}
+
+/// The pictures of a data set by name, numbered as its frames are.
+pub fn picture_names(set: &Dataset) -> PictureNames {
+    PictureNames::of(set.frames.iter().map(|f| f.name.as_str()))
 }
 
 /// The lens of a picture scaled by `scale`, at least one pixel wide and high.

@@ -10,5 +10,6 @@ pub mod georef;
 pub mod grid;
 pub mod height_raster;
 mod preview;
+pub mod up;
 
 pub use error::OrthoError;

@@ -164,7 +164,7 @@ fn what_is_wrong_with_a_file_is_one_line_and_the_rest_is_used() {
     let card = open(dir.path());
     let names: Vec<&str> = card.pictures.iter().map(|p| p.name.as_str()).collect();
     assert_eq!((names.len(), card.found), (8, 12), "{names:?}");
-    assert_note(&card, &["notes.jpg", "no JPEG, PNG or TIFF"]);
+    assert_note(&card, &["notes.jpg", "no JPEG, PNG, TIFF or WebP"]);
     assert_note(&card, &["empty.JPG", "is empty"]);
     assert_note(&card, &["DJI_0003.JPG", "cut off"]);
     assert_note(&card, &["the same file as another one"]);

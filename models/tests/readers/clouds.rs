@@ -171,10 +171,14 @@ fn spz_models() {
     };
     survive(&Reader {
         name: "spz",
-        seeds: [(0, 9), (3, 3)].map(|(degree, n)| written(|path| spz::write(path, &cloud(degree, n)))).into(),
+        seeds: [(0, 9), (3, 3)]
+            .map(|(degree, n)| {
+                written(|path| spz::write(path, &cloud(degree, n), spz::SpzOptions::default()).map(drop))
+            })
+            .into(),
         text: false,
         shell: Some(shell),
         memory: (512 << 10, 400),
-        read: Read::File("m.spz", &|path| line(spz::read(path), |model| all_valid(&model.cloud))),
+        read: Read::File("m.spz", &|path| line(spz::read(path, spz::Axes::Rub), |model| all_valid(&model.cloud))),
     });
 }

@@ -132,7 +132,7 @@ fn colmap_origin() {
         for (name, content) in beside.iter().filter(|b| !folder.join(b.0).exists()) {
             std::fs::write(folder.join(name), content).expect("written");
         }
-        let model = colmap::Model::find(folder).expect("a model");
+        let model = colmap::Model::find(folder).expect("readable").expect("a model");
         line(model.read(), |r| r.origin.is_some_and(|o| o.is_valid()))
     };
     let seeds = [r#"{"lat":48.1,"lon":11.5,"alt":500.0}"#, "{\n\"lat\": -33,\n\"lon\": 151.25,\n\"alt\": -3\n}"];

@@ -18,6 +18,7 @@ use vulkan::trainer::{Rendering, Trainer};
 
 use crate::error::EngineError;
 use crate::renderings;
+use crate::tiles;
 use crate::transfer::PoseTransfer;
 
 /// PSNR of equal pictures; JSON has no infinity.
@@ -145,7 +146,7 @@ pub fn evaluate(
     for (&i, file) in frames.iter().zip(&files) {
         let truth = set.load(i, scale)?;
         let view = View { intrinsics: truth.view.intrinsics, pose: into.transfer.apply(&truth.view.pose) };
-        trainer.render(&view, &mut rendering)?;
+        tiles::render(trainer, &view, &mut rendering)?;
         let Some(mut picture) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
             return Err(EngineError::RenderingSize(truth.name));
         };

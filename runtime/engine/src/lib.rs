@@ -42,6 +42,7 @@ mod resumed;
 pub mod source;
 #[cfg(test)]
 mod testing;
+pub mod tiles;
 mod training;
 pub mod transfer;
 mod waiting;

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use disk::Disk;
-use glam::{DVec2, DVec3};
-use models::camera::View;
+use glam::{DQuat, DVec2, DVec3, Vec3};
+use models::camera::{Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{Chunks, ModelHeader};
 use survey::ortho::OrthoError;
@@ -12,6 +12,7 @@ use survey::ortho::crs::Crs;
 use survey::ortho::extent::{Extent, SAMPLE, ViewsAround};
 use survey::ortho::files::{MapFiles, NO_HEIGHT, Written};
 use survey::ortho::grid::{BLOCK, Block, BlockView, Grid};
+use survey::ortho::up::{self, Up};
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::device::map_renderer;
@@ -35,12 +36,14 @@ pub struct MapRequest {
     pub bounds: Option<[f64; 4]>,
     /// Ground that fewer training pictures saw is left out.
     pub min_views: usize,
+    /// The axis that points up, where the model is nowhere on Earth; `None`: what its cameras say.
+    pub up: Option<Up>,
 }
 
 impl Default for MapRequest {
     fn default() -> Self {
         // bench map: orthophoto 26.0 dB of what two pictures saw, 29.3 dB of what four did; the sparsest flights leave few places to four.
-        Self { gsd: None, most_pixels: None, epsg: None, bounds: None, min_views: 3 }
+        Self { gsd: None, most_pixels: None, epsg: None, bounds: None, min_views: 3, up: None }
     }
 }
 
@@ -49,6 +52,8 @@ pub struct Map {
     extent: Extent,
     grid: Grid,
     min_views: usize,
+    /// Model → a frame whose z is up, which all else here is in.
+    turn: DQuat,
 }
 
 /// Keeps what the TIFF writer puts aside on the disk of `folder`: the system's temporary folder is memory on many boards. For
@@ -93,8 +98,25 @@ impl Map {
     /// # Errors
     /// A request that makes no map of this model.
     pub fn of(header: &ModelHeader, cloud: &GaussianCloud, request: &MapRequest) -> Result<Self, EngineError> {
-        let views: Vec<View> = header.views.iter().map(|(_, view)| *view).collect();
-        let Some(extent) = Extent::of(cloud, &views, &header.region) else {
+        let mut views: Vec<View> = header.views.iter().map(|(_, view)| *view).collect();
+        let turn = match (header.origin, request.up) {
+            (Some(_), Some(_)) => return Err(OrthoError::KnownUp.into()),
+            (Some(_), None) => DQuat::IDENTITY,
+            (None, Some(up)) => up.turn(),
+            (None, None) => up::found(&views)?,
+        };
+        let mut turned = None;
+        if turn != DQuat::IDENTITY {
+            tracing::info!("the scene is turned so that its vertical {:.2} is up", turn.conjugate() * DVec3::Z);
+            for view in &mut views {
+                view.pose = Pose { rotation: turn * view.pose.rotation, center: turn * view.pose.center };
+            }
+            // Where and how solid they are is all that is asked of them.
+            let cloud = turned.insert(cloud.clone());
+            let rotation = turn.as_quat();
+            cloud.means.iter_mut().for_each(|m| *m = (rotation * Vec3::from_array(*m)).to_array());
+        }
+        let Some(extent) = Extent::of(turned.as_ref().unwrap_or(cloud), &views, &header.region) else {
             return Err(EngineError::Request("the model holds no solid ground inside of its region".into()));
         };
         let crs = match (header.origin, request.epsg) {
@@ -121,7 +143,7 @@ impl Map {
             let size = bounds[1] - bounds[0];
             gsd = gsd.max((size.x * size.y / f64::from(most.max(1))).sqrt());
         }
-        Ok(Self { extent, grid: Grid::new(crs, bounds, gsd)?, min_views: request.min_views })
+        Ok(Self { extent, grid: Grid::new(crs, bounds, gsd)?, min_views: request.min_views, turn })
     }
 
     /// Ground that fewer training pictures saw is left out.
@@ -175,7 +197,11 @@ impl Map {
         }
         let ground = self.extent.ground(place);
         let look = self.grid.look(block, self.extent.top(place))?;
-        trainer.render_orthographic(&look.view, &mut into.rendering)?;
+        let back = self.turn.conjugate();
+        let pose = &look.view.pose;
+        let mut view = look.view;
+        view.pose = Pose { rotation: back * pose.rotation, center: back * pose.center };
+        trainer.render_orthographic(&view, &mut into.rendering)?;
         let pixels = block.width as usize * block.height as usize;
         into.rgba.clear();
         into.rgba.resize(4 * pixels, 0);

@@ -69,6 +69,11 @@ mod tests {
             ["a.jpg.png", "a.jpg_depth.png", "a_depth.jpg.png", "a_depth.jpg_depth.png"]
         );
         assert_eq!(of(&["../../etc/a.png", "./b"], &[".png"]), ["etc/a.png", "b.png"], "nothing leads out");
+        for name in ["/tmp/esc/..", "..", "", "/", "C:\\x\\..\\..\\a.jpg"] {
+            let file = PathBuf::from(of(&[name], &[".png"]).concat());
+            assert!(file.components().all(|part| matches!(part, Component::Normal(_))), "{name:?}: {file:?}");
+            assert!(file.extension().is_some_and(|e| e == "png"), "{name:?}: {file:?}");
+        }
         let error = places(&["x/a.jpg", "x/a.jpg"], &[".png"]).err().map(|e| e.to_string()).unwrap_or_default();
         assert!(error.contains("a.jpg") && !error.contains('\n'), "{error}");
     }

@@ -8,7 +8,7 @@
 use geometry::median;
 use glam::{DQuat, DVec3};
 use models::camera::{Pose, View};
-use survey::dataset::Dataset;
+use survey::dataset::{Dataset, picture_names};
 
 /// Neighbours that vote: enough to average their noise, few enough to stay local.
 const NEIGHBOURS: usize = 4;
@@ -35,7 +35,7 @@ impl PoseTransfer {
     /// Without a common picture, or with equal poses, nothing is moved. Pairs that share a name and not the motion of the
     /// others are left out, which is said; where most do, nothing is moved.
     pub fn between(set: &Dataset, model_views: &[(String, View)]) -> Self {
-        let found = set.names().pair(model_views.iter().map(|(name, _)| name.as_str()));
+        let found = picture_names(set).pair(model_views.iter().map(|(name, _)| name.as_str()));
         let pairs = found.iter().zip(model_views).filter_map(|(i, (_, view))| {
             let i = (*i)?;
             Some((set.frames[i].view.pose, view.pose))

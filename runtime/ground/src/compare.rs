@@ -7,7 +7,7 @@ use image::RgbImage;
 use models::camera::View;
 use models::formats::model;
 use models::metrics::to_rgb8;
-use survey::dataset::Dataset;
+use survey::dataset::{Dataset, picture_names};
 use vulkan::trainer::{Rendering, Trainer};
 
 use super::region::Region;
@@ -121,7 +121,7 @@ fn by_nearest_training_view(
     frames: &[usize],
     locals: &[(String, PathBuf)],
 ) -> Result<Vec<Vec<usize>>, EngineError> {
-    let (known, mut centers) = (set.names(), Vec::new());
+    let (known, mut centers) = (picture_names(set), Vec::new());
     for (m, (_, path)) in locals.iter().enumerate() {
         let header = model::read_header(path)?.0;
         let trained = known.pair(header.views.iter().map(|(name, _)| name.as_str()));

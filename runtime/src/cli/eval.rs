@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 use engine::device::{file_renderer, map_renderer};
 use engine::evaluate::{BaselineScores, IntoModel, Scores, baselines, evaluate, heights, open_metric};
 use engine::ortho::{Map, MapRequest};
+use engine::tiles;
 use models::formats::model::{Chunks, ModelHeader};
 use serde::Serialize;
-use survey::dataset::Dataset;
+use survey::card::CardOptions;
+use survey::dataset::{Dataset, picture_names};
 
 use super::CliError;
 use super::plan::largest;
@@ -33,6 +35,9 @@ pub struct Args {
     /// Only the pictures of this region.
     #[arg(long)]
     pub region: Option<String>,
+    /// Of a card with several bands or lenses the one of this name, as it was trained.
+    #[arg(long, value_name = "NAME")]
+    pub band: Option<String>,
     /// Image scale, above 0 and at most 1.
     #[arg(long, default_value_t = 1.0)]
     pub scale: f64,
@@ -76,7 +81,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return compare_heights(&args, reference);
     }
     let dataset = args.dataset.clone().unwrap_or_default();
-    let mut set = Dataset::open(&dataset)?;
+    let mut set = match args.band.clone() {
+        None => Dataset::open(&dataset)?,
+        band => Dataset::open_card(std::slice::from_ref(&dataset), &CardOptions { band, ..CardOptions::default() })?,
+    };
     take_settled(&mut set, &args.model)?;
     let frames = set.select(&args.split, args.region.as_deref())?;
     if frames.is_empty() {
@@ -84,7 +92,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let (width, height) = largest(&set, &frames, args.scale)?;
     let mut metric = open_metric(args.metric.as_deref(), (width, height))?;
-    let (header, mut trainer) = file_renderer(args.device.as_deref(), &args.model, (width, height))?;
+    let (header, mut trainer) = file_renderer(args.device.as_deref(), &args.model, tiles::size((width, height)))?;
     let into = IntoModel::of(&set, &header);
     let scores = evaluate(&mut trainer, &set, &frames, args.scale, &into, metric.as_mut(), args.save.as_deref())?;
     let naive = match args.baselines {
@@ -152,7 +160,7 @@ fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
 /// What a naive guess may use: the pictures the model was trained on, where this data set has them, else the split
 /// `train`; never an evaluated one.
 fn training_frames(set: &Dataset, header: &ModelHeader, held_out: &[usize]) -> Result<Vec<usize>, CliError> {
-    let used = set.names().pair(header.views.iter().map(|(name, _)| name.as_str()));
+    let used = picture_names(set).pair(header.views.iter().map(|(name, _)| name.as_str()));
     let mut frames: Vec<usize> = used.into_iter().flatten().collect();
     frames.sort_unstable();
     if frames.is_empty() {

@@ -12,7 +12,7 @@ pub(super) const EXAMPLES: &Examples = &[
         &["dgtr train pictures --out model --seconds 120", "dgtr train /media/card/DCIM --out model --preset medium"],
     ),
     ("eval", &["dgtr eval model/model.dgtr pictures --split test --baselines"]),
-    ("render", &["dgtr render model/model.dgtr --cameras pictures --out renders"]),
+    ("render", &["dgtr render model/model.dgtr --cameras pictures/transforms.json --out renders"]),
     ("ortho", &["dgtr ortho global.dgtr --out map --gsd 5"]),
     ("aggregate", &["dgtr aggregate west/model.dgtr east/model.dgtr --out merged"]),
     (

@@ -6,16 +6,18 @@ use clap::ValueEnum;
 use disk::Disk;
 use geometry::lens::Distortion;
 use glam::DVec3;
+use models::camera::Pose;
 use models::cloud::{GaussianCloud, SH_C0};
 use models::formats::colmap::Point;
 use models::formats::delivery::Rounding;
 use models::formats::model::{Chunks, ModelHeader};
 use models::formats::reconstruction::{LensDescription, Reconstruction, Shot};
+use models::formats::spz::{Axes, SpzOptions};
 use models::formats::{colmap, gltf, model, opensfm, ply, sog, spz, transforms};
 use models::levels;
 use pages::viewer::{self, ViewerRequest};
 use survey::dataset::Dataset;
-use survey::ortho::georef::{FROM_Y_UP, Georef, shifted};
+use survey::ortho::georef::{FROM_Y_UP, Georef, Rows, shifted};
 
 use super::CliError;
 use crate::cli::output::outln;
@@ -25,7 +27,7 @@ use crate::cli::output::outln;
 pub enum Format {
     /// 3DGS point cloud: every viewer reads it; keeps the georeference as a comment.
     Ply,
-    /// Niantic's SPZ, version 3: a tenth of the size, rounded.
+    /// Niantic's SPZ: a tenth of the size, rounded.
     Spz,
     /// PlayCanvas' SOG: a tenth of the size, rounded less than SPZ; for viewers in a browser.
     Sog,
@@ -43,6 +45,24 @@ pub enum Format {
     Nerfstudio,
     /// Poses and lenses as OpenSfM's and OpenDroneMap's reconstruction.json, in a folder.
     Opensfm,
+}
+
+/// Which way the coordinates of an SPZ file point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SpzAxes {
+    /// Right, up, back, as the format says: half a turn about x from a PLY's.
+    Rub,
+    /// The model's own, as a PLY has them.
+    Own,
+}
+
+impl From<SpzAxes> for Axes {
+    fn from(axes: SpzAxes) -> Self {
+        match axes {
+            SpzAxes::Rub => Self::Rub,
+            SpzAxes::Own => Self::Own,
+        }
+    }
 }
 
 impl Format {
@@ -66,6 +86,12 @@ pub struct Args {
     /// With `--to ply|spz|sog|gltf|html|streamed`: leave out colours of a higher degree (0: the same colour from every side).
     #[arg(long, value_name = "0-3", value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: Option<u8>,
+    /// With `--to spz`: axes of the file.
+    #[arg(long, value_enum)]
+    pub axes: Option<SpzAxes>,
+    /// With `--to spz`: version of the format, 3 (which all viewers read) or 4.
+    #[arg(long, value_name = "3|4", value_parser = clap::value_parser!(u8).range(3..=4))]
+    pub spz_version: Option<u8>,
     /// With `--to delivery`: rounded more finely, for scenes seen from near (trained with `--for-delivery=fine`); a third more bytes.
     #[arg(long)]
     pub fine: bool,
@@ -92,6 +118,8 @@ impl Args {
                 "--sh-degree",
                 "ply, spz, sog, gltf, html and streamed",
             ),
+            (self.axes.is_some() && self.format != Format::Spz, "--axes", "spz"),
+            (self.spz_version.is_some() && self.format != Format::Spz, "--spz-version", "spz"),
             (self.thumbnails.is_some() && !of_html, "--thumbnails", "html"),
             (self.device.is_some() && !of_html, "--device", "html"),
         ];
@@ -149,7 +177,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         return Err(CliError::input(format!("{}: keeps no views; give --cameras", args.model.display())));
     }
     match args.format {
-        Format::Colmap => colmap::write(&out, &cameras, &points(&cloud))?,
+        Format::Colmap => colmap::write(&out, &cameras, &points(&header, &cloud))?,
         Format::Nerfstudio => transforms::write(&out, &cameras)?,
         _ => opensfm::write(&out, &cameras)?,
     }
@@ -160,7 +188,23 @@ pub fn run(args: Args) -> Result<(), CliError> {
 /// The Gaussians for others, and beside them where on Earth they are.
 fn scene(args: &Args, out: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result<(), CliError> {
     let middle = DVec3::from_array(cloud.middle().map(f64::from));
-    let georef = |to_enu| Georef::new(out, header.origin, to_enu, middle);
+    // Whoever puts the file beside others needs their coordinates, not ours.
+    let theirs = |rows: Rows| match header.local {
+        Some(local) => [0, 1, 2].map(|k| {
+            let mut row = rows[k].map(|v| v / local.scale);
+            row[3] += local.shift[k];
+            row
+        }),
+        None => rows,
+    };
+    if let Some(local) = header.local {
+        tracing::info!(
+            "{}: its coordinates are not those of the pictures' poses ({local}); {} leads back",
+            out.display(),
+            Georef::path(out).display()
+        );
+    }
+    let georef = |to_enu| Georef::new(out, header.origin, theirs(to_enu), middle);
     let as_they_are = shifted([0.0; 3]);
     let georef = match args.format {
         Format::Html => {
@@ -174,8 +218,20 @@ fn scene(args: &Args, out: &Path, header: &ModelHeader, cloud: &GaussianCloud) -
         }
         Format::Sog => georef(shifted(sog::write(out, cloud)?.shift.map(f64::from)))?,
         Format::Spz => {
-            spz::write(out, cloud)?;
-            georef(as_they_are)?
+            let axes = args.axes.map(Axes::from).unwrap_or_default();
+            let written = spz::write(out, cloud, SpzOptions { axes, is_latest: args.spz_version == Some(4) })?;
+            if written.strays > 0 {
+                tracing::warn!(
+                    "{}: {} Gaussians far from all others were left out, which would have cost everybody's precision",
+                    out.display(),
+                    written.strays
+                );
+            }
+            let mut rows = shifted(written.shift.map(f64::from));
+            if axes == Axes::Rub {
+                (rows[1][1], rows[2][2]) = (-1.0, -1.0);
+            }
+            georef(rows)?
         }
         _ => {
             ply::write(out, cloud, header.origin)?;
@@ -222,17 +278,23 @@ fn views(header: &ModelHeader) -> Reconstruction {
     let shots = header.views.iter().map(|(name, view)| Shot {
         path: name.clone(),
         lens: LensDescription::new(&view.intrinsics, Distortion::default()),
-        pose: view.pose,
+        pose: Pose { center: theirs(header, view.pose.center), ..view.pose },
         mask: None,
     });
     Reconstruction { shots: shots.collect(), origin: header.origin }
 }
 
+/// Coordinates as the pictures' poses had them.
+fn theirs(header: &ModelHeader, own: DVec3) -> DVec3 {
+    header.local.map_or(own, |local| local.into_theirs(own))
+}
+
 /// Centres and plain colours: what other trainers start from.
-fn points(cloud: &GaussianCloud) -> Vec<Point> {
+fn points(header: &ModelHeader, cloud: &GaussianCloud) -> Vec<Point> {
     let stride = cloud.sh_stride();
     let color =
         |i: usize| [0, 1, 2].map(|c| ((0.5 + SH_C0 * cloud.sh[i * stride + c]).clamp(0.0, 1.0) * 255.0).round() as u8);
     let valid = (0..cloud.len()).filter(|i| cloud.is_valid(*i));
-    valid.map(|i| Point { position: cloud.means[i].map(f64::from), color: color(i) }).collect()
+    let place = |i: usize| theirs(header, DVec3::from_array(cloud.means[i].map(f64::from))).to_array();
+    valid.map(|i| Point { position: place(i), color: color(i) }).collect()
 }

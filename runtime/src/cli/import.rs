@@ -1,18 +1,25 @@
-//! `dgtr import FILE`: a 3DGS PLY or an SPZ, from any trainer, as a model to evaluate, render, continue or merge.
+//! `dgtr import FILE`: Gaussians in another program's form as a model to evaluate, render, continue or merge.
 
 use std::path::PathBuf;
 
+use glam::DVec3;
+use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
-use models::formats::{ply, spz};
+use models::formats::reconstruction::LocalFrame;
+use models::formats::splats;
 
 use super::CliError;
+use super::export::SpzAxes;
 use crate::cli::output::outln;
 
 /// Arguments of `dgtr import`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The 3DGS .ply or .spz file.
+    /// A PLY (3DGS, 2DGS, compressed), SPZ, SOG, .glb or .splat file, told by its content.
     pub file: PathBuf,
+    /// Axes of an SPZ file.
+    #[arg(long, value_enum, default_value = "rub")]
+    pub axes: SpzAxes,
     /// Where to write the model; default: beside the file, with the extension .dgtr.
     #[arg(long)]
     pub out: Option<PathBuf>,
@@ -23,14 +30,14 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let is_spz = args.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("spz"));
-    let (cloud, origin, dropped) = if is_spz {
-        let read = spz::read(&args.file)?;
-        (read.cloud, None, read.dropped)
-    } else {
-        let read = ply::read(&args.file)?;
-        (read.cloud, read.origin, read.dropped)
-    };
+    let read = splats::read(&args.file, args.axes.into())?;
+    let (mut cloud, origin, dropped) = (read.cloud, read.origin, read.dropped);
+    if read.is_antialiased {
+        tracing::warn!(
+            "{}: trained with antialiasing (Mip-Splatting), which dgtr does not render: what is thinner than a pixel looks fuller",
+            args.file.display()
+        );
+    }
     if cloud.is_empty() {
         return Err(CliError::input(format!("{}: holds no usable Gaussian", args.file.display())));
     }
@@ -38,8 +45,32 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if out == args.file {
         return Err(CliError::input(format!("{}: would overwrite itself; give another --out", out.display())));
     }
-    let header = ModelHeader { origin, finished: true, ..Default::default() };
+    let local = if origin.is_none() { moved(&mut cloud) } else { None };
+    if let Some(local) = local {
+        tracing::warn!(
+            "{}: lies far from its origin; its coordinates are brought near it ({local})",
+            args.file.display()
+        );
+    }
+    let header = ModelHeader { origin, local, finished: true, ..Default::default() };
     model::write(&out, &header, &cloud)?;
-    outln!("{}: {} Gaussians, {} unusable ones left out", out.display(), cloud.len(), dropped);
+    outln!("{}: {} Gaussians of a {}, {dropped} unusable ones left out", out.display(), cloud.len(), read.form);
     Ok(())
+}
+
+/// Means looked at for where a cloud lies.
+const SAMPLED: usize = 100_000;
+
+/// Brings a cloud that lies far from its origin near it; its size is its trainer's business.
+fn moved(cloud: &mut GaussianCloud) -> Option<LocalFrame> {
+    let every = cloud.len().div_ceil(SAMPLED).max(1);
+    let places: Vec<DVec3> = cloud.means.iter().step_by(every).map(|m| DVec3::from_array(m.map(f64::from))).collect();
+    let local = LocalFrame { scale: 1.0, ..LocalFrame::of(&places)? };
+    if local.shift == [0.0; 3] {
+        return None;
+    }
+    for m in &mut cloud.means {
+        *m = local.into_own(DVec3::from_array(m.map(f64::from))).as_vec3().to_array();
+    }
+    Some(local)
 }

@@ -2,12 +2,14 @@
 
 use std::path::PathBuf;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use disk::Disk;
 use engine::device::map_renderer;
 use engine::ortho::{Map, MapRequest, keep_scratch_in};
 use job::console;
 use job::interrupt;
 use models::formats::model::Chunks;
+use survey::ortho::up::Up;
 
 use super::CliError;
 use crate::error::JobError;
@@ -33,12 +35,20 @@ pub struct Args {
     /// Another projected reference system in metres, by its EPSG code.
     #[arg(long, value_name = "CODE")]
     pub epsg: Option<u16>,
+    /// The axis that points up, of a model that is nowhere on Earth [default: what its cameras say].
+    #[arg(long, value_name = "AXIS", value_parser = ups(), allow_hyphen_values = true)]
+    pub up: Option<Up>,
     /// Leave out ground that fewer training pictures saw.
     #[arg(long, value_name = "N", default_value_t = MapRequest::default().min_views)]
     pub min_views: usize,
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
+}
+
+fn ups() -> impl TypedValueParser<Value = Up> {
+    let names = Up::NAMED.map(|(name, _)| name);
+    PossibleValuesParser::new(names).try_map(|name| Up::named(&name).ok_or("no such axis"))
 }
 
 fn four(text: &str) -> Result<[f64; 4], String> {
@@ -58,6 +68,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         epsg: args.epsg,
         bounds: args.bounds,
         min_views: args.min_views,
+        up: args.up,
         ..MapRequest::default()
     };
     let map = Map::of_file(&model, &request)?;
@@ -75,6 +86,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let Some(written) = written else {
         return Err(CliError::interrupted(format!("stopped; no new map in {}", args.out.display())));
     };
+    if let Some(local) = model.header.local {
+        tracing::info!("{}: the map's metres are not those of the pictures' poses ({local})", args.out.display());
+    }
     let crs = map.grid().crs().epsg().map_or("the model's own metres".to_owned(), |code| format!("EPSG:{code}"));
     progress.finish(&format!(
         "{}: {columns} × {rows} pixels of {:.3} m in {crs}, {:.1} % covered",

@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 
 use engine::device::file_renderer;
 use engine::evaluate::save_png;
-use engine::renderings;
+use engine::{renderings, tiles};
 use image::{ImageBuffer, Luma};
 use job::console;
 use job::interrupt;
 use models::camera::View;
 use models::formats::reconstruction::Shot;
-use models::formats::{FormatError, transforms, write_atomic};
+use models::formats::{FormatError, model, transforms, write_atomic};
 use models::metrics::to_rgb8;
 use vulkan::trainer::Rendering;
 
@@ -46,7 +46,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if !(args.depth_unit > 0.0 && args.depth_unit.is_finite()) {
         return Err(CliError::input(format!("--depth-unit {} must be a positive number of metres", args.depth_unit)));
     }
-    let cameras = transforms::read(&args.cameras)?;
+    let mut cameras = transforms::read(&args.cameras)?;
+    if let Some(local) = model::read_header(&args.model)?.0.local {
+        cameras.shots.iter_mut().for_each(|shot| shot.pose.center = local.into_own(shot.pose.center));
+    }
     let views: Vec<(String, View)> =
         cameras.shots.iter().map(|s| Ok((s.path.clone(), view(&args.cameras, s)?))).collect::<Result<_, CliError>>()?;
     let bent = cameras.shots.iter().filter(|s| !s.lens.distortion.is_none()).count();
@@ -59,7 +62,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let files = renderings::places(&names, &[".png", "_depth.png"])?;
     let width = views.iter().map(|v| v.1.intrinsics.width).max().unwrap_or(1);
     let height = views.iter().map(|v| v.1.intrinsics.height).max().unwrap_or(1);
-    let (_, mut trainer) = file_renderer(args.device.as_deref(), &args.model, (width, height))?;
+    let (_, mut trainer) = file_renderer(args.device.as_deref(), &args.model, tiles::size((width, height)))?;
     let stop = interrupt::Interrupt::install()?;
     let mut progress = console::Progress::new("rendering", views.len() as u64);
     let mut rendering = Rendering::default();
@@ -71,7 +74,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 args.out.display()
             )));
         }
-        trainer.render(view, &mut rendering)?;
+        tiles::render(&mut trainer, view, &mut rendering)?;
         let Some(color) = to_rgb8(&rendering.rgb, rendering.width, rendering.height) else {
             return Err(CliError::failed(format!("{name}: the rendering has another size than its camera")));
         };

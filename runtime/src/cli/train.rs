@@ -20,7 +20,7 @@ use survey::dataset::PoseSource;
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::train_job::{TrainJob, log};
+use crate::train_job::{PictureScale, TrainJob, log};
 
 /// A settings file has a few KiB.
 const SETTINGS_LIMIT: u64 = 1 << 20;
@@ -101,18 +101,8 @@ pub struct Args {
     /// Take telemetry poses as they are.
     #[arg(long, help_heading = POSES)]
     no_refine: bool,
-    /// Positions of a card's pictures: OpenDroneMap's geo.txt, Mission Planner's list, geotags.csv of `dgtr fly`.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
-    geotags: Option<PathBuf>,
-    /// The flight's log beside a card, MAVLink (.tlog) or ArduPilot (.BIN), matched by order and time.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
-    log: Option<PathBuf>,
-    /// Surveyed points marked in a card's pictures; a gcp_list.txt beside them is found without this.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
-    gcp: Option<PathBuf>,
-    /// Surveyed points in a file of that form that measure the finished model instead of helping it.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
-    check: Option<PathBuf>,
+    #[command(flatten)]
+    card: CardArgs,
 
     /// Where the first Gaussians come from.
     #[arg(long, value_enum, default_value = "feed-forward", help_heading = START)]
@@ -168,6 +158,38 @@ pub struct Args {
     /// TOML file with any of the mission file's tables [training], [init], [refine], [network], [keyframes], [failsafe].
     #[arg(long, value_name = "FILE", help_heading = RECIPE)]
     settings: Option<PathBuf>,
+}
+
+/// What a card of pictures is read with.
+#[derive(Debug, clap::Args)]
+struct CardArgs {
+    /// Positions of a card's pictures: OpenDroneMap's geo.txt, Mission Planner's list, geotags.csv of `dgtr fly`, a film's .SRT.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    geotags: Option<PathBuf>,
+    /// The flight's log beside a card, MAVLink (.tlog) or ArduPilot (.BIN), matched by order and time.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    log: Option<PathBuf>,
+    /// Surveyed points marked in a card's pictures; a gcp_list.txt beside them is found without this.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    gcp: Option<PathBuf>,
+    /// Of a card with several bands or lenses the one of this name [default: natural colours].
+    #[arg(long, value_name = "NAME", help_heading = PICTURES)]
+    band: Option<String>,
+    /// Surveyed points in a file of that form that measure the finished model instead of helping it.
+    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    check: Option<PathBuf>,
+}
+
+impl CardArgs {
+    fn options(self) -> Result<CardOptions, CliError> {
+        Ok(CardOptions {
+            geotags: self.geotags,
+            control: self.gcp,
+            check: self.check,
+            exposures: self.log.as_deref().map(log::exposures).transpose()?.unwrap_or_default(),
+            band: self.band,
+        })
+    }
 }
 
 /// Headings of the options.
@@ -242,12 +264,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let job = TrainJob {
         folders: args.folders,
-        card: CardOptions {
-            geotags: args.geotags,
-            control: args.gcp,
-            check: args.check,
-            exposures: args.log.as_deref().map(log::exposures).transpose()?.unwrap_or_default(),
-        },
+        card: args.card.options()?,
         out: args.out,
         split: args.split,
         region: args.region,
@@ -273,7 +290,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
         max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
         scene_gaussians: args.scene_gaussians,
         view_slots: args.view_slots,
-        scale: args.scale.or(preset.map(|p| p.image_scale.into())),
+        scale: args
+            .scale
+            .map(PictureScale::Exactly)
+            .unwrap_or_else(|| preset.map_or(PictureScale::AsHeld, |p| PictureScale::OfJob(p.image_scale.into()))),
         device: args.device,
         network: settings.network,
         checkpoint_seconds: args.checkpoint_seconds,
@@ -286,6 +306,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let ended = job.run()?;
     let model = job.model_path();
+    if !ended.finished && !model.is_file() {
+        return Err(CliError::interrupted(format!(
+            "interrupted before there was a model in {}; the same command begins again",
+            job.out.display()
+        )));
+    }
     if !ended.finished {
         return Err(CliError::interrupted(format!(
             "interrupted after {} steps; {} is valid, the same command continues it",

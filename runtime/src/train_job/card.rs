@@ -16,14 +16,14 @@ use models::formats::reconstruction::Shot;
 use models::formats::transforms;
 use models::refine::Refiner;
 use survey::card::name_list;
-use survey::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled};
+use survey::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled, picture_names};
 
 use crate::error::JobError;
 
 mod control;
 
 /// Poses of a card, in the folder of the model.
-const FILE: &str = "transforms.json";
+pub(super) const FILE: &str = "transforms.json";
 /// Rotations that the pictures contradict by more than this many standard deviations, and this many degrees, are named.
 const CONTRADICTION: (f64, f64) = (5.0, 20.0);
 
@@ -60,6 +60,7 @@ fn announce(set: &Dataset, notes: &CardNotes) {
         set.frames.len(),
         sizes.join(", ")
     );
+    notes.read.iter().for_each(|line| tracing::info!("{line}"));
     notes.lines.iter().for_each(|line| tracing::warn!("{line}"));
 }
 
@@ -131,7 +132,7 @@ pub fn take_settled(set: &mut Dataset, model: &Path) -> Result<(), JobError> {
     let file = model.with_file_name(FILE);
     let earlier = if file.is_file() { transforms::read(&file)?.shots } else { Vec::new() };
     // The card may be mounted elsewhere now.
-    let pairs = set.names().pair(earlier.iter().map(|s| s.path.as_str()));
+    let pairs = picture_names(set).pair(earlier.iter().map(|s| s.path.as_str()));
     let settled: HashMap<_, _> = pairs
         .into_iter()
         .zip(&earlier)
@@ -274,12 +275,14 @@ fn refined(
     refiner.set_control(surveyed::marked(set, &notes.control, scale));
     if notes.floats {
         let placed = refiner.bootstrap()?;
-        tracing::info!(
-            "{} of {} pictures placed, from {}",
-            placed.placed,
-            all.len(),
-            placed.start.map_or_else(String::new, |s| s.join(" and "))
-        );
+        match placed.start {
+            Some(pair) => {
+                tracing::info!("{} of {} pictures placed, from {}", placed.placed, all.len(), pair.join(" and "));
+            }
+            None => {
+                tracing::warn!("none of {} pictures placed: no two show enough of the same from two places", all.len())
+            }
+        }
     }
     let (mut solved, mut found) = (refiner.solve()?, Found::in_pictures(set, &refiner));
     for _ in 0..if notes.floats { FLOATING_LOOKS } else { 1 } {
@@ -294,7 +297,7 @@ fn refined(
         "{} of {} pictures tied together, reprojection {:.2} px",
         solved.frames_tied,
         all.len(),
-        solved.reprojection_rms_px
+        solved.reprojection_rms_px.max(0.0)
     ));
     let Found { mut settled, contradicted, untied } = found;
     if !contradicted.is_empty() {
@@ -312,7 +315,7 @@ fn refined(
         let what = if notes.floats { "cannot be placed; left out" } else { "their stated poses are kept" };
         tracing::warn!("{}: see too little of what others see; {what}", name_list(&untied));
     }
-    control::announce(&solved.control);
+    control::announce(&solved.control, &notes.control);
     let fixed = refiner.is_fixed().then(|| notes.control[0].position);
     if notes.floats {
         remarks.push(("pictures_not_placed", serde_json::json!(untied)));

@@ -11,7 +11,7 @@ use models::camera::Pinhole;
 use survey::dataset::Dataset;
 
 use super::TrainJob;
-use super::scale::largest;
+use super::scale::{PictureScale, largest};
 use crate::error::JobError;
 
 /// Points and pictures that are looked at for the share of a scene that a picture shows, at the most; and the least of points that says
@@ -76,7 +76,7 @@ impl TrainJob {
             steps: self.steps,
             seconds,
             max_gaussians: self.max_gaussians.map(|n| u32::try_from(n).unwrap_or(u32::MAX)),
-            image_scale: self.scale,
+            image_scale: self.scale.exact(),
         };
         Ok(wanted.choose(&cost, &Room::of(gpu.info(), self.budget_mib, None), gpu.info().lanes()))
     }
@@ -85,7 +85,9 @@ impl TrainJob {
     pub(super) fn fill(&mut self, choice: &Choice) {
         self.budget_mib = self.budget_mib.or(Some(choice.device_mib));
         self.max_gaussians = self.max_gaussians.or(Some(choice.max_gaussians as usize));
-        self.scale = self.scale.or(Some(choice.image_scale));
+        if self.scale.exact().is_none() {
+            self.scale = PictureScale::Exactly(choice.image_scale);
+        }
         if self.training.seconds.is_none() {
             self.seconds = self.seconds.or(choice.seconds);
         }

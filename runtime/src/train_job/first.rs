@@ -37,6 +37,11 @@ pub(super) fn check(model: &Chunks, set: &Dataset) -> Result<(), JobError> {
                 "--from: the model's frame begins at {from}, that of the pictures at {set}; give a model of the same frame"
             )))
         }
+        // A model that was moved by itself lies where nobody else's does.
+        _ if model.header.local != set.local => Err(JobError::Request(
+            "--from: the model's coordinates were brought near another origin than those of the pictures; give a model of the same frame"
+                .to_owned(),
+        )),
         _ => Ok(()),
     }
 }

@@ -3,6 +3,7 @@
 use config::plan::{Lanes, Plan, WORKING_SIDE};
 use engine::device::DeviceRequest;
 use engine::preset::SCALES;
+use survey::card::name_list;
 use survey::dataset::{Dataset, scaled};
 
 use super::TrainJob;
@@ -10,8 +11,31 @@ use crate::error::JobError;
 
 /// Room that must remain for Gaussians before pictures are made larger: a small survey's worth.
 const GAUSSIANS_OF_A_CARD: usize = 100_000;
+/// Pictures of fewer pixels a side show nothing.
+const LEAST_SIDE: u32 = 8;
 /// Lanes that share the work at most; fewer need less memory.
 const MOST_LANES: Lanes = Lanes::CARD;
+
+/// How large pictures are trained, as a share of their size.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum PictureScale {
+    /// This, whatever the memory.
+    Exactly(f64),
+    /// That of a size of job, or less where its memory does not hold it.
+    OfJob(f64),
+    /// As large as the memory holds.
+    AsHeld,
+}
+
+impl PictureScale {
+    /// What was asked for.
+    pub fn exact(self) -> Option<f64> {
+        match self {
+            Self::Exactly(scale) => Some(scale),
+            _ => None,
+        }
+    }
+}
 
 /// Size of the largest picture by area.
 pub(super) fn largest(set: &Dataset, frames: &[usize], scale: f64) -> Result<(u32, u32), JobError> {
@@ -20,16 +44,43 @@ pub(super) fn largest(set: &Dataset, frames: &[usize], scale: f64) -> Result<(u3
     Ok(sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height)))
 }
 
-impl TrainJob {
-    /// The scale asked for; else the largest for which the device holds all pictures and, for a card, Gaussians worth the name;
-    /// for more pictures than that a working size, and some of them wait in a file.
-    pub(super) fn picture_scale(&self, set: &Dataset, is_card: bool) -> Result<f64, JobError> {
-        if let Some(scale) = self.scale {
-            return Ok(scale);
+/// Those of `frames` that have something to learn from at `scale`; the others are named.
+///
+/// # Errors
+/// There is none.
+pub(super) fn large_enough(set: &Dataset, frames: Vec<usize>, scale: f64) -> Result<Vec<usize>, JobError> {
+    let mut small = Vec::new();
+    let mut left = Vec::with_capacity(frames.len());
+    for i in frames {
+        let lens = scaled(&set.frames[i].view.intrinsics, scale)?;
+        match lens.width.min(lens.height) < LEAST_SIDE {
+            true => small.push(&set.frames[i].name),
+            false => left.push(i),
         }
+    }
+    if !small.is_empty() {
+        let what = format!("fewer than {LEAST_SIDE} pixels a side at scale {scale}");
+        if left.is_empty() {
+            return Err(JobError::Request(format!("{}: its pictures have {what}; raise --scale", set.root.display())));
+        }
+        tracing::warn!("{}: {what}; left out", name_list(&small));
+    }
+    Ok(left)
+}
+
+impl TrainJob {
+    /// The scale asked for; else the largest, up to that of the size of job, for which the device holds all pictures and, for a card,
+    /// Gaussians worth the name; for more pictures than that a working size, and some of them wait in a file.
+    pub(super) fn picture_scale(&self, set: &Dataset, is_card: bool) -> Result<f64, JobError> {
+        let named = match self.scale {
+            PictureScale::Exactly(scale) => return Ok(scale),
+            PictureScale::OfJob(scale) => Some(scale),
+            PictureScale::AsHeld => None,
+        };
         let frames = set.select(&self.split, self.region.as_deref())?;
         let wanted = if is_card { self.max_gaussians.unwrap_or(usize::MAX).min(GAUSSIANS_OF_A_CARD) } else { 0 };
-        for scale in SCALES.into_iter().rev() {
+        let most = named.unwrap_or(1.0);
+        for scale in SCALES.into_iter().rev().filter(|scale| *scale <= most) {
             let all_on_device = DeviceRequest {
                 device: None,
                 device_mib: self.budget_mib(),
@@ -47,15 +98,17 @@ impl TrainJob {
                 plan.is_ok_and(|p| p.gaussians >= wanted)
             };
             let (w, h) = all_on_device.size;
-            if holds(&all_on_device) || (w.max(h) <= WORKING_SIDE && holds(&some_in_file)) {
-                if is_card || scale < 1.0 {
+            // Whoever names a size of job means the pictures at that size.
+            let may_wait = w.max(h) <= WORKING_SIDE || named.is_some();
+            if holds(&all_on_device) || (may_wait && holds(&some_in_file)) {
+                if is_card || scale < most {
                     tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {} MiB hold", self.budget_mib());
                 }
                 return Ok(scale);
             }
         }
         // Not even the smallest fits: the plan itself says what is missing.
-        Ok(1.0)
+        Ok(most)
     }
 
     /// Crops that find use: all of all pictures, at the most as many as the settings say.

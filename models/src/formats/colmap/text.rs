@@ -48,22 +48,47 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, LensDescription>, Form
 pub(super) fn images(path: &Path) -> Result<Vec<ColmapImage>, FormatError> {
     let mut lines = Lines::open(path, LINE)?;
     let mut images = Vec::new();
-    while let Some(row) = lines.next_row()? {
-        // `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, where a name may hold spaces.
-        let mut cells = row.splitn(10, ' ').map(str::trim);
-        let first: Vec<&str> = cells.by_ref().take(9).collect();
-        let (Some(name), Some(v)) = (cells.next(), numbers::<9>(&first)) else {
-            return Err(lines.bad("an image is `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`"));
-        };
-        let Some(pose) = pose([v[1], v[2], v[3], v[4]], DVec3::new(v[5], v[6], v[7])) else {
-            return Err(lines.bad(&format!("image {name:?} has no usable pose")));
-        };
-        images.push(ColmapImage { id: v[0] as u32, name: name.to_owned(), camera_id: v[8] as u32, pose });
+    let mut next = lines.next_row()?;
+    while let Some(row) = next {
+        let image = image(&row).ok_or_else(|| lines.bad("an image is `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`"))?;
+        images.push(image.map_err(|name| lines.bad(&format!("image {name:?} has no usable pose")))?);
         check_count(path, images.len() as u64)?;
-        // Its keypoints, which may be none: an empty line.
-        lines.next_line()?;
+        // Its keypoints, which may be none: an empty line. Some writers leave the line out.
+        let line = lines.next_line()?.map(|line| line.trim().to_owned());
+        next = match line {
+            Some(line) if is_image(&line) => Some(line),
+            Some(_) => lines.next_row()?,
+            None => None,
+        };
     }
     Ok(images)
+}
+
+/// `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, where a name may hold spaces; the name of one without a usable pose.
+fn image(row: &str) -> Option<Result<ColmapImage, String>> {
+    let mut rest = row;
+    let mut v = [0.0; 9];
+    for value in &mut v {
+        let (cell, after) = rest.trim_start().split_once(char::is_whitespace)?;
+        *value = cell.parse().ok()?;
+        rest = after;
+    }
+    let name = rest.trim();
+    if name.is_empty() {
+        return None;
+    }
+    let pose = pose([v[1], v[2], v[3], v[4]], DVec3::new(v[5], v[6], v[7]));
+    Some(
+        pose.map(|pose| ColmapImage { id: v[0] as u32, name: name.to_owned(), camera_id: v[8] as u32, pose })
+            .ok_or(name.to_owned()),
+    )
+}
+
+/// Whether a line in the place of keypoints is the next image: these come in threes, all numbers.
+fn is_image(line: &str) -> bool {
+    let cells: Vec<&str> = line.split_whitespace().collect();
+    let keypoints = cells.len().is_multiple_of(3) && cells.iter().all(|cell| cell.parse::<f64>().is_ok());
+    !line.starts_with('#') && !keypoints && matches!(image(line), Some(Ok(_)))
 }
 
 pub(super) fn points(path: &Path, take: &mut dyn FnMut(ColmapPoint)) -> Result<(), FormatError> {

@@ -1,15 +1,15 @@
 //! Surveyed points marked in pictures: OpenDroneMap's `gcp_list.txt`. Its first line is the reference system; every other line is
 //! `x y z pixel-x pixel-y picture [name [sigma-horizontal sigma-vertical]]`, the standard deviations in metres being ours.
 
-use std::collections::HashSet;
 use std::path::Path;
 
 use geometry::geodesy::Geodetic;
 use glam::DVec3;
 
 use super::record::Record;
-use crate::ortho::crs::SurveyCrs;
-use models::formats::{FormatError, read_bounded};
+use crate::coordinates::{Reference, cells, number, picture_name, text};
+use crate::names::PictureNames;
+use models::formats::FormatError;
 
 /// A hundred thousand marks at 160 bytes each.
 const LIMIT: u64 = 16 << 20;
@@ -31,7 +31,7 @@ pub struct SurveyedPoint {
     pub position: Geodetic,
     /// Standard deviation, horizontal and vertical, metres.
     pub sigma_m: [f64; 2],
-    /// Pictures that show it (lower-case file names), and where: pixels of the picture as it is stored, the top left corner being
+    /// Pictures that show it (in lower case, as the file names them), and where: pixels of the picture as it is stored, the top left corner being
     /// (0, 0).
     pub marks: Vec<(String, [f64; 2])>,
 }
@@ -41,26 +41,32 @@ pub struct SurveyedPoint {
 /// # Errors
 /// The file cannot be read, its first line names no known reference system, or a line is no mark of a point.
 pub fn read(path: &Path) -> Result<Vec<SurveyedPoint>, FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let text = std::str::from_utf8(&bytes).map_err(|_| FormatError::invalid(path, "not UTF-8 text"))?;
+    let text = text(path, LIMIT)?;
     let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#'));
-    let first = lines.next().map(|(_, l)| l.trim().trim_start_matches('\u{feff}')).unwrap_or_default();
-    let crs = SurveyCrs::named(first).ok_or_else(|| {
-        FormatError::invalid(
-            path,
-            format!("line 1: {first:?} names no known reference system (EPSG:CODE, WGS84 UTM 32N, +proj=…)"),
-        )
-    })?;
+    let first = lines.next().map(|(_, l)| l.trim()).unwrap_or_default();
+    let unknown = || format!("{first:?} names no known reference system (EPSG:CODE, WGS84 UTM 32N, +proj=…)");
+    let crs = Reference::named(first).unwrap_or_else(|| Err(unknown()));
+    let crs = crs.map_err(|why| FormatError::invalid(path, format!("line 1: {why}")))?;
     let same = SAME[usize::from(crs.is_in_degrees())];
     let mut points: Vec<(DVec3, SurveyedPoint)> = Vec::new();
     for (i, line) in lines {
         let bad = |what: &str| FormatError::invalid(path, format!("line {}: {what}", i + 1));
-        let cells: Vec<&str> = line.split([' ', '\t', ',']).filter(|c| !c.is_empty()).collect();
-        let number = |k: usize| cells.get(k)?.parse::<f64>().ok().filter(|v| v.is_finite());
-        let five = (|| Some([number(0)?, number(1)?, number(2)?, number(3)?, number(4)?]))();
-        let (Some([x, y, z, u, v]), Some(picture)) = (five, cells.get(5)) else {
+        let cells: Vec<&str> = cells(line).into_iter().filter(|c| !c.is_empty()).collect();
+        let numbers: Vec<f64> = cells.iter().take(5).map_while(|cell| number(cell)).collect();
+        if points.is_empty()
+            && numbers.is_empty()
+            && cells.len() >= 6
+            && cells[0].chars().all(|c| c.is_alphabetic() || c == '_')
+        {
+            // The names of the columns.
+            continue;
+        }
+        let (&[x, y, z, u, v], Some((picture, taken))) =
+            (numbers.as_slice(), picture_name(cells.get(5..).unwrap_or_default()))
+        else {
             return Err(bad("x, y, z, the pixel's x and y and a picture's name are needed"));
         };
+        let more = &cells[5 + taken..];
         let mark = (picture.to_lowercase(), [u, v]);
         let place = DVec3::new(x, y, z);
         let known = points.iter_mut().find(|(at, _)| (*at - place).abs().max_element() < same);
@@ -74,24 +80,26 @@ pub fn read(path: &Path) -> Result<Vec<SurveyedPoint>, FormatError> {
             )));
         }
         let position = crs.geodetic(place).ok_or_else(|| bad("is outside of its reference system"))?;
-        let name = cells.get(6).map_or_else(|| (points.len() + 1).to_string(), |name| (*name).to_owned());
-        let sigma_m = [7, 8].map(|k| number(k).filter(|s| *s > 0.0));
+        let name = more.first().map_or_else(|| (points.len() + 1).to_string(), |name| (*name).to_owned());
+        let sigma_m = [1, 2].map(|k| number(more.get(k)?).filter(|s| *s > 0.0));
         let sigma_m = [0, 1].map(|k| sigma_m[k].unwrap_or(SIGMA_M[k]).clamp(SIGMAS_M[0], SIGMAS_M[1]));
         points.push((place, SurveyedPoint { name, position, sigma_m, marks: vec![mark] }));
     }
     Ok(points.into_iter().map(|(_, point)| point).collect())
 }
 
-/// One line: how many points are marked in how many of the card's pictures.
-pub(super) fn summary(path: &Path, points: &[SurveyedPoint], records: &[Record]) -> String {
-    let names: HashSet<String> = records.iter().map(|r| r.name.to_lowercase()).collect();
+/// One line: how many points are marked in how many of the card's pictures; and whether all of these are here.
+pub(super) fn summary(path: &Path, points: &[SurveyedPoint], records: &[Record]) -> (String, bool) {
+    let names: Vec<String> = records.iter().map(|r| r.name.to_lowercase()).collect();
+    let names = PictureNames::of(names.iter().map(String::as_str));
     let marks = points.iter().flat_map(|p| &p.marks);
-    let (here, elsewhere): (Vec<_>, Vec<_>) = marks.partition(|(picture, _)| names.contains(picture));
+    let (here, elsewhere): (Vec<_>, Vec<_>) = marks.partition(|(picture, _)| names.find(picture).is_some());
     let others = match elsewhere.first() {
         Some((picture, _)) => format!("; {} marks are in pictures that are not here ({picture}, …)", elsewhere.len()),
         None => String::new(),
     };
-    format!("{}: {} surveyed points with {} marks{others}", path.display(), points.len(), here.len())
+    let line = format!("{}: {} surveyed points with {} marks{others}", path.display(), points.len(), here.len());
+    (line, elsewhere.is_empty())
 }
 
 #[cfg(test)]

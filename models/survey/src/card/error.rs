@@ -20,8 +20,18 @@ pub enum CardError {
         /// The operating system's word.
         source: std::io::Error,
     },
+    /// No picture is of the band that was asked for.
+    #[error("{}: has no pictures of a band called {wanted:?}; there are: {known}", path.display())]
+    NoBand {
+        /// The first folder.
+        path: PathBuf,
+        /// The band.
+        wanted: String,
+        /// Bands with their number of pictures.
+        known: String,
+    },
     /// Nothing to use.
-    #[error("{}: no picture in it can be used ({why}); give a folder that holds JPEG, PNG or TIFF files", path.display())]
+    #[error("{}: no picture in it can be used ({why}); give a folder that holds JPEG, PNG, TIFF or WebP files", path.display())]
     NoPictures {
         /// The first folder.
         path: PathBuf,

@@ -53,27 +53,39 @@ impl Fields<'_> {
     }
 
     fn degrees(&self, tag: Tag, reference: Tag, negative: char) -> Option<f64> {
-        let Value::Rational(v) = self.value(tag)? else { return None };
+        let parts: Vec<f64> = match self.value(tag)? {
+            Value::Rational(v) => v.iter().map(exif::Rational::to_f64).collect(),
+            // Some firmware writes the signed type, and with it the sign.
+            Value::SRational(v) => v.iter().map(exif::SRational::to_f64).collect(),
+            Value::Float(v) => v.iter().map(|v| f64::from(*v)).collect(),
+            Value::Double(v) => v.clone(),
+            _ => return None,
+        };
         // Degrees alone, or with minutes, or with seconds.
-        let part = |i: usize| v.get(i).map_or(0.0, |r| r.to_f64());
-        let degrees = v.first()?.to_f64() + part(1) / 60.0 + part(2) / 3600.0;
-        let negative = self.text(reference).is_some_and(|r| r.to_uppercase().starts_with(negative));
+        let part = |i: usize| parts.get(i).map_or(0.0, |v| v.abs());
+        let degrees = part(0) + part(1) / 60.0 + part(2) / 3600.0;
+        let below = parts.first()?.is_sign_negative() || parts.iter().any(|v| *v < 0.0);
+        let negative = below || self.text(reference).is_some_and(|r| r.to_uppercase().starts_with(negative));
         degrees.is_finite().then_some(if negative { -degrees } else { degrees })
     }
 
-    /// Latitude, longitude and altitude; 0/0 is what a receiver without a fix writes, and is none.
-    pub(super) fn position(&self) -> Option<Geodetic> {
+    /// Latitude and longitude; 0/0 is what a receiver without a fix writes, and is none.
+    pub(super) fn place(&self) -> Option<[f64; 2]> {
         let lat_deg = self.degrees(Tag::GPSLatitude, Tag::GPSLatitudeRef, 'S')?;
         let lon_deg = self.degrees(Tag::GPSLongitude, Tag::GPSLongitudeRef, 'W')?;
+        let valid = Geodetic { lat_deg, lon_deg, alt_m: 0.0 }.is_valid() && (lat_deg, lon_deg) != (0.0, 0.0);
+        valid.then_some([lat_deg, lon_deg])
+    }
+
+    /// Altitude.
+    pub(super) fn altitude(&self) -> Option<f64> {
         let below = self.value(Tag::GPSAltitudeRef).and_then(|v| match v {
             Value::Byte(b) => b.first().copied(),
             other => other.get_uint(0).map(|n| n as u8),
         });
-        let alt_m = self.number(Tag::GPSAltitude).unwrap_or(0.0);
+        let alt_m = self.number(Tag::GPSAltitude)?;
         // Some makers write a signed altitude as well as the reference.
-        let alt_m = if matches!(below, Some(1 | 3)) { -alt_m.abs() } else { alt_m };
-        let position = Geodetic { lat_deg, lon_deg, alt_m };
-        (position.is_valid() && (lat_deg, lon_deg) != (0.0, 0.0)).then_some(position)
+        Some(if matches!(below, Some(1 | 3)) { -alt_m.abs() } else { alt_m })
     }
 
     /// Horizontal standard deviation, metres: the stated error, else 1.5 m per unit of dilution of precision.

@@ -1,14 +1,18 @@
-//! Files of positions: OpenDroneMap's `geo.txt`, Mission Planner's geotag list, our own `geotags.csv` and anything else whose
-//! first line names its columns.
+//! Files of positions: OpenDroneMap's `geo.txt`, Mission Planner's geotag list, our own `geotags.csv`, anything else whose first line
+//! names its columns.
 
-use std::collections::HashMap;
 use std::path::Path;
 
 use geometry::geodesy::Geodetic;
-use glam::DQuat;
+use glam::{DQuat, DVec3};
 
-use super::record::{Attitude, AttitudeSource, Fix, GPS_SIGMA_M, Record, nadir_rotation};
-use models::formats::{FormatError, read_bounded};
+use super::record::{
+    Attitude, AttitudeSource, FROM_HORIZON_DEG, Fix, GPS_SIGMA_M, Record, UNKNOWN_HEIGHT_SIGMA_M, nadir_rotation,
+};
+use crate::coordinates::{self, Reference, cells, number, picture_name};
+use crate::names::PictureNames;
+use models::formats::FormatError;
+use models::formats::telemetry::dji_rotation;
 use models::picture::Orientation;
 
 /// A hundred thousand pictures at 600 bytes each.
@@ -19,53 +23,76 @@ const LIMIT: u64 = 64 << 20;
 pub struct Geotag {
     /// Position with its standard deviations.
     pub fix: Fix,
+    /// Whether the file says its height, too.
+    pub has_height: bool,
     /// Attitude, where the file has one.
     pub attitude: Option<Attitude>,
 }
 
-/// Reads a file of positions: tags by lower-case file name without its extension (a flight stores its pictures as PNG under
-/// the camera's names).
+/// Reads a file of positions: tags by what it calls the pictures, in lower case.
 ///
 /// # Errors
 /// The file cannot be read, names no columns that are understood, or a line is no number where one must be.
-pub fn read(path: &Path) -> Result<HashMap<String, Geotag>, FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let text = std::str::from_utf8(&bytes).map_err(|_| FormatError::invalid(path, "not UTF-8 text"))?;
-    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
-    let Some((_, first)) = lines.next() else { return Err(FormatError::invalid(path, "is empty")) };
-    let projection = Projection::parse(first.trim().trim_start_matches('\u{feff}'));
-    let columns = match &projection {
-        Some(Ok(_)) => Columns::of_geo_txt(),
-        Some(Err(what)) => return Err(FormatError::invalid(path, what.clone())),
-        None => Columns::named(first).ok_or_else(|| {
+pub fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
+    let text = coordinates::text(path, LIMIT)?;
+    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()).peekable();
+    if lines.peek().is_none() {
+        return Err(FormatError::invalid(path, "is empty"));
+    }
+    // Metashape names the reference system in a comment before the columns.
+    let (mut reference, mut columns) = (None, None);
+    while let Some((number, line)) = lines.peek().copied() {
+        if let Some(named) = Columns::named(line) {
+            columns = Some(named);
+            lines.next();
+            break;
+        }
+        match Reference::named(line) {
+            Some(Ok(known)) => reference = Some(known),
+            Some(Err(why)) => return Err(FormatError::invalid(path, format!("line {}: {why}", number + 1))),
+            None if line.trim_start().starts_with('#') => {}
+            None => break,
+        }
+        lines.next();
+    }
+    let is_table = columns.is_some();
+    let columns = match (columns, &reference) {
+        (Some(columns), _) => columns,
+        (None, Some(_)) => Columns::of_geo_txt(),
+        (None, None) => {
             let what = "its first line is neither a projection (EPSG:4326, WGS84 UTM 32N) nor names columns for picture, latitude, longitude and altitude";
-            FormatError::invalid(path, what)
-        })?,
+            return Err(FormatError::invalid(path, what));
+        }
     };
-    let mut tags = HashMap::new();
-    for (number, line) in lines.filter(|(_, l)| !l.trim_start().starts_with('#')) {
-        let cells = split(line);
-        let bad = |what: &str| FormatError::invalid(path, format!("line {}: {what}", number + 1));
+    let mut tags = Vec::new();
+    for (at, line) in lines.filter(|(_, l)| !l.trim_start().starts_with('#')) {
+        let mut cells = cells(line);
+        let named = if is_table { None } else { picture_name(&cells) };
+        if let Some((_, taken)) = &named {
+            // Blanks in a picture's name are none between columns.
+            cells.drain(1..*taken);
+        }
+        let bad = |what: &str| FormatError::invalid(path, format!("line {}: {what}", at + 1));
         let cell = |i: Option<usize>| i.and_then(|i| cells.get(i)).map(|c| c.trim()).filter(|c| !c.is_empty());
         let value = |i: Option<usize>| -> Result<Option<f64>, FormatError> {
             let Some(c) = cell(i) else { return Ok(None) };
-            match c.parse::<f64>() {
-                Ok(v) if v.is_finite() => Ok(Some(v)),
-                _ => Err(bad(&format!("{c:?} is not a number"))),
-            }
+            number(c).map(Some).ok_or_else(|| bad(&format!("{c:?} is not a number")))
         };
-        let Some(name) = cell(Some(columns.name)) else { return Err(bad("names no picture")) };
+        let name = named.map(|n| n.0).or_else(|| cell(Some(columns.name)).map(str::to_owned));
+        let Some(name) = name else { return Err(bad("names no picture")) };
         let (Some(x), Some(y)) = (value(Some(columns.x))?, value(Some(columns.y))?) else {
             return Err(bad("has no position"));
         };
-        let alt_m = value(columns.alt)?.unwrap_or(0.0);
-        let position = match &projection {
-            Some(Ok(p)) => p.to_geodetic(x, y, alt_m),
-            _ => Geodetic { lat_deg: y, lon_deg: x, alt_m },
+        let alt_m = value(columns.alt)?;
+        let position = match &reference {
+            Some(reference) => reference.geodetic(DVec3::new(x, y, alt_m.unwrap_or_default())),
+            None => Some(Geodetic { lat_deg: y, lon_deg: x, alt_m: alt_m.unwrap_or_default() }),
         };
-        if !position.is_valid() {
-            return Err(bad(&format!("{y}, {x} is not a position on the earth")));
-        }
+        let Some(position) = position.filter(Geodetic::is_valid) else {
+            return Err(bad(&format!(
+                "{y}, {x} is not a position on the earth; a table in metres needs a line EPSG:CODE before it"
+            )));
+        };
         let three = |of: [Option<usize>; 3]| -> Result<Option<[f64; 3]>, FormatError> {
             Ok(match (value(of[0])?, value(of[1])?, value(of[2])?) {
                 (Some(a), Some(b), Some(c)) => Some([a, b, c]),
@@ -74,6 +101,7 @@ pub fn read(path: &Path) -> Result<HashMap<String, Geotag>, FormatError> {
         };
         let horizontal = value(columns.sigma[0])?.filter(|s| *s > 0.0).unwrap_or(GPS_SIGMA_M);
         let vertical = value(columns.sigma[1])?.filter(|s| *s > 0.0).unwrap_or(horizontal);
+        let vertical = if alt_m.is_some() { vertical } else { UNKNOWN_HEIGHT_SIGMA_M };
         let attitude = match (three([columns.q[1], columns.q[2], columns.q[3]])?, value(columns.q[0])?) {
             (Some([x, y, z]), Some(w)) => {
                 let q = DQuat::from_xyzw(x, y, z, w);
@@ -82,51 +110,73 @@ pub fn read(path: &Path) -> Result<HashMap<String, Geotag>, FormatError> {
                 }
                 Some(Attitude { rotation: q.normalize(), source: AttitudeSource::Gimbal })
             }
-            _ => three(columns.angles)?.map(|[y, p, r]| Attitude {
-                rotation: nadir_rotation(y, p, r),
-                source: if projection.is_some() { AttitudeSource::Gimbal } else { AttitudeSource::Airframe },
+            // No mapping camera looks back: a pitch like that is measured from the horizon, as in XMP.
+            _ => three(columns.angles)?.map(|[y, p, r]| match p < FROM_HORIZON_DEG {
+                true => Attitude { rotation: dji_rotation(y, p, r), source: AttitudeSource::Gimbal },
+                false => Attitude {
+                    rotation: nadir_rotation(y, p, r),
+                    source: if is_table { AttitudeSource::Airframe } else { AttitudeSource::Gimbal },
+                },
             }),
         };
-        tags.insert(key(name), Geotag { fix: Fix { position, sigma_m: [horizontal, vertical] }, attitude });
+        let fix = Fix { position, sigma_m: [horizontal, vertical] };
+        tags.push((name.to_lowercase(), Geotag { fix, has_height: alt_m.is_some(), attitude }));
     }
     Ok(tags)
 }
 
-fn key(name: &str) -> String {
-    let file = name.rsplit(['/', '\\']).next().unwrap_or(name).to_lowercase();
-    file.rsplit_once('.').map_or(file.clone(), |(stem, _)| stem.to_owned())
-}
-
-/// Gives the pictures their tags, which count more than what the pictures say; one line about it.
-pub(super) fn apply(file: &Path, tags: &HashMap<String, Geotag>, records: &mut [Record]) -> String {
-    let mut used = 0;
-    for r in records.iter_mut() {
-        let Some(tag) = tags.get(&key(&r.path.to_string_lossy())) else { continue };
-        used += 1;
-        r.fix = Some(tag.fix);
-        // Heights above take-off belong to another scale than a file's.
-        r.relative_alt_m = None;
+/// Gives the pictures their tags, which count more than what the pictures say; one line about it, and whether every picture has one.
+///
+/// # Errors
+/// The file's positions are nowhere near those of the pictures themselves.
+pub(super) fn apply(
+    file: &Path,
+    tags: &[(String, Geotag)],
+    records: &mut [Record],
+) -> Result<(String, bool), FormatError> {
+    let paths: Vec<String> = records.iter().map(|r| r.path.to_string_lossy().to_lowercase()).collect();
+    let names = PictureNames::of(paths.iter().map(String::as_str));
+    let found = names.pair(tags.iter().map(|(name, _)| name.as_str()));
+    let pairs: Vec<(usize, &Geotag)> =
+        found.into_iter().zip(tags).filter_map(|(i, (_, tag))| Some((i?, tag))).collect();
+    let stated = pairs.iter().filter_map(|(i, tag)| Some((records[*i].fix?.position, tag.fix.position)));
+    super::sources::near_what_pictures_say(file, &stated.collect::<Vec<_>>())?;
+    for (i, tag) in &pairs {
+        let r = &mut records[*i];
+        match (tag.has_height, &mut r.fix) {
+            // The picture's own height is better than none.
+            (false, Some(fix)) => {
+                let alt_m = fix.position.alt_m;
+                fix.position = Geodetic { alt_m, ..tag.fix.position };
+                fix.sigma_m[0] = tag.fix.sigma_m[0];
+            }
+            _ => {
+                r.fix = Some(tag.fix);
+                // Heights above take-off belong to another scale than a file's.
+                r.relative_alt_m = None;
+            }
+        }
         if tag.attitude.is_some() {
             r.attitude = tag.attitude;
             r.orientation = Orientation::default();
         }
     }
-    format!("{}: positions of {used} of {} pictures ({} lines)", file.display(), records.len(), tags.len())
+    let line = format!(
+        "{}: positions of {} of {} pictures ({} lines)",
+        file.display(),
+        pairs.len(),
+        records.len(),
+        tags.len()
+    );
+    Ok((line, pairs.len() == records.len()))
 }
 
-fn split(line: &str) -> Vec<&str> {
-    let separator = [',', ';', '\t'].into_iter().find(|s| line.contains(*s));
-    match separator {
-        Some(s) => {
-            let mut quoted = false;
-            let between = |c: char| {
-                quoted ^= c == '"';
-                c == s && !quoted
-            };
-            line.split(between).map(|c| c.trim().trim_matches('"')).collect()
-        }
-        None => line.split_whitespace().collect(),
-    }
+/// As [`apply`] for a film's subtitles; `None` where no picture is a frame of the film.
+pub(super) fn apply_to_some(file: &Path, tags: &[(String, Geotag)], records: &mut [Record]) -> Option<String> {
+    let names: Vec<String> = records.iter().map(|r| r.name.to_lowercase()).collect();
+    let names = PictureNames::of(names.iter().map(String::as_str));
+    let is_any = tags.iter().any(|(name, _)| names.find(name).is_some());
+    is_any.then(|| apply(file, tags, records).map_or_else(|e| e.to_string(), |(line, _)| line))
 }
 
 /// Where what stands.
@@ -158,19 +208,23 @@ impl Columns {
     }
 
     fn named(line: &str) -> Option<Self> {
-        let names: Vec<String> = split(line).iter().map(|n| n.trim_start_matches('#').trim().to_lowercase()).collect();
+        let names: Vec<String> = cells(line).iter().map(|n| n.trim_start_matches('#').trim().to_lowercase()).collect();
         let starting = |of: &[&str]| of.iter().find_map(|o| names.iter().position(|n| n.starts_with(o)));
         let exactly = |of: &str| names.iter().position(|n| n == of);
+        let holding = |of: &str| names.iter().position(|n| n.contains(of) && !n.contains("accuracy"));
         let accuracy = |axis: &[&str]| {
             let sigma =
                 |n: &String| (n.contains("accuracy") || n.contains("sigma")) && axis.iter().any(|a| n.contains(a));
             names.iter().position(sigma)
         };
+        // Metashape writes "X/Longitude", RealityCapture x and y.
+        let x = starting(&["lon", "lng", "east"]).or_else(|| holding("longitude")).or_else(|| exactly("x"));
+        let y = starting(&["lat", "north"]).or_else(|| holding("latitude")).or_else(|| exactly("y"));
         Some(Self {
-            name: starting(&["picture", "image", "name", "file", "photo", "label"])?,
-            y: starting(&["lat"])?,
-            x: starting(&["lon", "lng"])?,
-            alt: starting(&["alt", "height", "elev"]),
+            name: starting(&["picture", "image", "name", "file", "photo", "label", "source"])?,
+            y: y?,
+            x: x?,
+            alt: starting(&["alt", "height", "elev"]).or_else(|| holding("altitude")).or_else(|| exactly("z")),
             angles: [starting(&["yaw", "heading"]), starting(&["pitch"]), starting(&["roll"])],
             q: ["qw", "qx", "qy", "qz"].map(exactly),
             sigma: [accuracy(&["hor", "xy"]).or(exactly("sigma_m")), accuracy(&["ver", "z"])],
@@ -178,114 +232,16 @@ impl Columns {
     }
 }
 
-/// How positions are written in `geo.txt`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Projection {
-    /// Longitude and latitude, degrees.
-    Degrees,
-    /// Universal Transverse Mercator, metres.
-    Utm { zone: u8, south: bool },
-}
-
-impl Projection {
-    /// `None` where the line is no projection; an error where it is one that is not understood.
-    fn parse(line: &str) -> Option<Result<Self, String>> {
-        let upper = line.to_uppercase();
-        let utm = |zone: u8, south: bool| match (1..=60).contains(&zone) {
-            true => Ok(Self::Utm { zone, south }),
-            false => Err(format!("{line:?}: UTM has zones 1 to 60")),
-        };
-        if let Some(code) = upper.strip_prefix("EPSG:") {
-            return Some(match code.trim().parse::<u32>() {
-                Ok(4326 | 4979) => Ok(Self::Degrees),
-                Ok(code @ 32_601..=32_660) => utm((code - 32_600) as u8, false),
-                Ok(code @ 32_701..=32_760) => utm((code - 32_700) as u8, true),
-                _ => Err(format!("{line}: positions can be read in EPSG:4326 and WGS84 UTM (EPSG:326xx, EPSG:327xx)")),
-            });
-        }
-        if upper.contains("+PROJ=LONGLAT") || upper.contains("+PROJ=LATLONG") {
-            return Some(Ok(Self::Degrees));
-        }
-        if let Some(rest) = upper.strip_prefix("WGS84 UTM ").or(upper.strip_prefix("WGS 84 UTM ")) {
-            let rest = rest.trim();
-            let zone = rest.trim_end_matches(['N', 'S']).trim().parse().unwrap_or(0);
-            return Some(utm(zone, rest.ends_with('S')));
-        }
-        if upper.contains("+PROJ=UTM") {
-            let zone =
-                upper.split("+ZONE=").nth(1).and_then(|z| z.split_whitespace().next()?.parse().ok()).unwrap_or(0);
-            return Some(utm(zone, upper.contains("+SOUTH")));
-        }
-        upper.starts_with("+PROJ").then(|| Err(format!("{line}: only longlat and utm can be read")))
-    }
-
-    fn to_geodetic(self, x: f64, y: f64, alt_m: f64) -> Geodetic {
-        match self {
-            Self::Degrees => Geodetic { lat_deg: y, lon_deg: x, alt_m },
-            Self::Utm { zone, south } => from_utm(zone, south, x, y, alt_m),
-        }
-    }
-}
-
-/// Inverse UTM by Krüger's series to n⁴ (Karney, "Transverse Mercator with an accuracy of a few nanometers", eqs. 12 and
-/// 36): below a millimetre within a zone.
-fn from_utm(zone: u8, south: bool, easting: f64, northing: f64, alt_m: f64) -> Geodetic {
-    const A: f64 = 6_378_137.0;
-    const F: f64 = 1.0 / 298.257_223_563;
-    let n: f64 = F / (2.0 - F);
-    let (n2, n3, n4) = (n * n, n.powi(3), n.powi(4));
-    let radius = A / (1.0 + n) * (1.0 + n2 / 4.0 + n4 / 64.0);
-    let beta = [
-        n / 2.0 - 2.0 * n2 / 3.0 + 37.0 * n3 / 96.0 - n4 / 360.0,
-        n2 / 48.0 + n3 / 15.0 - 437.0 * n4 / 1440.0,
-        17.0 * n3 / 480.0 - 37.0 * n4 / 840.0,
-        4397.0 * n4 / 161_280.0,
-    ];
-    let xi = (northing - if south { 1e7 } else { 0.0 }) / (0.9996 * radius);
-    let eta = (easting - 500_000.0) / (0.9996 * radius);
-    let (mut xi0, mut eta0) = (xi, eta);
-    for (j, b) in beta.iter().enumerate() {
-        let k = 2.0 * (j as f64 + 1.0);
-        xi0 -= b * (k * xi).sin() * (k * eta).cosh();
-        eta0 -= b * (k * xi).cos() * (k * eta).sinh();
-    }
-    let e = (F * (2.0 - F)).sqrt();
-    let tau0 = xi0.sin() / eta0.sinh().hypot(xi0.cos());
-    let mut tau = tau0;
-    for _ in 0..5 {
-        let sigma = (e * (e * tau / tau.hypot(1.0)).atanh()).sinh();
-        let now = tau * sigma.hypot(1.0) - sigma * tau.hypot(1.0);
-        let slope = (1.0 + (1.0 - e * e) * tau * tau) / ((1.0 - e * e) * now.hypot(1.0) * tau.hypot(1.0));
-        tau += (tau0 - now) * slope;
-    }
-    let meridian = f64::from(zone) * 6.0 - 183.0;
-    Geodetic { lat_deg: tau.atan().to_degrees(), lon_deg: meridian + eta0.sinh().atan2(xi0.cos()).to_degrees(), alt_m }
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a test may
 mod tests {
     use super::*;
 
-    fn read_text(text: &str) -> Result<HashMap<String, Geotag>, FormatError> {
+    fn read_text(text: &str) -> Result<Vec<(String, Geotag)>, FormatError> {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("geo.txt");
         std::fs::write(&path, text).unwrap();
         read(&path)
-    }
-
-    #[test]
-    fn utm_positions_lie_where_meridian_arcs_and_parallels_say() {
-        // On the meridian a northing is the length of the meridian's arc, integrated numerically (Simpson), times 0.9996.
-        let p = from_utm(32, false, 500_000.0, 5_000_000.0, 0.0);
-        assert!((p.lat_deg - 45.1534771834).abs() < 1e-9 && (p.lon_deg - 9.0).abs() < 1e-12, "{p:?}");
-        // A degree of longitude off the meridian and back: forward by the length of the parallel to first order.
-        let a = from_utm(17, false, 333_000.0, 3_103_000.0, 0.0);
-        let b = from_utm(17, false, 333_010.0, 3_103_000.0, 0.0);
-        let moved = geometry::geodesy::EnuFrame::new(a).to_enu(b);
-        assert!((moved.truncate().length() - 10.0 / 0.99994).abs() < 2e-3, "{moved}");
-        let s = from_utm(33, true, 500_000.0, 1e7, 0.0);
-        assert!(s.lat_deg.abs() < 1e-9 && (s.lon_deg - 15.0).abs() < 1e-12, "{s:?}");
     }
 
     #[test]
@@ -297,16 +253,42 @@ mod tests {
             "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt\nIMG_1.JPG 46.8426 -91.9945 198.3 90 0 0 0\n";
         let odm = "EPSG:4326\nIMG_1.JPG -91.9945 46.8426 198.3 90 0 0 0.8 1.5\n";
         for (text, sigma) in [(ours, [0.8, 0.8]), (planner, [3.0, 3.0]), (odm, [0.8, 1.5])] {
-            let tag = read_text(text).unwrap()["img_1"];
+            let (name, tag) = read_text(text).unwrap().remove(0);
+            assert!(name.starts_with("img_1."), "{name}");
             assert_eq!((tag.fix.position, tag.fix.sigma_m), (position, sigma), "{text}");
             assert!((tag.attitude.unwrap().rotation * glam::DVec3::Z).z < -0.999, "{text}");
         }
     }
 
     #[test]
-    fn a_separator_within_quotation_marks_belongs_to_the_name() {
-        assert_eq!(split("\"a,b.jpg\", 1,\"2\""), ["a,b.jpg", "1", "2"]);
-        assert_eq!(split("\"a b.jpg\";1;2"), ["a b.jpg", "1", "2"]);
+    fn tables_of_other_programs_are_read_whatever_they_call_their_columns() {
+        let position = Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 198.3 };
+        for text in [
+            "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll\nDJI 1.JPG,-91.9945,46.8426,198.3,+45.00,0,0\n",
+            "# CoordinateSystem: WGS 84 (EPSG::4326)\n#Label,X/Longitude,Y/Latitude,Z/Altitude\nDJI 1.JPG,-91.9945,46.8426,198.3\n",
+            "#name,x,y,alt,yaw,pitch,roll\nDJI 1.JPG,-91.9945,46.8426,198.3,+45.00,0,0\n",
+            "\u{feff}imagename;latitude;longitude;altitude\r\nDJI 1.JPG;46,8426;-91,9945;198,3\r\n",
+            "EPSG: 4326\nDJI 1.JPG -91.9945 46.8426 198.3\n",
+            "WGS84\nDJI 1.JPG\t-91.9945\t46.8426\t198.3\n",
+        ] {
+            let tags = read_text(text).unwrap();
+            assert_eq!((tags[0].0.as_str(), tags[0].1.fix.position, tags.len()), ("dji 1.jpg", position, 1), "{text}");
+        }
+        if cfg!(not(feature = "epsg")) {
+            return;
+        }
+        let polish = read_text("EPSG:2180\na.jpg 340607 548220 100\n").unwrap()[0].1.fix.position;
+        assert!((52.0..54.0).contains(&polish.lat_deg) && (16.0..18.0).contains(&polish.lon_deg), "{polish:?}");
+    }
+
+    #[test]
+    fn a_pitch_of_minus_ninety_looks_down_and_a_missing_height_is_not_zero() {
+        for pitch in ["-90", "0"] {
+            let tag = read_text(&format!("EPSG:4326\na.jpg 7 46 400 45 {pitch} 0\n")).unwrap()[0].1;
+            assert!((tag.attitude.unwrap().rotation * glam::DVec3::Z).z < -0.999, "{pitch}");
+        }
+        let tag = read_text("EPSG:4326\na.jpg 7 46\n").unwrap()[0].1;
+        assert!(!tag.has_height && tag.fix.sigma_m[1] >= UNKNOWN_HEIGHT_SIGMA_M);
     }
 
     #[test]
@@ -314,7 +296,9 @@ mod tests {
         for (text, expected) in [
             ("", "is empty"),
             ("hello world\n", "names columns"),
-            ("EPSG:2154\na 1 2 3\n", "EPSG:4326"),
+            ("EPSG:1\na 1 2 3\n", "EPSG:1 is not known"),
+            ("a.jpg 7.5 46.2 400\n", "names columns"),
+            ("name,x,y,z\na.jpg,576700,5188100,198\n", "EPSG:CODE"),
             ("EPSG:4326\na.jpg 200 95 3\n", "line 2"),
             ("EPSG:4326\na.jpg x 95 3\n", "\"x\" is not a number"),
             ("name,lat,lon\na.jpg,1\n", "line 2: has no position"),

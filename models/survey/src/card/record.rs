@@ -1,5 +1,6 @@
 //! One picture's own word: EXIF, maker note and XMP brought to one meaning. See the table in [`super`].
 
+use std::cmp::Ordering;
 use std::collections::{HashMap, HashSet};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -13,6 +14,7 @@ use super::exif::Fields;
 use super::notes::Notes;
 use super::xmp::{Maker, Xmp};
 use super::{container, lens, maker_note};
+use models::formats::natural;
 use models::formats::reconstruction::LensDescription;
 use models::formats::telemetry::dji_rotation;
 use models::picture::Orientation;
@@ -22,10 +24,18 @@ pub(super) const GPS_SIGMA_M: f64 = 3.0;
 /// RTK, fixed and float solutions, where the picture does not say: horizontal and vertical, metres.
 const RTK_FIXED_M: [f64; 2] = [0.03, 0.06];
 const RTK_FLOAT_M: [f64; 2] = [0.5, 1.0];
+/// A height that is not stated, one standard deviation, metres.
+pub(super) const UNKNOWN_HEIGHT_SIGMA_M: f64 = 100.0;
+/// Heights that an aircraft can have, metres.
+const HEIGHTS_M: std::ops::RangeInclusive<f64> = -1000.0..=20_000.0;
+/// What a height of thousandths of a metre below zero becomes in 32 bits without a sign, metres.
+const WRAPS_M: f64 = 4_294_967.296;
+/// Pictures of fewer pixels a side show nothing that can be matched.
+const LEAST_SIDE: u32 = 8;
 /// No receiver in an aircraft is better; what claims less does not count its lever arm.
 const BEST_M: f64 = 0.01;
 /// A pitch in the `Camera:` namespace below this is measured from the horizon, degrees: no mapping camera looks back.
-const FROM_HORIZON_DEG: f64 = -45.0;
+pub(super) const FROM_HORIZON_DEG: f64 = -45.0;
 
 /// A position.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,6 +68,15 @@ pub struct Attitude {
     pub source: AttitudeSource,
 }
 
+/// What tells a picture's eye.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Eye {
+    /// The band or lens that the picture names: XMP `BandName` or `ImageSource`.
+    pub stated: Option<String>,
+    /// One value a pixel.
+    pub is_grey: bool,
+}
+
 /// What one picture says.
 #[derive(Clone, Debug)]
 pub struct Record {
@@ -81,6 +100,10 @@ pub struct Record {
     pub attitude: Option<Attitude>,
     /// Course over ground, degrees clockwise from north, as the receiver says.
     pub course_deg: Option<f64>,
+    /// Which eye of the camera took it.
+    pub eye: Eye,
+    /// What was found wrong with it and how it was mended.
+    pub mended: Vec<String>,
 }
 
 /// Reads all heads; what cannot be used, and copies of the same file, are noted and left out.
@@ -97,10 +120,13 @@ pub(super) fn read_all(files: Vec<PathBuf>, notes: &mut Notes) -> Vec<Record> {
             Ok(_) if !fingerprint(&path).is_none_or(|f| seen.insert(f)) => {
                 notes.add("the same file as another one; left out", file_name(&path));
             }
-            Ok(record) => records.push(record),
+            Ok(mut record) => {
+                record.mended.drain(..).for_each(|what| notes.add(what, record.name.clone()));
+                records.push(record);
+            }
         }
     }
-    records.sort_by(|a, b| a.path.cmp(&b.path));
+    records.sort_by(|a, b| natural_paths(&a.path, &b.path));
     unique_names(&mut records);
     records
 }
@@ -143,8 +169,12 @@ fn unique_names(records: &mut [Record]) {
 pub(super) fn in_order(records: &mut [Record]) {
     match records.iter().all(|r| r.time_ns.is_some()) {
         true => records.sort_by(|a, b| (a.time_ns, &a.name).cmp(&(b.time_ns, &b.name))),
-        false => records.sort_by(|a, b| a.path.cmp(&b.path)),
+        false => records.sort_by(|a, b| natural_paths(&a.path, &b.path)),
     }
+}
+
+fn natural_paths(a: &Path, b: &Path) -> Ordering {
+    natural(&a.to_string_lossy(), &b.to_string_lossy())
 }
 
 fn read(path: &Path) -> Result<Record, String> {
@@ -152,7 +182,15 @@ fn read(path: &Path) -> Result<Record, String> {
     let fields = head.exif.as_ref().map(Fields);
     let exif = fields.as_ref();
     let xmp = head.xmp.as_deref().map(Xmp::parse).unwrap_or_default();
+    let projection = xmp.text(Maker::Panorama, "ProjectionType").unwrap_or_default();
+    if ["equirectangular", "cylindrical"].iter().any(|p| projection.eq_ignore_ascii_case(p)) {
+        return Err(format!("is a panorama ({} projection), no picture through a lens", projection.to_lowercase()));
+    }
+    if head.size.0.min(head.size.1) < LEAST_SIDE {
+        return Err(format!("is smaller than {LEAST_SIDE} pixels"));
+    }
     let (lens, focal_sigma) = lens::guess(head.size, exif, &xmp);
+    let mut mended = Vec::new();
     Ok(Record {
         name: file_name(path),
         path: path.to_owned(),
@@ -160,26 +198,41 @@ fn read(path: &Path) -> Result<Record, String> {
         lens,
         focal_sigma,
         time_ns: exif.and_then(Fields::time_ns),
-        fix: fix(exif, &xmp),
+        fix: fix(exif, &xmp, &mut mended),
         relative_alt_m: [Maker::Dji, Maker::Parrot, Maker::Skydio]
             .iter()
             .find_map(|m| xmp.number(*m, "RelativeAltitude")),
         attitude: attitude(exif, &xmp),
         course_deg: exif.and_then(Fields::track_deg),
+        eye: Eye {
+            stated: [(Maker::Pix4d, "BandName"), (Maker::Dji, "BandName"), (Maker::Dji, "ImageSource")]
+                .iter()
+                .find_map(|(maker, name)| xmp.text(*maker, name).filter(|v| !v.is_empty()))
+                .map(str::to_owned),
+            is_grey: head.is_grey,
+        },
+        mended,
     })
 }
 
-fn fix(exif: Option<&Fields>, xmp: &Xmp) -> Option<Fix> {
+fn fix(exif: Option<&Fields>, xmp: &Xmp, mended: &mut Vec<String>) -> Option<Fix> {
     let own = |maker, lat: &[&str], lon: &[&str]| {
         let first = |names: &[&str]| names.iter().find_map(|n| xmp.number(maker, n));
-        let alt_m = xmp.number(maker, "AbsoluteAltitude")?;
-        let position = Geodetic { lat_deg: first(lat)?, lon_deg: first(lon)?, alt_m };
-        (position.is_valid() && (position.lat_deg, position.lon_deg) != (0.0, 0.0)).then_some(position)
+        let place = [first(lat)?, first(lon)?];
+        let valid = Geodetic { lat_deg: place[0], lon_deg: place[1], alt_m: 0.0 }.is_valid() && place != [0.0, 0.0];
+        (valid && xmp.number(maker, "AbsoluteAltitude").is_some()).then_some(place)
     };
     // XMP has more digits than EXIF's rationals in some firmware; `GpsLongtitude` is DJI's own spelling.
-    let position = own(Maker::Dji, &["GpsLatitude", "Latitude"], &["GpsLongitude", "GpsLongtitude", "Longitude"])
-        .or_else(|| own(Maker::Skydio, &["Latitude"], &["Longitude"]))
-        .or_else(|| exif.and_then(Fields::position))?;
+    let by_xmp = own(Maker::Dji, &["GpsLatitude", "Latitude"], &["GpsLongitude", "GpsLongtitude", "Longitude"])
+        .or_else(|| own(Maker::Skydio, &["Latitude"], &["Longitude"]));
+    let [lat_deg, lon_deg] = by_xmp.or_else(|| exif.and_then(Fields::place))?;
+    let heights = [
+        ("EXIF", exif.and_then(Fields::altitude)),
+        ("XMP", [Maker::Dji, Maker::Skydio].iter().find_map(|m| xmp.number(*m, "AbsoluteAltitude"))),
+    ];
+    let [first, second] = if by_xmp.is_some() { [heights[1], heights[0]] } else { heights };
+    let alt_m = height(first, second, mended);
+    let position = Geodetic { lat_deg, lon_deg, alt_m: alt_m.unwrap_or_default() };
     let dji = |name| xmp.number(Maker::Dji, name).filter(|v| *v > 0.0);
     let pix4d = |name| xmp.number(Maker::Pix4d, name).filter(|v| *v > 0.0);
     let by_flag = match xmp.number(Maker::Dji, "RtkFlag").map(|f| f as i64) {
@@ -196,7 +249,37 @@ fn fix(exif: Option<&Fields>, xmp: &Xmp) -> Option<Fix> {
         .unwrap_or(GPS_SIGMA_M);
     let vertical =
         dji("RtkStdHgt").or(by_flag.map(|f| f[1])).or(pix4d("GPSZAccuracy")).unwrap_or(horizontal.max(GPS_SIGMA_M));
+    let vertical = if alt_m.is_some() { vertical } else { UNKNOWN_HEIGHT_SIGMA_M };
     Some(Fix { position, sigma_m: [horizontal, vertical].map(|s| s.clamp(BEST_M, 1000.0)) })
+}
+
+/// The height that the first source states, unless it cannot be or is a zero beside one that the second states.
+fn height(first: (&str, Option<f64>), second: (&str, Option<f64>), mended: &mut Vec<String>) -> Option<f64> {
+    let mut believed = |(whose, stated): (&str, Option<f64>)| {
+        let stated = stated?;
+        let unwrapped = stated - WRAPS_M;
+        if !HEIGHTS_M.contains(&stated) && HEIGHTS_M.contains(&unwrapped) {
+            mended.push(format!("its {whose} altitude is a negative one in bits without a sign; taken as that"));
+            return Some(unwrapped);
+        }
+        if !HEIGHTS_M.contains(&stated) {
+            mended.push(format!("its {whose} altitude is one that no aircraft has; not used"));
+            return None;
+        }
+        Some(stated)
+    };
+    let [a, b] = [believed(first), believed(second)];
+    match (a, b) {
+        (Some(0.0), Some(other)) if other != 0.0 => {
+            mended.push(format!("its {} altitude is 0 beside another in {}; the latter is taken", first.0, second.0));
+            Some(other)
+        }
+        (None, None) => {
+            mended.push("states a position without an altitude; believed within 100 m".to_owned());
+            None
+        }
+        _ => a.or(b),
+    }
 }
 
 fn attitude(exif: Option<&Fields>, xmp: &Xmp) -> Option<Attitude> {
@@ -250,6 +333,24 @@ pub fn nadir_rotation(yaw_deg: f64, pitch_deg: f64, roll_deg: f64) -> DQuat {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_height_that_cannot_be_is_mended_from_the_other_source_and_said() {
+        let of = |exif, xmp| {
+            let mut mended = Vec::new();
+            (height(("EXIF", exif), ("XMP", xmp), &mut mended), mended.join("; "))
+        };
+        let (alt, why) = of(Some(4_294_914.296), None);
+        assert!(alt.is_some_and(|a| (a + 53.0).abs() < 1e-6) && why.contains("without a sign"), "{alt:?} {why}");
+        let (alt, why) = of(Some(0.0), Some(198.3));
+        assert!(alt == Some(198.3) && why.contains("is 0 beside"), "{why}");
+        let (alt, why) = of(Some(1e9), Some(198.3));
+        assert!(alt == Some(198.3) && why.contains("no aircraft"), "{why}");
+        let (alt, why) = of(None, None);
+        assert!(alt.is_none() && why.contains("without an altitude"), "{why}");
+        assert_eq!(of(Some(0.0), None), (Some(0.0), String::new()), "sea level");
+        assert_eq!(of(Some(12.0), Some(198.0)), (Some(12.0), String::new()));
+    }
 
     #[test]
     fn angles_from_nadir_and_from_the_horizon_agree_where_both_can_be_said() {

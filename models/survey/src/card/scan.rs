@@ -6,6 +6,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::error::CardError;
+use super::unread::Unread;
 
 /// Names looked at below the folders given; more is no card.
 const MAX_FILES: usize = 200_000;
@@ -16,6 +17,8 @@ const SKIPPED: [&str; 7] =
     ["masks", "thm", "thumbnails", "@eadir", "__macosx", "$recycle.bin", "system volume information"];
 /// Files of positions that are found by their names.
 const GEOTAGS: [&str; 3] = ["geo.txt", "geotags.csv", "location.txt"];
+/// Pictures are found by their names' ends; what they are is told by their content.
+const PICTURES: [&str; 7] = [".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp"];
 
 /// Surveyed points are found by this name.
 const CONTROL: &str = "gcp_list.txt";
@@ -29,6 +32,10 @@ pub(super) struct Scanned {
     pub geotags: Vec<PathBuf>,
     /// Files of surveyed points.
     pub control: Vec<PathBuf>,
+    /// Subtitles of films.
+    pub subtitles: Vec<PathBuf>,
+    /// Files of other kinds.
+    pub unread: Unread,
     /// One line per folder that could not be read, or for a bound that was met.
     pub notes: Vec<String>,
     /// Device and number of the folders looked through: a link may lead back.
@@ -50,6 +57,7 @@ pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
     found.geotags.sort();
     found.geotags.dedup();
     found.control.sort();
+    found.subtitles.sort();
     Ok(found)
 }
 
@@ -88,7 +96,9 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
                 found.geotags.push(path);
             } else if name == CONTROL {
                 found.control.push(path);
-            } else if ["jpg", "jpeg", "jpe", "png", "tif", "tiff"].iter().any(|e| name.ends_with(&format!(".{e}"))) {
+            } else if name.ends_with(".srt") {
+                found.subtitles.push(path);
+            } else if PICTURES.iter().any(|e| name.ends_with(e)) {
                 if found.files.len() == MAX_FILES {
                     found
                         .notes
@@ -96,6 +106,8 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
                     return Ok(());
                 }
                 found.files.push(path);
+            } else {
+                found.unread.add(&path);
             }
         }
     }

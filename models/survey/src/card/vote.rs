@@ -25,6 +25,11 @@ const MAX_SPEED_M_S: f64 = 70.0;
 /// Barometers of two flights from one place differ by less than this, metres.
 const SAME_TAKE_OFF_M: f64 = 5.0;
 
+/// Pictures in a row without a position that may be placed between those before and after.
+const FEW: f64 = 3.0;
+/// What is known of where others were taken, at the least, metres.
+const ANYWHERE_M: f64 = 100.0;
+
 pub(super) fn settle(records: &mut [Record], notes: &mut Notes) {
     for flight in flights(records) {
         heights(&mut records[flight.clone()], notes);
@@ -189,12 +194,22 @@ fn steps(records: &mut [Record], notes: &mut Notes) {
     }
 }
 
-/// Pictures without a position take it from those before and after, as wide as these are apart.
+/// Largest horizontal distance of a position from the first, metres.
+fn extent(records: &[Record]) -> f64 {
+    let Some(first) = records.iter().find_map(|r| r.fix) else { return 0.0 };
+    let frame = EnuFrame::new(first.position);
+    let away = records.iter().filter_map(|r| Some(frame.to_enu(r.fix?.position).truncate().length()));
+    away.fold(0.0, f64::max)
+}
+
+/// Pictures without a position take it from those before and after: between these where they are few, else somewhere on the card.
 fn fill(records: &mut [Record], notes: &mut Notes) {
     let known: Vec<usize> = (0..records.len()).filter(|&i| records[i].fix.is_some()).collect();
     if known.is_empty() {
         return;
     }
+    // Anywhere that the others were.
+    let anywhere_m = extent(records).max(ANYWHERE_M);
     for i in 0..records.len() {
         if records[i].fix.is_some() {
             continue;
@@ -212,12 +227,22 @@ fn fill(records: &mut [Record], notes: &mut Notes) {
                 };
                 let frame = EnuFrame::new(a.position);
                 let way = frame.to_enu(b.position);
-                Fix { position: frame.to_geodetic(way * share), sigma_m: [(0.5 * way.length()).max(GPS_SIGMA_M); 2] }
+                let position = frame.to_geodetic(way * share);
+                match to - from <= FEW + 1.0 {
+                    true => Fix { position, sigma_m: [(0.5 * way.length()).max(GPS_SIGMA_M); 2] },
+                    false => Fix { position, sigma_m: [anywhere_m, 30.0] },
+                }
             }
-            (Some(a), None) | (None, Some(a)) => Fix { sigma_m: [100.0, 30.0], ..a },
+            (Some(a), None) | (None, Some(a)) => Fix { sigma_m: [anywhere_m, 30.0], ..a },
             (None, None) => continue,
         };
+        let what = match filled.sigma_m[0] >= anywhere_m {
+            true => format!(
+                "has no GPS position (or 0, 0), nor have those beside it; within {anywhere_m:.0} m, for the pictures to tell (--geotags or --log would say)"
+            ),
+            false => "has no GPS position (or 0, 0); taken from the pictures beside it".to_owned(),
+        };
         records[i].fix = Some(filled);
-        notes.add("has no GPS position (or 0, 0); taken from the pictures beside it", records[i].name.clone());
+        notes.add(what, records[i].name.clone());
     }
 }

@@ -11,6 +11,8 @@ pub(super) enum Maker {
     Parrot,
     Skydio,
     Pix4d,
+    /// Google's tags of panoramas.
+    Panorama,
 }
 
 impl Maker {
@@ -22,6 +24,7 @@ impl Maker {
             ("www.skydio.com/drone-skydio", Self::Skydio),
             ("pix4d.com/camera", Self::Pix4d),
             ("www.pix4d.com/camera", Self::Pix4d),
+            ("ns.google.com/photos/1.0/panorama", Self::Panorama),
         ]
         .iter()
         .find_map(|(known, maker)| key.starts_with(known).then_some(*maker))

@@ -7,6 +7,7 @@ use geometry::lens::{Distortion, Lens};
 use models::camera::{PosePrior, View};
 use models::formats::telemetry::Telemetry;
 use models::picture::Orientation;
+use models::picture::values::ValueRange;
 
 /// One picture of the set.
 #[derive(Clone, Debug)]
@@ -23,6 +24,8 @@ pub struct DatasetFrame {
     pub orientation: Orientation,
     /// Its mask, where there is one: a picture of the stored one's shape, black where nothing is to be learnt.
     pub mask: Option<PathBuf>,
+    /// Which of its 16-bit values become black and white; `None` for pictures of eight bits.
+    pub values: Option<ValueRange>,
     /// Pose from GPS and gimbal angles, where recorded.
     pub prior: Option<PosePrior>,
     /// The row of `gps.csv` that it comes from.

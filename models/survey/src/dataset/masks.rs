@@ -69,47 +69,44 @@ impl Finder {
     }
 }
 
-impl Dataset {
-    /// Finds the masks that the description does not name, and leaves out pictures of which a mask keeps nothing.
-    pub(super) fn with_masks(mut self) -> Result<Self, DatasetError> {
-        let mut finder = Finder::default();
-        for frame in &mut self.frames {
-            frame.mask = frame.mask.take().or_else(|| finder.of(&frame.path));
-        }
-        let masked: Vec<&DatasetFrame> = self.frames.iter().filter(|f| f.mask.is_some()).collect();
-        let judged: Vec<(&str, bool)> = masked
-            .par_iter()
-            .map(|frame| Ok((frame.name.as_str(), frame.stored_mask()?.is_some_and(|mask| mask.count() == 0))))
-            .collect::<Result<_, PictureError>>()?;
-        let black: Vec<String> =
-            judged.iter().filter(|(_, black)| *black).map(|(name, _)| (*name).to_owned()).collect();
-        if !judged.is_empty() {
-            tracing::info!("{}: {} of {} pictures have masks", self.root.display(), judged.len(), self.frames.len());
-        }
-        if !black.is_empty() {
-            tracing::warn!("{}: the mask is black all over; left out", name_list(&black));
-            self.retain(|frame| !black.contains(&frame.name));
-        }
-        match self.frames.is_empty() {
-            true => Err(DatasetError::Request(format!("{}: every picture's mask is black", self.root.display()))),
-            false => Ok(self),
-        }
+/// Finds the masks that the description does not name, and leaves out pictures of which a mask keeps nothing.
+pub(super) fn find(set: &mut Dataset) -> Result<(), DatasetError> {
+    let mut finder = Finder::default();
+    for frame in &mut set.frames {
+        frame.mask = frame.mask.take().or_else(|| finder.of(&frame.path));
     }
+    let masked: Vec<&DatasetFrame> = set.frames.iter().filter(|f| f.mask.is_some()).collect();
+    let judged: Vec<(&str, bool)> = masked
+        .par_iter()
+        .map(|frame| Ok((frame.name.as_str(), frame.stored_mask()?.is_some_and(|mask| mask.count() == 0))))
+        .collect::<Result<_, PictureError>>()?;
+    let black: Vec<String> = judged.iter().filter(|(_, black)| *black).map(|(name, _)| (*name).to_owned()).collect();
+    if !judged.is_empty() {
+        tracing::info!("{}: {} of {} pictures have masks", set.root.display(), judged.len(), set.frames.len());
+    }
+    if !black.is_empty() {
+        tracing::warn!("{}: the mask is black all over; left out", name_list(&black));
+        retain(set, |frame| !black.contains(&frame.name));
+    }
+    match set.frames.is_empty() {
+        true => Err(DatasetError::Request(format!("{}: every picture's mask is black", set.root.display()))),
+        false => Ok(()),
+    }
+}
 
-    /// Keeps the frames for which `keep` says so, in order, and their numbers in the lists.
-    pub(super) fn retain(&mut self, mut keep: impl FnMut(&DatasetFrame) -> bool) {
-        let mut number = vec![None; self.frames.len()];
-        let (mut i, mut kept) = (0, 0);
-        self.frames.retain(|frame| {
-            let stays = keep(frame);
-            number[i] = stays.then_some(kept);
-            (i, kept) = (i + 1, kept + usize::from(stays));
-            stays
-        });
-        let regions = self.split.regions.iter_mut().flat_map(|r| r.lists.values_mut());
-        for list in self.split.lists.values_mut().chain(regions) {
-            *list = list.iter().filter_map(|i| number[*i]).collect();
-        }
+/// Keeps the frames for which `keep` says so, in order, and their numbers in the lists.
+pub(super) fn retain(set: &mut Dataset, mut keep: impl FnMut(&DatasetFrame) -> bool) {
+    let mut number = vec![None; set.frames.len()];
+    let (mut i, mut kept) = (0, 0);
+    set.frames.retain(|frame| {
+        let stays = keep(frame);
+        number[i] = stays.then_some(kept);
+        (i, kept) = (i + 1, kept + usize::from(stays));
+        stays
+    });
+    let regions = set.split.regions.iter_mut().flat_map(|r| r.lists.values_mut());
+    for list in set.split.lists.values_mut().chain(regions) {
+        *list = list.iter().filter_map(|i| number[*i]).collect();
     }
 }
 
@@ -130,9 +127,10 @@ impl DatasetFrame {
         Ok(Some(mask))
     }
 
-    /// The mask of the picture as it is loaded at the size of `lens`: turned, undistorted and scaled with it.
-    pub(super) fn mask_at(&self, lens: &Intrinsics) -> Result<Option<Mask>, PictureError> {
-        let Some(stored) = self.stored_mask()? else { return Ok(None) };
+    /// The mask of the picture as it is loaded at the size of `lens`: turned, undistorted and scaled with it. Where no file is its mask,
+    /// what is `opaque` of the picture.
+    pub(super) fn mask_at(&self, lens: &Intrinsics, opaque: Option<Mask>) -> Result<Option<Mask>, PictureError> {
+        let Some(stored) = self.stored_mask()?.or(opaque) else { return Ok(None) };
         let full = &self.view.intrinsics;
         let bent = Lens {
             focal: [full.fx.into(), full.fy.into()],

@@ -2,8 +2,12 @@
 
 use std::collections::{HashMap, HashSet};
 
-use super::{Dataset, DatasetError};
-use models::formats::{colmap, opensfm};
+use glam::DVec3;
+
+use super::sources::TRANSFORMS;
+use super::{Dataset, DatasetError, picture_names};
+use models::formats::transforms::{self, PointsOf};
+use models::formats::{colmap, opensfm, ply};
 
 /// Sparse points held at most (some 100 bytes each); initialisation needs far fewer.
 const MAX_POINTS: usize = 2_000_000;
@@ -44,7 +48,10 @@ impl Dataset {
     /// full, so that what remains is an even sample.
     fn points_where(&self, wanted: &dyn Fn(&SparsePoint) -> bool) -> Result<Vec<SparsePoint>, DatasetError> {
         let (mut points, mut seen, mut every) = (Vec::new(), 0u64, 1u64);
-        let mut take = |point: SparsePoint| {
+        let mut take = |mut point: SparsePoint| {
+            if let Some(local) = self.local {
+                point.position = local.into_own(DVec3::from_array(point.position)).to_array();
+            }
             if !wanted(&point) {
                 return;
             }
@@ -63,14 +70,22 @@ impl Dataset {
             }
             seen += 1;
         };
-        if let Some(model) = colmap::Model::find(&self.root) {
-            let names = self.names();
+        let described = self.root.join(TRANSFORMS);
+        let of = if described.is_file() { transforms::points_of(&described)? } else { PointsOf::default() };
+        let own = of.ply.map(|path| self.root.join(path)).filter(|path| path.is_file());
+        let place = |p: DVec3| of.applied.map_or(p, |(turn, shift)| turn * p + shift);
+        if let Some(file) = own {
+            ply::points(&file, &mut |position, color| {
+                take(SparsePoint { position, color, error_px: 0.0, frames: Vec::new() });
+            })?;
+        } else if let Some(model) = colmap::Model::find(&self.root)? {
+            let names = picture_names(self);
             let by_id: HashMap<u32, u32> =
                 model.images()?.iter().filter_map(|m| Some((m.id, names.find(&m.name)? as u32))).collect();
             let dropped = model.points(&mut |p| {
                 let mut frames: Vec<u32> = p.images.iter().filter_map(|id| by_id.get(id).copied()).collect();
                 frames.sort_unstable();
-                let position = p.position.to_array();
+                let position = place(p.position).to_array();
                 take(SparsePoint { position, color: p.color, error_px: p.error, frames });
             })?;
             if dropped > 0 {

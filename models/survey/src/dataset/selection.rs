@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::{Dataset, DatasetError};
+use glam::DVec3;
+
+use super::{Dataset, DatasetError, picture_names};
 use models::formats::{FormatError, split};
 
 /// Without a `split.json` every eighth picture is held out, as 3DGS and its successors do.
@@ -94,7 +96,7 @@ impl Dataset {
 
     fn resolve(&self, path: &Path) -> Result<Split, DatasetError> {
         let file = split::read(path)?;
-        let known = self.names();
+        let known = picture_names(self);
         let lists = |lists: BTreeMap<String, Vec<String>>| -> Result<BTreeMap<String, Vec<usize>>, DatasetError> {
             lists
                 .into_iter()
@@ -120,8 +122,12 @@ impl Dataset {
             if let Some(images) = lists.get("images").cloned() {
                 lists.entry("train_dense".to_owned()).or_insert(images);
             }
+            let own = |[x, y]: [f64; 2]| {
+                let p = DVec3::new(x, y, 0.0);
+                self.local.map_or(p, |local| local.into_own(p)).truncate().to_array()
+            };
             let polygon = vec![[r.min[0], r.min[1]], [r.max[0], r.min[1]], [r.max[0], r.max[1]], [r.min[0], r.max[1]]];
-            regions.push(Region { name: r.name, polygon, lists });
+            regions.push(Region { name: r.name, polygon: polygon.into_iter().map(own).collect(), lists });
         }
         Ok(Split { lists: lists(file.lists)?, regions })
     }

@@ -6,8 +6,8 @@ use std::path::Path;
 use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DVec3;
 
-use super::crs::SurveyCrs;
-use models::formats::{FormatError, read_bounded};
+use crate::coordinates::{Reference, cells, number, text};
+use models::formats::FormatError;
 
 /// Far more points than anybody surveys.
 const LIMIT: u64 = 16 << 20;
@@ -21,8 +21,7 @@ const SAME_M: f64 = 1e-3;
 /// # Errors
 /// The file cannot be read, a line of it is no point, or it says where on Earth and the model does not.
 pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<Vec<DVec3>, FormatError> {
-    let bytes = read_bounded(path, LIMIT)?;
-    let text = std::str::from_utf8(&bytes).map_err(|_| FormatError::invalid(path, "not UTF-8 text"))?;
+    let text = text(path, LIMIT)?;
     let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#'));
     let first = lines.next().map(|(_, l)| l.trim()).unwrap_or_default();
     let table = Columns::of(first);
@@ -31,13 +30,13 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<Vec<DVec3>, FormatE
         || FormatError::invalid(path, "says where on Earth its points are, and the model has no origin there");
     let survey = match (&table, &frame) {
         (None, _) => {
-            let known = SurveyCrs::named(first);
             let unknown = || {
                 format!(
-                    "line 1: {first:?} names neither columns (lat, lon, alt or x, y, z) nor a known reference system"
+                    "{first:?} names neither columns (lat, lon, alt or x, y, z) nor a reference system (EPSG:CODE, WGS84 UTM 32N, +proj=…)"
                 )
             };
-            Some(known.ok_or_else(|| FormatError::invalid(path, unknown()))?)
+            let known = Reference::named(first).unwrap_or_else(|| Err(unknown()));
+            Some(known.map_err(|why| FormatError::invalid(path, format!("line 1: {why}")))?)
         }
         (Some(_), _) => None,
     };
@@ -46,7 +45,7 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<Vec<DVec3>, FormatE
         let bad = |what: &str| FormatError::invalid(path, format!("line {}: {what}", i + 1));
         let numbers = match &table {
             Some(columns) => columns.pick(line),
-            None => three(line.split_whitespace()),
+            None => three(cells(line).into_iter()),
         };
         let p = numbers.ok_or_else(|| bad("three finite numbers are needed"))?;
         let place = match (&table, &survey) {
@@ -71,15 +70,14 @@ pub fn read(path: &Path, origin: Option<Geodetic>) -> Result<Vec<DVec3>, FormatE
 
 /// Where a table has its coordinates.
 struct Columns {
-    separator: char,
     at: [usize; 3],
     geodetic: bool,
 }
 
 impl Columns {
     fn of(line: &str) -> Option<Self> {
-        let separator = if line.contains(',') { ',' } else { ' ' };
-        let names: Vec<String> = cells(line, separator).map(|c| c.to_ascii_lowercase()).collect();
+        let names: Vec<String> =
+            cells(line).iter().map(|c| c.trim_start_matches('#').trim().to_ascii_lowercase()).collect();
         let find = |wanted: [&[&str]; 3]| -> Option<[usize; 3]> {
             let at = wanted.map(|known| names.iter().position(|n| known.contains(&n.as_str())));
             Some([at[0]?, at[1]?, at[2]?])
@@ -91,23 +89,17 @@ impl Columns {
         ]);
         let own = || find([&["x", "east"], &["y", "north"], &["z", "up"]]);
         let is_geodetic = geodetic.is_some();
-        Some(Self { separator, at: geodetic.or_else(own)?, geodetic: is_geodetic })
+        Some(Self { at: geodetic.or_else(own)?, geodetic: is_geodetic })
     }
 
     fn pick(&self, line: &str) -> Option<DVec3> {
-        let cells: Vec<&str> = cells(line, self.separator).collect();
+        let cells = cells(line);
         three(self.at.iter().filter_map(|i| cells.get(*i).copied()))
     }
 }
 
-fn cells(line: &str, separator: char) -> impl Iterator<Item = &str> {
-    line.split(move |c: char| if separator == ' ' { c.is_whitespace() } else { c == separator })
-        .map(str::trim)
-        .filter(move |c| separator != ' ' || !c.is_empty())
-}
-
 fn three<'a>(mut cells: impl Iterator<Item = &'a str>) -> Option<DVec3> {
-    let mut next = || cells.next()?.parse::<f64>().ok().filter(|v| v.is_finite());
+    let mut next = || number(cells.next()?);
     Some(DVec3::new(next()?, next()?, next()?))
 }
 

@@ -6,14 +6,10 @@ use proj4rs::Proj;
 use proj4rs::transform::transform;
 
 use super::OrthoError;
+use crate::coordinates::{UTM_NORTH, UTM_SOUTH, definition, geographic};
 
 /// Northern and southern limit of the UTM zones, degrees.
 const UTM_LATITUDES: std::ops::Range<f64> = -80.0..84.0;
-/// EPSG code of UTM zone 0 on WGS 84, north and south.
-const UTM_NORTH: u16 = 32_600;
-const UTM_SOUTH: u16 = 32_700;
-const UTM_ZONES: std::ops::RangeInclusive<u16> = 1..=60;
-
 /// Model coordinates (east, north, up in metres around the origin) ↔ map coordinates (easting and northing in the
 /// projection's metres, height on the origin's own vertical scale).
 pub struct Crs {
@@ -51,7 +47,7 @@ impl Crs {
     /// [`OrthoError::Epsg`] for a code that is not known, that is in degrees or not in metres.
     pub fn projected(code: u16, origin: Geodetic) -> Result<Self, OrthoError> {
         let refused = |why| OrthoError::Epsg { code, why };
-        let projected = definition(code)?;
+        let projected = definition(code).map_err(refused)?;
         if projected.is_latlong() || projected.is_geocent() {
             return Err(refused("is in degrees or geocentric; maps are drawn in projected metres"));
         }
@@ -96,70 +92,6 @@ impl Crs {
         let enu = earth.frame.to_enu(place);
         if enu.is_finite() { Ok(enu) } else { Err(outside()) }
     }
-}
-
-/// A reference system that surveyed points are given in: any that the library knows, degrees included.
-pub struct SurveyCrs {
-    geographic: Proj,
-    source: Proj,
-}
-
-impl SurveyCrs {
-    /// By what the first line of a `gcp_list.txt` says: a PROJ string, `EPSG:CODE`, `WGS84` or `WGS84 UTM 17N`.
-    pub fn named(text: &str) -> Option<Self> {
-        let words: Vec<&str> = text.split_whitespace().collect();
-        let source = match words.as_slice() {
-            [first, ..] if first.starts_with("+proj=") => Proj::from_proj_string(text).ok()?,
-            [one] if one.eq_ignore_ascii_case("WGS84") || *one == "EPSG:4326" => geographic()?,
-            [one] => definition(one.strip_prefix("EPSG:").or(one.strip_prefix("epsg:"))?.parse().ok()?).ok()?,
-            [datum, utm, zone] if datum.eq_ignore_ascii_case("WGS84") && utm.eq_ignore_ascii_case("UTM") => {
-                let (number, base) = match zone.strip_suffix(['S', 's']) {
-                    Some(number) => (number, UTM_SOUTH),
-                    None => (zone.trim_end_matches(['N', 'n']), UTM_NORTH),
-                };
-                let number = number.parse::<u16>().ok().filter(|n| UTM_ZONES.contains(n))?;
-                definition(base + number).ok()?
-            }
-            _ => return None,
-        };
-        Some(Self { geographic: geographic()?, source })
-    }
-
-    /// Whether its first two coordinates are angles.
-    pub fn is_in_degrees(&self) -> bool {
-        self.source.is_latlong()
-    }
-
-    /// Easting, northing (or longitude and latitude in degrees) and height → WGS 84; `None` outside of the projection.
-    pub fn geodetic(&self, p: DVec3) -> Option<Geodetic> {
-        let unit = |v: f64| if self.source.is_latlong() { v.to_radians() } else { v };
-        let mut at = (unit(p.x), unit(p.y), 0.0);
-        transform(&self.source, &self.geographic, &mut at).ok()?;
-        let place = Geodetic { lat_deg: at.1.to_degrees(), lon_deg: at.0.to_degrees(), alt_m: p.z };
-        place.is_valid().then_some(place)
-    }
-}
-
-fn geographic() -> Option<Proj> {
-    Proj::from_proj_string("+proj=longlat +datum=WGS84 +no_defs").ok()
-}
-
-#[cfg(feature = "epsg")]
-fn definition(code: u16) -> Result<Proj, OrthoError> {
-    Proj::from_epsg_code(code).map_err(|_| OrthoError::Epsg { code, why: "is not known" })
-}
-
-/// Without the table of all codes: UTM on WGS 84.
-#[cfg(not(feature = "epsg"))]
-fn definition(code: u16) -> Result<Proj, OrthoError> {
-    let unknown = |_| OrthoError::Epsg { code, why: "is not one of UTM on WGS 84, all that this build knows" };
-    let (zone, south) =
-        if code > UTM_SOUTH { (code - UTM_SOUTH, " +south") } else { (code.saturating_sub(UTM_NORTH), "") };
-    if !UTM_ZONES.contains(&zone) {
-        return Err(unknown(()));
-    }
-    Proj::from_proj_string(&format!("+proj=utm +zone={zone}{south} +datum=WGS84 +units=m +no_defs"))
-        .map_err(|_| unknown(()))
 }
 
 #[cfg(test)]

@@ -20,6 +20,14 @@ pub enum OrthoError {
     /// A reference system for a scene that is nowhere on Earth.
     #[error("EPSG:{0}: the model has no origin on Earth; leave the code out for a map in its own metres")]
     NoOrigin(u16),
+    /// A scene that is nowhere on Earth, whose cameras do not tell its vertical.
+    #[error(
+        "this scene has no up: its cameras are neither level nor do they look down its z axis; say which axis points up (--up y, --up=-y, …)"
+    )]
+    NoUp,
+    /// An axis for a scene that knows its vertical.
+    #[error("--up: the model has an origin on Earth, and its z axis points up; leave it out")]
+    KnownUp,
     /// A place outside of what the reference system describes.
     #[error("east {east_m:.0} m, north {north_m:.0} m of the origin is outside of the map's reference system")]
     Outside {

@@ -1,6 +1,5 @@
 //! A card's pictures, what they say of themselves, and the files and logs beside them.
 
-use std::collections::HashMap;
 use std::io::Cursor;
 use std::path::Path;
 
@@ -182,8 +181,8 @@ fn files_of_positions() {
         shell: None,
         memory: (64 << 10, 64),
         read: Read::File("geo.txt", &|path| {
-            line(geotags::read(path), |tags: HashMap<_, geotags::Geotag>| {
-                tags.values().all(|t| {
+            line(geotags::read(path), |tags: Vec<(String, geotags::Geotag)>| {
+                tags.iter().all(|(_, t)| {
                     let turned = t.attitude.is_none_or(|a| (a.rotation.length() - 1.0).abs() < 1e-6);
                     t.fix.position.is_valid() && t.fix.sigma_m.iter().all(|s| *s > 0.0) && turned
                 })

@@ -8,6 +8,7 @@ use models::refine::ControlPoint;
 use serde::Serialize;
 use survey::card::control::SurveyedPoint;
 use survey::dataset::{Dataset, scaled};
+use survey::names::PictureNames;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::error::EngineError;
@@ -39,8 +40,10 @@ pub struct SurveyedScores {
 pub fn marked(set: &Dataset, surveyed: &[SurveyedPoint], scale: f64) -> Vec<ControlPoint> {
     let Some(origin) = set.origin.or(surveyed.first().map(|p| p.position)) else { return Vec::new() };
     let frame = EnuFrame::new(origin);
+    let names: Vec<String> = set.frames.iter().map(|f| f.name.to_lowercase()).collect();
+    let names = PictureNames::of(names.iter().map(String::as_str));
     let mark = |picture: &str, pixel: [f64; 2]| {
-        let frame = set.frames.iter().find(|f| f.name.to_lowercase() == picture)?;
+        let frame = &set.frames[names.find(picture)?];
         let lens = scaled(&frame.view.intrinsics, scale).ok()?;
         Some((frame.name.clone(), frame.loaded_pixel(pixel, (lens.width, lens.height))?))
     };

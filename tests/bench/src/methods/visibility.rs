@@ -101,11 +101,12 @@ mod tests {
             distortion: geometry::lens::Distortion::default(),
             orientation: models::picture::Orientation::default(),
             mask: None,
+            values: None,
             prior: None,
             telemetry: None,
         };
         let frames = cameras.iter().enumerate().map(frame).collect();
-        Dataset { root: "set".into(), frames, split: Split::default(), origin: None, card: None }
+        Dataset { root: "set".into(), frames, split: Split::default(), origin: None, local: None, card: None }
     }
 
     fn territory(name: &str, x: f64, own: Vec<usize>) -> Territory {

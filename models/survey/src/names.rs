@@ -1,7 +1,10 @@
 //! Which picture a name means: descriptions, splits and models name the same picture with more or fewer of its folders, and
 //! with another extension where it was stored anew.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
+
+use icu_normalizer::ComposingNormalizerBorrowed;
 
 /// Pictures by name.
 #[derive(Clone, Debug, Default)]
@@ -15,8 +18,9 @@ impl PictureNames {
     pub fn of<'a>(names: impl IntoIterator<Item = &'a str>) -> Self {
         let mut all = Self::default();
         for (i, name) in names.into_iter().enumerate() {
-            all.whole.entry(parts(name).join("/")).or_insert(i);
-            let bare = bare(name);
+            let name = composed(name);
+            all.whole.entry(parts(&name).join("/")).or_insert(i);
+            let bare = bare(&name);
             all.by_stem.entry(bare.last().cloned().unwrap_or_default()).or_default().push((bare, i));
         }
         all
@@ -25,10 +29,11 @@ impl PictureNames {
     /// The picture called `name`: exactly so, else the only one whose folders, as far as both have any, and file name without
     /// its extension are those of `name`. `None` where there is none, or where it could be one of several.
     pub fn find(&self, name: &str) -> Option<usize> {
-        if let Some(i) = self.whole.get(&parts(name).join("/")) {
+        let name = composed(name);
+        if let Some(i) = self.whole.get(&parts(&name).join("/")) {
             return Some(*i);
         }
-        let wanted = bare(name);
+        let wanted = bare(&name);
         let alike = self.by_stem.get(wanted.last()?)?;
         let only = |fits: &dyn Fn(&[String]) -> bool| {
             let mut fitting = alike.iter().filter(|(bare, _)| fits(bare));
@@ -50,12 +55,17 @@ impl PictureNames {
             }
         }
         for (i, takers) in takers.into_iter().filter(|(_, takers)| takers.len() > 1) {
-            let exact = |k: &usize| self.whole.get(&parts(names[*k]).join("/")) == Some(&i);
+            let exact = |k: &usize| self.whole.get(&parts(&composed(names[*k])).join("/")) == Some(&i);
             let keeps = takers.iter().copied().find(exact);
             takers.iter().filter(|k| Some(**k) != keeps).for_each(|k| found[*k] = None);
         }
         found
     }
+}
+
+/// Letters with their accents in one character (NFC): Apple's file systems write two.
+pub(crate) fn composed(name: &str) -> Cow<'_, str> {
+    ComposingNormalizerBorrowed::new_nfc().normalize(name)
 }
 
 /// Folders and file name.
@@ -86,6 +96,12 @@ mod tests {
         assert_eq!((found("r_0.png"), found("DJI_1.png")), (None, None), "either could be meant");
         assert_eq!((found("card/b/DJI_1.png"), found(r"card\a\DJI_1.JPG")), (Some(3), Some(2)));
         assert_eq!((found("DJI_2.png"), found("./b/DJI_2.JPG"), found("c/DJI_2.JPG")), (Some(4), Some(4), None));
+    }
+
+    #[test]
+    fn an_accent_is_the_same_in_one_character_and_in_two() {
+        let names = PictureNames::of(["H\u{f6}he/DJI_1.JPG"]);
+        assert_eq!((names.find("Ho\u{308}he/DJI_1.png"), names.find("Hohe/DJI_1.JPG")), (Some(0), None));
     }
 
     #[test]
