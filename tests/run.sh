@@ -12,6 +12,7 @@ skip=${DGTR_SKIP:-}
 lacks() { case ",$skip," in *",$1,"*) ;; *) skip="${skip:+$skip,}$1" ;; esac; }
 has() { command -v "$1" >/dev/null 2>&1; }
 [ -d "${DGTR_DATA:-../shared}/data" ] || lacks data
+[ -d "${DGTR_DATA:-../shared}/field/cards" ] || lacks cases
 [ -n "${DGTR_S3_TEST:-}" ] || lacks bucket
 { has chromium || has chromium-browser || has google-chrome; } && has node || lacks chromium
 has npm || lacks viewer

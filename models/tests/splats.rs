@@ -10,9 +10,6 @@ use models::formats::splats::{self, Splats};
 use models::formats::spz::{Axes, SpzOptions};
 use models::formats::{gltf, ply, sog, spz};
 
-#[path = "../../tests/shared_data.rs"]
-mod shared_data;
-
 fn read(path: &Path) -> Splats {
     splats::read(path, Axes::Rub).unwrap()
 }
@@ -187,7 +184,7 @@ fn splat_files_are_told_from_others_of_that_name() {
 
 #[test]
 fn files_of_other_programs_hold_the_same_gaussians() {
-    let Some(folder) = shared_data::shared("field/splats") else { return };
+    let Some(folder) = needs::shared("field/splats") else { return };
     let of = |name: &str| read(&folder.join(name));
     let reference = of("ref_le.ply").cloud;
     assert_eq!(of("big_endian.ply").cloud, reference);

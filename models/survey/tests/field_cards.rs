@@ -7,11 +7,8 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 use survey::card::{Card, CardError, CardOptions, control};
 
-#[path = "../../../tests/shared_data.rs"]
-mod shared_data;
-
 fn field(name: &str) -> Option<PathBuf> {
-    shared_data::shared(&format!("field/cards/{name}"))
+    needs::shared(&format!("field/cards/{name}"))
 }
 
 fn open(folder: &Path) -> Result<Card, CardError> {

@@ -21,6 +21,8 @@ pub enum Need {
     Viewer,
     /// The reference data sets; a user's clone has none of them.
     Data,
+    /// Files of other programs, beside the reference data sets.
+    Cases,
     /// A bucket, which `DGTR_S3_TEST` names.
     Bucket,
     /// The host name localhost.
@@ -28,7 +30,7 @@ pub enum Need {
 }
 
 /// All of them, by their names in `DGTR_SKIP`.
-const NAMES: [(&str, Need); 9] = [
+const NAMES: [(&str, Need); 10] = [
     ("vulkan", Need::Vulkan),
     ("validation-layer", Need::ValidationLayer),
     ("onnxruntime", Need::OnnxRuntime),
@@ -36,6 +38,7 @@ const NAMES: [(&str, Need); 9] = [
     ("chromium", Need::Chromium),
     ("viewer", Need::Viewer),
     ("data", Need::Data),
+    ("cases", Need::Cases),
     ("bucket", Need::Bucket),
     ("localhost", Need::Localhost),
 ];
@@ -76,7 +79,7 @@ pub fn missing(need: Need, what: impl Display) {
 /// A file or folder of the reference data (beside the checkout, or where `DGTR_DATA` says).
 ///
 /// # Panics
-/// It is not there, and `DGTR_SKIP` does not name `data`.
+/// It is not there, and `DGTR_SKIP` does not name `data` (`cases` for what is below field/).
 #[track_caller]
 pub fn shared(path: &str) -> Option<PathBuf> {
     let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
@@ -84,7 +87,8 @@ pub fn shared(path: &str) -> Option<PathBuf> {
     if path.exists() {
         return Some(path);
     }
-    missing(Need::Data, format!("{} is not there (DGTR_DATA names the folder that holds data/)", path.display()));
+    let need = if path.components().any(|part| part.as_os_str() == "field") { Need::Cases } else { Need::Data };
+    missing(need, format!("{} is not there (DGTR_DATA names the folder that holds data/ and field/)", path.display()));
     None
 }
 
