@@ -265,7 +265,8 @@ impl Receiver {
         self.begin_look();
         let begun = Instant::now();
         let until = begun + Duration::from_secs_f64(self.link.settings.poll_s);
-        self.seats.iter_mut().for_each(|seat| seat.has_worked = false);
+        // Whoever is at work has his turn now.
+        self.seats.iter_mut().for_each(|seat| seat.has_worked = seat.is_at_work());
         loop {
             self.collect();
             self.take_in();
@@ -277,8 +278,10 @@ impl Receiver {
             if stop.load(Ordering::Relaxed) {
                 self.link.stop.store(true, Ordering::Relaxed);
             }
-            let is_busy = self.lookout.is_waiting() || self.seats.iter().any(Seat::is_at_work);
-            if Instant::now() >= until || (!is_busy && self.waiting().next().is_none()) {
+            let is_at_work = self.seats.iter().any(Seat::is_at_work);
+            // Those who have had their turn and want another get it in the next round.
+            let is_waiting = self.lookout.is_waiting() && !self.seats.iter().any(Seat::wants_work);
+            if Instant::now() >= until || (!is_at_work && !is_waiting && self.waiting().next().is_none()) {
                 break;
             }
             if self.wake.try_recv().is_ok() {
