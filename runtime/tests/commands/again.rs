@@ -17,7 +17,7 @@ fn a_training_into_the_folder_of_another_is_refused_in_one_line_and_begins_anew_
     short_training(&set, &out, &[]);
     let file = dir.path().join("set/transforms.json");
     let text = std::fs::read_to_string(&file).unwrap();
-    std::fs::write(&file, text.replacen("40.0", "41.5", 1)).unwrap();
+    std::fs::write(&file, text.replace("40.0", "41.5")).unwrap();
     let few = ["--init", "random", "--max-gaussians", "500", "--budget-mib", "64", "--steps", "20", "--no-eval"];
     let output = dgtr(&[&["train", &set, "--out", &out], &few[..]].concat());
     let line = error_line(&output);
