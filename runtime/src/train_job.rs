@@ -161,8 +161,12 @@ impl TrainJob {
         let go_on = || !stop.requested();
         let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
         from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
-        Identity::of(self, &set)?.claim(&self.out, &self.model_path(), self.fresh)?;
+        let identity = Identity::of(self, &set)?;
+        let is_new = identity.is_new_in(&self.out, &self.model_path(), self.fresh)?;
         let is_card = set.card.is_some();
+        if is_card && is_new {
+            identity.write(&self.out)?;
+        }
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
         let poses = if is_card { PoseSource::Dataset } else { self.poses };
         let picture_scale = self.picture_scale(&set, is_card)?;
@@ -224,6 +228,10 @@ impl TrainJob {
             ..Default::default()
         };
         let mut engine = Reconstruction::open(settings, header, "train")?;
+        // What is written of a data set comes after all that can be refused.
+        if !is_card && is_new {
+            identity.write(&self.out)?;
+        }
         engine.report.views = frames.len() as u64;
         if is_card {
             engine.report.stage_ms.insert("poses".into(), settled.as_secs_f64() * 1e3);

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use config::training::TrainSettings;
 use disk::Disk;
@@ -24,13 +24,28 @@ const LIMIT: u64 = 64 << 10;
 const LARGEST_MASK: u64 = 256 << 20;
 
 /// The folder of results is this process's as long as it lives.
-pub(super) struct Held(#[expect(dead_code, reason = "the lock lives as long as the file is open")] File);
+pub(super) struct Held {
+    #[expect(dead_code, reason = "the lock lives as long as the file is open")]
+    folder: File,
+    /// The folder, if it was made for this job: one in which nothing came to lie goes again.
+    made: Option<PathBuf>,
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        if let Some(made) = &self.made {
+            // Refused by the system where anything lies in it.
+            let _ = std::fs::remove_dir(made);
+        }
+    }
+}
 
 /// Takes `out` for this process.
 ///
 /// # Errors
 /// Another process trains into it, or the folder cannot be written to.
 pub(super) fn hold(out: &Path) -> Result<Held, JobError> {
+    let made = (!out.exists()).then(|| out.to_owned());
     std::fs::create_dir_all(out).map_err(JobError::io(out))?;
     // The folder itself is locked: no file is left, and the system unlocks it however the process ends.
     let folder = File::open(out).map_err(JobError::io(out))?;
@@ -43,7 +58,7 @@ pub(super) fn hold(out: &Path) -> Result<Held, JobError> {
             if let Err(e) = locked {
                 tracing::warn!("{}: cannot be locked ({e}); nothing keeps a second dgtr out", out.display());
             }
-            Ok(Held(folder))
+            Ok(Held { folder, made })
         }
     }
 }
@@ -92,12 +107,12 @@ impl Identity {
         Ok(Self(of.into_iter().map(|(what, hash)| (what.to_owned(), hash.finalize().to_hex().to_string())).collect()))
     }
 
-    /// Writes it into `out`, unless what is there already was made from something else: then nothing is changed, and what is
-    /// different is said. With `fresh`, whatever is there.
+    /// Whether it has yet to be written into `out`: what lies there, if anything, was made from the same. With `fresh`, whatever
+    /// lies there.
     ///
     /// # Errors
-    /// Another training lies there, or the folder cannot be written to.
-    pub(super) fn claim(&self, out: &Path, model: &Path, fresh: bool) -> Result<(), JobError> {
+    /// Another training lies there: what is different is said.
+    pub(super) fn is_new_in(&self, out: &Path, model: &Path, fresh: bool) -> Result<bool, JobError> {
         let file = out.join(FILE);
         // Where neither poses nor a model were written yet, nothing can be mistaken.
         let anything = model.is_file() || out.join(SETTLED).is_file();
@@ -108,7 +123,7 @@ impl Identity {
             let differs = |(what, hash): &(&String, &String)| before.0.get(*what) != Some(*hash);
             let other: Vec<&str> = self.0.iter().filter(differs).map(|(what, _)| what.as_str()).collect();
             if other.is_empty() {
-                return Ok(());
+                return Ok(false);
             }
             return Err(JobError::Request(format!(
                 "{}: holds a training with other {}; give another --out, or --fresh to begin anew",
@@ -122,6 +137,15 @@ impl Identity {
                 model.display()
             );
         }
+        Ok(true)
+    }
+
+    /// Writes it into `out`.
+    ///
+    /// # Errors
+    /// The folder cannot be written to.
+    pub(super) fn write(&self, out: &Path) -> Result<(), JobError> {
+        let file = out.join(FILE);
         Disk::default()
             .replace(&file, |w| serde_json::to_writer_pretty(w, self).map_err(std::io::Error::other))
             .map_err(|e| FormatError::disk(&file, e))?;
@@ -157,7 +181,11 @@ mod tests {
     fn a_folder_of_another_training_is_refused_in_one_line_and_begun_anew_when_asked() {
         let dir = tempfile::tempdir().expect("a folder");
         let model = dir.path().join("model.dgtr");
-        let claim = |poses, fresh| identity(poses).claim(dir.path(), &model, fresh).map_err(|e| e.to_string());
+        let claim = |poses, fresh| {
+            let own = identity(poses);
+            let is_new = own.is_new_in(dir.path(), &model, fresh).map_err(|e| e.to_string())?;
+            if is_new { own.write(dir.path()).map_err(|e| e.to_string()) } else { Ok(()) }
+        };
         assert_eq!((claim("a", false), claim("b", false)), (Ok(()), Ok(())), "nothing was trained yet");
         std::fs::write(&model, b"").expect("written");
         assert_eq!(claim("b", false), Ok(()));
@@ -176,6 +204,10 @@ mod tests {
         let error = hold(dir.path()).map(|_| ()).expect_err("held").to_string();
         assert!(error.contains("another dgtr train") && !error.contains('\n'), "{error}");
         drop(held);
-        assert!(hold(dir.path()).is_ok());
+        assert!(hold(dir.path()).is_ok() && dir.path().is_dir());
+        // One that was made for a training that wrote nothing goes again.
+        let new = dir.path().join("new");
+        drop(hold(&new).expect("made"));
+        assert!(!new.exists());
     }
 }
