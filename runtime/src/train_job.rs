@@ -164,7 +164,10 @@ impl TrainJob {
         let identity = Identity::of(self, &set)?;
         let is_new = identity.is_new_in(&self.out, &self.model_path(), self.fresh)?;
         let is_card = set.card.is_some();
-        if is_card && is_new {
+        // Over a model that is replaced, the record follows when the new model is there: whoever stops the job before must not find the old
+        // model taken for one of these pictures.
+        let replaces = self.model_path().is_file();
+        if is_card && is_new && !replaces {
             identity.write(&self.out)?;
         }
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
@@ -229,7 +232,7 @@ impl TrainJob {
         };
         let mut engine = Reconstruction::open(settings, header, "train")?;
         // What is written of a data set comes after all that can be refused.
-        if !is_card && is_new {
+        if !is_card && is_new && !replaces {
             identity.write(&self.out)?;
         }
         engine.report.views = frames.len() as u64;
@@ -245,6 +248,9 @@ impl TrainJob {
             }
             // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
             engine.checkpoint(&self.out, false)?;
+        }
+        if is_new && replaces {
+            identity.write(&self.out)?;
         }
         let built = self.take(&mut engine, &mut source, &go_on)?
             && engine.build(&go_on).map_err(|e| cause::of(e, &set, &frames))?;

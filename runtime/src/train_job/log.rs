@@ -71,7 +71,6 @@ fn exposure(f: &CAMERA_FEEDBACK_DATA) -> Option<Exposure> {
 }
 
 #[cfg(test)]
-#[cfg(test)]
 mod tests {
     use super::*;
 

@@ -24,6 +24,11 @@ fn a_training_into_the_folder_of_another_is_refused_in_one_line_and_begins_anew_
     assert_eq!(output.status.code(), Some(2), "{line}");
     assert!(line.contains("other poses") && line.contains("--fresh"), "{line}");
     assert!(std::fs::read(dir.path().join("out/model.dgtr")).unwrap() == model, "nothing was changed");
+    // One that ended before it had a model of its own leaves the old one's record: it is still not these pictures' model.
+    let nowhere = [&["train", &set, "--out", &out, "--fresh", "--device", "nowhere"], &few[..]].concat();
+    assert!(!dgtr(&nowhere).status.success());
+    let output = dgtr(&[&["train", &set, "--out", &out], &few[..]].concat());
+    assert!(output.status.code() == Some(2) && error_line(&output).contains("other poses"));
     short_training(&set, &out, &["--fresh"]);
     assert!(std::fs::read(dir.path().join("out/model.dgtr")).unwrap() != model);
 }
