@@ -1,5 +1,5 @@
-//! Clouds of Gaussians in the forms that other programs write: the same Gaussians from each. Files that others wrote lie in the
-//! reference data; where that is not there, this says so and passes.
+//! Clouds of Gaussians in the forms that other programs write: the same Gaussians from each. Files that other
+//! programs wrote are the need `cases` of `tests/needs`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
 
 use std::fmt::Write as _;
@@ -208,5 +208,48 @@ fn files_of_other_programs_hold_the_same_gaussians() {
             let d = differences(&reference.rows(&[j as u32]), &found.rows(&[i as u32]));
             assert!(d.iter().zip(rounding).all(|(d, most)| *d <= most), "{name} {i}: {d:?}");
         }
+    }
+}
+
+/// What a stranger's file claims is held against its size before anything is allocated.
+#[test]
+fn a_small_sog_that_claims_a_city_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.sog");
+    sog::write(&path, &cloud(50)).unwrap();
+    let mut entries = zip::ZipArchive::new(std::fs::File::open(&path).unwrap()).unwrap();
+    let rewritten = |entries: &mut zip::ZipArchive<std::fs::File>, count: u64| {
+        let mut out = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+        for i in 0..entries.len() {
+            let mut entry = entries.by_index(i).unwrap();
+            let mut bytes = Vec::new();
+            std::io::copy(&mut entry, &mut bytes).unwrap();
+            if entry.name() == "meta.json" {
+                let mut meta: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
+                meta["count"] = count.into();
+                bytes = serde_json::to_vec(&meta).unwrap();
+            }
+            out.start_file(entry.name(), zip::write::SimpleFileOptions::default()).unwrap();
+            std::io::Write::write_all(&mut out, &bytes).unwrap();
+        }
+        out.finish().unwrap().into_inner()
+    };
+    for (count, said) in [(9_000_000, "number of Gaussians"), (60_000, "too small")] {
+        let other = dir.path().join("claims.sog");
+        std::fs::write(&other, rewritten(&mut entries, count)).unwrap();
+        let error = splats::read(&other, Axes::Rub).unwrap_err().to_string();
+        assert!(error.contains(said) && !error.contains('\n'), "{error}");
+    }
+}
+
+#[test]
+fn rows_of_text_with_more_numbers_than_properties_or_without_end_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.ply");
+    let whole = String::from_utf8(ply_as(&cloud(3), "ascii", &[], "")).unwrap();
+    for (line, said) in [("1 ".to_owned(), "numbers of"), (" ".repeat(10_000), "longer than")] {
+        std::fs::write(&path, whole.replacen("end_header\n", &format!("end_header\n{line}"), 1)).unwrap();
+        let error = splats::read(&path, Axes::Rub).unwrap_err().to_string();
+        assert!(error.contains(said) && !error.contains('\n'), "{error}");
     }
 }

@@ -19,7 +19,7 @@ pub use write::{Point, write};
 
 /// Where a model lies below the folder of a data set, the usual place first.
 const PLACES: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."];
-/// Folders looked at beside a numbered model.
+/// Most folders examined beside a numbered model.
 const MOST_MODELS: usize = 4096;
 
 /// The files of a model.

@@ -8,7 +8,7 @@ use image::{ColorType, DynamicImage, ExtendedColorType, ImageDecoder, RgbImage};
 use super::{PictureError, bad, decode_stored, open, webp};
 use crate::formats::one_line;
 
-/// Pictures looked at for the range of all.
+/// Pictures sampled for the range of all.
 const SAMPLED: usize = 12;
 /// Share of the values that may lie beyond either end of a band's range: stray pixels and glints.
 const BEYOND: f64 = 1e-3;
@@ -63,8 +63,8 @@ impl ValueRange {
     /// All values.
     pub const FULL: Self = Self { low: 0, high: u16::MAX };
 
-    /// The range of like pictures of 16 bits, of which some are looked at: for bands (one value a pixel) what nearly all of their values
-    /// lie in; for colours, whose proportions must stay, as many bits as are used. `None` where none can be read.
+    /// The range of 16-bit pictures of one kind, from a sample of them. For bands (one value a pixel) it holds nearly all values. For
+    /// colours, whose proportions must stay, it is as many bits as are used. `None` where none can be read.
     pub fn of<P: AsRef<Path>>(pictures: &[P]) -> Option<Self> {
         if pictures.is_empty() {
             return None;
@@ -77,6 +77,9 @@ impl ValueRange {
             match decode_stored(path.as_ref()) {
                 Ok(DynamicImage::ImageLuma16(image)) => {
                     image.as_raw().iter().for_each(|v| counts[usize::from(*v)] += 1)
+                }
+                Ok(DynamicImage::ImageLumaA16(image)) => {
+                    image.pixels().filter(|p| p.0[1] > 0).for_each(|p| counts[usize::from(p.0[0])] += 1);
                 }
                 Ok(DynamicImage::ImageRgb16(image)) => {
                     is_grey = false;

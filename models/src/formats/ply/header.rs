@@ -292,8 +292,11 @@ impl<'a> Rows<'a> {
             bytes.clear();
             let mut byte = [0];
             while self.input.read(&mut byte).map_err(|e| FormatError::io(self.path, "reading", e))? == 1 {
-                if byte[0] == b'\n' || bytes.len() as u64 > MAX_LINE {
+                if byte[0] == b'\n' {
                     break;
+                }
+                if bytes.len() as u64 == MAX_LINE {
+                    return Err(bad("its line is longer than its numbers can be"));
                 }
                 bytes.push(byte[0]);
             }
@@ -309,7 +312,7 @@ impl<'a> Rows<'a> {
         for word in text.split_ascii_whitespace() {
             values.push(word.parse().map_err(|_| bad(&format!("{word:?} is no number")))?);
         }
-        match values.len() >= self.element.properties.len() {
+        match values.len() == self.element.properties.len() {
             true => Ok(()),
             false => Err(bad(&format!("has {} numbers of {}", values.len(), self.element.properties.len()))),
         }

@@ -18,8 +18,12 @@ const LIMIT: u64 = 256 << 20;
 const MAX_META: u64 = 1 << 20;
 /// A picture's file at most: all its pixels.
 const MAX_PICTURE: u64 = 64 << 20;
-/// Most Gaussians read.
+/// Most Gaussians read, and those that a file of any size may hold; beyond them a file has a byte for each (real scenes: 8 to 20), so that
+/// a small file cannot claim the memory of a city.
 const MAX_GAUSSIANS: usize = 10_000_000;
+const FREE_GAUSSIANS: usize = 1 << 16;
+/// Pixels of the largest palette: 65,536 entries of 15 coefficients.
+const PALETTE_PIXELS: usize = 1 << 20;
 
 #[derive(Deserialize)]
 struct Meta {
@@ -77,6 +81,7 @@ impl Pixels {
 pub fn read(path: &Path) -> Result<(GaussianCloud, usize), FormatError> {
     let bytes = read_bounded(path, LIMIT)?;
     let bad = |what: &str| FormatError::invalid(path, format!("is no SOG file that can be read: {what}"));
+    let limit = bytes.len().clamp(FREE_GAUSSIANS, MAX_GAUSSIANS);
     let mut zip = ZipArchive::new(Cursor::new(bytes)).map_err(|e| bad(&one_line(e)))?;
     let mut file = |name: &str, limit: u64| -> Result<Vec<u8>, FormatError> {
         let entry = zip.by_name(name).map_err(|e| bad(&format!("{name}: {}", one_line(e))))?;
@@ -89,14 +94,20 @@ pub fn read(path: &Path) -> Result<(GaussianCloud, usize), FormatError> {
     if meta.version != VERSION {
         return Err(bad(&format!("it is version {}, of which 2 can be read", meta.version)));
     }
-    if meta.count > MAX_GAUSSIANS || meta.scales.codebook.len() < 256 || meta.sh0.codebook.len() < 256 {
+    if meta.count > limit {
+        let (size, limit) = (meta.count as u64, limit as u64);
+        return Err(FormatError::TooLarge { path: path.to_owned(), what: "its number of Gaussians", size, limit });
+    }
+    if meta.scales.codebook.len() < 256 || meta.sh0.codebook.len() < 256 {
         return Err(bad("its description is damaged"));
     }
     let mut pictures: HashMap<String, Pixels> = HashMap::new();
     let palette = meta.sh_n.iter().flat_map(|sh| &sh.files);
     let names = meta.means.files.iter().chain(&meta.scales.files).chain(&meta.quats.files).chain(&meta.sh0.files);
     for name in names.chain(palette) {
-        let picture = picture(file(name, MAX_PICTURE)?).ok_or_else(|| bad(&format!("{name} is no picture")))?;
+        let most = 2 * meta.count + PALETTE_PIXELS;
+        let picture = picture(file(name, MAX_PICTURE)?, most)
+            .ok_or_else(|| bad(&format!("{name} is no picture, or far larger than its scene")))?;
         pictures.insert(name.clone(), picture);
     }
     let of = |name: &String, i: usize| pictures.get(name).and_then(|p| p.at(i));
@@ -105,6 +116,9 @@ pub fn read(path: &Path) -> Result<(GaussianCloud, usize), FormatError> {
         return Err(bad("its directional colours are damaged"));
     }
     let coefficients = sh_coefficients(degree) - 1;
+    if meta.count > 0 && meta.means.files.iter().any(|name| of(name, meta.count - 1).is_none()) {
+        return Err(bad("a picture is too small"));
+    }
     let mut cloud = GaussianCloud::with_capacity(degree, meta.count);
     let mut sh = vec![0.0; cloud.sh_stride()];
     for i in 0..meta.count {
@@ -139,10 +153,11 @@ pub fn read(path: &Path) -> Result<(GaussianCloud, usize), FormatError> {
     Ok((cloud, dropped))
 }
 
-fn picture(bytes: Vec<u8>) -> Option<Pixels> {
+/// The pixels of a picture that has `most` at most.
+fn picture(bytes: Vec<u8>, most: usize) -> Option<Pixels> {
     let mut decoder = WebPDecoder::new(Cursor::new(bytes)).ok()?;
     let (width, height) = decoder.dimensions();
-    if width.max(height) as usize > MAX_SIDE {
+    if width.max(height) as usize > MAX_SIDE || width as usize * height as usize > most {
         return None;
     }
     let mut pixels = vec![0; decoder.output_buffer_size()?];

@@ -15,7 +15,7 @@ const MEET: f64 = 0.5;
 const SPREAD: f64 = 0.02;
 /// Points that fewer than this share of the cameras have before them are behind all.
 const BEFORE: f64 = 0.05;
-/// Points and cameras looked at.
+/// Most points and cameras sampled.
 const SAMPLED: usize = 1000;
 
 /// Says so where all cameras look away from the place where their axes meet.

@@ -13,7 +13,7 @@ use models::picture::{Orientation, dimensions};
 
 /// nerfstudio's description.
 pub(super) const TRANSFORMS: &str = "transforms.json";
-/// Names looked at in one folder of pictures.
+/// Most names read in one folder of pictures.
 const MOST_NAMES: usize = 200_000;
 
 pub(super) fn file_name(path: &str) -> &str {
