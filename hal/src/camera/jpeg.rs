@@ -11,7 +11,7 @@ use disk::regular;
 const MAX_PICTURE: usize = 32 << 20;
 
 /// True when the file at `path` holds a JPEG or PNG to its end. Half-written files do not; what a camera writes behind the
-/// end is not looked at.
+/// end is not read.
 ///
 /// # Errors
 /// It cannot be read, or is no regular file.

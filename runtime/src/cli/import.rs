@@ -58,7 +58,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Means looked at for where a cloud lies.
+/// Means sampled to find where a cloud lies.
 const SAMPLED: usize = 100_000;
 
 /// Brings a cloud that lies far from its origin near it; its size is its trainer's business.

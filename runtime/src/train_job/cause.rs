@@ -8,9 +8,9 @@ use survey::dataset::Dataset;
 
 use crate::error::JobError;
 
-/// Pictures looked at.
+/// Pictures sampled.
 const SAMPLED: usize = 12;
-/// Side at which they are looked at, pixels.
+/// Side at which they are compared, pixels.
 const SIDE: f64 = 64.0;
 /// Brightest value of a black picture.
 const BLACK: u8 = 12;
@@ -51,7 +51,7 @@ fn why(set: &Dataset, frames: &[usize]) -> Option<String> {
         let is_black = |p: &RgbImage| p.iter().all(|v| *v < BLACK);
         let black = pictures.iter().filter(|p| is_black(p)).count();
         if black == pictures.len() {
-            return Some(format!("its pictures are black ({black} of {black} looked at); expose them longer"));
+            return Some(format!("its pictures are black ({black} of {black} sampled); expose them longer"));
         }
         let differs = |a: &RgbImage, b: &RgbImage| {
             let sum: f64 = a.iter().zip(b.iter()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();

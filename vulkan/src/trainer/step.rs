@@ -128,7 +128,7 @@ impl Trainer {
         let pixels_share = f64::from(width) * f64::from(height) / whole;
         let (share, whole) = (pixels_share as f32, whole as f32);
         (lens.cx, lens.cy, lens.width, lens.height) = (lens.cx - x as f32, lens.cy - y as f32, width, height);
-        // View dependence costs nothing where views are visited too seldom to be learnt by heart.
+        // View dependence costs nothing where views are visited too seldom to be overfitted.
         let dependent = self.schedule.visits_each(pictures.len(), s.loss.view_dependence_visits);
         let (t, extent) = (self.schedule.adam_step(), self.model.extent);
         let plan = self.device.plan();

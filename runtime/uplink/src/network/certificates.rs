@@ -48,7 +48,7 @@ pub(super) fn settings(identity: &Identity, id: &str) -> Result<Option<serde_jso
     let own = contents(id).map_err(network)?;
     let certificate = own.self_signed(&key).map_err(network)?.pem();
     let issuer = Issuer::from_params(&own, &key);
-    // Only name and key of these count: that they are signed by us says nothing and is not looked at.
+    // Only name and key of these count: that we signed them ourselves says nothing and is not checked.
     let believed = identity.public_keys().filter(|(name, _)| (*name == GROUND) != (id == GROUND));
     let anchor = |(name, key)| contents(name)?.signed_by(&Public(key), &issuer).map(|c| c.pem());
     let anchors: String = believed.map(anchor).collect::<Result<_, rcgen::Error>>().map_err(network)?;

@@ -15,9 +15,9 @@ use super::{ANSWER, ReceiveCounters, STACK_BYTES};
 pub(super) const QUIET: Duration = Duration::from_millis(100);
 /// Looks that may wait for answers at the same time.
 const AT_ONCE: u32 = 8;
-/// Answers that wait to be looked at, of each look; each may be as long as an offer.
+/// Answers of one look that wait to be checked; each may be as long as an offer.
 const WAITING: usize = 4;
-/// Answers looked at in one go.
+/// Answers checked in one go.
 const IN_ONE_GO: usize = 64;
 
 enum Answer {
