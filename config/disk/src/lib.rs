@@ -13,10 +13,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 pub mod bounded;
+mod lock;
 mod operations;
 pub mod plan;
 pub mod regular;
 
+pub use lock::FolderLock;
 pub use operations::{Operations, Output, System};
 
 /// What every temporary file's name begins with.

@@ -3,14 +3,12 @@
 //! A job that finds another mission's files (or a ground station that finds a session it has finished) puts them aside under
 //! `earlier-N/` instead of continuing, replacing or reporting them as its own.
 
-use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use config::error::{Error, ErrorKind};
-use disk::{Disk, DiskError};
+use disk::{Disk, DiskError, FolderLock};
 use models::formats::{FormatError, read_bounded};
-use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};
 
 use crate::run_json::RunReport;
@@ -68,7 +66,7 @@ pub struct Owner {
 /// The right to write to a folder; ends with the process at the latest.
 #[derive(Debug)]
 pub struct Session {
-    _lock: File,
+    _lock: FolderLock,
     /// Where the files of an earlier session were put.
     pub put_aside: Option<PathBuf>,
 }
@@ -84,12 +82,10 @@ impl Session {
             move |source: io::Error| SessionError::Disk { path: out.into(), source: DiskError { action, source } }
         };
         disk.make_folders(out).map_err(failed("making the folder"))?;
-        // The folder itself is locked: no file is left, and the kernel unlocks it however the process ends.
-        let lock = File::open(out).map_err(failed("opening the folder"))?;
-        match flock(&lock, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => {}
-            Err(rustix::io::Errno::WOULDBLOCK) => return Err(SessionError::Busy(out.into())),
-            Err(e) => tracing::warn!("{}: cannot be locked ({e}); nothing keeps a second dgtr out", out.display()),
+        let lock = FolderLock::take(out).map_err(failed("opening the folder"))?;
+        let lock = lock.ok_or_else(|| SessionError::Busy(out.into()))?;
+        if !lock.held() {
+            tracing::warn!("{}: cannot be locked; nothing keeps a second dgtr out", out.display());
         }
         disk.sweep(out);
         disk.sweep(&out.join("map"));

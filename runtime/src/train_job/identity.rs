@@ -2,13 +2,11 @@
 //! from writing there at once.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use config::training::TrainSettings;
-use disk::Disk;
+use disk::{Disk, FolderLock};
 use models::formats::{FormatError, read_bounded};
-use rustix::fs::{FlockOperation, flock};
 use survey::dataset::Dataset;
 
 use super::TrainJob;
@@ -25,8 +23,8 @@ const LARGEST_MASK: u64 = 256 << 20;
 
 /// The folder of results is this process's as long as it lives.
 pub(super) struct Held {
-    #[expect(dead_code, reason = "the lock lives as long as the file is open")]
-    folder: File,
+    #[expect(dead_code, reason = "the folder is this process's as long as the lock lives")]
+    lock: FolderLock,
     /// The folder, if it was made for this job: one in which nothing came to lie goes again.
     made: Option<PathBuf>,
 }
@@ -47,20 +45,14 @@ impl Drop for Held {
 pub(super) fn hold(out: &Path) -> Result<Held, JobError> {
     let made = (!out.exists()).then(|| out.to_owned());
     std::fs::create_dir_all(out).map_err(JobError::io(out))?;
-    // The folder itself is locked: no file is left, and the system unlocks it however the process ends.
-    let folder = File::open(out).map_err(JobError::io(out))?;
-    match flock(&folder, FlockOperation::NonBlockingLockExclusive) {
-        Err(rustix::io::Errno::WOULDBLOCK) => Err(JobError::Request(format!(
-            "{}: another dgtr train writes here; let it end, or give another --out",
-            out.display()
-        ))),
-        locked => {
-            if let Err(e) = locked {
-                tracing::warn!("{}: cannot be locked ({e}); nothing keeps a second dgtr out", out.display());
-            }
-            Ok(Held { folder, made })
-        }
+    let Some(lock) = FolderLock::take(out).map_err(JobError::io(out))? else {
+        let what = format!("{}: another dgtr train writes here; let it end, or give another --out", out.display());
+        return Err(JobError::Request(what));
+    };
+    if !lock.held() {
+        tracing::warn!("{}: cannot be locked; nothing keeps a second dgtr out", out.display());
     }
+    Ok(Held { lock, made })
 }
 
 /// Hashes of what a model is made from, by what they are of.
