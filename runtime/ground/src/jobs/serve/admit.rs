@@ -1,5 +1,6 @@
 //! The last two gates: a received file must be a model, and the model what this aircraft of this mission should have made.
 
+use std::collections::HashSet;
 use std::path::Path;
 
 use config::mission::Mission;
@@ -40,6 +41,10 @@ pub fn admit(mission: &Mission, aircraft: &str, path: &Path) -> Result<LocalMode
         return refuse(format!("its origin is no place within {:.0} km of the mission's", MAX_APART_M / 1e3));
     };
     // The reader bounds them by what a picture can be; each is rendered here, so the mission's camera is the bound.
+    let (views, most) = (header.views.len(), mission.keyframes.max as usize);
+    if views > most {
+        return refuse(format!("it has {views} views, more than the mission's keyframes.max, {most}"));
+    }
     let too_large = |v: &View| v.intrinsics.width > mission.camera.width || v.intrinsics.height > mission.camera.height;
     if let Some((name, _)) = header.views.iter().find(|(_, v)| too_large(v)) {
         return refuse(format!("its view {name:?} is larger than the mission's camera"));
@@ -50,10 +55,33 @@ pub fn admit(mission: &Mission, aircraft: &str, path: &Path) -> Result<LocalMode
     header.region = mission.region(known);
     to_own.corners(&mut header.region);
     header.aircraft = aircraft.into();
-    match touches_region(&model) {
-        true => Ok(model),
-        false => refuse("none of its Gaussians lies near its aircraft's region".into()),
+    match place(&model, mission.ground.cell_m.into()) {
+        Some(Place { near: 0, .. }) | None => refuse("none of its Gaussians lies near its aircraft's region".into()),
+        Some(Place { far, gaussians, .. }) if 2 * far > gaussians => refuse(format!(
+            "{far} of its {gaussians} Gaussians lie farther from its aircraft's region than {FAR_LENGTHS:.0} times its length"
+        )),
+        Some(Place { squares, most_squares, .. }) if squares > most_squares => refuse(format!(
+            "its Gaussians are strewn over {squares} squares of ground.cell_m, its aircraft's region makes {most_squares} likely at most"
+        )),
+        Some(_) => Ok(model),
     }
+}
+
+/// From its aircraft's region a model shows little beyond so many times the region's length: the horizon behind what was flown over.
+const FAR_LENGTHS: f64 = 20.0;
+/// Squares of ground that the Gaussians of the horizon and of false matches may lie in, beyond those around the region.
+const STRAY_SQUARES: f64 = 256.0;
+
+/// Where the Gaussians of a model lie beside its aircraft's region.
+struct Place {
+    gaussians: usize,
+    /// No farther from it than it is long.
+    near: usize,
+    /// Farther than [`FAR_LENGTHS`] times that.
+    far: usize,
+    /// Squares of ground with one of them, those that are far left out, and how many there may be: each is a job of the merge.
+    squares: usize,
+    most_squares: usize,
 }
 
 /// From the mission's frame to the model's own, if they belong together.
@@ -62,14 +90,29 @@ fn motion(mission: Geodetic, own: Geodetic) -> Option<Motion> {
     (motion.point(DVec3::ZERO).length() <= MAX_APART_M).then_some(motion)
 }
 
-/// Whether at least one Gaussian lies in the region or no farther from it than the region is long.
-fn touches_region(model: &LocalModel) -> bool {
-    // The mission declares it, so that no height is asked for.
-    let Some(region) = Region::of(&model.header, 0.0) else { return false };
+/// Of a model whose region the mission declares; `None` where it has none.
+fn place(model: &LocalModel, cell_m: f64) -> Option<Place> {
+    // No height is asked for.
+    let region = Region::of(&model.header, 0.0)?;
     let low = region.corners.iter().copied().fold(DVec2::INFINITY, DVec2::min);
     let high = region.corners.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
-    let near = |mean: &[f32; 3]| region.distance(Vec3::from(*mean).as_dvec3().truncate()) <= low.distance(high);
-    model.cloud.means.iter().any(near)
+    let length = low.distance(high);
+    let around = ((high - low + 2.0 * length) / cell_m).ceil() + 1.0;
+    let most_squares = (around.x * around.y + STRAY_SQUARES) as usize;
+    let (mut near, mut far, mut squares) = (0, 0, HashSet::new());
+    for mean in &model.cloud.means {
+        let at = Vec3::from(*mean).as_dvec3().truncate();
+        let distance = region.distance(at);
+        near += usize::from(distance <= length);
+        match distance <= FAR_LENGTHS * length {
+            // More than the bound are not counted on.
+            true if squares.len() <= most_squares => _ = squares.insert((at / cell_m).floor().as_i64vec2()),
+            true => {}
+            // What is no number is nowhere.
+            false => far += 1,
+        }
+    }
+    Some(Place { gaussians: model.cloud.len(), near, far, squares: squares.len(), most_squares })
 }
 
 #[cfg(test)]

@@ -81,3 +81,51 @@ fn a_view_larger_than_the_missions_camera_costs_its_own_model_only() {
     assert!(with(|v| v.intrinsics = v.intrinsics.resized(6400, 4800)).is_err());
     assert_eq!(with(|v| v.intrinsics = v.intrinsics.resized(32, 24)), Ok(()));
 }
+
+/// 20,000 Gaussians over a thousand kilometres, 1.1 MB, made a job and a synced file each.
+#[test]
+fn a_model_strewn_over_more_ground_than_its_aircraft_can_have_seen_is_refused_before_it_is_merged() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let mission = mission(dir.path());
+    let strewn = |share: f64, reach: f32| {
+        let path = written(dir.path(), "west", |m| {
+            let n = m.cloud.len();
+            let strewn = (share * n as f64) as usize;
+            // A sequence that fills the square evenly (Roberts 2018, R2).
+            for (i, mean) in m.cloud.means.iter_mut().enumerate().take(strewn) {
+                let along = |step: f64| ((i as f64 * step).fract() * 2.0 - 1.0) as f32 * reach;
+                *mean = [along(0.754_877_666), along(0.569_840_291), 0.0];
+            }
+        });
+        admit(&mission, "west", &path).map_or_else(|e| e.to_string(), |_| "admitted".into())
+    };
+    assert_eq!(strewn(0.0, 0.0), "admitted");
+    assert_eq!(strewn(0.02, 1000.0), "admitted", "a horizon");
+    assert_eq!(strewn(0.02, 1e6), "admitted", "and false matches, which the merge leaves out");
+    assert!(strewn(0.9, 1e6).contains("farther from its aircraft's region"), "{}", strewn(0.9, 1e6));
+    assert!(strewn(0.9, 10_000.0).contains("farther from its aircraft's region"));
+    let mut mission = mission.clone();
+    mission.ground.cell_m = 32.0;
+    let path = written(dir.path(), "west", |m| {
+        for (i, mean) in m.cloud.means.iter_mut().enumerate().skip(1) {
+            *mean = [(i % 56) as f32 * 32.0 - 900.0, (i / 56) as f32 * 32.0 - 900.0, 0.0];
+        }
+    });
+    let why = admit(&mission, "west", &path).map_or_else(|e| e.to_string(), |_| "admitted".into());
+    assert!(why.contains("strewn over"), "{why}");
+}
+
+/// 60,000 views in a header of two megabytes kept the merge busy for hours.
+#[test]
+fn a_model_with_more_views_than_the_mission_keeps_is_refused() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let mut mission = mission(dir.path());
+    mission.keyframes.max = 3;
+    let with = |views: usize| {
+        let view = |i: usize| (format!("v{i}"), nadir(i as f64, 0.0, 30.0));
+        let path = written(dir.path(), "west", |m| m.header.views = (0..views).map(view).collect());
+        admit(&mission, "west", &path).map_or_else(|e| e.to_string(), |_| "admitted".into())
+    };
+    assert_eq!(with(3), "admitted");
+    assert!(with(4).contains("keyframes.max"), "{}", with(4));
+}
