@@ -13,6 +13,7 @@ mod aggregate;
 #[cfg(feature = "lab")]
 mod demo;
 mod doctor;
+mod ending;
 mod error;
 mod eval;
 pub mod examples;

@@ -18,6 +18,7 @@ use survey::dataset::Dataset;
 use crate::cli::output::outln;
 
 use super::CliError;
+use super::ending::within_bounds;
 
 /// Arguments of `dgtr aggregate`.
 #[derive(Debug, clap::Args)]
@@ -144,6 +145,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mut settings = GroundSettings::default();
     args.settings.merging.apply(&mut settings)?;
     let stop = Interrupt::install()?;
+    within_bounds(&stop).map_err(CliError::failed)?;
     let members = args.models.iter().map(|p| LocalModel::read(p).map(Member::of)).collect::<Result<Vec<_>, _>>()?;
     let outcome = aggregate::run(members, &settings, None, &args.out, &|| !stop.requested())?;
     let mut run = summary::run_report("aggregate", &outcome, settings.seed);

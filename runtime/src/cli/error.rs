@@ -14,7 +14,12 @@ pub const EXIT_CODES: [(ErrorKind, u8, &str); 4] = [
 
 /// The exit code of an error of this kind.
 pub fn exit_code(kind: ErrorKind) -> ExitCode {
-    EXIT_CODES.iter().find(|row| row.0 == kind).map_or(ExitCode::FAILURE, |row| ExitCode::from(row.1))
+    ExitCode::from(code_of(kind))
+}
+
+/// The same as a number.
+pub(super) fn code_of(kind: ErrorKind) -> u8 {
+    EXIT_CODES.iter().find(|row| row.0 == kind).map_or(1, |row| row.1)
 }
 
 /// One line (what, where, how to mend) and its kind.

@@ -20,6 +20,7 @@ use pages::report::{REPORT, ReportData, Timing, bytes};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};
+use super::ending::within_bounds;
 use super::http::HttpArgs;
 
 /// Arguments of `dgtr serve`.
@@ -99,7 +100,10 @@ pub fn run(args: Args) -> Result<(), CliError> {
         mission.aircraft.len() - reception.missing.len(),
         mission.aircraft.len()
     ));
-    // A first Ctrl-C ends the reception; what is here is merged all the same, and a second one ends at once.
+    // A Ctrl-C that ended the reception: what is here is merged all the same, and a second one ends at once.
+    if !interrupt.requested() {
+        within_bounds(&interrupt).map_err(CliError::failed)?;
+    }
     supervisor.status(&format!("merging {} models", reception.received.len()));
     board.say("merging and distilling");
     let at_work = || {

@@ -83,3 +83,32 @@ fn what_cannot_be_done_is_said_in_a_line() {
     refused(&["ground", "cell", "--store", &store], 2, "required");
     refused(&["ground", "plan", &models[0], "--store", "s3://"], 2, "s3://");
 }
+
+/// Thousands of Gaussians over a thousand kilometres make a job each; asked to stop, the merge went on for an hour.
+#[test]
+fn a_merge_of_very_many_cells_obeys_a_request_to_stop_and_keeps_what_is_made() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut cloud = GaussianCloud::with_capacity(0, 8000);
+    for i in 0..8000 {
+        let along = |step: f64| ((f64::from(i) * step).fract() * 2e6 - 1e6) as f32;
+        cloud.push([along(0.754_877_666), along(0.569_840_291), 0.0], [0.7; 3], [1.0, 0.0, 0.0, 0.0], 3.0, &[0.1; 3]);
+    }
+    let (path, out) = (dir.path().join("strewn.dgtr"), dir.path().join("out"));
+    model::write(&path, &ModelHeader::default(), &cloud).unwrap();
+    let mut command = program();
+    command.arg("aggregate").arg(&path).arg("--out").arg(&out).args(["--epochs", "0"]);
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let made = || std::fs::read_dir(out.join("ground/cells")).map_or(0, Iterator::count);
+    let until = Instant::now() + Duration::from_secs(120);
+    while made() < 20 {
+        assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
+        assert!(Instant::now() < until, "nothing was made");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let pid = rustix::process::Pid::from_child(&child);
+    rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+    let ended = child.wait_with_output().unwrap();
+    assert_eq!(ended.status.code(), Some(4));
+    assert!(String::from_utf8_lossy(&ended.stderr).contains("run the same command again"));
+    assert!((20..8000).contains(&made()), "{} cells", made());
+}

@@ -10,6 +10,7 @@ use job::interrupt::Interrupt;
 use models::ground_cell::CellKey;
 
 use super::CliError;
+use crate::cli::ending::within_bounds;
 use crate::cli::output::outln;
 
 /// Arguments of `dgtr ground cell`.
@@ -51,6 +52,7 @@ impl FromStr for Share {
 
 pub(super) fn run(args: Args) -> Result<(), CliError> {
     let stop = Interrupt::install()?;
+    within_bounds(&stop).map_err(CliError::failed)?;
     let store = Store::open(&args.store)?;
     let plan = Plan::of(&store)?;
     let index = |key: &CellKey| {

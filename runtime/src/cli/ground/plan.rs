@@ -16,6 +16,7 @@ use models::formats::model::read_header;
 
 use super::CliError;
 use crate::cli::aggregate::Merging;
+use crate::cli::ending::within_bounds;
 use crate::cli::output::outln;
 
 /// Arguments of `dgtr ground plan`.
@@ -40,6 +41,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
     let mut settings = mission.as_ref().map_or_else(GroundSettings::default, |m| m.ground.clone());
     args.settings.apply(&mut settings)?;
     let stop = Interrupt::install()?;
+    within_bounds(&stop).map_err(CliError::failed)?;
     let store = Store::open(&args.store)?;
     let member = |path: &PathBuf| match &mission {
         None => Ok(Member::of(LocalModel::read(path)?)),
