@@ -16,8 +16,9 @@ const SIGNED_FOR: Duration = Duration::from_secs(3600);
 const TRIES: u32 = 5;
 const REST: Duration = Duration::from_millis(200);
 const CONNECT: Duration = Duration::from_secs(10);
-/// Between two pieces of an answer or after the last one of a question.
-const SILENCE: Duration = Duration::from_secs(60);
+/// A request with its answer takes no longer than this, and a second for every so many bytes: 64 KiB/s is a slow link.
+const ANSWER: Duration = Duration::from_secs(20);
+const BYTES_PER_S: u64 = 64 << 10;
 
 pub struct Bucket {
     agent: Agent,
@@ -25,6 +26,19 @@ pub struct Bucket {
     credentials: Credentials,
     /// What all names begin with.
     prefix: String,
+    /// How long a request without content may take.
+    limit: Duration,
+}
+
+fn agent() -> Agent {
+    let config = Agent::config_builder()
+        .http_status_as_error(false)
+        .timeout_connect(Some(CONNECT))
+        // Elsewhere there is somebody else: what is signed and sent is for the endpoint that was named.
+        .max_redirects(0)
+        .max_redirects_will_error(false)
+        .build();
+    config.into()
 }
 
 impl Bucket {
@@ -52,14 +66,14 @@ impl Bucket {
             Some(token) => Credentials::new_with_token(key, secret, token),
             None => Credentials::new(key, secret),
         };
-        let config = Agent::config_builder()
-            .http_status_as_error(false)
-            .timeout_connect(Some(CONNECT))
-            .timeout_recv_response(Some(SILENCE))
-            .build();
         let prefix = prefix.trim_end_matches('/');
         let prefix = if prefix.is_empty() { String::new() } else { format!("{prefix}/") };
-        Ok(Self { agent: config.into(), bucket, credentials, prefix })
+        Ok(Self { agent: agent(), bucket, credentials, prefix, limit: ANSWER })
+    }
+
+    /// How long a request that carries so many bytes may take.
+    fn within(&self, bytes: u64) -> Option<Duration> {
+        Some(self.limit + Duration::from_secs(bytes / BYTES_PER_S))
     }
 
     fn key(&self, name: &str) -> String {
@@ -78,6 +92,13 @@ impl Bucket {
             std::thread::sleep(REST * n);
             match send() {
                 Ok(answer) if answer.status().is_server_error() => why = format!("the server says {}", answer.status()),
+                Ok(answer) if answer.status().is_redirection() => {
+                    why = format!(
+                        "the server says {} and names another place, which is not followed; name it in AWS_ENDPOINT_URL",
+                        answer.status()
+                    );
+                    break;
+                }
                 Ok(answer) => {
                     let is_refused = answer.status().is_client_error();
                     match read(answer) {
@@ -99,7 +120,7 @@ impl Bucket {
         let key = self.key(name);
         let send = || {
             let url = self.bucket.head_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
-            self.agent.head(url.as_str()).call()
+            self.agent.head(url.as_str()).config().timeout_global(self.within(0)).build().call()
         };
         self.ask((name, "asking for it"), &send, &|answer| match answer.status() {
             StatusCode::NOT_FOUND => Ok(None),
@@ -116,7 +137,8 @@ impl Bucket {
         let send = || {
             let url = self.bucket.get_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
             let range = format!("bytes={from}-{}", from + bytes - 1);
-            self.agent.get(url.as_str()).header("range", range).call()
+            let question = self.agent.get(url.as_str()).header("range", range);
+            question.config().timeout_global(self.within(bytes)).build().call()
         };
         let found = self.ask((name, "reading"), &send, &|mut answer| match answer.status() {
             StatusCode::NOT_FOUND => Ok(None),
@@ -141,7 +163,8 @@ impl Bucket {
         fill(&mut bytes).map_err(disk)?;
         let send = || {
             let url = self.bucket.put_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
-            self.agent.put(url.as_str()).send(&bytes[..])
+            let question = self.agent.put(url.as_str()).config().timeout_global(self.within(bytes.len() as u64));
+            question.build().send(&bytes[..])
         };
         self.ask((name, "writing"), &send, &|answer| match answer.status().is_success() {
             true => Ok(()),
@@ -153,12 +176,99 @@ impl Bucket {
         let key = self.key(name);
         let send = || {
             let url = self.bucket.delete_object(Some(&self.credentials), &key).sign(SIGNED_FOR);
-            self.agent.delete(url.as_str()).call()
+            self.agent.delete(url.as_str()).config().timeout_global(self.within(0)).build().call()
         };
         self.ask((name, "removing"), &send, &|answer| match answer.status() {
             StatusCode::NOT_FOUND => Ok(()),
             status if status.is_success() => Ok(()),
             status => Err(format!("the server says {status}")),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read, Write};
+    use std::net::{SocketAddr, TcpListener, TcpStream};
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    /// A server that does the same with every connection; how many there were.
+    fn server(answer: impl Fn(TcpStream) + Send + 'static) -> (SocketAddr, Arc<AtomicUsize>) {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("listens");
+        let (at, met) = (listener.local_addr().expect("bound"), Arc::new(AtomicUsize::new(0)));
+        let counted = met.clone();
+        std::thread::spawn(move || {
+            for stream in listener.incoming().flatten() {
+                counted.fetch_add(1, Ordering::SeqCst);
+                answer(stream);
+            }
+        });
+        (at, met)
+    }
+
+    fn bucket(at: SocketAddr, limit: Duration) -> Bucket {
+        let url = format!("http://{at}").parse().expect("an address");
+        Bucket {
+            agent: agent(),
+            bucket: rusty_s3::Bucket::new(url, UrlStyle::Path, "bucket", "us-east-1").expect("a bucket"),
+            credentials: Credentials::new("key", "secret"),
+            prefix: String::new(),
+            limit,
+        }
+    }
+
+    /// The endpoint's certificate and name were checked, and what was signed for it went to whom it named.
+    #[test]
+    fn a_server_that_names_another_place_is_not_followed_and_nobody_there_hears_of_it() {
+        let (elsewhere, met) = server(drop);
+        let (at, _) = server(move |mut stream| {
+            let _ = stream.read(&mut [0; 4096]);
+            let head = format!(
+                "HTTP/1.1 307 Temporary Redirect\r\nLocation: http://{elsewhere}/x\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+            );
+            let _ = stream.write_all(head.as_bytes());
+        });
+        let bucket = bucket(at, ANSWER);
+        let all = [
+            bucket.size("cells/a").map(drop),
+            bucket.range("cells/a", 0, 10).map(drop),
+            bucket.put("cells/a", &|out| out.write_all(b"secret")),
+            bucket.remove("cells/a"),
+        ];
+        for refused in all {
+            let line = refused.expect_err("refused").to_string();
+            assert!(line.contains("307") && line.contains("not followed"), "{line}");
+        }
+        assert_eq!(met.load(Ordering::SeqCst), 0, "somebody else was asked");
+    }
+
+    #[test]
+    fn a_server_that_stalls_before_or_in_its_answer_or_drips_is_given_up_after_so_many_tries() {
+        let hold = |bytes: &'static [u8], drips: bool| {
+            server(move |mut stream| {
+                std::thread::spawn(move || {
+                    let _ = stream.read(&mut [0; 4096]);
+                    let _ = stream.write_all(bytes);
+                    // Longer than anybody waits.
+                    for _ in 0..100 {
+                        std::thread::sleep(Duration::from_millis(50));
+                        if drips && stream.write_all(b"x").is_err() {
+                            return;
+                        }
+                    }
+                });
+            })
+        };
+        let half = b"HTTP/1.1 206 Partial Content\r\nContent-Length: 5000\r\n\r\nxxxxxxxxxx";
+        for (begun, drips) in [(&b""[..], false), (half, false), (half, true)] {
+            let (at, met) = hold(begun, drips);
+            let line =
+                bucket(at, Duration::from_millis(200)).range("cells/a", 0, 5000).expect_err("given up").to_string();
+            assert!(line.contains("cells/a: reading failed") && !line.contains('\n'), "{line}");
+            assert_eq!(met.load(Ordering::SeqCst), TRIES as usize);
+        }
     }
 }
