@@ -13,7 +13,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use super::access::{Token, Verdict, address, judge};
 use super::request::{Refusal, parse};
 use super::respond::{answer, keep_token, refusal, status};
-use super::room::{Room, Seat};
+use super::room::{Guest, Room};
 use super::{HttpError, Watch};
 
 /// Bytes of a request's head (what nginx and Apache allow).
@@ -91,14 +91,16 @@ fn serve(listener: &TcpListener, token: Option<Arc<Token>>, watch: &Watch, room:
             }
             continue;
         };
-        let Some(seat) = Seat::take(room) else {
+        let Some(guest) = Guest::enter(room, &stream) else {
             turn_away(&stream);
             continue;
         };
         let (watch, token) = (watch.clone(), token.clone());
         // Without a thread the connection is closed. Whoever has gone is not missed.
         let _ = std::thread::Builder::new().name("http".into()).stack_size(STACK).spawn(move || {
-            let _ = connection(&stream, token.as_deref(), &watch, seat.room());
+            let _ = connection(&stream, token.as_deref(), &watch, &guest);
+            // Before its number is another's.
+            drop((guest, stream));
         });
     }
 }
@@ -133,7 +135,7 @@ fn refuse(stream: &TcpStream, why: Refusal) -> io::Result<()> {
     Ok(())
 }
 
-fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, room: &Room) -> io::Result<()> {
+fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, guest: &Guest) -> io::Result<()> {
     stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
     let mut bytes = [0; HEAD_BYTES];
@@ -158,8 +160,13 @@ fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, room: &R
             Err(why) => return refuse(stream, why),
         }
     };
+    guest.has_spoken();
+    let Some(seat) = guest.seat() else {
+        turn_away(stream);
+        return Ok(());
+    };
     match (judge(&asked, token), token) {
-        (Verdict::Welcome, _) => answer(stream, asked.route, watch, room),
+        (Verdict::Welcome, _) => answer(stream, asked.route, watch, seat.room()),
         (Verdict::Keep, Some(token)) => keep_token(stream, token),
         (Verdict::Keep | Verdict::Stranger, _) => status(stream, "401 Unauthorized", "WWW-Authenticate: Bearer\r\n"),
         (Verdict::Rebound, _) => status(stream, "403 Forbidden", ""),
