@@ -63,6 +63,7 @@ fn talk(python: &Path, signing: Signing, peer_key: Option<&str>) -> (serde_json:
     let folder = tempfile::tempdir().expect("a folder");
     let key = folder.path().join("key");
     std::fs::write(&key, KEY).expect("written");
+    std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
     let settings = VehicleSettings {
         address: LinkAddress::Pty(None),
         patient: false,

@@ -260,6 +260,7 @@ fn signing_keys_and_their_time_stamps() {
         read: Read::File("link.key", &|path| line(signing_store::open(&settings(path)), |(_, store)| store.is_some())),
     });
     std::fs::write(&key, [7; 32]).expect("written");
+    std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
     let settings = settings(&key);
     survive(&Reader {
         name: "signing-time",

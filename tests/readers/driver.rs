@@ -8,7 +8,7 @@
 
 use std::cell::RefCell;
 use std::fs::File;
-use std::os::unix::fs::{FileExt, MetadataExt};
+use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::time::Instant;
@@ -116,7 +116,8 @@ fn write(file: &mut Option<File>, path: &Path, bytes: &[u8]) -> std::io::Result<
         open.write_all_at(bytes, 0)?;
         return open.set_len(bytes.len() as u64);
     }
-    let new = File::create(path)?;
+    // As secrets lie on a disk.
+    let new = File::options().write(true).create(true).truncate(true).mode(0o600).open(path)?;
     new.write_all_at(bytes, 0)?;
     *file = Some(new);
     Ok(())

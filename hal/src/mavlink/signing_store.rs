@@ -51,21 +51,31 @@ pub fn open(settings: &LinkSettings) -> Result<(Signer, Option<SigningStore>), H
 
 /// As much of a file as a key or a time stamp can have, and one byte more.
 fn read(path: &Path) -> std::io::Result<Vec<u8>> {
+    bounded(disk::regular::open(path)?)
+}
+
+fn bounded(file: File) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
+    file.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
     Ok(bytes)
+}
+
+/// Zeros are what a disk gives that lost the key, and anybody's first guess.
+fn usable(key: [u8; 32]) -> Result<[u8; 32], String> {
+    if key == [0; 32] { Err("is all zeros; make a new key".into()) } else { Ok(key) }
 }
 
 fn read_key(path: &Path) -> Result<[u8; 32], HalError> {
     let wrong = |why: String| HalError::Signing { path: path.into(), why };
-    let bytes = read(path).map_err(|e| wrong(e.to_string()))?;
+    let file = disk::regular::open_secret(path).map_err(|e| wrong(e.to_string()))?;
+    let bytes = bounded(file).map_err(|e| wrong(e.to_string()))?;
     if let Ok(key) = <[u8; 32]>::try_from(bytes.as_slice()) {
-        return Ok(key);
+        return usable(key).map_err(wrong);
     }
     let digits: Vec<u32> = bytes.trim_ascii().iter().map_while(|b| char::from(*b).to_digit(16)).collect();
     let pairs: Vec<u8> = digits.chunks_exact(2).map(|d| (d[0] * 16 + d[1]) as u8).collect();
     match <[u8; 32]>::try_from(pairs) {
-        Ok(key) if bytes.trim_ascii().len() == 64 => Ok(key),
+        Ok(key) if bytes.trim_ascii().len() == 64 => usable(key).map_err(wrong),
         _ => Err(wrong(format!("{} bytes; a key is 32 bytes or 64 hexadecimal digits", bytes.len()))),
     }
 }
@@ -122,7 +132,14 @@ impl SigningStore {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
+
+    fn write_key(path: &Path, key: impl AsRef<[u8]>) {
+        std::fs::write(path, key).expect("written");
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600)).expect("its own");
+    }
 
     fn settings(key: &Path) -> LinkSettings {
         LinkSettings { signing: Signing::Require, signing_key: Some(key.into()), ..LinkSettings::default() }
@@ -132,7 +149,7 @@ mod tests {
     fn the_time_stamp_never_goes_back_over_a_restart() {
         let folder = tempfile::tempdir().expect("a folder");
         let key = folder.path().join("key");
-        std::fs::write(&key, [7; 32]).expect("written");
+        write_key(&key, [7; 32]);
         let (first, _) = open(&settings(&key)).expect("opens");
         let (second, _) = open(&settings(&key)).expect("opens");
         assert!(second.timestamp() >= first.timestamp() + RESERVE);
@@ -143,7 +160,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let (key, state) = (folder.path().join("etc/key"), folder.path().join("state"));
         std::fs::create_dir(folder.path().join("etc")).expect("made");
-        std::fs::write(&key, [7; 32]).expect("written");
+        write_key(&key, [7; 32]);
         // As an earlier release left it.
         std::fs::write(folder.path().join("etc/key.timestamp"), "700000000000").expect("written");
         let mut store = SigningStore::of(&key, &state).expect("opens");
@@ -159,7 +176,7 @@ mod tests {
     fn a_damaged_time_stamp_is_set_aside_and_none_is_used_again() {
         let folder = tempfile::tempdir().expect("a folder");
         let key = folder.path().join("key");
-        std::fs::write(&key, [7; 32]).expect("written");
+        write_key(&key, [7; 32]);
         open(&settings(&key)).expect("opens");
         let (last, _) = open(&settings(&key)).expect("opens");
         let stamp = folder.path().join("key.timestamp");
@@ -170,12 +187,27 @@ mod tests {
     }
 
     #[test]
+    fn keys_of_zeros_and_keys_that_others_may_read_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let key = folder.path().join("key");
+        for zeros in [vec![0; 32], b"00".repeat(32)] {
+            write_key(&key, zeros);
+            let error = open(&settings(&key)).err().expect("refused").to_string();
+            assert!(error.contains("all zeros"), "{error}");
+        }
+        write_key(&key, [7; 32]);
+        std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o644)).expect("its own");
+        let error = open(&settings(&key)).err().expect("refused").to_string();
+        assert!(error.contains("mode 644") && error.contains("chmod 600"), "{error}");
+    }
+
+    #[test]
     fn keys_are_read_raw_or_in_hexadecimal_and_nothing_else() {
         let folder = tempfile::tempdir().expect("a folder");
         let key = folder.path().join("key");
-        std::fs::write(&key, "0a".repeat(32) + "\n").expect("written");
+        write_key(&key, "0a".repeat(32) + "\n");
         assert_eq!(read_key(&key).expect("a key"), [10; 32]);
-        std::fs::write(&key, "secret").expect("written");
+        write_key(&key, "secret");
         let error = open(&settings(&key)).err().expect("refused").to_string();
         assert!(error.contains("64 hexadecimal digits"), "{error}");
         let error = open(&settings(&folder.path().join("none"))).err().expect("refused").to_string();

@@ -51,6 +51,7 @@ fn a_live_page_that_others_could_see_is_refused_before_anything_begins() {
     let out = dir.path().join("out").to_string_lossy().into_owned();
     let token = dir.path().join("token").to_string_lossy().into_owned();
     std::fs::write(&token, "short").unwrap();
+    std::fs::set_permissions(&token, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
     for command in ["fly", "serve"] {
         let refused = |more: &[&str]| {
             let output = dgtr(&[&[command, "--mission", &mission, "--out", &out], more].concat());

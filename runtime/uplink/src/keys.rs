@@ -110,7 +110,7 @@ fn public(key: &SigningKey) -> PublicKey {
 
 fn read_private(path: &Path) -> Result<SigningKey, KeyError> {
     let io = |source| KeyError::Io { path: path.into(), source };
-    let file = File::open(path).map_err(io)?;
+    let file = disk::regular::open(path).map_err(io)?;
     let mode = file.metadata().map_err(io)?.mode() & 0o777;
     if mode & 0o077 != 0 {
         return Err(KeyError::Permissions { path: path.into(), mode });

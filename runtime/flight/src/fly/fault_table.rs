@@ -94,6 +94,7 @@ fn fly(row: &Row, world: &Arc<World>) -> Rehearsed {
     if script.sim.autopilot.signing_key.is_some() {
         let key = folder.path().join("key");
         std::fs::write(&key, KEY).expect("key");
+        std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
         script.vehicle.link.signing_key = Some(key);
     }
     rehearse(&script, world.clone(), folder.path())

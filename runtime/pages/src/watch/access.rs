@@ -1,9 +1,8 @@
 //! Who may look: anybody on this machine, elsewhere whoever shows the token.
 
+use std::io::Read;
 use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
-
-use models::formats::read_bounded;
 
 use super::HttpError;
 use super::request::Asked;
@@ -33,7 +32,9 @@ impl Token {
     /// The file cannot be read, or what it holds is no token.
     pub fn read(path: &Path) -> Result<Self, HttpError> {
         let refused = |what: String| HttpError::Token { path: path.into(), what };
-        let bytes = read_bounded(path, FILE_BYTES).map_err(|e| refused(e.to_string()))?;
+        let mut bytes = Vec::new();
+        let read = disk::regular::open_secret(path).and_then(|file| file.take(FILE_BYTES).read_to_end(&mut bytes));
+        read.map_err(|e| refused(e.to_string()))?;
         let text = std::str::from_utf8(&bytes).unwrap_or_default().trim();
         let fits = |c: char| c.is_ascii_alphanumeric() || "-._~".contains(c);
         if !LENGTH.contains(&text.len()) || !text.chars().all(fits) {
@@ -102,6 +103,9 @@ pub(super) fn address(text: &str, token: Option<&Token>) -> Result<SocketAddr, H
 
 #[cfg(test)]
 mod tests {
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
 
     #[test]
@@ -134,6 +138,7 @@ mod tests {
         let read = |text: &[u8]| {
             let path = dir.path().join("token");
             std::fs::write(&path, text).expect("write");
+            std::fs::set_permissions(&path, Permissions::from_mode(0o600)).expect("its own");
             Token::read(&path)
         };
         let token = read(b" 0123456789abcdef\n").expect("a token");
@@ -144,5 +149,9 @@ mod tests {
         {
             assert!(matches!(read(bad), Err(HttpError::Token { .. })));
         }
+        read(b"0123456789abcdef").expect("a token");
+        let path = dir.path().join("token");
+        std::fs::set_permissions(&path, Permissions::from_mode(0o644)).expect("its own");
+        assert!(Token::read(&path).is_err_and(|e| e.to_string().contains("chmod 600")));
     }
 }
