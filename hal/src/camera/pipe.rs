@@ -3,11 +3,13 @@
 //! first bytes.
 
 use std::io::Read;
+use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, TrySendError, sync_channel};
 use std::time::Instant;
 
 use image::RgbImage;
+use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::jpeg::JpegSplitter;
 use super::picture::Picture;
@@ -46,6 +48,8 @@ impl PipeCamera {
     /// The program ended: says so once, and starts it again when its time has come.
     fn revive(&mut self) -> Result<(), HalError> {
         if let Some(mut child) = self.child.take() {
+            // What it started and left behind holds the camera.
+            end_group(&child);
             let status = child.wait().map_or_else(|e| e.to_string(), |s| s.to_string());
             self.restart.failed();
             return Err(failed(&self.command, format!("ended ({status}); it is started again")));
@@ -62,9 +66,18 @@ impl Drop for PipeCamera {
     fn drop(&mut self) {
         if let Some(child) = &mut self.child {
             // It may have ended by itself; either way it is reaped.
+            end_group(child);
             let _ = child.kill();
             let _ = child.wait();
         }
+    }
+}
+
+/// Ends a program that has not been reaped yet, with all that it started: they are a group of their own.
+fn end_group(child: &Child) {
+    if let Some(group) = i32::try_from(child.id()).ok().and_then(Pid::from_raw) {
+        // Nobody may be left in it.
+        let _ = kill_process_group(group, Signal::KILL);
     }
 }
 
@@ -78,6 +91,7 @@ fn spawn(command: &[String], size: (u32, u32)) -> Result<(Child, Receiver<Grabbe
         .args(arguments)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
+        .process_group(0)
         .spawn()
         .map_err(|e| failed(command, format!("cannot be started: {e}")))?;
     let stdout = child.stdout.take().ok_or_else(|| failed(command, "has no standard output".into()))?;
@@ -215,6 +229,49 @@ mod tests {
         let raw = |i: usize| RgbImage::from_raw(16, 8, bytes[i * 384..(i + 1) * 384].to_vec()).map(Picture::Rgb);
         let expected: Vec<_> = (0..2).filter_map(|i| Some((Some(i as u64 + 1), raw(i)?))).collect();
         assert!(pictures == expected, "{} pictures", pictures.len());
+    }
+
+    #[test]
+    fn what_a_program_started_ends_with_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let of = |name: &str| folder.path().join(name);
+        // A shell that starts another program, as wrappers of cameras do.
+        let script = |n: &str, last: &str| format!("sleep 3600 >/dev/null & echo $! > {}; {last}", of(n).display());
+        let started = |n: &str, last: &str| {
+            let camera = PipeCamera::start(&["sh".into(), "-c".into(), script(n, last)], (16, 8)).expect("starts");
+            let until = Instant::now() + Duration::from_secs(20);
+            let pid = loop {
+                assert!(Instant::now() < until, "nothing was started");
+                if let Some(pid) = std::fs::read_to_string(of(n)).ok().and_then(|t| t.trim().parse::<i32>().ok()) {
+                    break pid;
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            };
+            (camera, pid)
+        };
+        // Where nobody reaps it, it stays as a zombie.
+        let lives = |pid: i32| {
+            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+            stat.rsplit_once(") ").is_some_and(|s| !s.1.starts_with('Z'))
+        };
+        let ended = |pid: i32| {
+            let until = Instant::now() + Duration::from_secs(20);
+            while lives(pid) && Instant::now() < until {
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            !lives(pid)
+        };
+        let (camera, pid) = started("stopped", "wait");
+        assert!(lives(pid));
+        drop(camera);
+        assert!(ended(pid), "it outlived the camera");
+        let (mut camera, pid) = started("ended", "exit 3");
+        let until = Instant::now() + Duration::from_secs(20);
+        while camera.next_picture(0).is_ok() {
+            assert!(Instant::now() < until, "its end is not noticed");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert!(ended(pid), "it outlived its program");
     }
 
     #[test]
