@@ -5,6 +5,7 @@
 //! library itself, which ONNX Runtime allows only once per process.
 
 pub mod depth;
+mod external;
 pub mod features;
 pub mod manifest;
 pub mod metric;

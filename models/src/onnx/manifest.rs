@@ -267,6 +267,14 @@ impl Manifest {
     pub fn read_network(&self) -> Result<Vec<u8>, OnnxError> {
         let bytes = read_bounded(&self.file, MAX_NETWORK_BYTES)?;
         self.check_hash(&bytes)?;
+        if let Some(other) = super::external::file_of(&bytes) {
+            let file = self.file.display();
+            let reason = format!(
+                "{file} keeps weights in another file ({}), which the manifest's hash does not cover; export it with its weights inside",
+                crate::formats::one_line(other)
+            );
+            return Err(OnnxError::Manifest { manifest: self.name.clone(), field: "file", reason });
+        }
         Ok(bytes)
     }
 

@@ -5,7 +5,9 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::OnceLock;
+use std::sync::{Arc, Condvar, Mutex, OnceLock, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
 
 use ort::environment::Environment;
 use ort::session::builder::GraphOptimizationLevel;
@@ -106,8 +108,19 @@ impl NetworkSession {
     /// Runs once and copies out the outputs in `wanted`, in that order. The last one of a series gives the memory back.
     ///
     /// # Errors
-    /// ONNX Runtime refused the inputs or failed; an output in `wanted` is missing or not f32.
+    /// ONNX Runtime refused the inputs or failed; it did not end in time; an output in `wanted` is missing or not f32.
     pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str], last: bool) -> Result<Vec<Tensor>, OnnxError> {
+        let floats: usize = inputs.iter().map(|(_, _, data)| data.len()).sum();
+        self.run_within(time_limit(floats), inputs, wanted, last)
+    }
+
+    fn run_within(
+        &mut self,
+        limit: Duration,
+        inputs: &[Input<'_>],
+        wanted: &[&str],
+        last: bool,
+    ) -> Result<Vec<Tensor>, OnnxError> {
         let network = self.name.clone();
         let fail = |reason: String| OnnxError::Runtime { network: network.clone(), reason };
         let mut values = Vec::with_capacity(inputs.len());
@@ -120,7 +133,12 @@ impl NetworkSession {
         if self.in_series && last {
             options.set("memory.enable_memory_arena_shrinkage", "cpu:0").map_err(|e| fail(one_line(e)))?;
         }
-        let results = self.session.run_with_options(values, &options).map_err(|e| fail(one_line(e)))?;
+        let watch = Watch::start(options, limit).map_err(|e| fail(one_line(e)))?;
+        let watched = watch.shared.clone();
+        let results = self.session.run_with_options(values, &watched.options);
+        let is_over_time = watch.end();
+        let too_long = || format!("did not end within {} s; an endless loop, or too large a network", limit.as_secs());
+        let results = results.map_err(|e| fail(if is_over_time { too_long() } else { one_line(e) }))?;
         wanted
             .iter()
             .map(|&name| {
@@ -131,6 +149,53 @@ impl NetworkSession {
                 Ok(Tensor { shape: shape.iter().map(|&d| d as usize).collect(), data: data.to_vec() })
             })
             .collect()
+    }
+}
+
+/// A run is ended after this, and so much longer for every million numbers that go in: ten times what the slowest network in use takes
+/// on a Raspberry Pi 5. A network's loop may have no end.
+const LIMIT: Duration = Duration::from_secs(15);
+const LIMIT_PER_MILLION: f64 = 120.0;
+
+fn time_limit(floats: usize) -> Duration {
+    LIMIT + Duration::from_secs_f64(LIMIT_PER_MILLION * floats as f64 / 1e6)
+}
+
+/// What the run and its watch share.
+struct Watched {
+    options: RunOptions,
+    ended: Mutex<bool>,
+    bell: Condvar,
+}
+
+/// Ends a run that takes too long.
+struct Watch {
+    shared: Arc<Watched>,
+    thread: JoinHandle<bool>,
+}
+
+impl Watch {
+    fn start(options: RunOptions, limit: Duration) -> std::io::Result<Self> {
+        let shared = Arc::new(Watched { options, ended: Mutex::new(false), bell: Condvar::new() });
+        let watched = shared.clone();
+        let watch = move || {
+            let ended = watched.ended.lock().unwrap_or_else(PoisonError::into_inner);
+            let waited = watched.bell.wait_timeout_while(ended, limit, |ended| !*ended);
+            let is_over_time = waited.is_ok_and(|(ended, _)| !*ended);
+            if is_over_time {
+                // It can only fail where there is nothing to end.
+                let _ = watched.options.terminate();
+            }
+            is_over_time
+        };
+        Ok(Self { shared, thread: std::thread::Builder::new().name("onnx-limit".into()).spawn(watch)? })
+    }
+
+    /// The run is over; whether it was ended.
+    fn end(self) -> bool {
+        *self.shared.ended.lock().unwrap_or_else(PoisonError::into_inner) = true;
+        self.shared.bell.notify_all();
+        self.thread.join().unwrap_or(false)
     }
 }
 
@@ -212,7 +277,59 @@ fn environment() -> Result<&'static Environment, OnnxError> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::external::writing::{bytes, int};
     use super::*;
+
+    /// A network that gives back `a`, by a Loop whose body says each time whether it goes on.
+    fn network_with_a_loop(goes_on: bool) -> Vec<u8> {
+        let value = |name: &str, element: u64| {
+            let scalar = bytes(1, &[int(1, element), bytes(2, &[])].concat());
+            [bytes(1, name.as_bytes()), bytes(2, &scalar)].concat()
+        };
+        let (float, int64, boolean) = (1, 7, 9);
+        let identity = |from: &[u8], to: &[u8]| [bytes(1, from), bytes(2, to), bytes(4, b"Identity")].concat();
+        let constant = |name: &[u8], truth: bool| {
+            [int(2, boolean), int(5, truth.into()), bytes(8, name)].concat() // int32_data
+        };
+        let body = [
+            bytes(1, &identity(b"goes_on", b"still")),
+            bytes(1, &identity(b"before", b"after")),
+            bytes(2, b"body"),
+            bytes(5, &constant(b"goes_on", goes_on)),
+            bytes(11, &value("turn", int64)),
+            bytes(11, &value("condition", boolean)),
+            bytes(11, &value("before", float)),
+            bytes(12, &value("still", boolean)),
+            bytes(12, &value("after", float)),
+        ];
+        let attribute = [bytes(1, b"body"), bytes(6, &body.concat()), int(20, 5)].concat();
+        let turns = [bytes(1, b""), bytes(1, b"yes"), bytes(1, b"a"), bytes(2, b"result"), bytes(4, b"Loop")];
+        let graph = [
+            bytes(1, &[turns.concat(), bytes(5, &attribute)].concat()),
+            bytes(2, b"graph"),
+            bytes(5, &constant(b"yes", true)),
+            bytes(11, &value("a", float)),
+            bytes(12, &value("result", float)),
+        ];
+        [int(1, 8), bytes(7, &graph.concat()), bytes(8, &int(2, 17))].concat()
+    }
+
+    #[test]
+    fn a_network_whose_loop_never_ends_is_ended_in_one_line_and_one_that_ends_is_left_alone() {
+        if environment().is_err() {
+            needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
+            return;
+        }
+        let run = |goes_on, limit| {
+            let network = network_with_a_loop(goes_on);
+            let mut session = NetworkSession::open("loop", &network, 1, &[], &BTreeMap::new(), false).unwrap();
+            session.run_within(limit, &[("a", &[], &[2.5])], &["result"], true)
+        };
+        assert_eq!(run(false, Duration::from_secs(3600)).unwrap()[0].data, [2.5]);
+        let line = run(true, Duration::from_secs(1)).unwrap_err().to_string();
+        assert!(line.contains("did not end within 1 s") && !line.contains('\n'), "{line}");
+        assert!(time_limit(0) == LIMIT && time_limit(1_000_000) > 8 * LIMIT);
+    }
 
     #[test]
     fn a_library_that_is_there_but_cannot_be_opened_is_not_called_found() {
