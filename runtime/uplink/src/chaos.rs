@@ -1,20 +1,25 @@
 //! Five aircraft, one ground and a rogue over bad links, in the manner of Jepsen: every node is a process, which is killed
 //! and started again at random; links are slow, late, lossy, cut and reset. When the chaos is over, every honest final
-//! model is at the ground, byte for byte, and nothing else is.
+//! model is at the ground, byte for byte, and nothing else is. Meanwhile the rogue offers what it has no right to, answers falsely or
+//! never, shows finals of another session, and holds connections that say nothing or anything.
 //!
 //! `DGTR_CHAOS_S` sets its length (12 s without it), `DGTR_CHAOS_SEED` what happens in it.
 
 use std::collections::BTreeMap;
+use std::io::Write;
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use config::upload::UploadSettings;
+use zenoh::Wait;
 
 use super::admission::Admission;
 use super::folder::write_whole;
 use super::network::open_client;
+use super::offer::{OfferedModel, Order};
 use super::receive::Receiver;
 use super::testing::{Dice, Proxy, Weather, certificates, free_port, knows_localhost, noise};
 use super::{Offerer, Source};
@@ -102,6 +107,7 @@ fn serve(dir: &Path, port: u16) {
     };
     let mut r = Receiver::open(&settings, admission, &dir.join("received")).expect("receiver");
     let mut finals = finished(&r);
+    let mut most = [0; 3];
     let counted = dir.join(format!("ground.{}.json", std::process::id()));
     loop {
         if !r.round(&AtomicBool::new(false)).expect("round") {
@@ -115,7 +121,8 @@ fn serve(dir: &Path, port: u16) {
         }
         finals = now;
         let done = r.all_finished() && r.all_told();
-        let said = serde_json::json!({ "done": done, "counters": r.counters, "refused": r.refusals });
+        most = std::array::from_fn(|i| most[i].max(held()[i]));
+        let said = serde_json::json!({ "done": done, "counters": r.counters, "refused": r.refusals, "most": most });
         write_whole(&counted, said.to_string().as_bytes()).expect("write");
     }
 }
@@ -137,9 +144,53 @@ fn lie(dir: &Path, port: u16) {
         o.offer_final(&model);
         o
     });
-    let _session = open_client(&settings, "dgtr/m/a2/**", vec![7; 1000]);
-    std::thread::sleep(Duration::from_secs(3600));
-    drop(offerers);
+    // What a2 made yesterday, kept and signed by its own key.
+    let order = Order { flight: u64::MAX - 1, counter: 1 };
+    let a2 = Source { identity: identities(AIRCRAFT)[1].clone(), ..Source::unsigned("m", "a2") };
+    let yesterdays = OfferedModel::open(&model, &settings, &a2, order, true).expect("a model").offer;
+    let yesterdays = yesterdays.bound_to(&[9; 32], &a2.identity).encode();
+    let mut dice = Dice(u64::from(std::process::id()) | 1);
+    loop {
+        let until = Instant::now() + Duration::from_millis(500 + dice.roll(3000));
+        match dice.roll(4) {
+            0 => {
+                let _session = open_client(&settings, "dgtr/m/a2/**", vec![7; 1000]);
+                wait_until(until);
+            }
+            1 => {
+                let _session = open_client(&settings, "dgtr/m/a2/offer", yesterdays.clone());
+                wait_until(until);
+            }
+            2 => {
+                let session = open_client(&settings, "dgtr/m/a2/nothing", Vec::new());
+                let held = std::sync::Mutex::new(Vec::new());
+                let hold = move |query| held.lock().map_or((), |mut held| held.push(query));
+                session.declare_queryable("dgtr/m/a2/**").callback(hold).background().wait().expect("queryable");
+                wait_until(until);
+            }
+            _ => {
+                let strangers: Vec<TcpStream> =
+                    (0..150).filter_map(|_| TcpStream::connect(("127.0.0.1", port)).ok()).collect();
+                for mut stranger in strangers.iter().step_by(3) {
+                    let _ = stranger.write_all(&noise(200 + dice.roll(2000) as usize, dice.roll(256) as u8));
+                }
+                wait_until(until);
+            }
+        }
+        let _ = &offerers;
+    }
+}
+
+fn wait_until(until: Instant) {
+    std::thread::sleep(until.saturating_duration_since(Instant::now()));
+}
+
+/// Descriptors, threads and resident MiB of this process.
+fn held() -> [u64; 3] {
+    let entries = |path: &str| std::fs::read_dir(path).map_or(0, |entries| entries.count() as u64);
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let kib = status.lines().find_map(|l| l.strip_prefix("VmRSS:")?.trim().strip_suffix(" kB")?.parse::<u64>().ok());
+    [entries("/proc/self/fd"), entries("/proc/self/task"), kib.unwrap_or(0) >> 10]
 }
 
 struct Node {
@@ -193,6 +244,16 @@ fn counted(dir: &Path) -> (BTreeMap<String, u64>, BTreeMap<String, u64>, bool) {
         }
     }
     (counters, refused, done)
+}
+
+/// The most that a ground held of descriptors, threads and MiB.
+fn most_held(dir: &Path) -> [u64; 3] {
+    let grounds = std::fs::read_dir(dir).expect("folder").flatten().map(|e| e.path());
+    let grounds = grounds.filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("ground.")));
+    let said = grounds.filter_map(|p| serde_json::from_slice::<serde_json::Value>(&std::fs::read(p).ok()?).ok());
+    said.fold([0; 3], |most: [u64; 3], said| {
+        std::array::from_fn(|i| most[i].max(said["most"][i].as_u64().unwrap_or(0)))
+    })
 }
 
 #[test]
@@ -266,6 +327,10 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
     println!(
         "{length} s of chaos, seed {seed}: {kills} kills, {cuts} cuts, {resets} resets\n{counters:?}\n{refused:#?}"
     );
+    let most = most_held(dir.path());
+    println!("at most {} descriptors, {} threads, {} MiB", most[0], most[1], most[2]);
+    // Of all grounds; an attack takes 150 connections at a time.
+    assert!(most[0] < 1024 && most[1] < 256 && most[2] < 512, "{most:?}");
     assert!(done, "not everything arrived");
     for (i, id) in AIRCRAFT.iter().enumerate() {
         let folder = dir.path().join("received").join(id);
