@@ -33,6 +33,25 @@ const BANNED: [(&str, &str); 5] = [
     ("bindgen", "a build needs no libclang"),
 ];
 
+/// Advisories of RustSec that are lived with, and why.
+const LIVED_WITH: [(&str, &str); 3] = [
+    (
+        "RUSTSEC-2026-0041",
+        "zenoh-transport 1.10 asks for lz4_flex 0.10 and calls it with its feature transport_compression only, which is off",
+    ),
+    (
+        "RUSTSEC-2024-0436",
+        "paste, a macro that simba (of nalgebra) runs while it is compiled; nobody maintains it, nothing is wrong with it",
+    ),
+    (
+        "RUSTSEC-2025-0134",
+        "rustls-pemfile, with which zenoh-link-tls reads our own certificates; nobody maintains it, nothing is wrong with it",
+    ),
+];
+
+/// The newest list that was at hand; `tests/advisories.py` writes it.
+const ADVISORIES: &str = include_str!("../data/advisories.txt");
+
 const REGISTRY: &str = "registry+https://github.com/rust-lang/crates.io-index";
 
 fn packages() -> Vec<Value> {
@@ -79,6 +98,52 @@ fn every_dependency_has_a_licence_that_may_be_linked_with_and_comes_from_crates_
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The advisories that this version of a crate is affected by.
+fn affecting(name: &str, version: &str) -> Vec<&'static str> {
+    let version = semver::Version::parse(version).expect("a version");
+    let is_good = |range: &str| semver::VersionReq::parse(range).expect(range).matches(&version);
+    let about = ADVISORIES.lines().skip(1).filter_map(|line| {
+        let mut words = line.split(' ');
+        let (id, about) = (words.next()?, words.next()?);
+        let good = words.next().unwrap_or_default();
+        (about == name && !good.split('|').filter(|r| !r.is_empty()).any(is_good)).then_some(id)
+    });
+    about.collect()
+}
+
+#[test]
+fn no_dependency_has_an_advisory_that_is_not_lived_with_for_a_reason() {
+    println!("{}", ADVISORIES.lines().next().expect("a date"));
+    let (mut wrong, mut met) = (Vec::new(), Vec::new());
+    // Of all platforms: what is locked may be built somewhere.
+    let lock: toml::Table = include_str!("../../Cargo.lock").parse().expect("a lock file");
+    for package in lock["package"].as_array().expect("packages") {
+        let word = |key: &str| package.get(key).and_then(toml::Value::as_str).unwrap_or_default();
+        let (name, version) = (word("name"), word("version"));
+        for id in affecting(name, version) {
+            match LIVED_WITH.iter().any(|l| l.0 == id) {
+                true => met.push(id),
+                false => wrong.push(format!("{name} {version}: https://rustsec.org/advisories/{id}")),
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    for (id, why) in LIVED_WITH {
+        assert!(met.contains(&id), "{id} does not concern us any more: take it off ({why})");
+    }
+}
+
+#[test]
+fn an_advisory_concerns_the_versions_it_names() {
+    assert_eq!(affecting("lz4_flex", "0.10.0"), ["RUSTSEC-2026-0041"]);
+    assert_eq!(affecting("lz4_flex", "0.12.0"), ["RUSTSEC-2026-0041"]);
+    for mended in ["0.11.6", "0.12.1", "0.13.0"] {
+        assert_eq!(affecting("lz4_flex", mended), [""; 0], "{mended}");
+    }
+    assert_eq!(affecting("paste", "1.0.15"), ["RUSTSEC-2024-0436"], "where no version is good, all are meant");
+    assert!(ADVISORIES.lines().count() > 1000 && ADVISORIES.lines().skip(1).all(|l| l.starts_with("RUSTSEC-")));
 }
 
 #[test]
