@@ -93,6 +93,9 @@ mount -t devpts -o newinstance,ptmxmode=0666 devpts "$bare/dev/pts"
 cp $debs tests/package/root.sh tests/package/units.sh "$bare/root/"
 inside() { chroot "$bare" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root TERM=dumb "$@"; }
 inside sh /root/root.sh 2>&1 | tee "$transcript"
+# A signed flight under the units' rules about what may be written.
+cp tests/package/sandbox.sh "$bare/root/" && inside bash /root/sandbox.sh /usr/bin/dgtr 2>&1 | tee -a "$transcript"
+tail -n 1 "$transcript" | grep -q "sandbox: all is well"
 command -v systemd-nspawn >/dev/null || { echo "package.sh: units not started (apt-get install systemd-container)"; exit 0; }
 umount "$bare/dev/pts" "$bare/proc"
 cat > "$bare/etc/systemd/system/units.service" <<'UNIT'

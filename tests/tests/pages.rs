@@ -12,7 +12,7 @@ const WORDS: [(&str, usize); 3] =
     [("README.md", 900), ("tests/BENCHMARKS.md", 1_500), (".github/ARCHITECTURE.md", 1_500)];
 
 /// Pages that people read.
-const PAGES: [&str; 11] = [
+const PAGES: [&str; 12] = [
     "README.md",
     ".github/ARCHITECTURE.md",
     ".github/ARDUPILOT.md",
@@ -21,6 +21,7 @@ const PAGES: [&str; 11] = [
     ".github/INSTALL.md",
     ".github/PX4.md",
     ".github/STYLE.md",
+    ".github/TRUST.md",
     "models/networks/EXPORT.md",
     "tests/BENCHMARKS.md",
     "tests/DEVICES.md",

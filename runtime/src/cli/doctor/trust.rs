@@ -1,5 +1,7 @@
 //! What protects the deliveries of a mission, and what does not.
 
+use std::path::Path;
+
 use config::link::Signing;
 use config::mission::Mission;
 use hal::link::LinkAddress;
@@ -58,6 +60,7 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
         }
     };
     all.push(("state folder", finding));
+    all.extend(upload.folder.as_deref().map(|folder| ("may write", writable(folder))));
     all.extend(exposed.map(|endpoint| {
         let finding = match &upload.tls {
             _ if upload.has_tls() => {
@@ -76,6 +79,24 @@ pub(super) fn findings(mission: &Mission) -> Vec<(&'static str, Finding)> {
     all
 }
 
+/// Whether models can be put into the folder that carries them, or taken out of it and answered.
+fn writable(folder: &Path) -> Finding {
+    let at = folder.display();
+    if !folder.exists() {
+        return Finding::note(
+            format!("{at} is not there yet; it is made where the folder above it is writable"),
+            "plug in the medium",
+        );
+    }
+    match tempfile::tempfile_in(folder) {
+        Ok(_) => Finding::Ok(format!("{at}: models are offered there")),
+        Err(e) => Finding::missing(
+            format!("{at} may not be written ({e}): no model is offered there"),
+            "put it below /var/lib/dgtr, or give the unit ReadWritePaths= in a drop-in",
+        ),
+    }
+}
+
 /// Whether somebody else could speak as the autopilot of aircraft `id`.
 fn autopilot_link(id: &str, link: &str, signing: &Signing) -> Finding {
     match (link.parse::<LinkAddress>(), signing) {
@@ -92,6 +113,15 @@ fn autopilot_link(id: &str, link: &str, signing: &Signing) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_folder_for_models_that_may_not_be_written_is_missing_and_one_that_is_not_there_a_note() {
+        let dir = tempfile::tempdir().expect("a folder");
+        assert!(matches!(writable(dir.path()), Finding::Ok(_)));
+        assert!(matches!(writable(&dir.path().join("stick")), Finding::Note(text) if text.contains("stick")));
+        // No file can be made in it, whoever asks.
+        assert!(matches!(writable(Path::new("/proc")), Finding::Missing(text) if text.contains("ReadWritePaths")));
+    }
 
     #[test]
     fn signing_is_advised_where_others_could_speak_as_the_autopilot() {
