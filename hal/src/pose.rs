@@ -35,3 +35,12 @@ pub enum PoseError {
     /// The samples on both sides are too far apart to interpolate.
     Gap,
 }
+
+/// Where the aircraft was. Times are nanoseconds on the source's own clock (the autopilot's boot clock for MAVLink).
+pub trait PoseSource {
+    /// The pose at `time_ns`, interpolated; refuses to extrapolate beyond its stated limit.
+    ///
+    /// # Errors
+    /// [`PoseError::NotYet`] when the answer will be known later, else a final refusal.
+    fn pose_at(&self, time_ns: u64) -> Result<BodyPose, PoseError>;
+}

@@ -5,8 +5,9 @@ use core::net::SocketAddr;
 use core::time::Duration;
 
 use crate::error::Error;
-use crate::pose::{BodyPose, PoseError};
 use crate::trigger::Trigger;
+
+pub use crate::pose::PoseSource;
 
 /// A monotonic clock: the companion's.
 pub trait Clock {
@@ -89,15 +90,6 @@ pub trait Link {
     fn state(&self) -> LinkState {
         LinkState::Up
     }
-}
-
-/// Where the aircraft was. Times are nanoseconds on the source's own clock (the autopilot's boot clock for MAVLink).
-pub trait PoseSource {
-    /// The pose at `time_ns`, interpolated; refuses to extrapolate beyond its stated limit.
-    ///
-    /// # Errors
-    /// [`PoseError::NotYet`] when the answer will be known later, else a final refusal.
-    fn pose_at(&self, time_ns: u64) -> Result<BodyPose, PoseError>;
 }
 
 /// Where exposures are announced.

@@ -78,7 +78,7 @@ fn sample(source: &PosedImage, camera: &Pinhole, p: DVec3) -> Option<[f32; 3]> {
 mod tests {
     use super::*;
     use crate::camera::{Intrinsics, Pose, PoseSigma};
-    use crate::picture::mask::Mask;
+    use crate::mask::Mask;
     use glam::DQuat;
     use image::{Rgb, RgbImage};
 

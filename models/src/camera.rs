@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec2, DVec3, Mat4, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::picture::mask::Mask;
+use crate::mask::Mask;
 
 mod projection;
 

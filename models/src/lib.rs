@@ -14,6 +14,7 @@ pub mod ground_cell;
 pub mod init;
 pub mod levels;
 pub mod light;
+pub mod mask;
 pub mod metrics;
 mod morton;
 pub mod onnx;

@@ -6,7 +6,7 @@
 //! it. (libjpeg-turbo is faster yet, but its crates want cmake and an assembler, which a board's two commands do not bring.)
 
 pub mod crops;
-pub mod mask;
+mod mask;
 pub mod tiff;
 pub mod values;
 pub mod webp;

@@ -17,9 +17,9 @@ mod summary;
 pub use evaluate::Figures;
 pub use summary::Summary;
 
-use engine::kernels;
 use job::interrupt::Interrupt;
 use processes::Process;
+use tuning::kernels;
 use uplink::keys::{self, GROUND};
 
 /// What the command line may change.

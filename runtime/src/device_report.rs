@@ -8,7 +8,7 @@ use job::health::board::Board;
 use job::health::power::pmic_watts;
 use serde::Serialize;
 use serde_json::{Value, json};
-use vulkan::autotune::autotune;
+use tuning::autotune::autotune;
 use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::kernel_config::KernelConfig;
 use vulkan::roofline;

@@ -15,7 +15,7 @@ use crate::commands::{Commands, Recording};
 use crate::error::TrainError;
 use crate::gpu::Gpu;
 use crate::kernel_config::KernelConfig;
-use crate::kernels::{GROUPS, Kernel};
+use crate::kernels::{Group, Kernel};
 use crate::layout::{Frame, Status};
 use crate::pipelines::Pipelines;
 use crate::stages::STAGE_NAMES;
@@ -111,9 +111,12 @@ impl Device {
         std::array::from_fn(|i| (STAGE_NAMES[i], ms[i]))
     }
 
-    /// Milliseconds of each kind of kernel since then (by `Group as usize`); zeros without timestamps.
-    pub(crate) fn group_ms(&self) -> [f64; GROUPS] {
-        self.commands.group_ms()
+    /// Milliseconds of the wide, the narrow and the blending kernels since then, whose sizes a [`KernelConfig`] chooses apart; zeros
+    /// without timestamps.
+    pub fn kind_ms(&self) -> [f64; 3] {
+        let ms = self.commands.group_ms();
+        let of = |group: Group| ms[group as usize];
+        [of(Group::Wide) + of(Group::Strips), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)]
     }
 
     pub(crate) fn clear_times(&self) {

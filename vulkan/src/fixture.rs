@@ -10,7 +10,7 @@ use config::training::TrainSettings;
 use image::RgbImage;
 use models::camera::{DepthPrior, PosedImage};
 use models::cloud::GaussianCloud;
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use std::ops::{ControlFlow, Deref, DerefMut};
 
 /// Trainer and pictures, opened by one plan.

@@ -217,7 +217,7 @@ impl Gpu {
     }
 
     /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
-    pub(crate) fn timestamp_ns(&self) -> f64 {
+    pub fn timestamp_ns(&self) -> f64 {
         self.inner.timestamp_ns
     }
 

@@ -1,5 +1,5 @@
 //! The kernel configuration: what is chosen per device. Every kernel works with any of the configurations here and leaves
-//! the same bits with each (`tests/kernel_configs.rs`); only the time differs, and [`autotune`](crate::autotune) measures
+//! the same bits with each (`tests/kernel_configs.rs`); only the time differs, and `tuning::autotune` measures
 //! which is the fastest.
 
 use crate::constants::{RUNS, SHORT_PART, STRIP};

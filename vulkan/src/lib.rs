@@ -4,7 +4,6 @@
 //! pictures, [`trainer::Trainer`] trains and renders.
 
 mod arena;
-pub mod autotune;
 #[cfg(feature = "lab")]
 pub mod cases;
 mod commands;

@@ -16,7 +16,7 @@ use config::training::{AdamSettings, RateSettings};
 use crops::Crop;
 use image::RgbImage;
 use models::camera::{DepthPrior, Pose, PosedImage, View};
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use pose::Adjust;
 use slots::Slots;
 

@@ -6,7 +6,7 @@ mod scenes;
 use config::training::ResolutionSettings;
 use models::camera::{DepthPrior, PosedImage};
 use models::cloud::GaussianCloud;
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use scenes::device::{empty_trainer, plain, posed};
 use scenes::{cloud, photo, view};
 use vulkan::gpu::Gpu;

@@ -6,7 +6,7 @@ mod scenes;
 use config::training::TrainSettings;
 use models::camera::{OrthographicView, Pose, PosedImage};
 use models::cloud::GaussianCloud;
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use scenes::device::{plain, posed, trainer};
 use scenes::{answer, cloud, photo, view};
 use vulkan::reference::camera::Camera;

@@ -107,6 +107,13 @@ struct Truth {
     attitude: DQuat,
 }
 
+/// Its own heartbeats.
+#[derive(Default)]
+struct Heartbeat {
+    sent: u64,
+    next_ns: u64,
+}
+
 struct Attached {
     channel: Channel<Reconnecting>,
     clock: MonotonicClock,
@@ -123,8 +130,7 @@ struct Attached {
     photographer: Photographer,
     /// Highest number of a picture that was in the folder before.
     numbered: u64,
-    beats: u64,
-    next_beat_ns: u64,
+    heartbeat: Heartbeat,
     is_told: bool,
     report: AttachedReport,
 }
@@ -163,8 +169,7 @@ pub fn photograph(
         views,
         photographer: Photographer::on_demand(camera_dir, settings.world_seed, pictures)?,
         numbered: highest_number(camera_dir, &settings.prefix),
-        beats: 0,
-        next_beat_ns: 0,
+        heartbeat: Heartbeat::default(),
         is_told: false,
         report: AttachedReport::default(),
     };
@@ -190,8 +195,8 @@ impl Attached {
         while let Some(answer) = self.autopilot.next_answer() {
             self.say(&answer);
         }
-        if now_ns >= self.next_beat_ns {
-            self.next_beat_ns = now_ns + BEAT_NS;
+        if now_ns >= self.heartbeat.next_ns {
+            self.heartbeat.next_ns = now_ns + BEAT_NS;
             self.beat(now_ns);
         }
         while let Some(trigger) = self.autopilot.next_trigger() {
@@ -247,7 +252,7 @@ impl Attached {
         });
         let request = self.autopilot.ask_time(now_ns);
         self.say(&request);
-        if self.beats % ASK_EVERY_BEATS == 1 {
+        if self.heartbeat.sent % ASK_EVERY_BEATS == 1 {
             for (id, every_us) in STREAMS {
                 self.say(&COMMAND_LONG_DATA {
                     command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
@@ -259,7 +264,7 @@ impl Attached {
                 });
             }
         }
-        self.beats += 1;
+        self.heartbeat.sent += 1;
     }
 
     /// Views of the exposures whose pose is known.

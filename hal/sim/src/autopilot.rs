@@ -98,6 +98,17 @@ impl Default for AutopilotSettings {
     }
 }
 
+/// Exposures so far.
+#[derive(Default)]
+struct Triggers {
+    /// The next one of the flight.
+    next: usize,
+    /// The autopilot's counter.
+    counted: u16,
+    /// Those whose announcement a fault swallowed.
+    lost: u64,
+}
+
 struct Stream {
     id: u32,
     period_s: Option<f64>,
@@ -117,9 +128,7 @@ pub struct Autopilot<L: Link<Error = HalError> = Reconnecting> {
     /// Simulation time of take-off.
     takeoff_s: Option<f64>,
     landed: bool,
-    next_exposure: usize,
-    announced: u16,
-    triggers_lost: u64,
+    triggers: Triggers,
     gps_lost_since_s: Option<f64>,
     wrong_key: bool,
     heard: u64,
@@ -151,9 +160,7 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
             unix_start_us,
             takeoff_s: None,
             landed: false,
-            next_exposure: 0,
-            announced: 0,
-            triggers_lost: 0,
+            triggers: Triggers::default(),
             gps_lost_since_s: None,
             wrong_key: false,
             heard: 0,
@@ -189,7 +196,7 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
 
     /// Exposures announced, and those swallowed by the fault.
     pub fn triggers(&self) -> (u64, u64) {
-        (u64::from(self.announced) - self.triggers_lost, self.triggers_lost)
+        (u64::from(self.triggers.counted) - self.triggers.lost, self.triggers.lost)
     }
 
     /// Faults acting at a simulation time.
@@ -244,7 +251,7 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
             let due = |s: &&mut Stream| s.period_s.is_some();
             let first = self.streams.iter_mut().filter(due).min_by(|a, b| a.next_s.total_cmp(&b.next_s));
             let stream_s = first.as_ref().map_or(f64::INFINITY, |s| s.next_s);
-            let trigger = self.flight.exposures.get(self.next_exposure);
+            let trigger = self.flight.exposures.get(self.triggers.next);
             let trigger_s = match (self.takeoff_s, trigger) {
                 (Some(t), Some(e)) => t + e.trigger_s,
                 _ => f64::INFINITY,

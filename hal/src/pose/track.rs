@@ -4,10 +4,10 @@
 use geometry::geodesy::Geodetic;
 use glam::{DQuat, DVec3};
 
+use super::PoseSource;
 use super::ring::{Around, Ring, Stamped};
 use super::{BodyPose, PoseError};
 use crate::frames::{attitude_to_enu, yaw_of_ned};
-use crate::traits::PoseSource;
 
 /// 6 s of GLOBAL_POSITION_INT at 10 Hz.
 const POSITIONS: usize = 64;

@@ -27,6 +27,14 @@ struct RawLens {
     w: Option<f64>,
     h: Option<f64>,
     camera_angle_x: Option<f64>,
+    is_fisheye: Option<bool>,
+    #[serde(flatten)]
+    terms: RawTerms,
+}
+
+/// Terms of a distortion.
+#[derive(Clone, Default, Deserialize)]
+struct RawTerms {
     k1: Option<f64>,
     k2: Option<f64>,
     k3: Option<f64>,
@@ -37,7 +45,6 @@ struct RawLens {
     p2: Option<f64>,
     sx1: Option<f64>,
     sy1: Option<f64>,
-    is_fisheye: Option<bool>,
 }
 
 #[derive(Deserialize)]
@@ -172,21 +179,22 @@ fn lens(own: &RawLens, all: &RawLens) -> Result<LensDescription, String> {
         None => own.is_fisheye.or(all.is_fisheye).unwrap_or(false),
     };
     // OpenCV's k4, k5, k6 stand below the fraction bar; in every other model k4 is the term after k3.
-    let rational = !fisheye && (model == Some("FULL_OPENCV") || pick(|l| l.k5).is_some() || pick(|l| l.k6).is_some());
-    let k4 = term(|l| l.k4);
+    let rational =
+        !fisheye && (model == Some("FULL_OPENCV") || pick(|l| l.terms.k5).is_some() || pick(|l| l.terms.k6).is_some());
+    let k4 = term(|l| l.terms.k4);
     let distortion = Distortion {
         fisheye,
-        k1: term(|l| l.k1),
-        k2: term(|l| l.k2),
-        k3: term(|l| l.k3),
+        k1: term(|l| l.terms.k1),
+        k2: term(|l| l.terms.k2),
+        k3: term(|l| l.terms.k3),
         k4: if rational { 0.0 } else { k4 },
-        p1: term(|l| l.p1),
-        p2: term(|l| l.p2),
+        p1: term(|l| l.terms.p1),
+        p2: term(|l| l.terms.p2),
         q1: if rational { k4 } else { 0.0 },
-        q2: if rational { term(|l| l.k5) } else { 0.0 },
-        q3: if rational { term(|l| l.k6) } else { 0.0 },
-        sx1: term(|l| l.sx1),
-        sy1: term(|l| l.sy1),
+        q2: if rational { term(|l| l.terms.k5) } else { 0.0 },
+        q3: if rational { term(|l| l.terms.k6) } else { 0.0 },
+        sx1: term(|l| l.terms.sx1),
+        sy1: term(|l| l.terms.sy1),
     };
     let size = match (pick(|l| l.w), pick(|l| l.h)) {
         (Some(w), Some(h)) => Some(picture_size(w, h).ok_or("w and h must be between 1 and 65536")?),

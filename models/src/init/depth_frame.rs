@@ -9,7 +9,7 @@ use image::RgbImage;
 
 use crate::camera::{Projector, Unprojector, View};
 use crate::frame_file::{AsBytes, FrameFile, Kept};
-use crate::picture::mask::Mask;
+use crate::mask::Mask;
 
 /// Depth of one picture on a grid of every `stride`-th pixel.
 #[derive(Clone, Debug)]

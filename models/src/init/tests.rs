@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
-use crate::picture::mask::Mask;
+use crate::mask::Mask;
 use config::init::InitSettings;
 use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};

@@ -6,7 +6,7 @@ use glam::{DMat2, DVec2};
 use image::{RgbImage, imageops};
 
 use crate::frame_file::AsBytes;
-use crate::picture::mask::Mask;
+use crate::mask::Mask;
 
 /// Grey value of a pixel that a mask leaves out.
 const LEFT_OUT: u8 = 0;

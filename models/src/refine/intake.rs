@@ -175,7 +175,7 @@ mod tests {
 
     use super::*;
     use crate::camera::Intrinsics;
-    use crate::picture::mask::Mask;
+    use crate::mask::Mask;
 
     #[test]
     fn no_key_point_is_taken_from_what_a_mask_leaves_out() {

@@ -17,9 +17,9 @@ use survey::ortho::grid::BLOCK;
 use vulkan::trainer::{PictureStore, TrainError, Trainer};
 
 use super::pieces;
-use crate::devices;
 use crate::error::EngineError;
-use crate::kernels;
+use tuning::devices;
+use tuning::kernels;
 
 /// Gaussian–tile instances that a renderer holds at once, per pixel; pictures with more are rendered in bands.
 const INSTANCES_PER_PIXEL: usize = 8;

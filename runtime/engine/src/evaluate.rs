@@ -250,7 +250,7 @@ mod tests {
     use glam::{DQuat, DVec3};
     use image::{Rgb, RgbImage};
     use models::camera::{Intrinsics, Pose, PoseSigma};
-    use models::picture::mask::Mask;
+    use models::mask::Mask;
 
     use super::*;
 

@@ -19,10 +19,8 @@ mod budget;
 #[path = "../../../tests/carpet.rs"]
 mod carpet;
 mod carry;
-pub mod cost;
 mod delivery;
 pub mod device;
-pub mod devices;
 pub mod energy;
 pub mod error;
 pub mod evaluate;
@@ -30,7 +28,6 @@ pub mod failsafe;
 mod first_gaussians;
 mod follow;
 pub mod host;
-pub mod kernels;
 mod map;
 pub mod ortho;
 pub mod pieces;

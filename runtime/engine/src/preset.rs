@@ -1,7 +1,7 @@
 //! What the preset `auto` stands for: the largest point of the measured front that this device reaches in the time there is.
 //!
 //! Points are picture sizes, each with the Gaussians in view per pixel that the front was measured with ([`config::preset`]); a larger one
-//! is better once each picture is visited often enough. What a step of each costs is forecast ([`crate::cost`]).
+//! is better once each picture is visited often enough. What a step of each costs is forecast ([`tuning::cost`]).
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -14,9 +14,9 @@ use models::formats::{FormatError, read_bounded, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::cost::loads::{Footprint, Sight};
-use crate::cost::model::CostModel;
 use crate::device::DeviceRequest;
+use tuning::loads::{Footprint, Sight};
+use tuning::model::CostModel;
 
 mod flight;
 mod memory;

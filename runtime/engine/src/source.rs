@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use image::RgbImage;
 use models::camera::PosedImage;
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use survey::dataset::{Dataset, PoseSource};
 
 use crate::error::EngineError;

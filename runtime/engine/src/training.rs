@@ -9,7 +9,7 @@ use models::camera::{DepthPrior, PosedImage, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::Chunks;
 use models::light::Light;
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use vulkan::trainer::{RunBudget, StepReport, TrainSummary, Trainer, Validated};
 
 use super::device::DeviceRequest;

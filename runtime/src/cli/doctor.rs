@@ -7,13 +7,13 @@ use config::error::ErrorKind;
 use config::kernels::{KernelChoice, VARIABLE};
 use config::mission::Mission;
 use config::plan::{Plan, PlanRequest};
-use engine::cost;
-use engine::cost::loads::{Footprint, Sight};
-use engine::devices;
-use engine::kernels::{self, Source};
 use job::resources;
 use models::onnx::network::{LazySession, Network};
 use models::onnx::{OnnxError, features::FeatureNetwork, session};
+use tuning::cost;
+use tuning::devices;
+use tuning::kernels::{self, Source};
+use tuning::loads::{Footprint, Sight};
 use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 

@@ -10,12 +10,12 @@ use config::refine::RefineSettings;
 use config::training::{CropSettings, ShSettings};
 use disk::plan::{DiskPlan, DiskRequest};
 use engine::device::DeviceRequest;
-use engine::devices;
 use engine::preset;
 use engine::scratch_bytes;
 use flight::fly::delivered_bytes;
 use job::service::limits::{DeviceMemory, ServiceLimits};
 use survey::dataset::{Dataset, scaled};
+use tuning::devices;
 use vulkan::gpu::GpuInfo;
 
 use super::CliError;

@@ -2,14 +2,14 @@
 //! device could do it in.
 
 use config::plan::{Plan, sh_columns};
-use engine::cost::measure::{Stopwatch, settings};
-use engine::cost::model::{SH_DEGREE, Sample};
-use engine::cost::slopes::Driver;
-use engine::cost::synthetic;
 use engine::device::DeviceRequest;
 use models::camera::PosedImage;
 use models::cloud::GaussianCloud;
 use serde::Serialize;
+use tuning::cost::measure::{Stopwatch, settings};
+use tuning::cost::synthetic;
+use tuning::model::{SH_DEGREE, Sample};
+use tuning::slopes::Driver;
 use vulkan::gpu::Gpu;
 use vulkan::kernel_config::KernelConfig;
 use vulkan::roofline::Roofline;

@@ -1,14 +1,14 @@
 //! What `--preset auto` chooses for a folder: by its pictures, the share of the scene that each shows, and what a step costs here.
 
 use config::kernels::KernelChoice;
-use engine::cost;
 use engine::device::DeviceRequest;
-use engine::devices;
 use engine::energy::{Meter, shorter};
-use engine::kernels;
 use engine::preset::{Choice, Room, Wanted, most_side, shown};
 use models::camera::Pinhole;
 use survey::dataset::Dataset;
+use tuning::cost;
+use tuning::devices;
+use tuning::kernels;
 
 use super::TrainJob;
 use super::scale::{PictureScale, largest};

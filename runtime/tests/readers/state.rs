@@ -5,7 +5,6 @@ use std::path::Path;
 
 use config::mission::CameraSettings;
 use disk::Disk;
-use engine::kernels::cache;
 use flight::keyframe_store::{KeyFrame, KeyframeStore};
 use geometry::geodesy::Geodetic;
 use ground::register::edge::{Edges, Fitted};
@@ -14,6 +13,7 @@ use job::run_json::RunReport;
 use job::session::{Owner, Session};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use runtime::train_job::log;
+use tuning::cache;
 use uplink::flight_number::FlightNumber;
 use uplink::keys;
 use vulkan::gpu::{DeviceLimits, GpuInfo};

@@ -1,11 +1,11 @@
 //! What `auto` forecasts of a step against what the step takes, at the three sizes of `dgtr doctor --report`.
 
-use engine::cost::loads::{Footprint, Sight};
-use engine::cost::model::{CostModel, load};
-use engine::cost::synthetic::IN_VIEW;
-use engine::cost::{measure, threads};
 use pages::report::Table;
 use serde::Serialize;
+use tuning::cost::synthetic::IN_VIEW;
+use tuning::cost::{measure, threads};
+use tuning::loads::{Footprint, Sight};
+use tuning::model::{CostModel, load};
 use vulkan::gpu::Gpu;
 use vulkan::kernel_config::KernelConfig;
 use vulkan::roofline::Roofline;

@@ -7,7 +7,6 @@ use std::time::Instant;
 use config::plan::{Lanes, Plan};
 use config::training::TrainSettings;
 use disk::Disk;
-use engine::cost::synthetic::picture;
 use engine::device::DeviceRequest;
 use engine::error::EngineError;
 use engine::evaluate::save_png;
@@ -20,6 +19,7 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{Chunks, ModelHeader};
 use models::metrics::to_rgb8;
 use serde::Serialize;
+use tuning::cost::synthetic::picture;
 use vulkan::trainer::{Rendering, RunBudget, Trainer};
 
 use super::frustum::{Frustum, mean, reach};

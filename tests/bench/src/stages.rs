@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
-use engine::cost::slopes::{DRIVERS, Driver, Line, fit};
 use pages::report::Table;
 use runtime::device_report::stages::{Scene, SizeFigures, StageFigures};
 use runtime::error::JobError;
 use runtime::figures::short;
 use serde::Serialize;
 use survey::dataset::Dataset;
+use tuning::slopes::{DRIVERS, Driver, Line, fit};
 use vulkan::stages::{STAGE_NAMES, STAGES};
 
 /// How one stage grows.

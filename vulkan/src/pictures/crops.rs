@@ -7,7 +7,7 @@ use crate::device::Device;
 use crate::error::TrainError;
 use image::RgbImage;
 use models::camera::{Intrinsics, View};
-use models::picture::mask::Mask;
+use models::mask::Mask;
 
 /// Where a crop lies in the picture it was cut out of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -41,11 +41,11 @@ pub(super) fn heartbeat(announcing: Announcing, armed: bool) -> HEARTBEAT_DATA {
 
 impl<L: Link<Error = HalError>> Autopilot<L> {
     pub(super) fn announce(&mut self, now_s: f64) -> Result<(), HalError> {
-        self.next_exposure += 1;
-        self.announced += 1;
+        self.triggers.next += 1;
+        self.triggers.counted += 1;
         let acting = self.acting(now_s);
-        if strikes(acting.trigger_loss_pct, self.settings.seed, About::Trigger, 0, u64::from(self.announced)) {
-            self.triggers_lost += 1;
+        if strikes(acting.trigger_loss_pct, self.settings.seed, About::Trigger, 0, u64::from(self.triggers.counted)) {
+            self.triggers.lost += 1;
             return Ok(());
         }
         let (s, at) = self.reported(now_s);
@@ -55,15 +55,15 @@ impl<L: Link<Error = HalError>> Autopilot<L> {
             // With a feedback pin ArduPilot's time is 32-bit boot µs.
             let boot = boot_us & u64::from(u32::MAX);
             let time_us = if acting.feedback_boot_time >= 0.5 { boot } else { unix_us };
-            return self.channel.send(&messages::feedback(time_us, self.announced, &s, at, &self.frame));
+            return self.channel.send(&messages::feedback(time_us, self.triggers.counted, &s, at, &self.frame));
         }
         if announcing != Announcing::Captured {
-            self.channel.send(&messages::camera_trigger(boot_us, self.announced))?;
+            self.channel.send(&messages::camera_trigger(boot_us, self.triggers.counted))?;
             self.channel.send(&messages::image_start_capture(self.settings.system_id))?;
             self.channel.send(&messages::digicam_control())?;
         }
         if announcing != Announcing::Trigger {
-            self.channel.send(&messages::image_captured(boot_us, unix_us, self.announced, &s, at))?;
+            self.channel.send(&messages::image_captured(boot_us, unix_us, self.triggers.counted, &s, at))?;
         }
         Ok(())
     }

@@ -10,8 +10,8 @@ use rayon::prelude::*;
 use super::{Dataset, DatasetError, DatasetFrame};
 use crate::card::name_list;
 use models::camera::Intrinsics;
+use models::mask::{CORNERS, Mask};
 use models::picture::PictureError;
-use models::picture::mask::{CORNERS, Mask};
 
 /// Names looked at in one folder of masks; no survey has more pictures.
 const MAX_FILES: usize = 200_000;

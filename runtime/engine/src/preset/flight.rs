@@ -10,13 +10,13 @@ use job::session;
 use vulkan::gpu::{Gpu, GpuInfo};
 
 use super::{Choice, Room, Wanted, shown};
-use crate::cost;
-use crate::cost::model::CostModel;
 use crate::device::DeviceRequest;
-use crate::devices;
 use crate::energy::{Meter, shorter};
-use crate::kernels;
 use crate::model_path;
+use tuning::cost;
+use tuning::devices;
+use tuning::kernels;
+use tuning::model::CostModel;
 
 /// Fills what the mission leaves to its device, and says what was chosen; `None` where the mission gives its numbers, and where nothing may
 /// be or was measured: then the defaults of the mission file hold. A device that was never measured is, which takes seconds. Whoever owns

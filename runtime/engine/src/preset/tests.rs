@@ -3,8 +3,8 @@
 use vulkan::gpu::GpuInfo;
 
 use super::*;
-use crate::cost::model::tests::{CARD, PROCESSOR};
-use crate::kernels::cache::tests::device;
+use tuning::fixtures::device;
+use tuning::fixtures::{CARD, PROCESSOR};
 
 fn room(device_mib: u32) -> Room {
     Room { device_mib, is_said: false, host_bytes: None, is_host: false }

@@ -6,7 +6,7 @@ use job::console::Progress;
 use job::run_json::RunReport;
 use models::camera::View;
 use models::picture::crops::{Crop, crops, finest};
-use models::picture::mask::Mask;
+use models::mask::Mask;
 use vulkan::trainer::CropPlace;
 
 use super::Training;

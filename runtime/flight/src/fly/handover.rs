@@ -15,7 +15,7 @@ use hal::mavlink::dialect::MavSeverity;
 use hal::mavlink_camera::Activity;
 use image::RgbImage;
 use models::camera::{Pose, PosedImage};
-use models::picture::mask::Mask;
+use models::mask::Mask;
 
 use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 

@@ -2,8 +2,8 @@
 
 use image::RgbImage;
 use models::camera::{Intrinsics, PoseSigma, PosedImage, View};
+use models::mask::Mask;
 use models::metrics::{self, to_rgb8};
-use models::picture::mask::Mask;
 use vulkan::trainer::{Rendering, Trainer};
 
 use crate::AggregateError;

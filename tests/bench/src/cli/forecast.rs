@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use engine::kernels;
+use tuning::kernels;
 use vulkan::gpu::Gpu;
 
 use crate::forecast::{measured, table};

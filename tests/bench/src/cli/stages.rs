@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use engine::kernels;
 use pages::report::Table;
+use tuning::kernels;
 use vulkan::gpu::Gpu;
 use vulkan::roofline;
 

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use vulkan::stages::STAGES;
 use vulkan::stages::work::Load;
 
-use super::slopes::{DRIVERS, Driver, nonnegative};
+use crate::slopes::{DRIVERS, Driver, nonnegative};
 
 /// SH degree of the scenes that costs are measured with; a lower one costs less.
 pub const SH_DEGREE: u8 = 3;
@@ -122,28 +122,9 @@ pub fn load(gaussians: u64, visible: u64, instances: u64, evaluations: u64, pixe
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
-
-    /// A processor of two cores: the slopes of `bench stages` there (4a95410).
-    pub(crate) const PROCESSOR: CostModel = CostModel {
-        fixed_ms: 5.0,
-        gaussian_ns: 54.0,
-        visible_ns: 664.0,
-        pixel_ns: 163.0,
-        instance_ns: 64.0,
-        evaluation_ns: 6.6,
-    };
-
-    /// A card: 1.0 ms at 10,000 Gaussians, 5 ms at half a million (the same, "On an NVIDIA H100").
-    pub(crate) const CARD: CostModel = CostModel {
-        fixed_ms: 0.8,
-        gaussian_ns: 0.5,
-        visible_ns: 4.0,
-        pixel_ns: 0.4,
-        instance_ns: 1.0,
-        evaluation_ns: 0.02,
-    };
+    use crate::fixtures::{CARD, PROCESSOR};
 
     const LOADS: [(u64, u64, u64, u64, u64); 6] = [
         (5000, 4000, 28_000, 900_000, 27_000),

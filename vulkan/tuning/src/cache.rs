@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use vulkan::gpu::GpuInfo;
 use vulkan::kernel_config::{KernelConfig, kernels_fingerprint};
 
-use crate::cost::model::CostModel;
+use crate::model::CostModel;
 
 /// Bound on the file; an entry takes some 400 bytes at the most.
 const LIMIT: u64 = 128 << 10;
@@ -221,9 +221,9 @@ fn load(path: &Path) -> Result<Kept, FormatError> {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
-    use vulkan::gpu::DeviceLimits;
+    use crate::fixtures::device;
 
     const CONFIG: KernelConfig = KernelConfig {
         wide: 128,
@@ -237,22 +237,6 @@ pub(crate) mod tests {
     };
     const OTHER: KernelConfig =
         KernelConfig { wide: 64, narrow: 32, share_lanes: 1, tiles: 32, tile_lanes: 1, fetched: 1, summed: 1, part: 8 };
-
-    /// A board's GPU.
-    pub(crate) fn device(name: &str) -> GpuInfo {
-        GpuInfo {
-            name: name.into(),
-            version: (1, 3),
-            is_cpu: false,
-            is_integrated: true,
-            subgroup_size: 16,
-            shuffles: true,
-            heap_bytes: 1 << 30,
-            ids: (0x14e4, 42),
-            driver_version: 7,
-            limits: DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 },
-        }
-    }
 
     #[test]
     fn every_device_gets_its_own_configuration_back() {

@@ -5,10 +5,11 @@
 use std::path::PathBuf;
 
 use config::kernels::KernelChoice;
-use vulkan::autotune::step_ms;
 use vulkan::gpu::{Gpu, GpuError, GpuInfo};
 
-use crate::kernels::{cache, choice};
+use crate::autotune::step_ms;
+use crate::cache;
+use crate::kernels::choice;
 
 /// The processor must be faster than a GPU by this: its cores are wanted for matching pictures and for networks, too. Chosen, not
 /// measured: no board was at hand.
@@ -85,7 +86,7 @@ pub fn fastest(devices: &[GpuInfo], steps: &[Option<f64>]) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernels::cache::tests::device;
+    use crate::fixtures::device;
 
     #[test]
     fn the_faster_device_trains_whichever_kind_it_is() {

@@ -10,7 +10,7 @@ use std::f64::consts::PI;
 use config::plan::{TILE_HEIGHT, TILE_WIDTH};
 use vulkan::stages::work::Load;
 
-use super::model;
+use crate::model;
 
 /// Standard deviations to which a Gaussian is drawn: √(2·ln(255·opacity)) for an opacity of 0.56. With it, the synthetic scenes of `bench
 /// stages` after four and trained ones after a hundred steps have as many instances as were counted within a quarter (the tests below).
@@ -29,7 +29,7 @@ impl Footprint {
     /// at half its size 1.01 and (12,000) 0.82, brighton_beach 0.90 (`dgtr train DATASET --no-eval`, one to three visits a picture,
     /// from `work` and `skipped.culled` of `run.json`).
     pub const TRAINED: Self = Self(1.0);
-    /// Of the synthetic scenes of `bench`, made with 0.6 ([`super::synthetic`]) and widened by a dozen steps: 0.70 to 0.76 (`bench
+    /// Of the synthetic scenes of `bench`, made with 0.6 ([`crate::cost::synthetic`]) and widened by a dozen steps: 0.70 to 0.76 (`bench
     /// stages --gaussians 6000,48000,100000 --sizes 128x96,480x360,640x480 --steps 12`).
     pub const SYNTHETIC: Self = Self(0.72);
 }

@@ -7,13 +7,11 @@ use config::kernels::KernelChoice;
 use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::kernel_config::KernelConfig;
 
-use crate::kernels::{cache, choice};
-use model::CostModel;
+use crate::cache;
+use crate::kernels::choice;
+use crate::model::CostModel;
 
-pub mod loads;
 pub mod measure;
-pub mod model;
-pub mod slopes;
 pub mod synthetic;
 
 /// Mesa's number of threads of its drivers for the processor.

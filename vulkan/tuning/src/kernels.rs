@@ -6,11 +6,11 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use config::kernels::{KernelChoice, VARIABLE};
-use vulkan::autotune::autotune;
 use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::kernel_config::KernelConfig;
 
-pub mod cache;
+use crate::autotune::autotune;
+use crate::cache;
 
 /// No further configuration is tried after this when nobody asked for it.
 const PATIENCE: Duration = Duration::from_millis(1500);
@@ -115,11 +115,12 @@ fn measured(gpu: &Gpu, path: Option<PathBuf>, limit: Option<Duration>) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fixtures::device;
     use config::kernels::PROFILES;
 
     #[test]
     fn a_profile_is_what_the_devices_of_its_name_begin_with() {
-        let board = cache::tests::device("Mali-G610");
+        let board = device("Mali-G610");
         let board = GpuInfo { ids: (0x13b5, 1), ..board };
         let card = GpuInfo { is_integrated: false, subgroup_size: 32, ..board.clone() };
         let processor = GpuInfo { is_cpu: true, subgroup_size: 8, ..board.clone() };

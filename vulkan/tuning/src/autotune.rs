@@ -10,14 +10,13 @@
 //! Every configuration's kernels are compiled first, which can take longer than all steps together (lavapipe: seconds per configuration),
 //! so the standard configuration comes first and no further one is begun once the given time is over.
 
-use crate::gpu::{Gpu, GpuInfo};
-use crate::kernel_config::KernelConfig;
-use crate::kernels::Group;
-use crate::synthetic::{cloud, photo, plain, posed, view};
-use crate::trainer::{PictureStore, TrainError, Trainer};
 use config::plan::{Plan, PlanRequest};
 use models::cloud::GaussianCloud;
 use std::time::{Duration, Instant};
+use vulkan::gpu::{Gpu, GpuInfo};
+use vulkan::kernel_config::KernelConfig;
+use vulkan::synthetic::{cloud, photo, plain, posed, view};
+use vulkan::trainer::{PictureStore, TrainError, Trainer};
 
 /// Enough tiles for every lane of the looping kernels, and still a few milliseconds per step in software.
 const SIDE: (u32, u32) = (128, 96);
@@ -221,14 +220,13 @@ fn trainer(gpu: &Gpu, config: KernelConfig) -> Result<(Trainer, PictureStore), T
 
 /// One step: milliseconds of each kind of its kernels.
 fn step((trainer, pictures): &mut (Trainer, PictureStore), timed: bool) -> Result<[f64; 3], TrainError> {
-    let (start, before) = (Instant::now(), trainer.device().group_ms());
+    let (start, before) = (Instant::now(), trainer.device().kind_ms());
     trainer.step(pictures)?;
     if !timed {
         return Ok([start.elapsed().as_secs_f64() * 1e3; 3]);
     }
-    let after = trainer.device().group_ms();
-    let of = |group: Group| after[group as usize] - before[group as usize];
-    Ok([of(Group::Wide) + of(Group::Strips), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)])
+    let after = trainer.device().kind_ms();
+    Ok(std::array::from_fn(|kind| after[kind] - before[kind]))
 }
 
 #[cfg(test)]
@@ -287,5 +285,19 @@ mod tests {
         let close = [trial(64, (32, 1), (32, 1, 1, 1), [10.0; 3]), trial(128, (32, 32), (8, 4, 1, 1), [9.8, 9.6, 9.8])];
         assert_eq!(fastest(&close, STANDARD, true).to_string(), "64x32x32x32x1x1x1x8");
         assert_eq!(fastest(&[], STANDARD, true), STANDARD);
+    }
+
+    #[test]
+    fn autotuning_without_time_for_more_measures_the_standard_configuration_and_keeps_it() {
+        let Ok(gpu) = Gpu::open(None) else {
+            println!("skipped: no Vulkan device");
+            return;
+        };
+        let found = autotune(&gpu, Some(Duration::ZERO)).unwrap();
+        println!("{found:?}");
+        let standard = KernelConfig::standard(gpu.info());
+        assert_eq!((found.config, found.trials.len(), found.trials[0].config), (standard, 1, standard));
+        let t = found.trials[0];
+        assert!(t.ms.iter().all(|ms| *ms > 0.0 && *ms < 1e6), "{t:?}");
     }
 }

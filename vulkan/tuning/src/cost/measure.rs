@@ -10,8 +10,8 @@ use vulkan::kernel_config::KernelConfig;
 use vulkan::stages::STAGES;
 use vulkan::trainer::{Counters, PictureStore, RunBudget, TrainError, Trainer};
 
-use super::model::{CostModel, SH_DEGREE, Sample, load};
 use super::synthetic;
+use crate::model::{CostModel, SH_DEGREE, Sample, load};
 
 /// Gaussians of the scenes, and pictures that each is looked at with: so that neither grows with the other. The largest of both takes
 /// 110 MiB of the device.
