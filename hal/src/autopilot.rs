@@ -9,7 +9,7 @@ mod triggers;
 
 use heapless::{Deque, LinearMap};
 
-use crate::counters::HalCounters;
+use crate::counters::{HalCounters, TelemetryCounters};
 use crate::mavlink::Frame;
 use crate::mavlink::MessageData;
 use crate::mavlink::dialect::{
@@ -148,7 +148,7 @@ impl Autopilot {
             self.ids.autopilot = frame.component();
         }
         if frame.system() != self.ids.system || frame.component() == self.ids.own_component {
-            self.counters.foreign += 1;
+            self.counters.link.foreign += 1;
             return Handled::Foreign;
         }
         self.watch_sequence(frame);
@@ -220,11 +220,12 @@ impl Autopilot {
 
     /// Totals; the link's and the cameras' fields are 0 here.
     pub fn counters(&self) -> HalCounters {
-        HalCounters {
+        let telemetry = TelemetryCounters {
             clock_steps: u64::from(self.clock.steps()) + u64::from(self.unix.steps()),
             clock_rejected: self.clock.rejected().into(),
-            ..self.counters
-        }
+            ..self.counters.telemetry
+        };
+        HalCounters { telemetry, ..self.counters }
     }
 
     fn watch_sequence(&mut self, frame: &Frame<'_>) {
@@ -234,7 +235,7 @@ impl Autopilot {
                 // The same again, or one that was overtaken, is no loss of 250.
                 let step = sequence.wrapping_sub(*last);
                 if (1..=128).contains(&step) {
-                    self.counters.lost += u64::from(step - 1);
+                    self.counters.link.lost += u64::from(step - 1);
                     *last = sequence;
                 }
             }
@@ -251,7 +252,7 @@ impl Autopilot {
 
     /// The boot clock restarted: what was known on the old one means nothing any more.
     fn forget(&mut self) {
-        self.counters.clock_restarts += 1;
+        self.counters.telemetry.clock_restarts += 1;
         self.clock.reset();
         self.unix.reset();
         self.track.clear();

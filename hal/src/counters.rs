@@ -1,9 +1,9 @@
 //! What the HAL met: every loss, refusal and repair is counted under its own name, none is silent.
 
-/// Totals since start.
+/// What the link brought and took.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "std", derive(serde::Serialize))]
-pub struct HalCounters {
+pub struct LinkCounters {
     /// MAVLink frames with a right checksum.
     pub frames: u64,
     /// Damaged stretches of the stream.
@@ -28,6 +28,14 @@ pub struct HalCounters {
     pub sent: u64,
     /// Frames the link would not take.
     pub send_failed: u64,
+    /// How often the link was lost.
+    pub link_losses: u64,
+}
+
+/// What the autopilot said of where it was and what time it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "std", derive(serde::Serialize))]
+pub struct TelemetryCounters {
     /// Messages with NaN, infinite or impossible values, not used.
     pub impossible: u64,
     /// Positions before the first fix (0, 0), not used.
@@ -48,6 +56,12 @@ pub struct HalCounters {
     pub clock_steps: u64,
     /// Clock samples not used.
     pub clock_rejected: u64,
+}
+
+/// Exposures that the autopilot announced.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "std", derive(serde::Serialize))]
+pub struct ExposureCounters {
     /// Exposures announced.
     pub triggers: u64,
     /// The same exposure announced again, or by a second message.
@@ -58,6 +72,16 @@ pub struct HalCounters {
     pub trigger_times_mended: u64,
     /// Exposures without a picture.
     pub triggers_unmatched: u64,
+    /// Exposures left out because the camera was tilted beyond `mount.max_tilt_deg`.
+    pub exposures_tilted: u64,
+    /// Exposures or pictures without a usable pose.
+    pub poseless: u64,
+}
+
+/// Pictures that the camera gave.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "std", derive(serde::Serialize))]
+pub struct PictureCounters {
     /// Complete pictures seen.
     pub pictures: u64,
     /// Pictures that were broken, or never completed.
@@ -78,16 +102,28 @@ pub struct HalCounters {
     pub pictures_late: u64,
     /// Pictures that found their exposure only when all were compared with all.
     pub pictures_reconciled: u64,
-    /// Exposures left out because the camera was tilted beyond `mount.max_tilt_deg`.
-    pub exposures_tilted: u64,
-    /// Exposures or pictures without a usable pose.
-    pub poseless: u64,
+}
+
+/// Totals since start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "std", derive(serde::Serialize))]
+pub struct HalCounters {
+    /// Those of the link.
+    #[cfg_attr(feature = "std", serde(flatten))]
+    pub link: LinkCounters,
+    /// Those of the telemetry.
+    #[cfg_attr(feature = "std", serde(flatten))]
+    pub telemetry: TelemetryCounters,
+    /// Those of the exposures.
+    #[cfg_attr(feature = "std", serde(flatten))]
+    pub exposures: ExposureCounters,
+    /// Those of the pictures.
+    #[cfg_attr(feature = "std", serde(flatten))]
+    pub pictures: PictureCounters,
     /// Frames given to the runtime.
     pub posed_frames: u64,
     /// Of those, frames with the pose of their EXIF data.
     pub exif_poses: u64,
-    /// How often the link was lost.
-    pub link_losses: u64,
     /// Events dropped because nobody fetched them.
     pub events_dropped: u64,
 }

@@ -20,7 +20,7 @@ pub use settings::VehicleSettings;
 use crate::autopilot::{Autopilot, AutopilotState, Handled, Ids};
 use crate::blank::{Blank, blank};
 use crate::camera::{AnyCamera, Picture, undistort};
-use crate::counters::HalCounters;
+use crate::counters::{ExposureCounters, HalCounters, LinkCounters, PictureCounters};
 use crate::error::HalError;
 use crate::failsafe::Flags;
 use crate::link::Reconnecting;
@@ -59,7 +59,6 @@ pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
     settings: VehicleSettings,
     events: VecDeque<Event>,
     lost: bool,
-    link_losses: u64,
     texts: u16,
     /// Exposures given up since the last picture came.
     pictureless: u32,
@@ -130,7 +129,6 @@ where
             settings: settings.clone(),
             events: VecDeque::with_capacity(EVENTS),
             lost: false,
-            link_losses: 0,
             texts: 0,
             pictureless: 0,
             poor: 0,
@@ -184,7 +182,7 @@ where
 
     /// Complete pictures seen so far.
     pub fn pictures(&self) -> u64 {
-        self.counters.pictures
+        self.counters.pictures.pictures
     }
 
     /// True while the autopilot is silent or the link closed.
@@ -238,9 +236,9 @@ where
         if let Some(blank) = blank {
             let path = frame.picture.name();
             *match blank {
-                Blank::Black => &mut self.counters.pictures_black,
-                Blank::Overexposed => &mut self.counters.pictures_overexposed,
-                Blank::Constant => &mut self.counters.pictures_constant,
+                Blank::Black => &mut self.counters.pictures.pictures_black,
+                Blank::Overexposed => &mut self.counters.pictures.pictures_overexposed,
+                Blank::Constant => &mut self.counters.pictures.pictures_constant,
             } += 1;
             if !self.poor_told && self.service.may_warn(self.now_ns()) {
                 self.poor_told = true;
@@ -265,37 +263,28 @@ where
     pub fn counters(&self) -> HalCounters {
         let (heard, wire) = (self.autopilot.counters(), self.channel.counters());
         let own = self.counters;
-        HalCounters {
+        let link = LinkCounters {
             frames: wire.frames.frames,
             damaged: wire.frames.damaged,
             skipped_bytes: wire.frames.skipped_bytes,
             unknown: wire.frames.unknown + wire.frames.unsupported,
-            refused_peers: own.refused_peers,
             unsigned: wire.unsigned,
             wrong_key: wire.wrong_key,
             replayed: wire.replayed,
             sent: wire.sent,
             send_failed: wire.send_failed,
-            foreign: heard.foreign + own.foreign,
-            triggers_unmatched: heard.triggers_unmatched + own.triggers_unmatched,
-            pictures: own.pictures,
-            pictures_broken: own.pictures_broken,
-            pictures_lost: self.camera.lost_pictures(),
-            pictures_black: own.pictures_black,
-            pictures_overexposed: own.pictures_overexposed,
-            pictures_constant: own.pictures_constant,
-            exposures_tilted: own.exposures_tilted,
-            picture_duplicates: own.picture_duplicates,
-            pictures_unmatched: own.pictures_unmatched,
-            pictures_late: own.pictures_late,
-            pictures_reconciled: own.pictures_reconciled,
-            poseless: own.poseless,
-            posed_frames: own.posed_frames,
-            exif_poses: own.exif_poses,
-            link_losses: self.link_losses,
-            events_dropped: own.events_dropped,
-            ..heard
-        }
+            foreign: heard.link.foreign + own.link.foreign,
+            lost: heard.link.lost,
+            ..own.link
+        };
+        let exposures = ExposureCounters {
+            triggers_unmatched: heard.exposures.triggers_unmatched + own.exposures.triggers_unmatched,
+            exposures_tilted: own.exposures.exposures_tilted,
+            poseless: own.exposures.poseless,
+            ..heard.exposures
+        };
+        let pictures = PictureCounters { pictures_lost: self.camera.lost_pictures(), ..own.pictures };
+        HalCounters { link, telemetry: heard.telemetry, exposures, pictures, ..own }
     }
 
     fn receive(&mut self, wait: Duration) -> Result<(), HalError> {
@@ -312,7 +301,7 @@ where
         let (now_ns, peer) = (self.now_ns(), self.channel.peer());
         loop {
             let (mut verdict, mut claims) = (Verdict::Refuse, false);
-            let (peers, refused) = (&mut self.peers, &mut self.counters.refused_peers);
+            let (peers, refused) = (&mut self.peers, &mut self.counters.link.refused_peers);
             let frame = self.channel.next_frame_if(|frame| {
                 verdict = peers.judge(peer, frame, now_ns);
                 *refused += u64::from(verdict == Verdict::Refuse);
@@ -347,7 +336,7 @@ where
         });
         let lost = silent || state != LinkState::Up;
         if lost && !self.lost {
-            self.link_losses += u64::from(state != LinkState::Ended);
+            self.counters.link.link_losses += u64::from(state != LinkState::Ended);
             self.channel.resynchronise();
             self.emit(Event::LinkLost);
         } else if !lost && self.lost {
@@ -368,13 +357,13 @@ where
         while let Some(trigger) = self.autopilot.next_trigger() {
             let passage = self.exposures.cameras.take_trigger(trigger);
             if passage == Passage::Other {
-                self.counters.foreign += 1;
+                self.counters.link.foreign += 1;
                 continue;
             }
             let delay_ns = (f64::from(self.settings.lens.exposure_delay_ms) * 1e6) as i64;
             let (mid_boot_ns, awaited) = (trigger.boot_ns.saturating_add_signed(delay_ns), !self.is_free_running());
             if let Some(oldest) = self.exposures.push(trigger, mid_boot_ns, now_ns, awaited) {
-                self.counters.triggers_unmatched += 1;
+                self.counters.exposures.triggers_unmatched += 1;
                 tracing::warn!("exposure {}: no picture came", oldest.sequence);
             }
             self.emit(Event::Trigger(trigger));

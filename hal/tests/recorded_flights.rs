@@ -140,8 +140,12 @@ fn survey_errors(path: &Path, due: impl Fn(&[u64]) -> Vec<Shot>) -> ([f64; 2], [
     frames.sort_by_key(|frame| frame.sequence);
     let named = |frame: &PosedPicture| frame.picture.name().to_string_lossy() == format!("{}.jpg", frame.sequence);
     assert!(frames.iter().all(named), "every exposure has its own picture");
-    assert_eq!((frames.len(), counters.triggers, counters.posed_frames), (40, 40, 40), "{others:?}");
-    assert_eq!((counters.damaged, counters.impossible, counters.trigger_gaps), (0, 0, 0), "{counters:?}");
+    assert_eq!((frames.len(), counters.exposures.triggers, counters.posed_frames), (40, 40, 40), "{others:?}");
+    assert_eq!(
+        (counters.link.damaged, counters.telemetry.impossible, counters.exposures.trigger_gaps),
+        (0, 0, 0),
+        "{counters:?}"
+    );
     let boot: Vec<u64> = boot_times(path);
     let (mut position, mut attitude) = ([0.0f64; 2], [0.0f64; 2]);
     for (frame, boot_ns) in frames.iter().zip(boot) {
@@ -246,11 +250,14 @@ fn an_old_log_with_damaged_frames_is_read_to_its_end() {
     let settings = VehicleSettings { system_id: 0, ..settings(&path) };
     let (_, _, counters) = play(&settings, Vec::new());
     // An independent reader (pymavlink) finds the same 75,477 good frames and 1,314 damaged ones.
-    assert_eq!((counters.frames, counters.damaged), (75_477, 1_314));
+    assert_eq!((counters.link.frames, counters.link.damaged), (75_477, 1_314));
     // Unix time is 0 and the position 0, 0 before the first fix; the autopilot was restarted once; system 51 is the radio,
     // 255 the ground station; until the first heartbeat nobody is known.
-    assert_eq!((counters.unfixed, counters.clock_restarts, counters.foreign), (149, 1, 4_513));
-    assert_eq!((counters.positions, counters.attitudes, counters.triggers), (2_676, 2_829, 0));
+    assert_eq!((counters.telemetry.unfixed, counters.telemetry.clock_restarts, counters.link.foreign), (149, 1, 4_513));
+    assert_eq!(
+        (counters.telemetry.positions, counters.telemetry.attitudes, counters.exposures.triggers),
+        (2_676, 2_829, 0)
+    );
 }
 
 #[test]

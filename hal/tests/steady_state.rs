@@ -100,12 +100,12 @@ fn a_thousand_messages_a_second_cost_no_allocation_and_little_time() {
         events
     };
     run(&mut vehicle, 1.5); // warm
-    let (cpu_before, frames) = (cpu(), vehicle.counters().frames);
+    let (cpu_before, frames) = (cpu(), vehicle.counters().link.frames);
     let counted_from = allocations();
     let events = run(&mut vehicle, 2.0);
     let counted = allocations() - counted_from;
     let spent = cpu() - cpu_before;
-    let frames = vehicle.counters().frames - frames;
+    let frames = vehicle.counters().link.frames - frames;
     println!("{frames} messages, {events} poses: {counted} allocations, {:.1} % of a core", spent.as_secs_f64() / 0.02);
     assert!(frames > 1500 && events > 100, "{frames} messages, {events} events");
     assert_eq!(counted, 0);
@@ -204,7 +204,11 @@ fn ten_million_hostile_bytes_neither_panic_nor_allocate() {
     let CaptureLoop { framer, autopilot, outcomes, poses, .. } = &capture;
     println!("{:?} {:?} {outcomes} outcomes {poses} poses", framer.counters(), autopilot.counters());
     assert_eq!(allocated, 0);
-    assert!(autopilot.counters().positions > 1000 && autopilot.counters().impossible > 100 && *outcomes > 100);
+    assert!(
+        autopilot.counters().telemetry.positions > 1000
+            && autopilot.counters().telemetry.impossible > 100
+            && *outcomes > 100
+    );
 }
 
 #[test]

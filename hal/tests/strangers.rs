@@ -12,7 +12,7 @@ use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
 use geometry::geodesy::Geodetic;
 use hal::camera::Picture;
-use hal::counters::HalCounters;
+use hal::counters::{HalCounters, LinkCounters};
 use hal::error::HalError;
 use hal::link::{LinkAddress, TlogLink};
 use hal::mavlink::dialect::{
@@ -225,7 +225,8 @@ fn fly(datagrams: &[Datagram], pictures: &VecDeque<u64>) -> Vec<String> {
             told.push(format!("{:?}", vehicle.autopilot()));
         }
     }
-    let counted = HalCounters {
+    let all = vehicle.counters();
+    let link = LinkCounters {
         frames: 0,
         damaged: 0,
         skipped_bytes: 0,
@@ -233,8 +234,9 @@ fn fly(datagrams: &[Datagram], pictures: &VecDeque<u64>) -> Vec<String> {
         refused_peers: 0,
         sent: 0,
         send_failed: 0,
-        ..vehicle.counters()
+        ..all.link
     };
+    let counted = HalCounters { link, ..all };
     told.push(format!("{counted:?}"));
     told
 }

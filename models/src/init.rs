@@ -24,7 +24,7 @@ pub use baselines::{from_sfm, random};
 pub use initialiser::{Initialiser, most_frame_bytes};
 pub use pairs::SkippedPairs;
 pub use range::mutual_matches;
-pub use report::{Growth, InitReport, Initialisation};
+pub use report::{AlignmentReport, Growth, InitReport, InitTimes, Initialisation, MergeReport};
 
 use config::error::{Error, ErrorKind};
 

@@ -163,5 +163,5 @@ fn a_pulled_cable_is_reported_and_plugged_in_again() {
     while beat(&mut channel, &mut vehicle) != Some(Event::LinkBack) {
         assert!(begun.elapsed() < Duration::from_secs(20), "not back: {:?}", vehicle.link().last_error());
     }
-    assert_eq!((vehicle.counters().link_losses, vehicle.is_link_lost()), (1, false));
+    assert_eq!((vehicle.counters().link.link_losses, vehicle.is_link_lost()), (1, false));
 }

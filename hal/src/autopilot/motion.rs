@@ -70,11 +70,11 @@ impl Autopilot {
         };
         // Exactly 0, 0 is what autopilots send before the first fix.
         if m.lat == 0 && m.lon == 0 {
-            self.counters.unfixed += 1;
+            self.counters.telemetry.unfixed += 1;
             return Handled::Other;
         }
         if !position.is_valid() {
-            self.counters.impossible += 1;
+            self.counters.telemetry.impossible += 1;
             return Handled::Other;
         }
         let cm_s = |v: i16| f64::from(v) * 0.01;
@@ -90,7 +90,7 @@ impl Autopilot {
         let Some(m) = frame.message::<ODOMETRY_DATA>() else { return Handled::Other };
         let fields = [m.x, m.y, m.z, m.vx, m.vy, m.vz];
         let (Some(q), true) = (unit(m.q), fields.iter().all(|v| v.is_finite())) else {
-            self.counters.impossible += 1;
+            self.counters.telemetry.impossible += 1;
             return Handled::Other;
         };
         // Only a frame tied to north can be placed in the world; only a body frame makes `q` an attitude.
@@ -101,7 +101,7 @@ impl Autopilot {
         }
         self.clock.arrival(now_ns, boot_ns);
         if self.motion.odometry_resets.replace(m.reset_counter).is_some_and(|r| r != m.reset_counter) {
-            self.counters.position_steps += 1;
+            self.counters.telemetry.position_steps += 1;
             self.track.clear_positions();
         }
         self.add_attitude(AttitudeSample { boot_ns, frd_to_ned: q, sigma_rad: attitude_sigma() }, 1);
@@ -109,7 +109,7 @@ impl Autopilot {
         let (Some(origin), false) = (self.motion.origin, global) else { return Handled::Other };
         let enu = ned_to_enu(DVec3::new(m.x.into(), m.y.into(), m.z.into()));
         if enu.length() > 1e5 {
-            self.counters.impossible += 1;
+            self.counters.telemetry.impossible += 1;
             return Handled::Other;
         }
         let velocity = ned_to_enu(q * DVec3::new(m.vx.into(), m.vy.into(), m.vz.into()));
@@ -132,7 +132,7 @@ impl Autopilot {
             Some(q) => {
                 self.add_attitude(AttitudeSample { boot_ns, frd_to_ned: q, sigma_rad: attitude_sigma() }, 3);
             }
-            None => self.counters.impossible += 1,
+            None => self.counters.telemetry.impossible += 1,
         }
     }
 
@@ -140,7 +140,7 @@ impl Autopilot {
         let Some(m) = frame.message::<ATTITUDE_DATA>() else { return };
         let boot_ns = self.stamp(m.time_boot_ms, now_ns);
         if ![m.roll, m.pitch, m.yaw].iter().all(|a| a.abs() <= 7.0) {
-            self.counters.impossible += 1;
+            self.counters.telemetry.impossible += 1;
             return;
         }
         let frd_to_ned = euler_to_ned(m.roll.into(), m.pitch.into(), m.yaw.into());
@@ -150,7 +150,7 @@ impl Autopilot {
     pub(super) fn on_gimbal(&mut self, frame: &Frame<'_>, now_ns: u64) {
         let Some(m) = frame.message::<GIMBAL_DEVICE_ATTITUDE_STATUS_DATA>() else { return };
         let Some(attitude) = unit(m.q) else {
-            self.counters.impossible += 1;
+            self.counters.telemetry.impossible += 1;
             return;
         };
         // A gimbal with a component of its own has a clock of its own.
@@ -167,7 +167,7 @@ impl Autopilot {
             Believed::Yes => {}
             Believed::Instead => self.track.clear_gimbals(),
             Believed::No => {
-                self.counters.foreign += 1;
+                self.counters.link.foreign += 1;
                 return;
             }
         }
@@ -180,7 +180,7 @@ impl Autopilot {
             !has(GimbalDeviceFlags::GIMBAL_DEVICE_FLAGS_YAW_LOCK)
         };
         if self.track.push_gimbal(GimbalSample { boot_ns, attitude, yaw_in_vehicle_frame }) {
-            self.counters.gimbals += 1;
+            self.counters.telemetry.gimbals += 1;
         }
     }
 
@@ -207,7 +207,7 @@ impl Autopilot {
             alt_m: f64::from(m.altitude) * 1e-3,
         };
         if origin.is_valid() && self.motion.origin.replace(origin).is_some_and(|o| o != origin) {
-            self.counters.position_steps += 1;
+            self.counters.telemetry.position_steps += 1;
         }
     }
 
@@ -224,13 +224,13 @@ impl Autopilot {
             let turn = newest.frd_to_ned.angle_between(sample.frd_to_ned);
             if turn > MAX_TURN * dt + TURN_SLACK && motion.attitude_spikes < SPIKES {
                 motion.attitude_spikes += 1;
-                self.counters.spikes += 1;
+                self.counters.telemetry.spikes += 1;
                 return;
             }
         }
         motion.attitude_spikes = 0;
         if self.track.push_attitude(sample) {
-            self.counters.attitudes += 1;
+            self.counters.telemetry.attitudes += 1;
         }
     }
 
@@ -243,10 +243,10 @@ impl Autopilot {
             if off > MAX_OFFSET + 0.5 * MAX_ACCELERATION * dt * dt {
                 if motion.position_spikes < SPIKES {
                     motion.position_spikes += 1;
-                    self.counters.spikes += 1;
+                    self.counters.telemetry.spikes += 1;
                     return Handled::Other;
                 }
-                self.counters.position_steps += 1;
+                self.counters.telemetry.position_steps += 1;
                 motion.step_m = off;
                 motion.step_boot_ns = sample.boot_ns;
                 self.track.clear_positions();
@@ -259,7 +259,7 @@ impl Autopilot {
         if !self.track.push_position(sample) {
             return Handled::Other;
         }
-        self.counters.positions += 1;
+        self.counters.telemetry.positions += 1;
         Handled::Position
     }
 }

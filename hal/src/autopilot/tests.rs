@@ -78,7 +78,15 @@ fn feedback_is_placed_from_unix_time_and_from_wrapping_boot_time() {
     assert_eq!(times[..2], [(1, 11_500), (3, 11_900)]);
     assert!(times.len() == 3 && times[2].1.abs_diff(12_000) < 60, "{times:?}");
     let c = h.counters();
-    assert_eq!((c.triggers, c.trigger_gaps, c.trigger_duplicates, c.trigger_times_mended), (3, 1, 1, 1));
+    assert_eq!(
+        (
+            c.exposures.triggers,
+            c.exposures.trigger_gaps,
+            c.exposures.trigger_duplicates,
+            c.exposures.trigger_times_mended
+        ),
+        (3, 1, 1, 1)
+    );
 }
 
 #[test]
@@ -99,7 +107,7 @@ fn px4s_second_announcement_of_an_exposure_is_a_duplicate() {
     }
     let kinds: std::vec::Vec<_> = core::iter::from_fn(|| h.autopilot.next_trigger()).map(|t| t.kind).collect();
     assert_eq!(kinds, [TriggerKind::CameraTrigger; 3]);
-    assert_eq!(h.counters().trigger_duplicates, 3);
+    assert_eq!(h.counters().exposures.trigger_duplicates, 3);
 }
 
 #[test]
@@ -153,7 +161,7 @@ fn odometry_is_placed_by_the_origin_and_only_in_frames_tied_to_north() {
     assert_eq!(h.handle(&adrift), Handled::Other);
     h.handle(&ODOMETRY_DATA { time_usec: 5_300_000, x: f32::NAN, ..odometry.clone() });
     h.handle(&ODOMETRY_DATA { time_usec: 5_400_000, reset_counter: 1, ..odometry });
-    assert_eq!((h.counters().impossible, h.counters().position_steps), (1, 1));
+    assert_eq!((h.counters().telemetry.impossible, h.counters().telemetry.position_steps), (1, 1));
 }
 
 #[test]
@@ -196,13 +204,16 @@ fn a_spike_is_left_out_and_a_lasting_jump_is_followed_with_its_size_as_uncertain
     h.handle(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_000, q2: 1.0, ..Default::default() });
     h.handle(&ATTITUDE_QUATERNION_DATA { time_boot_ms: 12_010, q1: f32::NAN, ..Default::default() });
     h.fly(12_100, 13_000);
-    assert_eq!((h.counters().spikes, h.counters().impossible, h.counters().position_steps), (2, 1, 0));
+    assert_eq!(
+        (h.counters().telemetry.spikes, h.counters().telemetry.impossible, h.counters().telemetry.position_steps),
+        (2, 1, 0)
+    );
     let heard: std::vec::Vec<_> = (0..6).map(|i| h.position(13_000 + i * 100, 60.0)).collect();
     assert_eq!(
         heard,
         [Handled::Other, Handled::Other, Handled::Other, Handled::Other, Handled::Position, Handled::Position]
     );
-    assert_eq!(h.counters().position_steps, 1);
+    assert_eq!(h.counters().telemetry.position_steps, 1);
     let newest = h.autopilot.track().newest_position().expect("one");
     assert!(newest.sigma_m.min_element() > 50.0, "{}", newest.sigma_m);
 }
@@ -237,7 +248,7 @@ fn a_restarted_autopilot_starts_a_new_track() {
     let mut h = Wire::new();
     h.fly(600_000, 602_000);
     h.fly(3_000, 5_000);
-    assert_eq!(h.counters().clock_restarts, 1);
+    assert_eq!(h.counters().telemetry.clock_restarts, 1);
     assert_eq!(h.autopilot.pose_at(601 * S), Err(PoseError::NotYet));
     assert!(h.autopilot.pose_at(4 * S).is_ok());
     let mapped = h.autopilot.clock().to_companion_ns(4_900_000_000).expect("mapped");
@@ -251,7 +262,7 @@ fn other_systems_and_our_own_echo_are_ignored_and_a_timesync_is_answered() {
     assert_eq!(h.position(9_000, 0.0), Handled::Foreign);
     h.encoder = Encoder::new(1, 100);
     assert_eq!(h.position(9_000, 0.0), Handled::Foreign);
-    assert_eq!(h.counters().foreign, 2);
+    assert_eq!(h.counters().link.foreign, 2);
     h.encoder = Encoder::new(1, 1);
     h.handle(&TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() });
     let answer = h.autopilot.next_answer().expect("an answer");
@@ -274,7 +285,7 @@ fn two_cameras_of_one_autopilot_count_for_themselves() {
     }
     let expected = [(0, 1, 11_000), (1, 4, 11_000), (0, 2, 11_500), (1, 5, 11_500), (1, 6, 11_900)];
     assert_eq!(announced(&mut h), expected);
-    assert_eq!((h.counters().trigger_gaps, h.counters().trigger_duplicates), (0, 0));
+    assert_eq!((h.counters().exposures.trigger_gaps, h.counters().exposures.trigger_duplicates), (0, 0));
 }
 
 #[test]
@@ -294,7 +305,7 @@ fn a_duplicate_is_the_same_in_time_place_and_number_and_a_counter_may_stand_stil
     assert_eq!(numbers[7] + 1, numbers[6], "the one that was overtaken comes before");
     numbers.sort_unstable();
     numbers.dedup();
-    assert_eq!((numbers.len(), h.counters().trigger_duplicates), (8, 1), "no number twice");
+    assert_eq!((numbers.len(), h.counters().exposures.trigger_duplicates), (8, 1), "no number twice");
 }
 
 #[test]
@@ -308,7 +319,7 @@ fn exposures_without_any_time_are_counted_as_they_come() {
     }
     let all = announced(&mut h);
     assert!(all.len() == 5 && all.windows(2).all(|w| w[1].2 - w[0].2 > 900 && w[1].1 > w[0].1), "{all:?}");
-    assert_eq!(h.counters().trigger_duplicates, 5, "each came twice");
+    assert_eq!(h.counters().exposures.trigger_duplicates, 5, "each came twice");
 }
 
 #[test]
@@ -327,7 +338,7 @@ fn doubled_and_reordered_frames_are_no_losses() {
             }
         }
     }
-    assert!(h.counters().lost <= 51, "{}", h.counters().lost);
+    assert!(h.counters().link.lost <= 51, "{}", h.counters().link.lost);
 }
 
 /// What is said of a gimbal: sender, device, pitch.
@@ -366,7 +377,7 @@ fn two_mounts_are_never_interpolated_into_each_other() {
     let mut h = Wire::new();
     h.autopilot = Autopilot::new(h.autopilot.ids()).with_gimbal(3);
     gimbal(&mut h, 1, 1, 11_000, down);
-    assert_eq!((h.autopilot.gimbals().0, h.counters().gimbals, h.counters().foreign), (None, 0, 1));
+    assert_eq!((h.autopilot.gimbals().0, h.counters().telemetry.gimbals, h.counters().link.foreign), (None, 0, 1));
 }
 
 #[test]
@@ -381,7 +392,7 @@ fn a_mount_that_two_components_report_is_taken_from_one_of_them() {
     let (chosen, others) = h.autopilot.gimbals();
     assert_eq!(chosen.map(|g| (g.device, g.component)), Some((154, 1)), "the autopilot's report has the track's clock");
     assert_eq!(others.len(), 1);
-    assert_eq!(h.counters().gimbals, 6, "its first came before");
+    assert_eq!(h.counters().telemetry.gimbals, 6, "its first came before");
 }
 
 #[test]

@@ -139,7 +139,7 @@ impl Autopilot {
             of_autopilot && self.announcements.believed.is_some_and(|(k, t)| k != kind && held(t))
         };
         if told {
-            self.counters.trigger_duplicates += 1;
+            self.counters.exposures.trigger_duplicates += 1;
             return;
         }
         let plausible = |t: &u64| {
@@ -161,7 +161,7 @@ impl Autopilot {
                     *before == said && (said.stamp != 0 || now_ns.saturating_sub(*at) < REPEATED_NS)
                 };
                 if heard.recent.as_slice().iter().any(same) {
-                    self.counters.trigger_duplicates += 1;
+                    self.counters.exposures.trigger_duplicates += 1;
                     return;
                 }
                 let step = if kind == TriggerKind::Feedback {
@@ -182,7 +182,7 @@ impl Autopilot {
                 };
                 heard.recent.write((said, now_ns));
                 if !reordered {
-                    self.counters.trigger_gaps += (step - 1).clamp(0, LARGEST_GAP).unsigned_abs();
+                    self.counters.exposures.trigger_gaps += (step - 1).clamp(0, LARGEST_GAP).unsigned_abs();
                     (heard.last, heard.last_number) = (trigger, said.number);
                 }
             }
@@ -196,7 +196,7 @@ impl Autopilot {
             }
         }
         if placed.is_none() {
-            self.counters.trigger_times_mended += 1;
+            self.counters.exposures.trigger_times_mended += 1;
         }
         if of_autopilot {
             announcements.believed = Some((kind, now_ns));
@@ -204,11 +204,11 @@ impl Autopilot {
         if kind != own {
             announcements.announced_ns = Some(now_ns);
         }
-        self.counters.triggers += 1;
+        self.counters.exposures.triggers += 1;
         self.landing.on_exposure();
         if announcements.waiting.is_full() {
             announcements.waiting.pop_front();
-            self.counters.triggers_unmatched += 1;
+            self.counters.exposures.triggers_unmatched += 1;
         }
         let _ = announcements.waiting.push_back(trigger);
     }

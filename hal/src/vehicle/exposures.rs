@@ -54,7 +54,7 @@ where
         for _ in 0..8 {
             match self.camera.next_picture(now_ns) {
                 Ok(Some((clues, picture))) => {
-                    self.counters.pictures += 1;
+                    self.counters.pictures.pictures += 1;
                     self.pictureless = 0;
                     if self.is_free_running() {
                         self.take_free_running(&clues, picture, now_ns);
@@ -71,7 +71,7 @@ where
                     if e.kind() != ErrorKind::Device {
                         break; // the camera, not a picture
                     }
-                    self.counters.pictures_broken += 1;
+                    self.counters.pictures.pictures_broken += 1;
                 }
             }
         }
@@ -89,10 +89,10 @@ where
             return;
         }
         let Some(boot_ns) = self.autopilot.clock().to_boot_ns(time_ns) else {
-            self.counters.poseless += 1;
+            self.counters.exposures.poseless += 1;
             return;
         };
-        let sequence = u32::try_from(self.counters.pictures).unwrap_or(u32::MAX);
+        let sequence = u32::try_from(self.counters.pictures.pictures).unwrap_or(u32::MAX);
         let (source, kind) = (Source::default(), TriggerKind::Command);
         let trigger = Trigger { source, sequence, boot_ns, time_ns, sigma_ns: FREE_RUNNING_SIGMA_NS, kind };
         self.exposures.push(trigger, boot_ns, now_ns, false);
@@ -134,7 +134,7 @@ where
                 trigger.sequence,
                 aside.picture.name().display()
             );
-            self.counters.pictures_reconciled += 1;
+            self.counters.pictures.pictures_reconciled += 1;
             self.found(trigger, aside.picture, aside.clues, confidence.min(self.exposures.cameras.confidence()));
         }
     }
@@ -147,9 +147,9 @@ where
         let now_ns = self.now_ns();
         // Whatever the camera has by now.
         for _ in 0..PUT_ASIDE {
-            let before = self.counters.pictures;
+            let before = self.counters.pictures.pictures;
             self.take_pictures(now_ns);
-            if self.counters.pictures == before {
+            if self.counters.pictures.pictures == before {
                 break;
             }
         }
@@ -168,7 +168,7 @@ where
             let taken =
                 |e: &Exposure| matches!(e.partner, Partner::Found(c) if c.number.is_some() && c.number == clues.number);
             if self.exposures.all.iter().any(taken) {
-                self.counters.picture_duplicates += 1;
+                self.counters.pictures.picture_duplicates += 1;
                 self.unmatched(None, path_of(&picture), UnmatchedReason::Matching(Reason::Duplicate));
             } else {
                 self.picture_alone(&picture, reason);
@@ -176,7 +176,7 @@ where
         }
         let missing: Vec<u32> = self.exposures.awaited().map(|e| e.trigger.sequence).collect();
         for sequence in missing {
-            self.counters.triggers_unmatched += 1;
+            self.counters.exposures.triggers_unmatched += 1;
             self.unmatched(Some(sequence), None, UnmatchedReason::Matching(Reason::NoPicture));
         }
         self.finished = true;
@@ -185,11 +185,11 @@ where
     pub(super) fn take_outcome(&mut self, outcome: Outcome<Picture>) {
         match outcome {
             Outcome::Matched { trigger, picture, clues, late } => {
-                self.counters.pictures_late += u64::from(late);
+                self.counters.pictures.pictures_late += u64::from(late);
                 self.found(trigger, picture, clues, self.exposures.cameras.confidence());
             }
             Outcome::Picture { picture, reason: Reason::Duplicate, .. } => {
-                self.counters.picture_duplicates += 1;
+                self.counters.pictures.picture_duplicates += 1;
                 self.unmatched(None, path_of(&picture), UnmatchedReason::Matching(Reason::Duplicate));
             }
             // Its exposure may be among those whose picture has not come; pixels in memory cannot wait for that.
@@ -214,7 +214,7 @@ where
 
     fn picture_alone(&mut self, picture: &Picture, reason: Reason) {
         if !self.use_exif(None, picture) {
-            self.counters.pictures_unmatched += 1;
+            self.counters.pictures.pictures_unmatched += 1;
             self.unmatched(None, path_of(picture), UnmatchedReason::Matching(reason));
         }
     }
@@ -223,7 +223,7 @@ where
         if self.pending.len() >= EXPOSURES
             && let Some(oldest) = self.pending.pop_front()
         {
-            self.counters.poseless += 1;
+            self.counters.exposures.poseless += 1;
             self.unmatched(Some(oldest.trigger.sequence), path_of(&oldest.picture), UnmatchedReason::Overflow);
         }
         self.pending.push_back(waiting);
@@ -245,7 +245,7 @@ where
                 None => self.give_up(waiting, UnmatchedReason::Pose(PoseError::NotYet)),
                 Some(Err(e)) => self.give_up(waiting, UnmatchedReason::Pose(e)),
                 Some(Ok(body)) if self.mount.is_tilted(&body) => {
-                    self.counters.exposures_tilted += 1;
+                    self.counters.exposures.exposures_tilted += 1;
                     let (sequence, path) = (waiting.trigger.sequence, path_of(&waiting.picture));
                     self.unmatched(Some(sequence), path, UnmatchedReason::Tilted);
                 }
@@ -276,7 +276,7 @@ where
 
     fn give_up(&mut self, waiting: PendingPicture, reason: UnmatchedReason) {
         if !self.use_exif(Some(&waiting.trigger), &waiting.picture) {
-            self.counters.poseless += 1;
+            self.counters.exposures.poseless += 1;
             self.unmatched(Some(waiting.trigger.sequence), path_of(&waiting.picture), reason);
         }
     }

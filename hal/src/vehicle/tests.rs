@@ -138,7 +138,7 @@ fn a_continued_flight_takes_pictures_it_missed_with_the_pose_in_their_own_data()
     assert!((frame.pose.rotation * glam::DVec3::Z + glam::DVec3::Z).length() < 1e-6, "looks straight down");
     let up = frame.pose.rotation * -glam::DVec3::Y;
     assert!((up.x.atan2(up.y).to_degrees() - 30.0).abs() < 1e-6, "its upper edge towards the yaw");
-    assert_eq!((vehicle.counters().exif_poses, vehicle.counters().pictures_unmatched), (1, 0));
+    assert_eq!((vehicle.counters().exif_poses, vehicle.counters().pictures.pictures_unmatched), (1, 0));
 
     let mut fresh = still(folder.path(), None, &Arc::new(ManualClock::default()));
     assert!(ten_seconds(&mut fresh, &ManualClock::default()).is_empty(), "an earlier flight's picture");
@@ -161,7 +161,7 @@ fn three_black_pictures_are_counted_refused_and_raise_the_flag() {
         flags.push(vehicle.flags().pictures_poor);
     }
     assert_eq!(flags, [false, false, true, false]);
-    assert_eq!(vehicle.counters().pictures_black, 3);
+    assert_eq!(vehicle.counters().pictures.pictures_black, 3);
 }
 
 #[test]
@@ -192,7 +192,7 @@ fn bursts_of_black_and_overexposed_pictures_are_told_once_each_with_their_count(
         (8, info, "dgtr: pictures are good again, 3 were not"),
     ];
     assert_eq!(said, expected.map(|(k, severity, text)| (k, severity, text.to_owned())));
-    assert_eq!((vehicle.counters().pictures_black, vehicle.counters().pictures_overexposed), (4, 3));
+    assert_eq!((vehicle.counters().pictures.pictures_black, vehicle.counters().pictures.pictures_overexposed), (4, 3));
 }
 
 /// A sender with the autopilot's ids.
@@ -254,5 +254,5 @@ fn a_stranger_who_says_disarmed_from_another_address_ends_no_flight() {
         }
     }
     assert_eq!(landed_s, Some(55), "three seconds after the autopilot itself has said so");
-    assert_eq!(vehicle.counters().refused_peers, 2 * 55);
+    assert_eq!(vehicle.counters().link.refused_peers, 2 * 55);
 }

@@ -215,7 +215,7 @@ impl Initialiser {
         self.by_name.insert(picture.name.clone(), self.frames.len());
         self.frames.push(DepthFrame::new(picture.name.clone(), image, view, self.file.as_ref())?.masked(mask));
         self.report.pictures = self.frames.len();
-        self.report.add_ms += started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.add_ms += started.elapsed().as_secs_f64() * 1e3;
         self.measure_range()
     }
 
@@ -282,7 +282,7 @@ impl Initialiser {
             Pairs::Unposed(_) => self.align_pairs(&views)?,
         }
         self.pairs.close();
-        self.report.depth_ms += started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.depth_ms += started.elapsed().as_secs_f64() * 1e3;
         if !self.frames.iter().any(DepthFrame::has_depth) {
             return Err(InitError::NoDepth { pictures: self.frames.len(), skipped: self.report.skipped.total() });
         }
@@ -317,7 +317,7 @@ impl Initialiser {
             self.range.measure((previous_view, previous), (&view, &found));
         }
         self.last_features = Some((i, view, found));
-        self.report.features_ms += started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.features_ms += started.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }
 

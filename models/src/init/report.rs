@@ -29,35 +29,24 @@ pub struct Growth {
     pub ground_m2: f64,
 }
 
-/// Counts and times; milliseconds are wall time.
-#[derive(Clone, Debug, Default, Serialize)]
-pub struct InitReport {
-    /// Name of the network.
-    pub network: String,
-    /// Pictures taken in.
-    pub pictures: usize,
-    /// Runs of the network.
-    pub runs: usize,
-    /// Pairs of the sliding window that were not sent to the network.
-    pub skipped: SkippedPairs,
-    /// Unposed networks: pairs in the connectivity graph.
+/// Global alignment of the pairs of an unposed network; zeros of other networks.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct AlignmentReport {
+    /// Pairs in the connectivity graph.
     pub edges: usize,
-    /// Unposed networks: pairs whose scale σ is not determined (no baseline, no confidence); left out.
+    /// Pairs whose scale σ is not determined (no baseline, no confidence); left out.
     pub edges_without_scale: usize,
-    /// Unposed networks: connected components of the graph, each anchored by its own baselines.
+    /// Connected components of the graph, each anchored by its own baselines.
     pub components: usize,
-    /// Unposed networks: steps of the global alignment.
+    /// Steps of the global alignment.
     pub align_steps: usize,
-    /// Unposed networks: mean distance between χ and the pairs' points, metres.
+    /// Mean distance between χ and the pairs' points, metres.
     pub align_residual_m: f64,
-    /// Nearest and farthest depth that any picture was looked at for, metres.
-    pub depth_m: [f32; 2],
-    /// Depths claimed by the network that were not positive finite numbers.
-    pub non_finite_depths: usize,
-    /// Depths near steps that the pictures put on the surface behind.
-    pub moved_depths: usize,
-    /// Median difference between pictures' colours of a place, natural logarithm, as stored and with their light taken out.
-    pub light: [f32; 2],
+}
+
+/// Samples of the depth maps, and the voxels they are merged in.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct MergeReport {
     /// Samples another view agrees with.
     pub supported: usize,
     /// Samples no other view confirms or denies.
@@ -76,8 +65,11 @@ pub struct InitReport {
     pub voxel_m: f32,
     /// Gaussians removed for abnormal extent.
     pub abnormal: usize,
-    /// Gaussians in the cloud.
-    pub gaussians: usize,
+}
+
+/// Wall time, milliseconds.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct InitTimes {
     /// Taking pictures in at the network's size.
     pub add_ms: f64,
     /// Features and triangulation for the depth range.
@@ -102,8 +94,40 @@ pub struct InitReport {
     pub cloud_ms: f64,
     /// Everything after the depths: the four above, side by side where they can be.
     pub merge_ms: f64,
+}
+
+/// Counts and times.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct InitReport {
+    /// Name of the network.
+    pub network: String,
+    /// Pictures taken in.
+    pub pictures: usize,
+    /// Runs of the network.
+    pub runs: usize,
+    /// Pairs of the sliding window that were not sent to the network.
+    pub skipped: SkippedPairs,
+    /// Nearest and farthest depth that any picture was looked at for, metres.
+    pub depth_m: [f32; 2],
+    /// Depths claimed by the network that were not positive finite numbers.
+    pub non_finite_depths: usize,
+    /// Depths near steps that the pictures put on the surface behind.
+    pub moved_depths: usize,
+    /// Median difference between pictures' colours of a place, natural logarithm, as stored and with their light taken out.
+    pub light: [f32; 2],
+    /// Gaussians in the cloud.
+    pub gaussians: usize,
     /// Host bytes planned.
     pub planned_bytes: u64,
+    /// The global alignment.
+    #[serde(flatten)]
+    pub alignment: AlignmentReport,
+    /// The merge.
+    #[serde(flatten)]
+    pub merge: MergeReport,
+    /// The times.
+    #[serde(flatten)]
+    pub times: InitTimes,
 }
 
 impl InitReport {

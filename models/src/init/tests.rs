@@ -213,7 +213,7 @@ fn an_unposed_network_runs_the_whole_way_and_its_plane_is_put_at_its_height() {
     }
     let out = init.build(4000, &mut no_prior).unwrap();
     assert!(out.cloud.len() > 500 && out.cloud.len() <= 4000, "{:?}", out.report);
-    assert_eq!((out.report.components, out.report.edges_without_scale), (1, 0), "{:?}", out.report);
+    assert_eq!((out.report.alignment.components, out.report.alignment.edges_without_scale), (1, 0), "{:?}", out.report);
     assert_eq!(out.report.depth_m, [40.0, 60.0]);
     let mut heights: Vec<f32> = out.cloud.means.iter().map(|m| m[2]).collect();
     heights.sort_by(f32::total_cmp);

@@ -259,7 +259,7 @@ impl Reconstruction {
         self.poses.note(&mut self.report)?;
         if let Some(made) = &fresh.report {
             self.report.skipped.insert("pairs".into(), made.skipped.total() as u64);
-            self.report.skipped.insert("depth_samples_inconsistent".into(), made.removed as u64);
+            self.report.skipped.insert("depth_samples_inconsistent".into(), made.merge.removed as u64);
             self.report.more.insert("init".into(), serde_json::to_value(made)?);
         }
         self.report.views = self.poses.len() as u64;
@@ -349,7 +349,7 @@ impl Reconstruct for Reconstruction {
         let mut new = 0;
         if let Some((made, growth)) = &made {
             self.training.even_light(&self.poses, made.light.as_ref(), &self.resumed, first_new)?;
-            let (edge_m, share) = (2.0 * made.report.voxel_m, self.share());
+            let (edge_m, share) = (2.0 * made.report.merge.voxel_m, self.share());
             new = growth::take_in(&mut self.training, &made.cloud, edge_m, &share, &mut self.grown)?;
             self.grown.depths += growth.depths as u64;
             self.grown.compared += growth.compared as u64;

@@ -55,7 +55,7 @@ fn every_photograph_arrives_with_its_own_pose() {
         );
         assert!(dp < 0.15 && dr < 0.5, "{name}: {dp} m, {dr}°");
     }
-    assert_eq!(companion.counters.damaged, 0);
+    assert_eq!(companion.counters.link.damaged, 0);
 }
 
 #[test]

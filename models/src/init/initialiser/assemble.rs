@@ -15,7 +15,7 @@ use crate::init::fill::continued;
 use crate::init::lighting::measure;
 use crate::init::merge::{Sample, VoxelMerge};
 use crate::init::pairs::{SkippedPairs, partners};
-use crate::init::report::Initialisation;
+use crate::init::report::{Initialisation, MergeReport};
 use crate::init::samples::samples;
 use crate::init::{InitError, finish};
 use crate::light::{Light, PictureLight};
@@ -54,9 +54,9 @@ impl Initialiser {
         let held = at_once(voxels);
         let mut strips = Strips::over(&looked_at, voxels.div_ceil(held));
         let report = &mut self.report;
-        (report.supported, report.alone, report.removed, report.filled, report.samples) = (0, 0, 0, 0, 0);
-        (report.consistency_ms, report.samples_ms, report.voxels_ms, report.cloud_ms) = (0.0, 0.0, 0.0, 0.0);
-        (report.voxels, report.voxel_m, report.dropped_samples, report.abnormal) = (0, 0.0, 0, 0);
+        report.merge = MergeReport::default();
+        let times = &mut report.times;
+        (times.consistency_ms, times.samples_ms, times.voxels_ms, times.cloud_ms) = (0.0, 0.0, 0.0, 0.0);
         // Pictures that show each strip: the first pass goes through all of them and finds out.
         let mut showing = vec![Vec::new(); strips.count()];
         showing[0] = pictures.iter().copied().filter(|&i| self.frames[i].has_depth()).collect();
@@ -91,35 +91,35 @@ impl Initialiser {
                     started.elapsed().as_secs_f64() * 1e3
                 });
                 let report = &mut self.report;
-                report.voxels_ms += voxels_ms;
+                report.times.voxels_ms += voxels_ms;
                 for done in std::mem::replace(&mut waiting, checked?) {
-                    report.consistency_ms += done.consistency_ms;
-                    report.samples_ms += done.samples_ms;
+                    report.times.consistency_ms += done.consistency_ms;
+                    report.times.samples_ms += done.samples_ms;
                     if strip == 0 {
-                        report.samples += done.samples.iter().map(Vec::len).sum::<usize>();
-                        report.supported += done.count.supported;
-                        report.alone += done.count.alone;
-                        report.removed += done.count.removed;
-                        report.filled += done.count.filled;
+                        report.merge.samples += done.samples.iter().map(Vec::len).sum::<usize>();
+                        report.merge.supported += done.count.supported;
+                        report.merge.alone += done.count.alone;
+                        report.merge.removed += done.count.removed;
+                        report.merge.filled += done.count.filled;
                     }
                 }
             }
             let (report, cutting) = (&mut self.report, Instant::now());
-            report.voxels += merge.len();
-            report.voxel_m = report.voxel_m.max(merge.edge());
-            report.dropped_samples += merge.dropped();
+            report.merge.voxels += merge.len();
+            report.merge.voxel_m = report.merge.voxel_m.max(merge.edge());
+            report.merge.dropped_samples += merge.dropped();
             let spread = if self.settings.local_scale { SPREAD } else { 0.0 };
             let merged = merge.finish(strips.share(strip, max_gaussians), spread);
             let (part, abnormal) = finish::cloud(&merged, self.settings.max_scale_ratio);
-            report.abnormal += abnormal;
+            report.merge.abnormal += abnormal;
             match strips.count() {
                 1 => cloud = part,
                 _ => cloud.extend(&part),
             }
-            report.cloud_ms += cutting.elapsed().as_secs_f64() * 1e3;
+            report.times.cloud_ms += cutting.elapsed().as_secs_f64() * 1e3;
         }
         self.report.gaussians = cloud.len();
-        self.report.merge_ms = started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.merge_ms = started.elapsed().as_secs_f64() * 1e3;
         self.report.planned_bytes = self.planned_bytes(self.frames.len(), max_gaussians);
         Ok(Initialisation { cloud, light: self.light.clone(), report: self.report.clone() })
     }
@@ -138,7 +138,7 @@ impl Initialiser {
         let started = Instant::now();
         let found = measure(&self.frames, |i| self.witnesses(i), self.settings.depth_tolerance)?;
         self.report.light = [found.solved.before, found.solved.after];
-        self.report.light_ms = started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.light_ms = started.elapsed().as_secs_f64() * 1e3;
         let [differ, left] = [found.solved.before, found.solved.after].map(|log| 100.0 * log.exp_m1());
         match &found.light {
             None => {

@@ -48,7 +48,7 @@ impl Initialiser {
             })
             .collect();
         let mut made = network.run_all(&requests, self.settings.stride as usize)?.into_iter();
-        self.report.open_ms = network.opening_ms();
+        self.report.times.open_ms = network.opening_ms();
         for (i, range, sources) in chosen {
             let made_with = sources.iter().map(|s| (s.0, self.frames[s.0].view)).collect();
             let made = if sources.is_empty() { None } else { made.next() };
@@ -56,7 +56,7 @@ impl Initialiser {
                 self.report.non_finite_depths += made.non_finite;
                 self.report.moved_depths += made.moved;
                 self.report.runs += 1;
-                self.report.run_ms += made.run_ms;
+                self.report.times.run_ms += made.run_ms;
                 self.report.searched(range);
             }
             let frame = &mut self.frames[i];

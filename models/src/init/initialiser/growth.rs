@@ -58,7 +58,7 @@ impl Initialiser {
         let mut changed: Vec<usize> = stale.chain(new).collect();
         changed.sort_unstable();
         self.make_depths(&changed)?;
-        self.report.depth_ms += started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.depth_ms += started.elapsed().as_secs_f64() * 1e3;
         changed.retain(|i| self.frames[*i].has_depth());
         if changed.is_empty() {
             return Ok(None);

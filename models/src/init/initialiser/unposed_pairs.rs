@@ -33,16 +33,16 @@ impl Initialiser {
             keep_better(&mut heads[pair[1]], second);
             edges.push(edge);
             self.report.runs += 1;
-            self.report.run_ms += started.elapsed().as_secs_f64() * 1e3;
+            self.report.times.run_ms += started.elapsed().as_secs_f64() * 1e3;
         }
         let residual = network.pair().sh_residual;
         let started = Instant::now();
         let alignment = align_frames(&mut self.frames, &edges, &self.settings)?;
-        self.report.edges = edges.len();
-        self.report.edges_without_scale = alignment.sigma.iter().filter(|s| s.is_none()).count();
-        self.report.components = crate::align::graph::components(views.len(), &edges).1;
-        self.report.align_steps = alignment.steps;
-        self.report.align_residual_m = alignment.mean_residual;
+        self.report.alignment.edges = edges.len();
+        self.report.alignment.edges_without_scale = alignment.sigma.iter().filter(|s| s.is_none()).count();
+        self.report.alignment.components = crate::align::graph::components(views.len(), &edges).1;
+        self.report.alignment.align_steps = alignment.steps;
+        self.report.alignment.align_residual_m = alignment.mean_residual;
         self.appearance.clear();
         for (frame, heads) in self.frames.iter().zip(&heads) {
             let made = frame.depth()?.zip(heads.as_ref()).and_then(|(grid, heads)| {
@@ -51,7 +51,7 @@ impl Initialiser {
             });
             self.appearance.push(made);
         }
-        self.report.align_ms += started.elapsed().as_secs_f64() * 1e3;
+        self.report.times.align_ms += started.elapsed().as_secs_f64() * 1e3;
         Ok(())
     }
 }

@@ -91,7 +91,7 @@ impl Training {
         }
         let capacity = self.trainer.plan().scene;
         let room = Room::new(Share::over(capacity, from.ground_m2.unwrap_or(0.0)).square());
-        Ok(carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.voxel_m, capacity, room))
+        Ok(carry_over(&mut self.cloud, &fresh.cloud, 2.0 * made.merge.voxel_m, capacity, room))
     }
 
     fn begin_anew(&mut self, fresh: &Fresh) -> usize {

@@ -50,7 +50,14 @@ const USUAL: Row = Row {
     fault: "none",
     settings: &[],
     also: |_| {},
-    noticed: |c, _| c.damaged + c.lost + c.link_losses + c.pictures_unmatched + c.triggers_unmatched == 0,
+    noticed: |c, _| {
+        c.link.damaged
+            + c.link.lost
+            + c.link.link_losses
+            + c.pictures.pictures_unmatched
+            + c.exposures.triggers_unmatched
+            == 0
+    },
     end: End::Model(10, 10),
     rung: Action::Nominal,
 };
@@ -64,28 +71,28 @@ pub(super) const ROWS: &[Row] = &[
     Row {
         fault: "bytes lost",
         settings: &[("SIM_UART_LOSS", 0.3)],
-        noticed: |c, r| r.line.bytes_lost > 100 && c.damaged > 50 && c.lost > 50,
+        noticed: |c, r| r.line.bytes_lost > 100 && c.link.damaged > 50 && c.link.lost > 50,
         end: End::Model(7, 10),
         ..USUAL
     },
     Row {
         fault: "bits flipped",
         settings: &[("SIM_UART_FLIP", 0.3)],
-        noticed: |c, r| r.line.bytes_flipped > 100 && c.damaged > 50 && c.lost > 50,
+        noticed: |c, r| r.line.bytes_flipped > 100 && c.link.damaged > 50 && c.link.lost > 50,
         end: End::Model(7, 10),
         ..USUAL
     },
     Row {
         fault: "frames lost",
         settings: &[("SIM_FRAME_LOSS", 20.0)],
-        noticed: |c, r| r.line.frames_lost > 200 && c.lost > 200 && c.damaged == 0,
+        noticed: |c, r| r.line.frames_lost > 200 && c.link.lost > 200 && c.link.damaged == 0,
         end: End::Model(7, 10),
         ..USUAL
     },
     Row {
         fault: "line silent for 12 s",
         settings: &[("SIM_LINK_PAUSE", 1.0), ("SIM_FLT_START", 12.0), ("SIM_FLT_LENGTH", 12.0)],
-        noticed: |c, r| r.line.frames_paused > 300 && c.link_losses == 1 && c.pictures_unmatched > 0,
+        noticed: |c, r| r.line.frames_paused > 300 && c.link.link_losses == 1 && c.pictures.pictures_unmatched > 0,
         end: End::Model(4, 8),
         rung: Action::Warn,
         ..USUAL
@@ -94,7 +101,7 @@ pub(super) const ROWS: &[Row] = &[
         fault: "line silent for good",
         settings: &[("SIM_LINK_PAUSE", 1.0), ("SIM_FLT_START", 16.0)],
         also: |script| script.end.silence = Duration::from_secs(150),
-        noticed: |c, _| c.link_losses == 1,
+        noticed: |c, _| c.link.link_losses == 1,
         end: End::Model(3, 6),
         rung: Action::Hold,
     },
@@ -109,7 +116,7 @@ pub(super) const ROWS: &[Row] = &[
     Row {
         fault: "GPS glitch of 111 m for 5 s",
         settings: &[("SIM_GPS1_GLTCH_X", 0.001), ("SIM_FLT_START", 12.0), ("SIM_FLT_LENGTH", 5.0)],
-        noticed: |c, _| c.position_steps > 0 && c.spikes > 0,
+        noticed: |c, _| c.telemetry.position_steps > 0 && c.telemetry.spikes > 0,
         end: End::Model(8, 10),
         rung: Action::Warn,
         ..USUAL
@@ -117,62 +124,71 @@ pub(super) const ROWS: &[Row] = &[
     Row {
         fault: "attitude spikes of 60°",
         settings: &[("SIM_ATT_SPK_PCT", 4.0), ("SIM_ATT_SPK_DEG", 60.0)],
-        noticed: |c, _| c.spikes > 20,
+        noticed: |c, _| c.telemetry.spikes > 20,
         ..USUAL
     },
-    Row { fault: "NaN in attitudes", settings: &[("SIM_NAN_PCT", 10.0)], noticed: |c, _| c.impossible > 100, ..USUAL },
+    Row {
+        fault: "NaN in attitudes",
+        settings: &[("SIM_NAN_PCT", 10.0)],
+        noticed: |c, _| c.telemetry.impossible > 100,
+        ..USUAL
+    },
     Row {
         fault: "boot clock jumps by 500 s",
         settings: &[("SIM_CLK_JUMP", 500.0), ("SIM_FLT_START", 15.0)],
         // A jump costs one exposure at most, the one whose pose was still being sought: the clock's rate outlives it, and
         // TIMESYNC is asked as often again as at the start.
-        noticed: |c, _| c.clock_restarts == 1,
+        noticed: |c, _| c.telemetry.clock_restarts == 1,
         end: End::Model(9, 10),
         ..USUAL
     },
     Row {
         fault: "boot clock starts again (reboot)",
         settings: &[("SIM_CLK_JUMP", -40.0), ("SIM_FLT_START", 15.0)],
-        noticed: |c, _| c.clock_restarts == 1,
+        noticed: |c, _| c.telemetry.clock_restarts == 1,
         end: End::Model(9, 10),
         ..USUAL
     },
     Row {
         fault: "no Unix time",
         settings: &[("SIM_UNIX_LOST", 1.0)],
-        noticed: |c, _| c.trigger_times_mended == EXPOSURES,
+        noticed: |c, _| c.exposures.trigger_times_mended == EXPOSURES,
         ..USUAL
     },
     Row {
         fault: "exposures suddenly in boot time",
         settings: &[("SIM_CAM_BOOTTIME", 1.0), ("SIM_FLT_START", 15.0)],
-        noticed: |c, _| c.triggers == EXPOSURES && c.trigger_times_mended == 0,
+        noticed: |c, _| c.exposures.triggers == EXPOSURES && c.exposures.trigger_times_mended == 0,
         ..USUAL
     },
     Row {
         fault: "announcements lost",
         settings: &[("SIM_CAM_TRG_LOSS", 60.0)],
-        noticed: |c, r| r.triggers_lost > 0 && c.trigger_gaps > 0 && c.pictures_unmatched == r.triggers_lost,
+        noticed: |c, r| {
+            r.triggers_lost > 0 && c.exposures.trigger_gaps > 0 && c.pictures.pictures_unmatched == r.triggers_lost
+        },
         end: End::Model(3, 9),
         ..USUAL
     },
     Row {
         fault: "pictures lost",
         settings: &[("SIM_PIC_LOSS", 40.0)],
-        noticed: |c, r| r.pictures.lost > 0 && c.triggers_unmatched == r.pictures.lost,
+        noticed: |c, r| r.pictures.lost > 0 && c.exposures.triggers_unmatched == r.pictures.lost,
         end: End::Model(4, 9),
         ..USUAL
     },
     Row {
         fault: "pictures twice",
         settings: &[("SIM_PIC_TWICE", 40.0)],
-        noticed: |c, r| r.pictures.twice > 0 && c.picture_duplicates + c.pictures_unmatched == r.pictures.twice,
+        noticed: |c, r| {
+            r.pictures.twice > 0 && c.pictures.picture_duplicates + c.pictures.pictures_unmatched == r.pictures.twice
+        },
         ..USUAL
     },
     Row {
         fault: "pictures 6 s late",
         settings: &[("SIM_PIC_LATE", 40.0), ("SIM_PIC_LATE_S", 6.0)],
-        noticed: |c, r| r.pictures.late > 0 && c.pictures_late > 0,
+        noticed: |c, r| r.pictures.late > 0 && c.pictures.pictures_late > 0,
         end: End::Model(8, 10),
         ..USUAL
     },
@@ -180,7 +196,7 @@ pub(super) const ROWS: &[Row] = &[
         fault: "every picture 40 s late",
         settings: &[("SIM_PIC_LATE", 100.0), ("SIM_PIC_LATE_S", 40.0)],
         noticed: |c, r| {
-            r.pictures.late == EXPOSURES && c.pictures_reconciled == EXPOSURES && c.posed_frames == EXPOSURES
+            r.pictures.late == EXPOSURES && c.pictures.pictures_reconciled == EXPOSURES && c.posed_frames == EXPOSURES
         },
         rung: Action::Warn,
         ..USUAL
@@ -189,7 +205,9 @@ pub(super) const ROWS: &[Row] = &[
         fault: "every picture 80 s late, line silent from the last exposure on",
         settings: &[("SIM_LINK_PAUSE", 1.0), ("SIM_FLT_START", 40.0)],
         also: |script| script.sim.imperfections.transfer_ms = 80_000.0,
-        noticed: |c, _| c.link_losses == 1 && c.pictures_reconciled == EXPOSURES && c.posed_frames == EXPOSURES,
+        noticed: |c, _| {
+            c.link.link_losses == 1 && c.pictures.pictures_reconciled == EXPOSURES && c.posed_frames == EXPOSURES
+        },
         rung: Action::Hold,
         ..USUAL
     },
@@ -203,21 +221,21 @@ pub(super) const ROWS: &[Row] = &[
         fault: "never disarmed, silent after the flight",
         settings: &[],
         also: |script| script.sim.autopilot.stays_armed = true,
-        noticed: |c, _| c.posed_frames == EXPOSURES && c.link_losses == 1,
+        noticed: |c, _| c.posed_frames == EXPOSURES && c.link.link_losses == 1,
         rung: Action::Warn,
         ..USUAL
     },
     Row {
         fault: "black pictures",
         settings: &[("SIM_PIC_BLACK", 40.0)],
-        noticed: |c, r| r.pictures.spoiled > 0 && c.pictures_black == r.pictures.spoiled,
+        noticed: |c, r| r.pictures.spoiled > 0 && c.pictures.pictures_black == r.pictures.spoiled,
         end: End::Model(4, 9),
         ..USUAL
     },
     Row {
         fault: "overexposed pictures",
         settings: &[("SIM_PIC_OVER", 100.0), ("SIM_FLT_START", 15.0)],
-        noticed: |c, r| r.pictures.spoiled > 0 && c.pictures_overexposed == r.pictures.spoiled,
+        noticed: |c, r| r.pictures.spoiled > 0 && c.pictures.pictures_overexposed == r.pictures.spoiled,
         end: End::Model(4, 9),
         rung: Action::Warn,
         ..USUAL
@@ -226,7 +244,9 @@ pub(super) const ROWS: &[Row] = &[
         fault: "pictures cut off",
         settings: &[("SIM_PIC_CUT", 40.0)],
         noticed: |c, r| {
-            r.pictures.cut > 0 && c.pictures_broken == r.pictures.cut && c.triggers_unmatched == r.pictures.cut
+            r.pictures.cut > 0
+                && c.pictures.pictures_broken == r.pictures.cut
+                && c.exposures.triggers_unmatched == r.pictures.cut
         },
         end: End::Model(4, 9),
         ..USUAL
@@ -235,7 +255,7 @@ pub(super) const ROWS: &[Row] = &[
         fault: "signed with another key from 16 s on",
         settings: &[("SIM_SIGN_BAD", 1.0), ("SIM_FLT_START", 16.0)],
         also: signed,
-        noticed: |c, _| c.wrong_key > 500 && c.link_losses == 1,
+        noticed: |c, _| c.link.wrong_key > 500 && c.link.link_losses == 1,
         end: End::Model(3, 6),
         rung: Action::Warn,
     },
@@ -243,26 +263,38 @@ pub(super) const ROWS: &[Row] = &[
         fault: "signed with another key from the start",
         settings: &[("SIM_SIGN_BAD", 1.0)],
         also: signed,
-        noticed: |c, _| c.wrong_key > 500 && c.triggers == 0 && c.pictures_unmatched == EXPOSURES,
+        noticed: |c, _| {
+            c.link.wrong_key > 500 && c.exposures.triggers == 0 && c.pictures.pictures_unmatched == EXPOSURES
+        },
         end: End::Nothing("signing refused"),
         rung: Action::Nominal,
     },
     Row {
         fault: "PX4: CAMERA_TRIGGER and two commands",
         also: |script| px4(Announcing::Trigger, script),
-        noticed: |c, _| c.triggers == EXPOSURES && c.trigger_duplicates >= EXPOSURES && c.posed_frames == EXPOSURES,
+        noticed: |c, _| {
+            c.exposures.triggers == EXPOSURES
+                && c.exposures.trigger_duplicates >= EXPOSURES
+                && c.posed_frames == EXPOSURES
+        },
         ..USUAL
     },
     Row {
         fault: "PX4: and CAMERA_IMAGE_CAPTURED",
         also: |script| px4(Announcing::TriggerAndCaptured, script),
-        noticed: |c, _| c.triggers == EXPOSURES && c.trigger_duplicates >= 2 * EXPOSURES && c.posed_frames == EXPOSURES,
+        noticed: |c, _| {
+            c.exposures.triggers == EXPOSURES
+                && c.exposures.trigger_duplicates >= 2 * EXPOSURES
+                && c.posed_frames == EXPOSURES
+        },
         ..USUAL
     },
     Row {
         fault: "CAMERA_IMAGE_CAPTURED alone",
         also: |script| px4(Announcing::Captured, script),
-        noticed: |c, _| c.triggers == EXPOSURES && c.trigger_duplicates == 0 && c.posed_frames == EXPOSURES,
+        noticed: |c, _| {
+            c.exposures.triggers == EXPOSURES && c.exposures.trigger_duplicates == 0 && c.posed_frames == EXPOSURES
+        },
         ..USUAL
     },
     Row {
@@ -271,7 +303,7 @@ pub(super) const ROWS: &[Row] = &[
             script.sim.survey.gimbal_pitch_deg = -60.0;
             (script.vehicle.mount.rotation_deg, script.vehicle.mount.max_tilt_deg) = ([0.0, -90.0, 0.0], 20.0);
         },
-        noticed: |c, r| r.triggers > 0 && c.exposures_tilted == r.triggers && c.posed_frames == 0,
+        noticed: |c, r| r.triggers > 0 && c.exposures.exposures_tilted == r.triggers && c.posed_frames == 0,
         end: End::Nothing("pictures were taken tilted"),
         ..USUAL
     },
