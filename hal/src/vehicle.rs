@@ -9,7 +9,6 @@ pub mod mount;
 mod service;
 mod settings;
 
-use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use geometry::geodesy::EnuFrame;
@@ -31,14 +30,11 @@ use crate::peer::{Peers, Verdict};
 use crate::time::MonotonicClock;
 use crate::traits::{Camera, Clock, Link, LinkState, TriggerSource};
 use cameras::{Cameras, Passage};
-use exposures::{Exposures, PendingPicture};
+use event::Events;
+use exposures::Exposures;
 use mount::Mount;
 use service::Service;
 
-/// Events kept for a runtime that is busy; beyond it the oldest is dropped, counted.
-const EVENTS: usize = 256;
-/// Matched pictures that wait for their pose at the same time, as a rule.
-const PENDING: usize = 32;
 /// The link is read in slices of this, so that pictures and timers are served while it is silent.
 const SLICE: Duration = Duration::from_millis(20);
 
@@ -46,28 +42,44 @@ const SLICE: Duration = Duration::from_millis(20);
 pub struct Vehicle<L: Link = Reconnecting, C = AnyCamera, K = MonotonicClock> {
     channel: Channel<L>,
     camera: C,
-    clock: K,
-    recorded_ns: Option<u64>,
+    now: Now<K>,
     peers: Peers,
     autopilot: Autopilot,
     matcher: Matcher<Picture>,
     exposures: Exposures,
-    /// Matched pictures waiting for their pose.
-    pending: VecDeque<PendingPicture>,
     mount: Mount,
     service: Service,
     settings: VehicleSettings,
-    events: VecDeque<Event>,
+    events: Events,
     lost: bool,
-    texts: u16,
+    trouble: Trouble,
+    finished: bool,
+    counters: HalCounters,
+}
+
+/// The companion's clock; a recording brings its own.
+struct Now<K> {
+    clock: K,
+    recorded_ns: Option<u64>,
+}
+
+/// What is wrong with the pictures that came last.
+#[derive(Default)]
+struct Trouble {
     /// Exposures given up since the last picture came.
     pictureless: u32,
     /// Pictures in a row that showed nothing or could not be decoded.
     poor: u32,
     /// The ground control station knows of them.
-    poor_told: bool,
-    finished: bool,
-    counters: HalCounters,
+    told: bool,
+}
+
+impl Trouble {
+    /// A picture is good again; what the ground control station is told of it.
+    fn recovered(&mut self) -> Option<String> {
+        let poor = std::mem::take(&mut self.poor);
+        std::mem::take(&mut self.told).then(|| format!("dgtr: pictures are good again, {poor} were not"))
+    }
 }
 
 impl Vehicle {
@@ -113,8 +125,7 @@ where
         Ok(Self {
             channel: Channel::new(link, ids.system, ids.own_component, signer),
             camera,
-            clock,
-            recorded_ns: None,
+            now: Now { clock, recorded_ns: None },
             peers: Peers::new(ids.system),
             autopilot: match settings.pictures_since {
                 Some(_) => Autopilot::new(ids).continued(ns(settings.link.standing_limit_s)),
@@ -123,16 +134,12 @@ where
             .with_gimbal(settings.mount.gimbal),
             matcher: Matcher::new(matching),
             exposures: Exposures::new(Cameras::new(settings.lens.index, matching.patience_ns)),
-            pending: VecDeque::with_capacity(PENDING),
             mount: Mount::new(&settings.mount, EnuFrame::new(settings.origin)),
             service,
             settings: settings.clone(),
-            events: VecDeque::with_capacity(EVENTS),
+            events: Events::default(),
             lost: false,
-            texts: 0,
-            pictureless: 0,
-            poor: 0,
-            poor_told: false,
+            trouble: Trouble::default(),
             finished: false,
             counters: HalCounters::default(),
         })
@@ -167,12 +174,12 @@ where
 
     /// The companion's clock as this vehicle sees it: a recording brings its own.
     pub fn now_ns(&self) -> u64 {
-        self.recorded_ns.unwrap_or_else(|| self.clock.now_ns())
+        self.now.recorded_ns.unwrap_or_else(|| self.now.clock.now_ns())
     }
 
     /// True once a recording is at its end and every picture and exposure is accounted for.
     pub fn is_finished(&self) -> bool {
-        self.finished && self.events.is_empty() && self.pending.is_empty() && self.exposures.is_closed()
+        self.finished && self.events.is_empty() && self.exposures.pending.is_empty() && self.exposures.is_closed()
     }
 
     /// True while pictures of announced exposures have not come.
@@ -198,8 +205,8 @@ where
             link_lost: self.lost && state.heartbeat_ns.is_some(),
             position_poor: state.gps_fix.is_some_and(|fix| fix < 3)
                 || sigma.is_some_and(|s| s > f64::from(limits.position_sigma_m)),
-            camera_silent: self.pictureless >= limits.silent_exposures,
-            pictures_poor: self.poor >= limits.poor_pictures,
+            camera_silent: self.trouble.pictureless >= limits.silent_exposures,
+            pictures_poor: self.trouble.poor >= limits.poor_pictures,
             battery_low: state.battery_percent.is_some_and(|p| p <= limits.battery_low_pct),
             ..Flags::default()
         }
@@ -229,9 +236,11 @@ where
         let decoded = frame.picture.decode(&self.settings.lens);
         let blank = decoded.as_ref().ok().and_then(blank);
         if blank.is_none() && decoded.is_ok() {
-            self.tell_recovery();
+            if let Some(text) = self.trouble.recovered() {
+                self.status_text(MavSeverity::MAV_SEVERITY_INFO, &text);
+            }
         } else {
-            self.poor = self.poor.saturating_add(1);
+            self.trouble.poor = self.trouble.poor.saturating_add(1);
         }
         if let Some(blank) = blank {
             let path = frame.picture.name();
@@ -240,23 +249,14 @@ where
                 Blank::Overexposed => &mut self.counters.pictures.pictures_overexposed,
                 Blank::Constant => &mut self.counters.pictures.pictures_constant,
             } += 1;
-            if !self.poor_told && self.service.may_warn(self.now_ns()) {
-                self.poor_told = true;
+            if !self.trouble.told && self.service.may_warn(self.now_ns()) {
+                self.trouble.told = true;
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &format!("dgtr: {name} is {blank}, left out"));
             }
             return Err(HalError::Blank { path, blank });
         }
         Ok(undistort(decoded?, &self.settings.lens))
-    }
-
-    /// A picture is good again.
-    fn tell_recovery(&mut self) {
-        if std::mem::take(&mut self.poor_told) {
-            let text = format!("dgtr: pictures are good again, {} were not", self.poor);
-            self.status_text(MavSeverity::MAV_SEVERITY_INFO, &text);
-        }
-        self.poor = 0;
     }
 
     /// Everything counted so far.
@@ -284,12 +284,19 @@ where
             ..heard.exposures
         };
         let pictures = PictureCounters { pictures_lost: self.camera.lost_pictures(), ..own.pictures };
-        HalCounters { link, telemetry: heard.telemetry, exposures, pictures, ..own }
+        HalCounters {
+            link,
+            telemetry: heard.telemetry,
+            exposures,
+            pictures,
+            events_dropped: self.events.dropped,
+            ..own
+        }
     }
 
     fn receive(&mut self, wait: Duration) -> Result<(), HalError> {
         self.channel.fill(wait)?;
-        self.recorded_ns = self.channel.received_ns().or(self.recorded_ns);
+        self.now.recorded_ns = self.channel.received_ns().or(self.now.recorded_ns);
         if self.channel.link().state() == LinkState::Ended {
             self.channel.end();
         }
@@ -320,7 +327,7 @@ where
             self.service.component.handle(&frame, self.autopilot.ids().system, now_ns);
             if self.autopilot.handle(&frame, now_ns) == Handled::Position {
                 let report = self.mount.report(&self.autopilot, now_ns);
-                self.counters.events_dropped += push(&mut self.events, report.map(Event::Pose));
+                report.into_iter().for_each(|pose| self.events.push(Event::Pose(pose)));
             }
         }
         if let Some(pinned) = self.peers.address().filter(|pinned| peer == Some(*pinned)) {
@@ -338,18 +345,14 @@ where
         if lost && !self.lost {
             self.counters.link.link_losses += u64::from(state != LinkState::Ended);
             self.channel.resynchronise();
-            self.emit(Event::LinkLost);
+            self.events.push(Event::LinkLost);
         } else if !lost && self.lost {
-            self.emit(Event::LinkBack);
+            self.events.push(Event::LinkBack);
         }
         self.lost = lost;
         if state == LinkState::Ended && !self.finished {
             self.finish();
         }
-    }
-
-    fn emit(&mut self, event: Event) {
-        self.counters.events_dropped += push(&mut self.events, Some(event));
     }
 
     /// Announced exposures into the matcher and the list of poses to find.
@@ -366,7 +369,7 @@ where
                 self.counters.exposures.triggers_unmatched += 1;
                 tracing::warn!("exposure {}: no picture came", oldest.sequence);
             }
-            self.emit(Event::Trigger(trigger));
+            self.events.push(Event::Trigger(trigger));
             if self.is_free_running() {
                 self.service.make_due();
             } else if passage == Passage::Through(trigger)
@@ -381,16 +384,3 @@ where
 
 #[cfg(test)]
 mod tests;
-
-/// Adds an event, dropping the oldest when nobody fetches them; returns how many were dropped.
-fn push(events: &mut VecDeque<Event>, event: Option<Event>) -> u64 {
-    let Some(event) = event else { return 0 };
-    let full = events.len() >= EVENTS;
-    if full {
-        // Poses are the first to go: the next one says more.
-        let oldest_pose = events.iter().position(|e| matches!(e, Event::Pose(_))).unwrap_or(0);
-        events.remove(oldest_pose);
-    }
-    events.push_back(event);
-    u64::from(full)
-}

@@ -1,5 +1,6 @@
 //! What a vehicle reports.
 
+use std::collections::VecDeque;
 use std::path::PathBuf;
 
 use glam::{DQuat, DVec3};
@@ -9,6 +10,9 @@ use crate::matcher::Reason;
 use crate::mavlink_camera::ParameterId;
 use crate::pose::PoseError;
 use crate::trigger::Trigger;
+
+/// Events kept for a runtime that is busy; beyond it the oldest is dropped, counted.
+const EVENTS: usize = 256;
 
 /// Something the runtime should know.
 #[derive(Clone, Debug, PartialEq)]
@@ -127,5 +131,43 @@ impl std::fmt::Display for Unmatched {
             UnmatchedReason::Tilted => ": taken in a turn, the camera tilted beyond mount.max_tilt_deg",
             UnmatchedReason::NoGimbal => ": no gimbal attitude (mount.attitude = \"fixed\" if there is no gimbal)",
         })
+    }
+}
+
+/// Events until somebody fetches them.
+pub(super) struct Events {
+    queue: VecDeque<Event>,
+    /// Those dropped because nobody did.
+    pub dropped: u64,
+}
+
+impl Default for Events {
+    fn default() -> Self {
+        Self { queue: VecDeque::with_capacity(EVENTS), dropped: 0 }
+    }
+}
+
+impl Events {
+    /// Adds an event; of too many the oldest one goes.
+    pub fn push(&mut self, event: Event) {
+        if self.queue.len() >= EVENTS {
+            // Poses are the first to go: the next one says more.
+            let oldest_pose = self.queue.iter().position(|e| matches!(e, Event::Pose(_))).unwrap_or(0);
+            self.queue.remove(oldest_pose);
+            self.dropped += 1;
+        }
+        self.queue.push_back(event);
+    }
+
+    pub fn pop_front(&mut self) -> Option<Event> {
+        self.queue.pop_front()
+    }
+
+    pub fn len(&self) -> usize {
+        self.queue.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.queue.is_empty()
     }
 }

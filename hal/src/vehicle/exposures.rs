@@ -17,6 +17,8 @@ mod ledger;
 pub(super) use ledger::Exposures;
 use ledger::{EXPOSURES, Exposure, PUT_ASIDE, Partner, PutAside};
 
+/// Matched pictures that wait for their pose at the same time, as a rule.
+const PENDING: usize = 32;
 /// Poses are found within seconds: only so many of the newest exposures can still be without.
 const UNPOSED: usize = 128;
 /// A pose that is still in the future of the track after this is taken from what there is, ns.
@@ -55,7 +57,7 @@ where
             match self.camera.next_picture(now_ns) {
                 Ok(Some((clues, picture))) => {
                     self.counters.pictures.pictures += 1;
-                    self.pictureless = 0;
+                    self.trouble.pictureless = 0;
                     if self.is_free_running() {
                         self.take_free_running(&clues, picture, now_ns);
                     } else if let Passage::Through((clues, picture)) =
@@ -200,7 +202,7 @@ where
             }
             Outcome::Picture { picture, reason, .. } => self.picture_alone(&picture, reason),
             // Its picture may still come: it counts as missing at the end of the flight.
-            Outcome::Trigger { .. } => self.pictureless = self.pictureless.saturating_add(1),
+            Outcome::Trigger { .. } => self.trouble.pictureless = self.trouble.pictureless.saturating_add(1),
         }
     }
 
@@ -220,28 +222,28 @@ where
     }
 
     fn wait_for_pose(&mut self, waiting: PendingPicture) {
-        if self.pending.len() >= EXPOSURES
-            && let Some(oldest) = self.pending.pop_front()
+        if self.exposures.pending.len() >= EXPOSURES
+            && let Some(oldest) = self.exposures.pending.pop_front()
         {
             self.counters.exposures.poseless += 1;
             self.unmatched(Some(oldest.trigger.sequence), path_of(&oldest.picture), UnmatchedReason::Overflow);
         }
-        self.pending.push_back(waiting);
+        self.exposures.pending.push_back(waiting);
     }
 
     /// Pictures whose pose is known become events, while somebody fetches them.
     pub(super) fn hand_out(&mut self, at_end: bool) {
-        for _ in 0..self.pending.len() {
+        for _ in 0..self.exposures.pending.len() {
             if self.events.len() >= EVENTS_WAITING {
                 return;
             }
-            let Some(waiting) = self.pending.pop_front() else { break };
+            let Some(waiting) = self.exposures.pending.pop_front() else { break };
             let (pose, mid_boot_ns) = match self.exposures.find(&waiting.trigger) {
                 Some(exposure) => (exposure.pose, exposure.mid_boot_ns),
                 None => (Some(Err(PoseError::TooOld)), waiting.trigger.boot_ns),
             };
             match pose {
-                None if !at_end => self.pending.push_back(waiting),
+                None if !at_end => self.exposures.pending.push_back(waiting),
                 None => self.give_up(waiting, UnmatchedReason::Pose(PoseError::NotYet)),
                 Some(Err(e)) => self.give_up(waiting, UnmatchedReason::Pose(e)),
                 Some(Ok(body)) if self.mount.is_tilted(&body) => {
@@ -260,7 +262,7 @@ where
         }
         while self.events.len() < EVENTS_WAITING {
             let Some(event) = self.exposures.closing.pop_front() else { break };
-            self.emit(event);
+            self.events.push(event);
         }
     }
 
@@ -271,7 +273,7 @@ where
         let unix_us = self.autopilot.unix_us(mid_boot_ns);
         self.service.captured(mid_boot_ns, unix_us, &pose, self.settings.origin);
         let sequence = trigger.sequence;
-        self.emit(Event::Posed(PosedPicture { sequence, time_ns, pose, speed_m_s, confidence, picture }));
+        self.events.push(Event::Posed(PosedPicture { sequence, time_ns, pose, speed_m_s, confidence, picture }));
     }
 
     fn give_up(&mut self, waiting: PendingPicture, reason: UnmatchedReason) {
@@ -308,7 +310,7 @@ where
     /// At once, or, when the end of the flight decides many things at the same time, as there is room.
     fn report(&mut self, event: Event) {
         if self.events.len() < EVENTS_WAITING {
-            self.emit(event);
+            self.events.push(event);
         } else {
             self.exposures.closing.push_back(event);
         }

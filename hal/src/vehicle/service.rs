@@ -36,6 +36,8 @@ pub(super) struct Service {
     clock_events: u64,
     gimbals_named: usize,
     last_free_ns: Option<u64>,
+    /// Number of the last long text.
+    texts: u16,
 }
 
 impl Service {
@@ -53,6 +55,7 @@ impl Service {
             clock_events: 0,
             gimbals_named: 0,
             last_free_ns: None,
+            texts: 0,
         };
         Ok((service, signer))
     }
@@ -130,8 +133,9 @@ where
         let bytes = text.as_bytes();
         let chunks = bytes.chunks(50).take(usize::from(u8::MAX));
         // Chunks of one text share an id; 0 means that there is only one.
-        self.texts = if bytes.len() > 50 { self.texts.wrapping_add(1).max(1) } else { self.texts };
-        let id = if bytes.len() > 50 { self.texts } else { 0 };
+        self.service.texts =
+            if bytes.len() > 50 { self.service.texts.wrapping_add(1).max(1) } else { self.service.texts };
+        let id = if bytes.len() > 50 { self.service.texts } else { 0 };
         for (chunk_seq, chunk) in chunks.enumerate() {
             let mut padded = [0; 50];
             padded[..chunk.len()].copy_from_slice(chunk);
@@ -200,7 +204,7 @@ where
         while let Some(request) = self.service.component.next_request(now_ns) {
             match request {
                 Request::Capture(sequence) => self.autopilot.announce_own(sequence, now_ns),
-                Request::Set(parameter, value) => self.emit(Event::Asked { parameter, value }),
+                Request::Set(parameter, value) => self.events.push(Event::Asked { parameter, value }),
             }
         }
         self.autopilot.settle_own(now_ns);

@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use super::{PENDING, PendingPicture};
 use crate::camera::Picture;
 use crate::matcher::reconcile::{Pairing, reconcile};
 use crate::matcher::{Matcher, Outcome, Reason};
@@ -48,6 +49,8 @@ pub(in crate::vehicle) struct Exposures {
     pub(super) all: VecDeque<Exposure>,
     pub(super) aside: Vec<PutAside>,
     pub(super) next_reconcile_ns: u64,
+    /// Matched pictures that wait for their pose.
+    pub(in crate::vehicle) pending: VecDeque<PendingPicture>,
     /// Whose they are.
     pub(in crate::vehicle) cameras: Cameras,
     /// Decided at the end of the flight and not reported yet.
@@ -62,6 +65,7 @@ impl Exposures {
             all: VecDeque::with_capacity(EXPOSURES),
             aside: Vec::with_capacity(PUT_ASIDE),
             next_reconcile_ns: 0,
+            pending: VecDeque::with_capacity(PENDING),
             closing: VecDeque::new(),
         }
     }
