@@ -110,7 +110,7 @@ fn talk(python: &Path, signing: Signing, peer_key: Option<&str>) -> (serde_json:
         }
     }
     let counters = vehicle.counters();
-    (seen.wrong_key, seen.unsigned) = (counters.wrong_key, counters.unsigned);
+    (seen.wrong_key, seen.unsigned) = (counters.link.wrong_key, counters.link.unsigned);
     let output = peer.wait_with_output().expect("its output");
     (serde_json::from_slice(&output.stdout).expect("its report"), seen)
 }

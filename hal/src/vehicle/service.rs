@@ -171,8 +171,8 @@ where
         }
         // A clock that jumped is learnt anew as fast as at the start.
         let heard = self.autopilot.counters();
-        if heard.clock_restarts + heard.clock_steps != self.service.clock_events {
-            self.service.clock_events = heard.clock_restarts + heard.clock_steps;
+        if heard.telemetry.clock_restarts + heard.telemetry.clock_steps != self.service.clock_events {
+            self.service.clock_events = heard.telemetry.clock_restarts + heard.telemetry.clock_steps;
             (self.service.requests, self.service.next_timesync_ns) = (0, now_ns);
         }
         if now_ns >= self.service.next_timesync_ns {

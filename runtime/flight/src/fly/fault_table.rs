@@ -114,11 +114,12 @@ fn noteworthy(counters: &str) -> String {
         "delivered:",
         "foreign:",
     ];
-    let inner = counters.split_once('{').map_or("", |c| c.1).trim_end_matches('}');
-    let told = |f: &&str| !f.is_empty() && !f.ends_with(": 0") && !USUAL.iter().any(|u| f.starts_with(u));
-    inner
+    // Counters are grouped by what they count.
+    let field = |f: &'_ str| f.rsplit('{').next().unwrap_or_default().trim_matches([' ', '}']).to_owned();
+    let told = |f: &String| !f.is_empty() && !f.ends_with(": 0") && !USUAL.iter().any(|u| f.starts_with(u));
+    counters
         .split(',')
-        .map(str::trim)
+        .map(field)
         .filter(told)
         .map(|f| f.replace(": ", " ").replace('_', " "))
         .collect::<Vec<_>>()
