@@ -5,8 +5,8 @@ use image::{RgbImage, imageops};
 use job::console::Progress;
 use job::run_json::RunReport;
 use models::camera::View;
-use models::picture::crops::{Crop, crops, finest};
 use models::mask::Mask;
+use models::picture::crops::{Crop, crops, finest};
 use vulkan::trainer::CropPlace;
 
 use super::Training;
