@@ -22,7 +22,7 @@ use jpeg_decoder::{Decoder, PixelFormat};
 
 use crate::formats::one_line;
 use crate::formats::reconstruction::{Focal, LensDescription};
-use mask::Mask;
+use crate::mask::Mask;
 use values::ValueRange;
 
 /// Largest picture edge taken; 16384² × 3 bytes is also what a decoder may allocate at most.
