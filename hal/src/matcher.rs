@@ -1,28 +1,46 @@
 //! Which picture belongs to which announced exposure.
 //!
 //! Three clues, none of them reliable alone: when the picture was complete (its latency is about constant), its number
-//! (gaps when the camera skips an exposure), its own camera's clock (offset unknown, often whole seconds). Offsets are
-//! learnt from pictures that were certain and dropped when they stop fitting. Fixed memory; what cannot be matched is
-//! returned with the reason, never dropped silently.
+//! (gaps when the camera skips an exposure), its own camera's clock (offset unknown, often whole seconds). All that came lately is
+//! aligned at once ([`alignment`]): a picture is matched when the best assignment is better than every other one by a margin, which
+//! is its confidence. Fixed memory; what cannot be matched is returned with the reason, never dropped silently.
 
-mod clues;
+mod alignment;
+#[cfg(feature = "std")]
+pub mod landing;
 #[cfg(feature = "std")]
 pub mod reconcile;
 
-use heapless::{Deque, HistoryBuf};
+use heapless::{HistoryBuf, Vec};
 
 use crate::traits::PictureClues;
 use crate::trigger::{Source, Trigger};
-use clues::{Choice, Learnt, WITNESSES};
+use alignment::{Band, Chain, Model, Rows, Slot, Verdict, confidence};
 
-/// Exposures waiting for their picture.
-const TRIGGERS: usize = 64;
-/// Pictures waiting for their exposure.
-const PICTURES: usize = 32;
+/// Exposures that are kept, and pictures, those that are matched with those that wait.
+const EXPOSURES: usize = 128;
+const PICTURES: usize = 48;
+/// Exposures that come into question for one picture.
+const WIDTH: usize = 64;
 /// Numbers of matched pictures remembered, to know a duplicate.
 const REMEMBERED: usize = 64;
-/// Before anything is learnt: so many older exposures without a picture mean that pictures may be late by any time.
-const UNSURE: usize = 3;
+/// The newest pictures are aligned again with everything that comes, however sure they were.
+const FRESH: usize = 12;
+/// A camera's clock that goes back by more was set.
+const LATEST_NS: u64 = 60_000_000_000;
+/// Announcements missing by their counter that are put on the list at most.
+const GAP: u32 = 8;
+/// What is less sure than this waits for the landing.
+pub const LEAST_CONFIDENCE: f32 = 0.5;
+/// While something waits and nothing comes, it is looked at again after this.
+const AGAIN_NS: u64 = 100_000_000;
+/// Announcements that came late by some time may come this much later.
+const LATER: f64 = 1.25;
+/// Least and greatest variance of the difference of two latencies, and that before any was measured, ns².
+const JITTER_NS2: core::ops::RangeInclusive<f32> = 2.5e15..=1.6e17;
+const FIRST_JITTER_NS2: f32 = 4e16;
+/// Weight of the newest latency.
+const BLEND: f32 = 0.1;
 
 /// What the matcher may assume.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -69,6 +87,8 @@ pub enum Outcome<P> {
         clues: PictureClues,
         /// The picture came after one of a later exposure.
         late: bool,
+        /// 0 … 1: by how much it is likelier than any other exposure.
+        confidence: f32,
     },
     /// A picture without an exposure.
     Picture {
@@ -88,31 +108,50 @@ pub enum Outcome<P> {
     },
 }
 
-struct Waiting<P> {
-    clues: PictureClues,
-    picture: P,
+/// What became of an exposure on the list.
+#[derive(Clone, Copy, PartialEq)]
+enum Fate {
+    Waits,
+    Matched,
+    /// Its picture did not come in time.
+    Missed,
+}
+
+/// A picture in the window.
+struct Shot<P> {
+    /// `None` once it was given out.
+    picture: Option<P>,
+    /// Compared with the numbers of earlier ones.
+    checked: bool,
+    verdict: Option<Verdict>,
+}
+
+/// The chain's rows.
+struct Stored {
+    bands: [Band; PICTURES],
+    ahead: [f32; PICTURES * WIDTH],
+    behind: [f32; PICTURES * WIDTH],
 }
 
 /// Matches pictures `P` (paths, handles) to exposures.
 pub struct Matcher<P> {
     settings: MatcherSettings,
-    triggers: Deque<Trigger, TRIGGERS>,
-    pictures: Deque<Waiting<P>, PICTURES>,
+    exposures: Vec<Slot, EXPOSURES>,
+    fates: Vec<Fate, EXPOSURES>,
+    clues: Vec<PictureClues, PICTURES>,
+    shots: Vec<Shot<P>, PICTURES>,
+    rows: Stored,
+    /// Pictures at the beginning of the window whose rows stand.
+    settled: usize,
     numbers: HistoryBuf<u64, REMEMBERED>,
-    learnt: Learnt,
-    newest_matched: Option<u32>,
-    /// Newest exposure that was given up.
-    given_up: Option<u32>,
-}
-
-enum Decision {
-    Wait,
-    Match(usize),
-    /// As `Match`; the camera's numbers mean other exposures from here on.
-    Shift(usize),
-    Alone(Reason),
-    /// As `Alone` without an exposure, because its number stands for this one.
-    Absent(u64),
+    newest_matched_ns: u64,
+    latencies: HistoryBuf<i64, FRESH>,
+    jitter_ns2: f32,
+    /// Matched, exposures that stayed alone, pictures that stayed alone.
+    counted: [f32; 3],
+    /// Something came since the last look, and when to look again if nothing does.
+    changed: bool,
+    next_look_ns: u64,
 }
 
 impl<P> Matcher<P> {
@@ -120,173 +159,322 @@ impl<P> Matcher<P> {
     pub fn new(settings: MatcherSettings) -> Self {
         Self {
             settings,
-            triggers: Deque::new(),
-            pictures: Deque::new(),
+            exposures: Vec::new(),
+            fates: Vec::new(),
+            clues: Vec::new(),
+            shots: Vec::new(),
+            rows: Stored {
+                bands: [Band::default(); PICTURES],
+                ahead: [0.0; PICTURES * WIDTH],
+                behind: [0.0; PICTURES * WIDTH],
+            },
+            settled: 0,
             numbers: HistoryBuf::new(),
-            learnt: Learnt::new(settings.latency_ns),
-            newest_matched: None,
-            given_up: None,
+            newest_matched_ns: 0,
+            latencies: HistoryBuf::new(),
+            jitter_ns2: FIRST_JITTER_NS2,
+            counted: [0.0; 3],
+            changed: false,
+            next_look_ns: 0,
         }
+    }
+
+    /// What it may assume.
+    pub fn settings(&self) -> MatcherSettings {
+        self.settings
     }
 
     /// Adds an announced exposure; returns the oldest one when there is no more room.
     pub fn push_trigger(&mut self, trigger: Trigger) -> Option<Outcome<P>> {
-        let evicted = if self.triggers.is_full() { self.triggers.pop_front() } else { None };
-        let _ = self.triggers.push_back(trigger);
+        self.changed = true;
+        let at = self.exposures.partition_point(|e| e.trigger.time_ns <= trigger.time_ns);
+        let before = at.checked_sub(1).and_then(|at| self.exposures.get(at)).map(|e| e.trigger);
+        let after = self.exposures.get(at).map(|e| e.trigger);
+        // Its place was kept.
+        let kept = [at.checked_sub(1), Some(at)]
+            .into_iter()
+            .flatten()
+            .find(|at| self.exposures.get(*at).is_some_and(|e| !e.announced && e.trigger.sequence == trigger.sequence));
+        if let Some(kept) = kept {
+            self.exposures[kept] = Slot { trigger, heard_ns: 0, announced: true };
+            return None;
+        }
+        // What the counter says was announced in between and did not come.
+        if let Some(before) = before.filter(|_| after.is_none()) {
+            for trigger in missing(&before, &trigger) {
+                // Room for the one that was announced.
+                if self.exposures.len() + 1 < EXPOSURES {
+                    let end = self.exposures.len();
+                    self.insert(end, Slot { trigger, heard_ns: 1, announced: false });
+                }
+            }
+        }
+        let evicted = if self.exposures.is_full() { self.forget_exposure() } else { None };
+        let at = self.exposures.partition_point(|e| e.trigger.time_ns <= trigger.time_ns);
+        self.insert(at, Slot { trigger, heard_ns: 0, announced: true });
         evicted.map(|trigger| Outcome::Trigger { trigger, reason: Reason::Overflow })
+    }
+
+    fn insert(&mut self, at: usize, slot: Slot) {
+        let full = self.exposures.insert(at, slot).is_err() || self.fates.insert(at, Fate::Waits).is_err();
+        debug_assert!(!full, "there is room");
+        // Rows that stand are aligned with the list.
+        for p in 0..self.settled {
+            let band = &mut self.rows.bands[p];
+            if band.from >= at {
+                band.from += 1;
+            } else if at < band.from + band.len {
+                self.settled = p;
+                break;
+            }
+        }
+    }
+
+    /// Takes the oldest exposure off the list; returns it when it still waited.
+    fn forget_exposure(&mut self) -> Option<Trigger> {
+        let (slot, fate) = (self.exposures.remove(0), self.fates.remove(0));
+        for p in 0..self.settled {
+            let band = &mut self.rows.bands[p];
+            if band.from > 0 {
+                band.from -= 1;
+            } else if band.len > 0 {
+                self.rows.ahead.copy_within(p * WIDTH + 1..p * WIDTH + band.len, p * WIDTH);
+                band.len -= 1;
+            }
+        }
+        for shot in &mut self.shots {
+            if let Some(verdict) = &mut shot.verdict {
+                verdict.exposure = verdict.exposure.and_then(|e| e.checked_sub(1));
+                verdict.other = verdict.other.and_then(|e| e.checked_sub(1));
+            }
+        }
+        (fate == Fate::Waits && slot.announced).then_some(slot.trigger)
     }
 
     /// Takes out the exposures of all cameras but this one, and what was learnt from them.
     pub fn keep_only(&mut self, source: Source) {
-        let others = self.triggers.iter().any(|t| t.source != source);
-        for _ in 0..self.triggers.len() {
-            if let Some(trigger) = self.triggers.pop_front().filter(|t| t.source == source) {
-                let _ = self.triggers.push_back(trigger);
-            }
+        if self.exposures.iter().all(|e| e.trigger.source == source) {
+            return;
         }
-        if others {
-            self.learnt = Learnt::new(self.settings.latency_ns);
-            (self.newest_matched, self.given_up) = (None, None);
-        }
+        let mut kept = self.exposures.iter().map(|e| e.trigger.source == source);
+        self.fates.retain(|_| kept.next().unwrap_or(false));
+        drop(kept);
+        self.exposures.retain(|e| e.trigger.source == source);
+        // Pictures that were matched stand for nothing any more.
+        let mut waits = self.shots.iter().map(|s| s.picture.is_some());
+        self.clues.retain(|_| waits.next().unwrap_or(false));
+        drop(waits);
+        self.shots.retain(|s| s.picture.is_some());
+        (self.settled, self.newest_matched_ns, self.latencies) = (0, 0, HistoryBuf::new());
+        (self.jitter_ns2, self.counted, self.changed) = (FIRST_JITTER_NS2, [0.0; 3], true);
     }
 
     /// Whether this exposure waits for its picture.
     pub fn awaits(&self, trigger: &Trigger) -> bool {
-        self.triggers.iter().any(|t| t == trigger)
+        self.exposures.iter().zip(&self.fates).any(|(e, fate)| e.trigger == *trigger && *fate == Fate::Waits)
     }
 
     /// Adds a complete picture; returns the oldest one when there is no more room.
     pub fn push_picture(&mut self, clues: PictureClues, picture: P) -> Option<Outcome<P>> {
-        let evicted = if self.pictures.is_full() { self.pictures.pop_front() } else { None };
-        let _ = self.pictures.push_back(Waiting { clues, picture });
-        evicted.map(|w| Outcome::Picture { picture: w.picture, clues: w.clues, reason: Reason::Overflow })
+        self.changed = true;
+        let evicted = if self.shots.is_full() { self.forget_picture() } else { None };
+        // In the order in which they were taken.
+        let mut at = self.clues.len();
+        while at > 0 && is_late(&self.clues[at - 1], &clues) {
+            at -= 1;
+        }
+        self.settled = self.settled.min(at);
+        let shot = Shot { picture: Some(picture), checked: false, verdict: None };
+        let full = self.clues.insert(at, clues).is_err() || self.shots.insert(at, shot).is_err();
+        debug_assert!(!full, "there is room");
+        evicted
+    }
+
+    fn forget_picture(&mut self) -> Option<Outcome<P>> {
+        let (clues, shot) = (self.clues.remove(0), self.shots.remove(0));
+        self.rows.bands.copy_within(1.., 0);
+        self.rows.ahead.copy_within(WIDTH.., 0);
+        self.settled = self.settled.saturating_sub(1);
+        shot.picture.map(|picture| Outcome::Picture { picture, clues, reason: Reason::Overflow })
     }
 
     /// The next thing that can be decided at `now_ns`; call until `None`.
     pub fn poll(&mut self, now_ns: u64) -> Option<Outcome<P>> {
-        for _ in 0..self.pictures.len() {
-            let waiting = self.pictures.pop_front()?;
-            match self.decide(&waiting.clues, now_ns) {
-                Decision::Wait => {
-                    // Same length as before the pop: there is room.
-                    let _ = self.pictures.push_back(waiting);
-                }
-                Decision::Match(index) => return Some(self.matched(index, waiting)),
-                Decision::Shift(index) => {
-                    if let Some(trigger) = self.triggers.iter().nth(index) {
-                        self.learnt.shifted(&waiting.clues, trigger);
-                    }
-                    return Some(self.matched(index, waiting));
-                }
-                Decision::Absent(sequence) => {
-                    let given_up = self.given_up.is_some_and(|newest| sequence <= u64::from(newest))
-                        && self.newest_matched.is_none_or(|newest| sequence > u64::from(newest));
-                    if !given_up {
-                        self.learnt.doubt_numbers();
-                    }
-                    let (picture, clues) = (waiting.picture, waiting.clues);
-                    return Some(Outcome::Picture { picture, clues, reason: Reason::NoTrigger });
-                }
-                Decision::Alone(reason) => {
-                    return Some(Outcome::Picture { picture: waiting.picture, clues: waiting.clues, reason });
-                }
+        for slot in self.exposures.iter_mut().filter(|e| e.heard_ns == 0) {
+            slot.heard_ns = now_ns.max(1);
+        }
+        if let Some(duplicate) = self.duplicate() {
+            return Some(duplicate);
+        }
+        if self.changed || now_ns >= self.next_look_ns {
+            self.look(now_ns);
+        }
+        for p in 0..self.shots.len() {
+            if let Some(outcome) = self.decide(p, now_ns) {
+                return Some(outcome);
             }
         }
-        let expired =
-            self.triggers.front().is_some_and(|t| now_ns.saturating_sub(t.time_ns) > self.settings.patience_ns);
-        let trigger = if expired { self.triggers.pop_front() } else { None };
-        self.given_up = trigger.map(|t| t.sequence).or(self.given_up);
-        trigger.map(|trigger| Outcome::Trigger { trigger, reason: Reason::NoPicture })
+        let patience = self.settings.patience_ns;
+        let expired = |(e, fate): (&Slot, &Fate)| {
+            e.announced && *fate == Fate::Waits && now_ns.saturating_sub(e.trigger.time_ns) > patience
+        };
+        let at = self.exposures.iter().zip(&self.fates).position(expired)?;
+        self.fates[at] = Fate::Missed;
+        self.counted[1] += 1.0;
+        Some(Outcome::Trigger { trigger: self.exposures[at].trigger, reason: Reason::NoPicture })
     }
 
     /// At the end of a mission: everything that waits is decided now; call until `None`.
     pub fn flush(&mut self) -> Option<Outcome<P>> {
-        let end = u64::MAX;
-        if let Some(outcome) = self.poll(end) {
+        if let Some(outcome) = self.poll(u64::MAX) {
             return Some(outcome);
         }
-        if let Some(Waiting { picture, clues }) = self.pictures.pop_front() {
+        let waits = self.shots.iter().position(|s| s.picture.is_some());
+        if let Some((picture, clues)) = waits.and_then(|p| Some((self.shots[p].picture.take()?, self.clues[p]))) {
             return Some(Outcome::Picture { picture, clues, reason: Reason::NoTrigger });
         }
         // Exposures whose time lies in a future that will not come.
-        let trigger = self.triggers.pop_front()?;
-        Some(Outcome::Trigger { trigger, reason: Reason::NoPicture })
+        let at = self.exposures.iter().zip(&self.fates).position(|(e, fate)| e.announced && *fate == Fate::Waits)?;
+        self.fates[at] = Fate::Missed;
+        Some(Outcome::Trigger { trigger: self.exposures[at].trigger, reason: Reason::NoPicture })
     }
 
-    fn decide(&self, clues: &PictureClues, now_ns: u64) -> Decision {
-        if clues.number.is_some_and(|n| self.numbers.as_slice().contains(&n)) {
-            return Decision::Alone(Reason::Duplicate);
+    /// A picture that came before.
+    fn duplicate(&mut self) -> Option<Outcome<P>> {
+        let at = self.shots.iter().position(|s| !s.checked)?;
+        self.shots[at].checked = true;
+        let number = self.clues[at].number;
+        let again = |(p, c): (usize, &PictureClues)| p != at && self.shots[p].checked && c.number == number;
+        let waits = number.is_some() && self.clues.iter().enumerate().any(again);
+        if waits || number.is_some_and(|n| self.numbers.as_slice().contains(&n)) {
+            let (clues, shot) = (self.clues.remove(at), self.shots.remove(at));
+            self.settled = self.settled.min(at);
+            let picture = shot.picture?;
+            return Some(Outcome::Picture { picture, clues, reason: Reason::Duplicate });
         }
-        let age = now_ns.saturating_sub(clues.arrived_ns);
-        match self.learnt.choose(clues, &self.triggers, self.settings.patience_ns) {
-            Choice::Exposure { index, certain: false }
-                if self.learnt.is_new() && (index >= UNSURE || self.given_up.is_some()) =>
-            {
-                // Taken for the newest exposure's, a late picture would shift all that follow.
-                if age >= self.settings.settle_ns { Decision::Alone(Reason::NoTrigger) } else { Decision::Wait }
-            }
-            Choice::Exposure { index, certain } if certain || age >= self.settings.settle_ns => Decision::Match(index),
-            Choice::Exposure { .. } => Decision::Wait,
-            Choice::Contradiction { by_number, by_time, shift } => {
-                let (agree, differ) = self.witnesses(shift);
-                match () {
-                    () if differ > 0 => Decision::Match(by_number),
-                    // The picture asked about is out of the queue.
-                    () if agree + 1 >= WITNESSES => Decision::Shift(by_time),
-                    () if age > self.settings.patience_ns / 2 => Decision::Alone(Reason::Contradictory),
-                    () => Decision::Wait,
-                }
-            }
-            // An announcement may be late, but not much.
-            Choice::Absent { sequence, by_time } if age > 4 * self.settings.settle_ns => {
-                let newest = self.triggers.iter().map(|t| t.sequence).chain(self.newest_matched).max();
-                match by_time {
-                    // A number beyond everything announced: the camera was also released by hand.
-                    Some(index) if newest.is_none_or(|n| sequence > u64::from(n)) => Decision::Shift(index),
-                    // Its own exposure's announcement was lost or has been given up; no other one's place is taken.
-                    _ => Decision::Absent(sequence),
-                }
-            }
-            Choice::Absent { .. } => Decision::Wait,
-            Choice::None if age > 4 * self.settings.settle_ns => Decision::Alone(Reason::NoTrigger),
-            Choice::None => Decision::Wait,
+        self.duplicate()
+    }
+
+    fn model(&self, now_ns: u64) -> Model {
+        let announced = self.exposures.iter().filter(|e| e.announced);
+        let late_ns = announced.map(|e| e.heard_ns.saturating_sub(e.trigger.time_ns)).max();
+        let open_ns =
+            late_ns.map_or(u64::MAX, |late| ((late as f64 * LATER) as u64).saturating_add(self.settings.settle_ns));
+        let patience = self.settings.patience_ns;
+        Model {
+            exposure_alone: rarity(self.counted[1], self.counted[0]),
+            picture_alone: rarity(self.counted[2], self.counted[0])
+                + alignment::chance(alignment::interval(&self.exposures), self.jitter_ns2),
+            jitter_ns2: self.jitter_ns2,
+            latency_ns: self.settings.latency_ns.min(i64::MAX as u64) as i64,
+            usual_ns: self.usual(),
+            reach_ns: patience.min(i64::MAX as u64) as i64,
+            stride: alignment::stride(&self.clues),
+            horizon_ns: if now_ns == u64::MAX { now_ns } else { now_ns.saturating_sub(open_ns.min(patience)) },
+            now_ns,
         }
     }
 
-    /// How many waiting pictures say that the camera skipped `shift` exposures, and how many say something else.
-    fn witnesses(&self, shift: u64) -> (usize, usize) {
-        let (mut agree, mut differ) = (0, 0);
-        for waiting in &self.pictures {
-            match self.learnt.choose(&waiting.clues, &self.triggers, self.settings.patience_ns) {
-                Choice::Contradiction { shift: other, .. } if other == shift => agree += 1,
-                Choice::None | Choice::Absent { .. } => {}
-                _ => differ += 1,
-            }
-        }
-        (agree, differ)
+    /// The middle one of the newest latencies.
+    fn usual(&self) -> Option<i64> {
+        let mut newest: Vec<i64, FRESH> = self.latencies.oldest_ordered().copied().collect();
+        newest.sort_unstable();
+        newest.get(newest.len() / 2).copied().filter(|_| newest.is_full())
     }
 
-    fn matched(&mut self, index: usize, waiting: Waiting<P>) -> Outcome<P> {
-        // Once round the ring keeps the order of the others.
-        let mut found = None;
-        for i in 0..self.triggers.len() {
-            match self.triggers.pop_front() {
-                Some(trigger) if i == index => found = Some(trigger),
-                Some(trigger) => drop(self.triggers.push_back(trigger)),
-                None => {}
-            }
+    /// Aligns what is on the lists anew.
+    fn look(&mut self, now_ns: u64) {
+        (self.changed, self.next_look_ns) = (false, now_ns.saturating_add(AGAIN_NS));
+        if self.shots.iter().all(|s| s.picture.is_none()) {
+            return;
         }
-        let Some(trigger) = found else {
-            return Outcome::Picture { picture: waiting.picture, clues: waiting.clues, reason: Reason::NoTrigger };
-        };
-        let late = self.newest_matched.is_some_and(|newest| trigger.sequence < newest);
-        self.newest_matched = Some(self.newest_matched.unwrap_or(0).max(trigger.sequence));
-        if let Some(number) = waiting.clues.number {
+        let model = self.model(now_ns);
+        let chain = Chain { model, exposures: &self.exposures, pictures: &self.clues };
+        let Stored { bands, ahead, behind } = &mut self.rows;
+        let mut rows = Rows { width: WIDTH, bands, ahead, behind };
+        chain.run(&mut rows, self.settled);
+        for (p, shot) in self.shots.iter_mut().enumerate().filter(|(_, s)| s.picture.is_some()) {
+            shot.verdict = Some(chain.verdict(&rows, self.settled, p));
+        }
+        let decided = self.shots.iter().take_while(|s| s.picture.is_none()).count();
+        self.settled = self.settled.max(decided.min(self.shots.len().saturating_sub(FRESH)));
+    }
+
+    /// What becomes of a picture, when that is known.
+    fn decide(&mut self, p: usize, now_ns: u64) -> Option<Outcome<P>> {
+        let verdict = self.shots[p].verdict.filter(|_| self.shots[p].picture.is_some())?;
+        let clues = self.clues[p];
+        let (sure, age) = (confidence(verdict.margin), now_ns.saturating_sub(clues.arrived_ns));
+        let open = clues.arrived_ns > self.model(now_ns).horizon_ns;
+        match verdict.exposure.filter(|e| self.exposures[*e].announced) {
+            // All pictures come too late, as it seems: the landing tells.
+            _ if self.counted[0] == 0.0 && self.counted[1] > 0.0 && !open => self.alone(p, Reason::NoTrigger),
+            Some(e) if self.fates[e] == Fate::Waits && sure >= LEAST_CONFIDENCE => self.matched(p, e, sure),
+            Some(_) if age > self.settings.patience_ns / 2 => self.alone(p, Reason::Contradictory),
+            None if !open && age > self.settings.patience_ns / 2 => self.alone(p, Reason::NoTrigger),
+            _ => None,
+        }
+    }
+
+    fn alone(&mut self, p: usize, reason: Reason) -> Option<Outcome<P>> {
+        self.counted[2] += 1.0;
+        Some(Outcome::Picture { picture: self.shots[p].picture.take()?, clues: self.clues[p], reason })
+    }
+
+    fn matched(&mut self, p: usize, exposure: usize, confidence: f32) -> Option<Outcome<P>> {
+        let (trigger, clues) = (self.exposures[exposure].trigger, self.clues[p]);
+        let picture = self.shots[p].picture.take()?;
+        self.fates[exposure] = Fate::Matched;
+        self.counted[0] += 1.0;
+        let late = trigger.time_ns < self.newest_matched_ns;
+        self.newest_matched_ns = self.newest_matched_ns.max(trigger.time_ns);
+        if let Some(number) = clues.number {
             self.numbers.write(number);
         }
-        self.learnt.learn(&waiting.clues, &trigger, late);
-        Outcome::Matched { trigger, picture: waiting.picture, clues: waiting.clues, late }
+        if !late {
+            let latency = clues.arrived_ns.wrapping_sub(trigger.time_ns) as i64;
+            if let Some(before) = self.latencies.recent() {
+                let off = latency.saturating_sub(*before) as f32;
+                let jitter = self.jitter_ns2 + BLEND * ((off * off).min(*JITTER_NS2.end()) - self.jitter_ns2);
+                self.jitter_ns2 = jitter.clamp(*JITTER_NS2.start(), *JITTER_NS2.end());
+            }
+            self.latencies.write(latency);
+        }
+        Some(Outcome::Matched { trigger, picture, clues, late, confidence })
     }
+}
+
+/// Whether a picture was taken before one that came before it, by its number or the camera's clock.
+fn is_late(before: &PictureClues, own: &PictureClues) -> bool {
+    match before.number.zip(own.number) {
+        Some((before, own)) => before.checked_sub(own).is_some_and(|behind| behind < PICTURES as u64),
+        None => before.camera_ns.zip(own.camera_ns).is_some_and(|(before, at)| {
+            let behind = before.saturating_sub(at);
+            behind > own.camera_resolution_ns && behind < LATEST_NS
+        }),
+    }
+}
+
+/// Exposures between two that the counter tells of, at times in between: their announcements were lost.
+fn missing(before: &Trigger, after: &Trigger) -> impl Iterator<Item = Trigger> {
+    let (before, after) = (*before, *after);
+    let missing = after.sequence.saturating_sub(before.sequence).saturating_sub(1);
+    let missing = if missing < GAP { missing } else { 0 };
+    (1..=missing).map(move |k| {
+        let part = |from: u64, to: u64| from + to.saturating_sub(from) / u64::from(missing + 1) * u64::from(k);
+        Trigger {
+            sequence: before.sequence + k,
+            boot_ns: part(before.boot_ns, after.boot_ns),
+            time_ns: part(before.time_ns, after.time_ns),
+            ..after
+        }
+    })
+}
+
+/// Negative logarithm of how often something stays alone, of which `alone` did and `matched` did not.
+pub(crate) fn rarity(alone: f32, matched: f32) -> f32 {
+    // Before anything is known: one in ten.
+    -libm::logf(((alone + 0.7) / (alone + matched + 7.0)).clamp(0.01, 0.3))
 }
 
 #[cfg(test)]

@@ -192,3 +192,53 @@ fn a_camera_that_is_late_from_the_start_is_matched_to_no_other_exposures() {
     let (matched, alone) = play(30, &burst, &[]);
     assert!(all_right(&matched) && !alone.is_empty(), "{matched:?}");
 }
+
+#[test]
+fn announcements_that_come_late_shift_no_picture_by_one() {
+    // Over a slow link each comes so much after its exposure, stamped right; pictures are there after 0.4 s.
+    for late_ms in [100, 1000, 1300, 2000, 2600, 3000, 4000] {
+        let (mut matcher, mut matched) = (Matcher::new(MatcherSettings::default()), Vec::new());
+        for now in (0..1000).map(|tick| 10 * S + tick * 100 * MS) {
+            let due = |at_ns: u64| at_ns / (100 * MS) == now / (100 * MS);
+            for t in (1..=30).map(trigger) {
+                if due(t.time_ns + late_ms * MS) {
+                    assert!(matcher.push_trigger(t).is_none());
+                }
+                if due(t.time_ns + 400 * MS) {
+                    let number = Some(1000 + u64::from(t.sequence));
+                    let clues = PictureClues { arrived_ns: now, number, ..PictureClues::default() };
+                    assert!(matcher.push_picture(clues, t.sequence).is_none());
+                }
+            }
+            while let Some(outcome) = matcher.poll(now) {
+                if let Outcome::Matched { trigger, picture, confidence, .. } = outcome {
+                    assert!(confidence >= LEAST_CONFIDENCE);
+                    matched.push((trigger.sequence, picture));
+                }
+            }
+        }
+        assert!(matched.len() == 30 && all_right(&matched), "{late_ms} ms: {matched:?}");
+    }
+}
+
+#[test]
+fn one_announcement_that_is_overtaken_costs_no_picture() {
+    let (mut matcher, mut matched) = (Matcher::new(MatcherSettings::default()), Vec::new());
+    for now in (0..1000).map(|tick| 10 * S + tick * 100 * MS) {
+        let due = |at_ns: u64| at_ns / (100 * MS) == now / (100 * MS);
+        for t in (1..=30).map(trigger) {
+            if due(t.time_ns + if t.sequence == 7 { 2500 * MS } else { 100 * MS }) {
+                matcher.push_trigger(t);
+            }
+            if due(t.time_ns + 400 * MS) {
+                matcher.push_picture(PictureClues { arrived_ns: now, ..PictureClues::default() }, t.sequence);
+            }
+        }
+        while let Some(outcome) = matcher.poll(now) {
+            if let Outcome::Matched { trigger, picture, .. } = outcome {
+                matched.push((trigger.sequence, picture));
+            }
+        }
+    }
+    assert!(matched.len() == 30 && all_right(&matched), "{matched:?}");
+}

@@ -8,6 +8,7 @@ use super::{CameraPose, Event, PosedPicture, Unmatched, UnmatchedReason, Vehicle
 use crate::camera::{Picture, exif_pose};
 use crate::error::{Error, ErrorKind, HalError};
 use crate::matcher::{Outcome, Reason};
+use crate::mavlink::dialect::MavSeverity;
 use crate::pose::PoseError;
 use crate::traits::{Camera, Clock, Link, PictureClues, PoseSource};
 use crate::trigger::{Source, Trigger, TriggerKind};
@@ -28,6 +29,8 @@ const FREE_RUNNING_SIGMA_NS: u64 = 50_000_000;
 /// In flight what was put aside is compared this often, and believed only when it is all but certain.
 const RECONCILE_EVERY_NS: u64 = 10_000_000_000;
 const CERTAIN: f32 = 0.999;
+/// More than this is sure.
+const SURE: f32 = 0.9;
 /// Late pictures and their like are handed out while at most so many events wait.
 const EVENTS_WAITING: usize = 64;
 
@@ -130,7 +133,30 @@ where
 
     /// Compares what was put aside all with all, and takes what pairs with at least this confidence.
     fn reconcile(&mut self, least: f32) {
-        for (trigger, aside, confidence) in self.exposures.reconcile(least) {
+        let pairs = self.exposures.reconcile(least);
+        self.take_pairs(pairs);
+    }
+
+    /// Aligns the whole flight once more, with both ends.
+    fn align_at_landing(&mut self) {
+        let (pairs, revised) = self.exposures.align(self.matcher.settings());
+        if revised > 0 {
+            let text = format!("dgtr: {revised} pictures may have another exposure's pose");
+            self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
+            tracing::warn!("the whole flight says another exposure of {revised} pictures that were posed in flight");
+        }
+        let doubtful = pairs.iter().filter(|(_, _, confidence)| *confidence <= SURE).count();
+        if doubtful > 0 {
+            tracing::warn!(
+                "the flight is ambiguous: {doubtful} pictures fit other exposures nearly as well; geotags.csv holds their confidence \
+                 (link.picture_latency_ms, numbers in file names or EXIF times tell them apart)"
+            );
+        }
+        self.take_pairs(pairs);
+    }
+
+    fn take_pairs(&mut self, pairs: Vec<(Trigger, PutAside, f32)>) {
+        for (trigger, aside, confidence) in pairs {
             tracing::debug!(
                 "exposure {} and {} paired late, {confidence:.2}",
                 trigger.sequence,
@@ -165,6 +191,7 @@ where
         while let Some(outcome) = self.matcher.flush() {
             self.take_outcome(outcome);
         }
+        self.align_at_landing();
         self.reconcile(0.0);
         for PutAside { clues, picture, reason } in std::mem::take(&mut self.exposures.aside) {
             let taken =
@@ -186,9 +213,9 @@ where
 
     pub(super) fn take_outcome(&mut self, outcome: Outcome<Picture>) {
         match outcome {
-            Outcome::Matched { trigger, picture, clues, late } => {
+            Outcome::Matched { trigger, picture, clues, late, confidence } => {
                 self.counters.pictures.pictures_late += u64::from(late);
-                self.found(trigger, picture, clues, self.exposures.cameras.confidence());
+                self.found(trigger, picture, clues, confidence.min(self.exposures.cameras.confidence()));
             }
             Outcome::Picture { picture, reason: Reason::Duplicate, .. } => {
                 self.counters.pictures.picture_duplicates += 1;

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::{PENDING, PendingPicture};
 use crate::camera::Picture;
 use crate::matcher::reconcile::{Pairing, reconcile};
-use crate::matcher::{Matcher, Outcome, Reason};
+use crate::matcher::{Matcher, MatcherSettings, Outcome, Reason, landing};
 use crate::pose::{BodyPose, PoseError};
 use crate::traits::PictureClues;
 use crate::trigger::Trigger;
@@ -15,6 +15,9 @@ use crate::vehicle::cameras::{Cameras, Decision};
 /// Exposures of one flight that are kept with their pose, and pictures put aside: an hour at one a second.
 pub(super) const EXPOSURES: usize = 4096;
 pub(super) const PUT_ASIDE: usize = 4096;
+
+/// Confidence of a match by vote at most.
+const BY_VOTE: f32 = 0.9;
 
 /// What an exposure waits for.
 #[derive(Clone, Copy, PartialEq)]
@@ -154,6 +157,25 @@ impl Exposures {
         let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
         let mut pairs = reconcile(&triggers, &clues, &known);
         pairs.retain(|p| p.confidence >= least);
+        // A vote between clocks or numbers cannot tell one interval from the next where the rhythm is regular.
+        pairs.iter_mut().for_each(|p| p.confidence = p.confidence.min(BY_VOTE));
+        self.take(&triggers, pairs)
+    }
+
+    /// Aligns the whole flight at its end: of the pictures put aside those that found their exposure, and how many of those found
+    /// in flight the whole says something else of.
+    pub(super) fn align(&mut self, settings: MatcherSettings) -> (Vec<(Trigger, PutAside, f32)>, usize) {
+        let paired = self.all.iter().filter(|e| e.partner != Partner::Unneeded);
+        let mut triggers: Vec<Trigger> = paired.map(|e| e.trigger).collect();
+        triggers.sort_by_key(|t| t.time_ns);
+        let clues: Vec<PictureClues> = self.aside.iter().map(|a| a.clues).collect();
+        let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
+        let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
+        let (pairs, revised) = landing::settle(&triggers, &clues, &known, settings);
+        (self.take(&triggers, pairs), revised.len())
+    }
+
+    fn take(&mut self, triggers: &[Trigger], mut pairs: Vec<Pairing>) -> Vec<(Trigger, PutAside, f32)> {
         // From the back, so that indices stay valid.
         pairs.sort_unstable_by_key(|p| std::cmp::Reverse(p.picture));
         let take = |p: &Pairing| (triggers[p.exposure], self.aside.remove(p.picture), p.confidence);

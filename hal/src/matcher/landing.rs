@@ -1,0 +1,136 @@
+//! The whole flight aligned at once when it is over: both ends are there then, and they tell a latency of one exposure more from
+//! one less.
+
+use super::alignment::{Band, Chain, Model, Rows, Slot, chance, confidence, interval, stride};
+use std::collections::HashSet;
+
+use super::reconcile::Pairing;
+use super::{FIRST_JITTER_NS2, LEAST_CONFIDENCE, MatcherSettings, rarity};
+use crate::traits::PictureClues;
+use crate::trigger::Trigger;
+
+/// Exposures that come into question for one picture.
+const WIDTH: usize = 96;
+
+/// A camera may be this many times later than in flight: pictures were copied at the landing.
+const REACH: u64 = 4;
+
+/// What is said of a picture when all is known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Answer {
+    /// Index of its exposure.
+    pub exposure: Option<usize>,
+    /// 0 … 1: by how much that is likelier than anything else.
+    pub confidence: f32,
+    /// Index of the exposure that is next likely.
+    pub other: Option<usize>,
+}
+
+/// Of every picture the exposure that it belongs to; exposures by their time, pictures in the order in which they were taken.
+pub fn align(exposures: &[Trigger], pictures: &[PictureClues], settings: MatcherSettings) -> Vec<Answer> {
+    let slots: Vec<Slot> = with_gaps(exposures);
+    let places: Vec<usize> = (0..slots.len()).filter(|k| slots[*k].announced).collect();
+    let by_chance = chance(interval(&slots), FIRST_JITTER_NS2);
+    let mut model = Model {
+        exposure_alone: rarity(0.0, 0.0),
+        picture_alone: rarity(0.0, 0.0) + by_chance,
+        jitter_ns2: FIRST_JITTER_NS2,
+        latency_ns: settings.latency_ns as i64,
+        usual_ns: None,
+        reach_ns: settings.patience_ns.saturating_mul(REACH).min(i64::MAX as u64) as i64,
+        stride: stride(pictures),
+        horizon_ns: u64::MAX,
+        now_ns: u64::MAX,
+    };
+    let mut bands = vec![Band::default(); pictures.len()];
+    let (mut ahead, mut behind) = (vec![0.0; pictures.len() * WIDTH], vec![0.0; pictures.len() * WIDTH]);
+    let mut answers = Vec::new();
+    // Twice: what stays alone the first time says how much of this flight was lost.
+    for _ in 0..2 {
+        let chain = Chain { model, exposures: &slots, pictures };
+        let mut rows = Rows { width: WIDTH, bands: &mut bands, ahead: &mut ahead, behind: &mut behind };
+        chain.run(&mut rows, 0);
+        answers = (0..pictures.len()).map(|p| chain.verdict(&rows, 0, p)).collect();
+        let announced = |e: &usize| slots[*e].announced;
+        let matched = answers.iter().filter(|v| v.exposure.is_some_and(|e| announced(&e))).count();
+        let mut latencies: Vec<i64> = answers
+            .iter()
+            .zip(pictures)
+            .filter_map(|(v, clues)| Some(clues.arrived_ns.wrapping_sub(slots[v.exposure?].trigger.time_ns) as i64))
+            .collect();
+        latencies.sort_unstable();
+        model.usual_ns = latencies.get(latencies.len() / 2).copied();
+        let lost = |all: usize| rarity(all.saturating_sub(matched) as f32, matched as f32);
+        (model.exposure_alone, model.picture_alone) = (lost(exposures.len()), lost(pictures.len()) + by_chance);
+    }
+    let index = |slot: Option<usize>| slot.and_then(|slot| places.binary_search(&slot).ok());
+    let answer = |v: &super::Verdict| Answer {
+        exposure: index(v.exposure),
+        confidence: confidence(v.margin),
+        other: index(v.other),
+    };
+    answers.iter().map(answer).collect()
+}
+
+/// The exposures, and between them those that the counter says were announced and did not come.
+fn with_gaps(exposures: &[Trigger]) -> Vec<Slot> {
+    let mut slots: Vec<Slot> = Vec::with_capacity(exposures.len());
+    for trigger in exposures {
+        if let Some(before) = slots.last().map(|s| s.trigger) {
+            slots.extend(super::missing(&before, trigger).map(|trigger| Slot {
+                trigger,
+                heard_ns: 1,
+                announced: false,
+            }));
+        }
+        slots.push(Slot { trigger: *trigger, heard_ns: 1, announced: true });
+    }
+    slots
+}
+
+/// Pairs pictures that found no exposure in flight when it is over; `known` were matched in flight. Also returned are those of
+/// `known` that the whole flight says something else of.
+pub fn settle(
+    exposures: &[Trigger],
+    pictures: &[PictureClues],
+    known: &[(Trigger, PictureClues)],
+    settings: MatcherSettings,
+) -> (Vec<Pairing>, Vec<usize>) {
+    // Of every picture its clues, and where it is on its list.
+    let waiting = pictures.iter().enumerate().map(|(k, clues)| (*clues, Err(k)));
+    let mut all: Vec<(PictureClues, Result<usize, usize>)> =
+        known.iter().enumerate().map(|(k, pair)| (pair.1, Ok(k))).chain(waiting).collect();
+    in_order(&mut all);
+    let clues: Vec<PictureClues> = all.iter().map(|a| a.0).collect();
+    let answers = align(exposures, &clues, settings);
+    let (mut taken, mut revised) = (HashSet::new(), Vec::new());
+    for (answer, (_, place)) in answers.iter().zip(&all) {
+        let Ok(k) = *place else { continue };
+        let flown = exposures.iter().position(|e| *e == known[k].0);
+        if answer.exposure == flown || answer.confidence < LEAST_CONFIDENCE {
+            taken.extend(flown);
+        } else {
+            revised.push(k);
+        }
+    }
+    let mut pairs = Vec::new();
+    for (answer, (_, place)) in answers.iter().zip(&all) {
+        let (Err(picture), Some(exposure)) = (*place, answer.exposure) else { continue };
+        if answer.confidence >= LEAST_CONFIDENCE && taken.insert(exposure) {
+            pairs.push(Pairing { exposure, picture, confidence: answer.confidence });
+        }
+    }
+    (pairs, revised)
+}
+
+/// Sorts pictures as they were taken: as they came, but by their numbers where one came late.
+fn in_order<T>(pictures: &mut [(PictureClues, T)]) {
+    pictures.sort_by_key(|p| p.0.arrived_ns);
+    for at in 1..pictures.len() {
+        let mut own = at;
+        while own > 0 && super::is_late(&pictures[own - 1].0, &pictures[own].0) {
+            pictures.swap(own - 1, own);
+            own -= 1;
+        }
+    }
+}
