@@ -29,8 +29,6 @@ const FREE_RUNNING_SIGMA_NS: u64 = 50_000_000;
 /// In flight what was put aside is compared this often, and believed only when it is all but certain.
 const RECONCILE_EVERY_NS: u64 = 10_000_000_000;
 const CERTAIN: f32 = 0.999;
-/// More than this is sure.
-const SURE: f32 = 0.9;
 /// Late pictures and their like are handed out while at most so many events wait.
 const EVENTS_WAITING: usize = 64;
 
@@ -125,36 +123,14 @@ where
         if now_ns >= self.exposures.next_reconcile_ns {
             self.exposures.next_reconcile_ns = now_ns.saturating_add(RECONCILE_EVERY_NS);
             if !self.exposures.aside.is_empty() && self.exposures.await_pictures() {
-                self.reconcile(CERTAIN);
+                let pairs = self.exposures.reconcile(CERTAIN);
+                self.take_pairs(pairs);
             }
         }
         self.hand_out(false);
     }
 
-    /// Compares what was put aside all with all, and takes what pairs with at least this confidence.
-    fn reconcile(&mut self, least: f32) {
-        let pairs = self.exposures.reconcile(least);
-        self.take_pairs(pairs);
-    }
-
-    /// Aligns the whole flight once more, with both ends.
-    fn align_at_landing(&mut self) {
-        let (pairs, revised) = self.exposures.align(self.matcher.settings());
-        if revised > 0 {
-            let text = format!("dgtr: {revised} pictures may have another exposure's pose");
-            self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
-            tracing::warn!("the whole flight says another exposure of {revised} pictures that were posed in flight");
-        }
-        let doubtful = pairs.iter().filter(|(_, _, confidence)| *confidence <= SURE).count();
-        if doubtful > 0 {
-            tracing::warn!(
-                "the flight is ambiguous: {doubtful} pictures fit other exposures nearly as well; geotags.csv holds their confidence \
-                 (link.picture_latency_ms, numbers in file names or EXIF times tell them apart)"
-            );
-        }
-        self.take_pairs(pairs);
-    }
-
+    /// Takes pictures that were put aside and found their exposure later.
     fn take_pairs(&mut self, pairs: Vec<(Trigger, PutAside, f32)>) {
         for (trigger, aside, confidence) in pairs {
             tracing::debug!(
@@ -191,8 +167,14 @@ where
         while let Some(outcome) = self.matcher.flush() {
             self.take_outcome(outcome);
         }
-        self.align_at_landing();
-        self.reconcile(0.0);
+        // The whole flight once more, with both ends; then by votes what is still alone.
+        let landing = self.exposures.align(self.matcher.settings());
+        if let Some(doubt) = landing.doubt() {
+            self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &doubt);
+        }
+        self.take_pairs(landing.pairs);
+        let pairs = self.exposures.reconcile(0.0);
+        self.take_pairs(pairs);
         for PutAside { clues, picture, reason } in std::mem::take(&mut self.exposures.aside) {
             let taken =
                 |e: &Exposure| matches!(e.partner, Partner::Found(c) if c.number.is_some() && c.number == clues.number);

@@ -18,6 +18,8 @@ pub(super) const PUT_ASIDE: usize = 4096;
 
 /// Confidence of a match by vote at most.
 const BY_VOTE: f32 = 0.9;
+/// A confidence above this is sure.
+const SURE: f32 = 0.9;
 
 /// What an exposure waits for.
 #[derive(Clone, Copy, PartialEq)]
@@ -45,6 +47,31 @@ pub(super) struct PutAside {
     pub(super) clues: PictureClues,
     pub(super) picture: Picture,
     pub(super) reason: Reason,
+}
+
+/// What the whole flight says when it is over.
+pub(super) struct Landing {
+    /// Pictures put aside that found their exposure, with the confidence of it.
+    pub(super) pairs: Vec<(Trigger, PutAside, f32)>,
+    /// Pictures found in flight that it says another exposure of.
+    revised: usize,
+}
+
+impl Landing {
+    /// One line for the pilot where the flight is ambiguous; the log says more.
+    pub(super) fn doubt(&self) -> Option<String> {
+        let doubtful = self.pairs.iter().filter(|(_, _, confidence)| *confidence <= SURE).count();
+        if self.revised > 0 {
+            tracing::warn!("the whole flight says another exposure of {} pictures that were posed in flight", self.revised);
+        }
+        if doubtful > 0 {
+            tracing::warn!(
+                "the flight is ambiguous: {doubtful} pictures fit other exposures nearly as well; geotags.csv holds their confidence \
+                 (link.picture_latency_ms, numbers in file names or EXIF times tell them apart)"
+            );
+        }
+        (self.revised > 0).then(|| format!("dgtr: {} pictures may have another exposure's pose", self.revised))
+    }
 }
 
 /// The exposures of the flight, and the pictures that found none.
@@ -162,9 +189,8 @@ impl Exposures {
         self.take(&triggers, pairs)
     }
 
-    /// Aligns the whole flight at its end: of the pictures put aside those that found their exposure, and how many of those found
-    /// in flight the whole says something else of.
-    pub(super) fn align(&mut self, settings: MatcherSettings) -> (Vec<(Trigger, PutAside, f32)>, usize) {
+    /// Aligns the whole flight at its end.
+    pub(super) fn align(&mut self, settings: MatcherSettings) -> Landing {
         let paired = self.all.iter().filter(|e| e.partner != Partner::Unneeded);
         let mut triggers: Vec<Trigger> = paired.map(|e| e.trigger).collect();
         triggers.sort_by_key(|t| t.time_ns);
@@ -172,7 +198,7 @@ impl Exposures {
         let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
         let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
         let (pairs, revised) = landing::settle(&triggers, &clues, &known, settings);
-        (self.take(&triggers, pairs), revised.len())
+        Landing { pairs: self.take(&triggers, pairs), revised: revised.len() }
     }
 
     fn take(&mut self, triggers: &[Trigger], mut pairs: Vec<Pairing>) -> Vec<(Trigger, PutAside, f32)> {
