@@ -10,6 +10,7 @@ use job::console;
 use job::trace::Trace;
 
 mod aggregate;
+mod change;
 #[cfg(feature = "lab")]
 mod demo;
 mod doctor;
@@ -36,6 +37,7 @@ mod serve;
 #[cfg(feature = "lab")]
 mod sim;
 mod train;
+mod volume;
 
 pub use error::CliError;
 use error::{EXIT_CODES, exit_code};
@@ -101,6 +103,10 @@ enum Command {
     Render(render::Args),
     /// Draws a model as a map: orthophoto and heights as Cloud-Optimised GeoTIFF.
     Ortho(ortho::Args),
+    /// Measures how much lies above and below the ground of polygons: cut, fill and net, each with its standard deviation.
+    Volume(volume::Args),
+    /// Finds what changed between two maps of one place: where, how high, how much.
+    Change(change::Args),
     /// Merges local models into a global one.
     Aggregate(aggregate::Args),
     /// Merging as jobs that many machines share: plan, cells, join.
@@ -202,6 +208,8 @@ fn command(command: Command) -> Result<(), CliError> {
         Command::Eval(args) => eval::run(args),
         Command::Render(args) => render::run(args),
         Command::Ortho(args) => ortho::run(args),
+        Command::Volume(args) => volume::run(args),
+        Command::Change(args) => change::run(args),
         Command::Aggregate(args) => aggregate::run(args),
         Command::Ground(args) => ground::run(args),
         Command::Serve(args) => serve::run(args),

@@ -29,6 +29,8 @@ mod keys;
 #[path = "commands/manual.rs"]
 #[cfg(feature = "lab")]
 mod manual;
+#[path = "commands/measured.rs"]
+mod measured;
 #[path = "commands/observed.rs"]
 mod observed;
 #[path = "commands/report.rs"]

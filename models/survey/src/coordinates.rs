@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use geometry::geodesy::Geodetic;
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use models::formats::{FormatError, read_bounded};
 use proj4rs::Proj;
 use proj4rs::transform::transform;
@@ -22,7 +22,7 @@ const PICTURES: [&str; 9] = [".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", "
 ///
 /// # Errors
 /// The file cannot be read or is larger.
-pub(crate) fn text(path: &Path, limit: u64) -> Result<String, FormatError> {
+pub fn text(path: &Path, limit: u64) -> Result<String, FormatError> {
     let bytes = read_bounded(path, limit)?;
     let wide = |bytes: &[u8], unit: fn([u8; 2]) -> u16| {
         let units = bytes.chunks_exact(2).map(|pair| unit([pair[0], pair[1]]));
@@ -85,7 +85,7 @@ pub(crate) fn picture_name(cells: &[&str]) -> Option<(String, usize)> {
 }
 
 /// A reference system that places are given in: any that the library knows, degrees included.
-pub(crate) struct Reference {
+pub struct Reference {
     geographic: Proj,
     source: Proj,
 }
@@ -95,7 +95,7 @@ impl Reference {
     /// a PROJ string, or WKT with an EPSG code.
     ///
     /// `None` where `line` names none; an error where it does, and the system is not known.
-    pub(crate) fn named(line: &str) -> Option<Result<Self, String>> {
+    pub fn named(line: &str) -> Option<Result<Self, String>> {
         let line = line
             .trim()
             .trim_start_matches('\u{feff}')
@@ -167,17 +167,25 @@ impl Reference {
     }
 
     /// Whether its first two coordinates are angles.
-    pub(crate) fn is_in_degrees(&self) -> bool {
+    pub fn is_in_degrees(&self) -> bool {
         self.source.is_latlong()
     }
 
     /// Easting, northing (or longitude and latitude in degrees) and height → WGS 84; `None` outside of the projection.
-    pub(crate) fn geodetic(&self, p: DVec3) -> Option<Geodetic> {
+    pub fn geodetic(&self, p: DVec3) -> Option<Geodetic> {
         let unit = |v: f64| if self.source.is_latlong() { v.to_radians() } else { v };
         let mut at = (unit(p.x), unit(p.y), 0.0);
         transform(&self.source, &self.geographic, &mut at).ok()?;
         let place = Geodetic { lat_deg: at.1.to_degrees(), lon_deg: at.0.to_degrees(), alt_m: p.z };
         place.is_valid().then_some(place)
+    }
+
+    /// WGS 84 → easting and northing (or longitude and latitude in degrees); `None` outside of the projection.
+    pub fn plane(&self, place: Geodetic) -> Option<DVec2> {
+        let mut at = (place.lon_deg.to_radians(), place.lat_deg.to_radians(), 0.0);
+        transform(&self.geographic, &self.source, &mut at).ok()?;
+        let unit = |v: f64| if self.source.is_latlong() { v.to_degrees() } else { v };
+        Some(DVec2::new(unit(at.0), unit(at.1))).filter(|p| p.is_finite())
     }
 }
 

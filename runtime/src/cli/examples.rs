@@ -13,7 +13,15 @@ pub(super) const EXAMPLES: &Examples = &[
     ),
     ("eval", &["dgtr eval model/model.dgtr pictures --split test --baselines"]),
     ("render", &["dgtr render model/model.dgtr --cameras pictures/transforms.json --out renders"]),
-    ("ortho", &["dgtr ortho global.dgtr --out map --gsd 5"]),
+    ("ortho", &["dgtr ortho global.dgtr --out map --gsd 5", "dgtr ortho global.dgtr --out map --contours 0.5"]),
+    (
+        "volume",
+        &[
+            "dgtr volume map/dsm.tif heaps.geojson --out volumes",
+            "dgtr volume new/dsm.tif pit.kml --base old/dsm.tif --out volumes",
+        ],
+    ),
+    ("change", &["dgtr change march/map june/map --out changes"]),
     ("aggregate", &["dgtr aggregate west/model.dgtr east/model.dgtr --out merged"]),
     (
         "ground plan",

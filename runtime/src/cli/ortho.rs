@@ -1,6 +1,6 @@
 //! `dgtr ortho MODEL --out DIR`: orthophoto and heights as Cloud-Optimised GeoTIFF.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use disk::Disk;
@@ -8,7 +8,11 @@ use engine::device::map_renderer;
 use engine::ortho::{Map, MapRequest, keep_scratch_in};
 use job::console;
 use job::interrupt;
+use measure::contours;
+use measure::heights::HeightMap;
+use measure::noise::Noise;
 use models::formats::model::Chunks;
+use survey::coordinates::Reference;
 use survey::ortho::up::Up;
 
 use super::CliError;
@@ -41,6 +45,9 @@ pub struct Args {
     /// Leave out ground that fewer training pictures saw.
     #[arg(long, value_name = "N", default_value_t = MapRequest::default().min_views)]
     pub min_views: usize,
+    /// Also draw lines of equal height every M metres: contours.geojson and contours.dxf.
+    #[arg(long, value_name = "M")]
+    pub contours: Option<f64>,
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
@@ -89,6 +96,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if let Some(local) = model.header.local {
         tracing::info!("{}: the map's metres are not those of the pictures' poses ({local})", args.out.display());
     }
+    if let Some(interval) = args.contours {
+        draw_contours(&args.out, interval)?;
+    }
     let crs = map.grid().crs().epsg().map_or("the model's own metres".to_owned(), |code| format!("EPSG:{code}"));
     progress.finish(&format!(
         "{}: {columns} × {rows} pixels of {:.3} m in {crs}, {:.1} % covered",
@@ -96,5 +106,21 @@ pub fn run(args: Args) -> Result<(), CliError> {
         map.grid().gsd(),
         100.0 * written.covered as f64 / (f64::from(columns) * f64::from(rows)),
     ));
+    Ok(())
+}
+
+/// Draws lines of equal height of the map in `folder`, smoothed over what errors reach.
+fn draw_contours(folder: &Path, interval: f64) -> Result<(), CliError> {
+    let mut map = HeightMap::open(&folder.join("dsm.tif"))?;
+    let reference = map.epsg().and_then(|code| Reference::named(&format!("EPSG:{code}"))).transpose();
+    let reference = reference.map_err(CliError::input)?;
+    let Some(heights) = map.part(map.bounds())? else { return Ok(()) };
+    let reach = Noise::of(&heights).map_or(1.0, |noise| noise.reach_m / heights.gsd());
+    let contours = contours::draw(&heights.coarser(reach.round() as usize), interval)?;
+    let disk = Disk::default();
+    let [geojson, dxf] = ["contours.geojson", "contours.dxf"].map(|name| folder.join(name));
+    disk.replace(&geojson, |file| contours::write_geojson(file, &contours, reference.as_ref()))
+        .map_err(|e| JobError::io(&geojson)(e.into()))?;
+    disk.replace(&dxf, |file| contours::write_dxf(file, &contours)).map_err(|e| JobError::io(&dxf)(e.into()))?;
     Ok(())
 }

@@ -2,7 +2,9 @@
 
 use std::collections::HashMap;
 
-use roxmltree::{Document, Node};
+use roxmltree::Node;
+
+use crate::xml;
 
 /// Namespaces of the makers; a trailing slash more or less, or http instead of https, is the same one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,10 +45,7 @@ impl Xmp {
         // Some writers repeat the packet header or leave zeros behind: the element itself is what counts.
         let element = packet.find("<x:xmpmeta").zip(packet.rfind("</x:xmpmeta>"));
         let packet = element.map_or(packet, |(from, to)| packet.get(from..to + "</x:xmpmeta>".len()).unwrap_or(packet));
-        if !is_shallow(packet) {
-            return all;
-        }
-        let Ok(document) = Document::parse(packet) else { return all };
+        let Ok(document) = xml::parse(packet) else { return all };
         for node in document.descendants().filter(|n| n.tag_name().name() == "Description") {
             for a in node.attributes() {
                 all.put(a.namespace(), a.name(), a.value());
@@ -93,50 +92,6 @@ impl Xmp {
     }
 }
 
-/// Elements within elements that are followed; the XMP of cameras has five. The parser calls itself for each.
-const MOST_NESTED: usize = 64;
-
-/// Whether no element of `xml` lies deeper than the parser may follow; false for markup that does not end.
-fn is_shallow(xml: &str) -> bool {
-    let (mut rest, mut depth) = (xml, 0usize);
-    while let Some(start) = rest.find('<') {
-        rest = &rest[start..];
-        let passed =
-            [("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>")].into_iter().find(|(open, _)| rest.starts_with(open));
-        let end = match passed {
-            Some((open, close)) => rest[open.len()..].find(close).map(|n| open.len() + n + close.len()),
-            None => tag_end(rest),
-        };
-        let Some(end) = end else { return false };
-        if passed.is_none() {
-            match &rest[..end] {
-                tag if tag.starts_with("</") => depth = depth.saturating_sub(1),
-                tag if tag.ends_with("/>") => {}
-                _ => depth += 1,
-            }
-        }
-        if depth > MOST_NESTED {
-            return false;
-        }
-        rest = &rest[end..];
-    }
-    true
-}
-
-/// Bytes up to and with the `>` that ends the tag at the start of `xml`; one within quotes does not.
-fn tag_end(xml: &str) -> Option<usize> {
-    let mut quote = None;
-    for (at, c) in xml.bytes().enumerate() {
-        match (quote, c) {
-            (None, b'>') => return Some(at + 1),
-            (None, b'"' | b'\'') => quote = Some(c),
-            (Some(q), c) if q == c => quote = None,
-            _ => {}
-        }
-    }
-    None
-}
-
 pub(super) fn number(text: &str) -> Option<f64> {
     let text = text.trim();
     let value = match text.split_once('/') {
@@ -168,8 +123,8 @@ mod tests {
     fn elements_nested_by_the_thousand_have_no_properties_and_end_nobody() {
         let deep =
             |n: usize| format!("<x:xmpmeta xmlns:x='a'>{}{}</x:xmpmeta>", "<a b='/>'>".repeat(n), "</a>".repeat(n));
-        assert!(is_shallow(&deep(MOST_NESTED - 1)) && !is_shallow(&deep(MOST_NESTED)));
-        assert!(is_shallow(&format!("<a>{}</a>", "<b/><!-- <c> --><d></d>".repeat(1000))));
+        assert!(xml::parse(&deep(63)).is_ok() && xml::parse(&deep(64)).is_err());
+        assert!(xml::parse(&format!("<a>{}</a>", "<b/><!-- <c> --><d></d>".repeat(1000))).is_ok());
         // The default stack of a thread.
         let thread = std::thread::Builder::new().stack_size(2 << 20);
         let parsed = thread.spawn(move || Xmp::parse(&deep(9_000)).0.len()).expect("a thread").join();

@@ -4,7 +4,7 @@
 use std::fs::File;
 use std::io::BufReader;
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use geometry::geodesy::Geodetic;
 use glam::{DVec2, DVec3};
@@ -34,22 +34,8 @@ const USER_DEFINED: u16 = 32767;
 /// The file cannot be read, is no raster of heights, or does not say where it lies in a way that is understood.
 pub fn read(path: &Path, origin: Option<Geodetic>, bounds: [DVec2; 2]) -> Result<Vec<DVec3>, FormatError> {
     let bad = |what: String| FormatError::invalid(path, what);
-    let failed = |e: std::io::Error| FormatError::io(path, "reading", e);
-    if !fits_its_tags(path).map_err(failed)? {
-        return Err(bad("is a damaged TIFF (a tag is larger than the file)".into()));
-    }
-    let damaged = |e: tiff::TiffError| FormatError::invalid(path, format!("no raster of heights ({})", one_line(e)));
-    let file = disk::regular::open(path).map_err(failed)?;
-    let most = MOST_CHUNK.min(MOST_INFLATED * file.metadata().map_err(failed)?.len()) as usize;
-    let mut limits = Limits::default();
-    (limits.decoding_buffer_size, limits.intermediate_buffer_size) = (most, most);
-    let mut raster = Decoder::new(BufReader::new(file)).map_err(damaged)?.with_limits(limits);
-    let (width, height) = raster.dimensions().map_err(damaged)?;
-    if raster.colortype().map_err(damaged)?.num_samples() != 1 {
-        return Err(bad("has more than one channel; heights have one".into()));
-    }
-    let placed = Placement::read(&mut raster, path)?;
-    let crs = match (placed.epsg, origin) {
+    let mut raster = Raster::open(path)?;
+    let crs = match (raster.epsg(), origin) {
         (Some(code), Some(origin)) => Crs::projected(code, origin).map_err(|e| bad(e.to_string()))?,
         (None, None) => Crs::local(),
         (Some(_), None) => return Err(bad("says where on Earth it lies, and the model has no origin there".into())),
@@ -59,32 +45,103 @@ pub fn read(path: &Path, origin: Option<Geodetic>, bounds: [DVec2; 2]) -> Result
             ));
         }
     };
-    let Some([columns, rows]) = placed.window(&crs, bounds, [width, height]) else { return Ok(Vec::new()) };
-    let inside = f64::from(columns.end - columns.start) * f64::from(rows.end - rows.start);
+    let Some(window) = raster.placed.window(&crs, bounds, raster.size) else { return Ok(Vec::new()) };
+    let inside: f64 = window.iter().map(|range| f64::from(range.end - range.start)).product();
     let step = (inside / MOST_POINTS).sqrt().ceil().max(1.0) as u32;
-    let (chunk_width, chunk_height) = raster.chunk_dimensions();
-    let across = width.div_ceil(chunk_width.max(1));
+    let placed = raster.placed;
     let mut points = Vec::new();
-    for chunk_row in rows.start / chunk_height..=(rows.end - 1) / chunk_height {
-        for chunk_column in columns.start / chunk_width..=(columns.end - 1) / chunk_width {
-            let index = chunk_row * across + chunk_column;
-            let (w, h) = raster.chunk_data_dimensions(index);
-            let values = Values::of(raster.read_chunk(index).map_err(damaged)?)
-                .ok_or_else(|| bad("its numbers are of a kind that heights are not stored in".into()))?;
-            let (x0, y0) = (chunk_column * chunk_width, chunk_row * chunk_height);
-            for y in (y0..y0 + h).filter(|y| rows.contains(y) && y % step == 0) {
-                for x in (x0..x0 + w).filter(|x| columns.contains(x) && x % step == 0) {
-                    let at = (y - y0) as usize * w as usize + (x - x0) as usize;
-                    let Some(z) = values.at(at).filter(|z| z.is_finite() && Some(*z) != placed.nothing) else {
-                        continue;
-                    };
-                    let place = placed.place(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                    points.extend(crs.to_enu(place.extend(z)).ok().filter(|p| within(p.truncate(), bounds)));
+    raster.each(window, step, |[x, y], z| {
+        let place = placed.place(f64::from(x) + 0.5, f64::from(y) + 0.5);
+        points.extend(crs.to_enu(place.extend(z)).ok().filter(|p| within(p.truncate(), bounds)));
+    })?;
+    Ok(points)
+}
+
+/// A raster of heights that is open for reading, chunk by chunk.
+pub struct Raster {
+    path: PathBuf,
+    decoder: Decoder<BufReader<File>>,
+    size: [u32; 2],
+    placed: Placement,
+}
+
+impl Raster {
+    /// Opens a GeoTIFF of one channel.
+    ///
+    /// # Errors
+    /// The file cannot be read, is no raster of heights, or does not say where it lies.
+    pub fn open(path: &Path) -> Result<Self, FormatError> {
+        let failed = |e: std::io::Error| FormatError::io(path, "reading", e);
+        if !fits_its_tags(path).map_err(failed)? {
+            return Err(FormatError::invalid(path, "is a damaged TIFF (a tag is larger than the file)"));
+        }
+        let file = disk::regular::open(path).map_err(failed)?;
+        let most = MOST_CHUNK.min(MOST_INFLATED * file.metadata().map_err(failed)?.len()) as usize;
+        let mut limits = Limits::default();
+        (limits.decoding_buffer_size, limits.intermediate_buffer_size) = (most, most);
+        let damaged = |e| damaged(path, e);
+        let mut decoder = Decoder::new(BufReader::new(file)).map_err(damaged)?.with_limits(limits);
+        let (width, height) = decoder.dimensions().map_err(damaged)?;
+        if decoder.colortype().map_err(damaged)?.num_samples() != 1 {
+            return Err(FormatError::invalid(path, "has more than one channel; heights have one"));
+        }
+        let placed = Placement::read(&mut decoder, path)?;
+        Ok(Self { path: path.to_owned(), decoder, size: [width, height], placed })
+    }
+
+    /// EPSG code of the projected reference system that it names.
+    pub fn epsg(&self) -> Option<u16> {
+        self.placed.epsg
+    }
+
+    /// Columns and rows.
+    pub fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// Map coordinates of the north-western corner, and the step from a pixel to the next: east, and south (negative).
+    pub fn place(&self) -> (DVec2, DVec2) {
+        (self.placed.corner, self.placed.pixel)
+    }
+
+    /// Gives the heights of every `step`-th column and row of a window, chunk by chunk; pixels without one are left out.
+    ///
+    /// # Errors
+    /// The file cannot be read, is damaged, or stores what heights are not stored in.
+    pub fn each(
+        &mut self,
+        [columns, rows]: [Range<u32>; 2],
+        step: u32,
+        mut take: impl FnMut([u32; 2], f64),
+    ) -> Result<(), FormatError> {
+        let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
+        let (chunk_width, chunk_height) = (chunk_width.max(1), chunk_height.max(1));
+        let across = self.size[0].div_ceil(chunk_width);
+        for chunk_row in rows.start / chunk_height..rows.end.div_ceil(chunk_height) {
+            for chunk_column in columns.start / chunk_width..columns.end.div_ceil(chunk_width) {
+                let index = chunk_row * across + chunk_column;
+                let (w, h) = self.decoder.chunk_data_dimensions(index);
+                let chunk = self.decoder.read_chunk(index).map_err(|e| damaged(&self.path, e))?;
+                let values = Values::of(chunk).ok_or_else(|| {
+                    FormatError::invalid(&self.path, "its numbers are of a kind that heights are not stored in")
+                })?;
+                let (x0, y0) = (chunk_column * chunk_width, chunk_row * chunk_height);
+                for y in (y0..y0 + h).filter(|y| rows.contains(y) && y % step == 0) {
+                    for x in (x0..x0 + w).filter(|x| columns.contains(x) && x % step == 0) {
+                        let at = (y - y0) as usize * w as usize + (x - x0) as usize;
+                        if let Some(z) = values.at(at).filter(|z| z.is_finite() && Some(*z) != self.placed.nothing) {
+                            take([x, y], z);
+                        }
+                    }
                 }
             }
         }
+        Ok(())
     }
-    Ok(points)
+}
+
+fn damaged(path: &Path, e: tiff::TiffError) -> FormatError {
+    FormatError::invalid(path, format!("no raster of heights ({})", one_line(e)))
 }
 
 fn within(p: DVec2, [low, high]: [DVec2; 2]) -> bool {
@@ -92,6 +149,7 @@ fn within(p: DVec2, [low, high]: [DVec2; 2]) -> bool {
 }
 
 /// Where the pixels lie.
+#[derive(Clone, Copy)]
 struct Placement {
     epsg: Option<u16>,
     /// Map coordinates of the upper left corner of the first pixel, and from a pixel to the next, rows going down.
@@ -186,8 +244,6 @@ impl Values {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a test may
 mod tests {
-    use std::path::PathBuf;
-
     use tiff::encoder::TiffEncoder;
     use tiff::encoder::colortype::{ColorType, Gray32Float, GrayI16, RGB8};
 

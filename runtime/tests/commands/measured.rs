@@ -1,0 +1,120 @@
+//! What is measured on maps: volumes of polygons, and what changed between two dates.
+
+use std::path::{Path, PathBuf};
+
+use disk::Disk;
+use glam::DVec2;
+use serde_json::Value;
+use survey::ortho::crs::Crs;
+use survey::ortho::files::MapFiles;
+use survey::ortho::grid::Grid;
+
+use super::{dgtr, error_line};
+
+/// A map of 60 m by 60 m at 0.2 m in its own metres.
+fn map(folder: &Path, height: impl Fn(DVec2) -> f64) -> PathBuf {
+    let grid = Grid::new(Crs::local(), [DVec2::splat(-30.0), DVec2::splat(30.0)], 0.2).unwrap();
+    let mut files = MapFiles::begin(folder, &grid).unwrap();
+    for block in files.blocks().to_vec() {
+        let pixels = || (0..block.height).flat_map(|y| (0..block.width).map(move |x| (x, y)));
+        let place =
+            |(x, y): (u32, u32)| grid.place(DVec2::new(f64::from(block.x + x) + 0.5, f64::from(block.y + y) + 0.5));
+        // Noise of a few centimetres, the same everywhere but nowhere alike.
+        let rough = |p: DVec2| 0.03 * ((p.x * 91.7).sin() + (p.y * 73.3).cos() + (p.x * p.y * 17.9).sin());
+        let heights: Vec<f32> = pixels().map(place).map(|p| (height(p) + rough(p)) as f32).collect();
+        let mut rgba: Vec<u8> = pixels().flat_map(|_| [120, 130, 140, 255]).collect();
+        files.write(block, &mut rgba, &heights).unwrap();
+    }
+    files.finish(&Disk::default(), None).unwrap();
+    folder.to_owned()
+}
+
+/// 3 m high over a circle of 6 m: 36π m³.
+fn cone(p: DVec2) -> f64 {
+    (3.0 * (1.0 - p.length() / 6.0)).max(0.0)
+}
+
+const CONE_M3: f64 = 36.0 * std::f64::consts::PI;
+
+fn hills(p: DVec2) -> f64 {
+    2.0 * (p.x / 9.0).sin() + (p.y / 6.0).cos()
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+const SQUARE: &str = r#"{"type":"Feature","properties":{"name":"heap"},"geometry":{"type":"Polygon",
+    "coordinates":[[[-8,-8],[8,-8],[8,8],[-8,8],[-8,-8]]]}}"#;
+
+#[test]
+fn a_heap_has_its_volume_over_its_rim_and_over_an_earlier_map() {
+    let folder = tempfile::tempdir().unwrap();
+    let [old, new] = ["old", "new"].map(|name| folder.path().join(name));
+    map(&old, |p| 0.1 * p.x + 40.0);
+    map(&new, |p| 0.1 * p.x + 40.6 + cone(p));
+    let areas = folder.path().join("areas.geojson");
+    std::fs::write(&areas, SQUARE).unwrap();
+    let earlier = old.to_str().unwrap();
+    for base in ["plane", "triangulated", earlier] {
+        let out = folder.path().join("volumes");
+        let [heights, areas, to] = [&new, &areas, &out].map(|p| p.to_str().unwrap());
+        let output = dgtr(&["volume", heights, areas, "--base", base, "--out", to]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let answer = json(&out.join("volumes.json"));
+        let volume = &answer["volumes"][0];
+        let [value, sigma] = ["value", "sigma"].map(|key| volume["net_m3"][key].as_f64().unwrap());
+        assert!((value - CONE_M3).abs() < 2.0 * sigma && sigma < 0.1 * CONE_M3, "{base}: {answer}");
+        if base == earlier {
+            assert!((answer["apart"]["offset_m"].as_f64().unwrap() - 0.6).abs() < 0.01, "{answer}");
+        }
+        let table = std::fs::read_to_string(out.join("volumes.csv")).unwrap();
+        assert!(table.lines().nth(1).unwrap().starts_with("\"heap\",256.000,"), "{table}");
+        assert!(String::from_utf8_lossy(&output.stdout).contains(" ± "));
+    }
+}
+
+#[test]
+fn what_cannot_be_measured_is_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let new = map(&folder.path().join("new"), hills);
+    let areas = folder.path().join("areas.geojson");
+    let [heights, path] = [&new, &areas].map(|p| p.to_str().unwrap());
+    let refused = |arguments: &[&str], word: &str| {
+        let output = dgtr(arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        let line = error_line(&output);
+        assert!(line.contains(word), "{line}");
+    };
+    std::fs::write(&areas, SQUARE).unwrap();
+    refused(&["volume", heights, path, "--base", "sea"], "none of lowest, plane, triangulated");
+    refused(&["volume", heights, path, "--base", heights, "--sigma", "-3"], "--sigma");
+    std::fs::write(&areas, SQUARE.replace("8", "900")).unwrap();
+    refused(&["volume", heights, path], "of its rim");
+    std::fs::write(&areas, SQUARE.replace("Polygon", "LineString")).unwrap();
+    refused(&["volume", heights, path], "no polygon");
+    refused(&["change", path, heights, "--out", folder.path().join("c").to_str().unwrap()], "areas.geojson");
+}
+
+#[test]
+fn what_came_between_two_dates_is_found_and_the_same_place_twice_shows_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let old = map(&folder.path().join("old"), hills);
+    let new =
+        map(&folder.path().join("new"), |p| hills(p - DVec2::new(1.2, -0.8)) + 1.5 + cone(p - DVec2::splat(10.0)));
+    let out = folder.path().join("changes");
+    for (later, changes) in [(&new, 1), (&old, 0)] {
+        let [a, b, to] = [&old, later, &out].map(|p| p.to_str().unwrap());
+        let output = dgtr(&["change", a, b, "--out", to]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let features = json(&out.join("change.geojson"));
+        assert_eq!(features["features"].as_array().unwrap().len(), changes, "{features}");
+        assert_eq!(json(&out.join("change.json"))["changes"], changes);
+        assert!(out.join("change.tif").is_file() && out.join("change.csv").is_file());
+        if changes == 1 {
+            let spot = &features["features"][0]["properties"];
+            let [value, sigma] = ["volume_m3", "volume_sigma_m3"].map(|key| spot[key].as_f64().unwrap());
+            assert!((value - CONE_M3).abs() < 3.0 * sigma && (value / CONE_M3 - 1.0).abs() < 0.1, "{spot}");
+        }
+    }
+}
