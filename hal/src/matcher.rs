@@ -31,8 +31,8 @@ const LATEST_NS: u64 = 60_000_000_000;
 /// Announcements missing by their counter that are put on the list at most.
 const GAP: u32 = 8;
 /// What is less sure than this waits for the landing.
-pub const LEAST_CONFIDENCE: f32 = 0.5;
-/// While something waits and nothing comes, it is looked at again after this.
+pub const LEAST_CONFIDENCE: f32 = 0.38;
+/// While something waits and nothing comes, it is aligned again after this.
 const AGAIN_NS: u64 = 100_000_000;
 /// Announcements that came late by some time may come this much later.
 const LATER: f64 = 1.25;
