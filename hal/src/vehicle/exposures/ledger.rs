@@ -62,7 +62,10 @@ impl Landing {
     pub(super) fn doubt(&self) -> Option<String> {
         let doubtful = self.pairs.iter().filter(|(_, _, confidence)| *confidence <= SURE).count();
         if self.revised > 0 {
-            tracing::warn!("the whole flight says another exposure of {} pictures that were posed in flight", self.revised);
+            tracing::warn!(
+                "the whole flight says another exposure of {} pictures that were posed in flight",
+                self.revised
+            );
         }
         if doubtful > 0 {
             tracing::warn!(
