@@ -2,7 +2,7 @@
 //!
 //! Three clues, none of them reliable alone: when the picture was complete (its latency is about constant), its number
 //! (gaps when the camera skips an exposure), its own camera's clock (offset unknown, often whole seconds). All that came lately is
-//! aligned at once ([`alignment`]): a picture is matched when the best assignment is better than every other one by a margin, which
+//! aligned at once (module `alignment`): a picture is matched when the best assignment is better than every other one by a margin, which
 //! is its confidence. Fixed memory; what cannot be matched is returned with the reason, never dropped silently.
 
 mod alignment;
