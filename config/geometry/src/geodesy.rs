@@ -84,6 +84,11 @@ impl EnuFrame {
         self.origin
     }
 
+    /// The rotation from axes through the middle of the Earth (ECEF) to east, north, up.
+    pub fn axes(&self) -> DMat3 {
+        self.to_enu
+    }
+
     /// Geodetic → east, north, up in metres.
     pub fn to_enu(&self, p: Geodetic) -> DVec3 {
         self.to_enu * (p.to_ecef() - self.ecef)

@@ -1,4 +1,4 @@
-//! Posed pictures: nerfstudio `transforms.json`, a COLMAP model, Mega-NeRF's form or an OpenDroneMap reconstruction, with the split, the
+//! Posed pictures: nerfstudio `transforms.json`, a COLMAP model, Mega-NeRF's form, an OpenDroneMap reconstruction or another program's project, with the split, the
 //! sparse points and the aircraft's own telemetry when they are there; or a card, whose pictures have only what they say
 //! of themselves. Opening reads the small files only; pictures are decoded
 //! one at a time, so that a thousand of them need no more memory than one.

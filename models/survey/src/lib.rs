@@ -6,4 +6,5 @@ pub mod coverage;
 pub mod dataset;
 pub mod names;
 pub mod ortho;
+mod projects;
 pub mod xml;

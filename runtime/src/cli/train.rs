@@ -66,7 +66,7 @@ impl Fineness {
 /// Arguments of `dgtr train`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Folder of posed pictures (nerfstudio, COLMAP, OpenDroneMap), or folders of a camera's card (DCIM).
+    /// Folder of posed pictures (nerfstudio, COLMAP, OpenDroneMap, Metashape, RealityScan, Bundler, OPF), or of a camera's card (DCIM).
     #[arg(required = true, value_name = "FOLDER")]
     pub folders: Vec<PathBuf>,
     /// Folder for model.dgtr and run.json; an unfinished model there is continued.

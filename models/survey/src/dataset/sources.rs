@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use super::error::DatasetError;
 use super::frame::DatasetFrame;
 use crate::names::composed;
+use crate::projects;
 use models::camera::View;
 use models::formats::reconstruction::Reconstruction;
 use models::formats::{colmap, mega_nerf, opensfm, transforms};
@@ -23,7 +24,7 @@ pub(super) fn file_name(path: &str) -> &str {
 /// A description, and the numbers of the pictures that it holds out, where it says so.
 pub(super) type Described = (Reconstruction, Option<Vec<usize>>);
 
-/// The description in `root`: nerfstudio's, COLMAP's, Mega-NeRF's, OpenSfM's; `None` where there is none.
+/// The description in `root`: nerfstudio's, COLMAP's, Mega-NeRF's, OpenSfM's, another program's project; `None` where there is none.
 pub(super) fn reconstruction(root: &Path) -> Result<Option<Described>, DatasetError> {
     let file = root.join(TRANSFORMS);
     if file.is_file() {
@@ -41,7 +42,12 @@ pub(super) fn reconstruction(root: &Path) -> Result<Option<Described>, DatasetEr
     if let Some((found, held_out)) = mega_nerf::read(root)? {
         return Ok(Some((found, Some(held_out))));
     }
-    Ok(opensfm::find(root).map(|file| opensfm::read(&file)).transpose()?.map(|found| (found, None)))
+    if let Some(file) = opensfm::find(root) {
+        return Ok(Some((opensfm::read(&file)?, None)));
+    }
+    let mut places = Places::default();
+    let mut size_of = |name: &str| dimensions(&places.locate(root, name)).ok();
+    Ok(projects::find(root, &mut size_of)?.map(|found| (found, None)))
 }
 
 /// Blender's form: a file for each list of pictures. What is for choosing between models (`val`) is neither trained on nor held out.
@@ -79,7 +85,10 @@ impl Places {
                 whole.push(extension);
                 PathBuf::from(whole)
             };
-            ["", ".png", ".jpg", ".jpeg"].iter().map(|e| with(e)).find(|p| p.is_file())
+            ["", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".TIF", ".webp"]
+                .iter()
+                .map(|e| with(e))
+                .find(|p| p.is_file())
         };
         let found = places.iter().find_map(there);
         found.or_else(|| places.iter().find_map(|path| self.alike(path))).unwrap_or_else(|| places[0].clone())
