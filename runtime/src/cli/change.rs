@@ -9,7 +9,7 @@ use serde::Serialize;
 use survey::coordinates::Reference;
 
 use super::CliError;
-use super::volume::raster_in;
+use super::ortho::heights_of;
 use crate::cli::output::outln;
 use crate::error::JobError;
 
@@ -23,13 +23,16 @@ const PRINTED: usize = 20;
                         deviations) and change.json. Ground that one of the two did not see is no change."
 )]
 pub struct Args {
-    /// The older map: a GeoTIFF of heights, or the folder of a map.
+    /// The older date: a GeoTIFF of heights, the folder of a map, or a .dgtr model.
     pub old: PathBuf,
-    /// The newer map.
+    /// The newer date.
     pub new: PathBuf,
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Vulkan device whose name contains this, for models.
+    #[arg(long)]
+    pub device: Option<String>,
 }
 
 /// What `change.json` says.
@@ -48,7 +51,9 @@ struct Answer<'a> {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let [old, new] = [&args.old, &args.new].map(|path| raster_in(path));
+    let device = args.device.as_deref();
+    let old = heights_of(&args.old, Some(&args.out.join("old")), device)?;
+    let new = heights_of(&args.new, Some(&args.out.join("new")), device)?;
     let (mut before, mut after) = (HeightMap::open(&old)?, HeightMap::open(&new)?);
     if before.epsg() != after.epsg() {
         return Err(CliError::input(format!(

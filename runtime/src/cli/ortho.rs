@@ -1,5 +1,6 @@
 //! `dgtr ortho MODEL --out DIR`: orthophoto and heights as Cloud-Optimised GeoTIFF.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -13,6 +14,7 @@ use measure::heights::HeightMap;
 use measure::noise::Noise;
 use models::formats::model::Chunks;
 use survey::coordinates::Reference;
+use survey::ortho::files::Written;
 use survey::ortho::up::Up;
 
 use super::CliError;
@@ -79,20 +81,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
         ..MapRequest::default()
     };
     let map = Map::of_file(&model, &request)?;
-    let mut trainer = map_renderer(args.device.as_deref(), &model)?;
-    let stop = interrupt::Interrupt::install()?;
     let [columns, rows] = map.grid().size();
-    let total = map.grid().blocks().count() as u64;
-    let mut progress = console::Progress::new("drawing", total);
-    std::fs::create_dir_all(&args.out).map_err(JobError::io(&args.out))?;
-    keep_scratch_in(&args.out);
-    let written = map.write(&mut trainer, &model.header, (&Disk::default(), &args.out), |done, _| {
-        progress.set(done as u64, || format!("{columns} × {rows} pixels"));
-        !stop.requested()
-    })?;
-    let Some(written) = written else {
-        return Err(CliError::interrupted(format!("stopped; no new map in {}", args.out.display())));
-    };
+    let mut progress = console::Progress::new("drawing", map.grid().blocks().count() as u64);
+    let written = draw(&map, &model, &args.out, args.device.as_deref(), &mut progress)?;
     if let Some(local) = model.header.local {
         tracing::info!("{}: the map's metres are not those of the pictures' poses ({local})", args.out.display());
     }
@@ -107,6 +98,52 @@ pub fn run(args: Args) -> Result<(), CliError> {
         100.0 * written.covered as f64 / (f64::from(columns) * f64::from(rows)),
     ));
     Ok(())
+}
+
+/// Draws a model's map into a folder.
+fn draw(
+    map: &Map,
+    model: &Chunks,
+    out: &Path,
+    device: Option<&str>,
+    progress: &mut console::Progress,
+) -> Result<Written, CliError> {
+    let mut trainer = map_renderer(device, model)?;
+    let stop = interrupt::Interrupt::install()?;
+    let [columns, rows] = map.grid().size();
+    std::fs::create_dir_all(out).map_err(JobError::io(out))?;
+    keep_scratch_in(out);
+    let written = map.write(&mut trainer, &model.header, (&Disk::default(), out), |done, _| {
+        progress.set(done as u64, || format!("{columns} × {rows} pixels"));
+        !stop.requested()
+    })?;
+    written.ok_or_else(|| CliError::interrupted(format!("stopped; no new map in {}", out.display())))
+}
+
+/// The heights that `path` is or holds: a raster, a map's folder, or a model, of which a map is drawn into `into` first.
+pub(super) fn heights_of(path: &Path, into: Option<&Path>, device: Option<&str>) -> Result<PathBuf, CliError> {
+    if path.is_dir() {
+        return Ok(path.join("dsm.tif"));
+    }
+    if !is_model(path) {
+        return Ok(path.to_owned());
+    }
+    let into = into.ok_or_else(|| {
+        CliError::input(format!("{}: is a model; give --out, where a map of it is drawn first", path.display()))
+    })?;
+    let model = Chunks::open(path)?;
+    let map = Map::of_file(&model, &MapRequest::default())?;
+    let mut progress = console::Progress::new("drawing", map.grid().blocks().count() as u64);
+    draw(&map, &model, into, device, &mut progress)?;
+    progress.finish(&format!("{}: a map of {}", into.display(), path.display()));
+    Ok(into.join("dsm.tif"))
+}
+
+/// By its first bytes: a TIFF begins with its byte order.
+fn is_model(path: &Path) -> bool {
+    let mut head = [0; 4];
+    let read = disk::regular::open(path).and_then(|mut file| file.read_exact(&mut head));
+    read.is_ok() && &head == b"dgtr"
 }
 
 /// Draws lines of equal height of the map in `folder`, smoothed over what errors reach.

@@ -13,6 +13,7 @@ use measure::volume::{Below, Volume, measure, write_table};
 use serde::Serialize;
 
 use super::CliError;
+use super::ortho::heights_of;
 use crate::cli::output::outln;
 use crate::error::JobError;
 
@@ -26,11 +27,11 @@ const AROUND: f64 = 0.5;
                   area. Without --sigma the noise is told from the map's own roughness."
 )]
 pub struct Args {
-    /// Heights: a GeoTIFF, as dgtr ortho writes it, or the folder of a map.
+    /// Heights: a GeoTIFF, the folder of a map, or a .dgtr model.
     pub heights: PathBuf,
     /// Polygons: GeoJSON or KML.
     pub areas: PathBuf,
-    /// The ground below: lowest, plane or triangulated of the polygon's rim, or another map of heights.
+    /// The ground below: lowest, plane or triangulated of the polygon's rim, or another map or model.
     #[arg(long, value_name = "GROUND", default_value = "triangulated")]
     pub base: String,
     /// Standard deviation of a height, centimetres.
@@ -42,9 +43,12 @@ pub struct Args {
     /// Standard deviation of what two maps are apart, centimetres [default: what the ground around the polygons says].
     #[arg(long, value_name = "CM", value_parser = centimetres)]
     pub bias: Option<f64>,
-    /// Folder for volumes.csv and volumes.json.
+    /// Folder for volumes.csv and volumes.json, and for the map of a model.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Vulkan device whose name contains this, for a model.
+    #[arg(long)]
+    pub device: Option<String>,
 }
 
 fn centimetres(text: &str) -> Result<f64, String> {
@@ -74,7 +78,8 @@ struct Answer<'a> {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let path = raster_in(&args.heights);
+    let path =
+        heights_of(&args.heights, args.out.as_ref().map(|out| out.join("map")).as_deref(), args.device.as_deref())?;
     let mut map = HeightMap::open(&path)?;
     let drawn = areas::read(&args.areas, map.epsg())?;
     if drawn.others > 0 {
@@ -102,7 +107,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
             drawn.areas.iter().map(|area| measure(area, &heights, &noise, &below)).collect()
         }
         None => {
-            let base = raster_in(Path::new(&args.base));
+            let into = args.out.as_ref().map(|out| out.join("base"));
+            let base = heights_of(Path::new(&args.base), into.as_deref(), args.device.as_deref())?;
             let mut before = HeightMap::open(&base).map_err(|e| {
                 CliError::input(format!(
                     "--base {}: is none of lowest, plane, triangulated, and no map: {e}",
@@ -142,11 +148,6 @@ pub fn run(args: Args) -> Result<(), CliError> {
         write(out, &answer)?;
     }
     Ok(())
-}
-
-/// The map of a folder, or the file itself.
-pub(super) fn raster_in(path: &Path) -> PathBuf {
-    if path.is_dir() { path.join("dsm.tif") } else { path.to_owned() }
 }
 
 /// The box around all areas and the ground around them.

@@ -3,13 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use disk::Disk;
-use glam::DVec2;
+use glam::{DQuat, DVec2, DVec3};
+use models::camera::{Intrinsics, Pose, View};
+use models::cloud::GaussianCloud;
+use models::formats::model::{self, ModelHeader};
 use serde_json::Value;
 use survey::ortho::crs::Crs;
 use survey::ortho::files::MapFiles;
 use survey::ortho::grid::Grid;
 
-use super::{dgtr, error_line};
+use super::{dgtr, error_line, has_device};
 
 /// A map of 60 m by 60 m at 0.2 m in its own metres.
 fn map(folder: &Path, height: impl Fn(DVec2) -> f64) -> PathBuf {
@@ -117,4 +120,53 @@ fn what_came_between_two_dates_is_found_and_the_same_place_twice_shows_nothing()
             assert!((value - CONE_M3).abs() < 3.0 * sigma && (value / CONE_M3 - 1.0).abs() < 0.1, "{spot}");
         }
     }
+}
+
+/// A carpet of Gaussians with a heap on it, seen by three pictures from above.
+fn write_model(path: &Path) {
+    let mut cloud = GaussianCloud::with_capacity(0, 160 * 160);
+    for n in 0..160 * 160 {
+        let p = DVec2::new(f64::from(n % 160), f64::from(n / 160)) * 0.25 - 20.0;
+        let height = cone(p) + 0.02 * (p.x * 37.3).sin() * (p.y * 41.9).cos();
+        let mean = [p.x as f32, p.y as f32, height as f32];
+        cloud.push(mean, [0.2f32.ln(), 0.2f32.ln(), 0.02f32.ln()], [1.0, 0.0, 0.0, 0.0], 6.0, &[0.3; 3]);
+    }
+    let intrinsics = Intrinsics { width: 400, height: 400, fx: 400.0, fy: 400.0, cx: 200.0, cy: 200.0 };
+    let view = |east: f64| {
+        let pose = Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), center: DVec3::new(east, 0.0, 40.0) };
+        (format!("{east}.jpg"), View { intrinsics, pose })
+    };
+    let views = [-2.0, 0.0, 2.0].map(view).to_vec();
+    model::write(path, &ModelHeader { views, ..Default::default() }, &cloud).unwrap();
+}
+
+#[test]
+fn a_models_map_is_drawn_before_it_is_measured_and_its_contours_go_around_the_heap() {
+    if !has_device() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let [path, areas, out, drawn] = ["m.dgtr", "areas.json", "out", "map"].map(|name| folder.path().join(name));
+    write_model(&path);
+    std::fs::write(&areas, SQUARE).unwrap();
+    let [path, areas, to, drawn_to] = [&path, &areas, &out, &drawn].map(|p| p.to_str().unwrap());
+    let refused = dgtr(&["volume", path, areas]);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(error_line(&refused).contains("give --out"));
+    let output = dgtr(&["volume", path, areas, "--out", to]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let volume = &json(&out.join("volumes.json"))["volumes"][0];
+    let [value, sigma] = ["value", "sigma"].map(|key| volume["net_m3"][key].as_f64().unwrap());
+    assert!((value / CONE_M3 - 1.0).abs() < 0.1 && sigma < 0.1 * CONE_M3, "{volume}");
+    assert!(out.join("map/dsm.tif").is_file());
+
+    let output = dgtr(&["ortho", path, "--out", drawn_to, "--contours", "0.5"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let contours = json(&drawn.join("contours.geojson"));
+    let at = |height: f64| {
+        contours["features"].as_array().unwrap().iter().filter(|f| f["properties"]["height_m"] == height).count()
+    };
+    assert!((1..5).all(|k| at(0.5 * f64::from(k)) == 1), "{contours}");
+    let dxf = std::fs::read_to_string(drawn.join("contours.dxf")).unwrap();
+    assert!(dxf.starts_with("0\nSECTION") && dxf.ends_with("0\nEOF\n"));
 }
