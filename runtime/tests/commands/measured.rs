@@ -128,7 +128,7 @@ fn write_model(path: &Path) {
         let p = DVec2::new(f64::from(n % 160), f64::from(n / 160)) * 0.25 - 20.0;
         let height = cone(p) + 0.02 * (p.x * 37.3).sin() * (p.y * 41.9).cos();
         let mean = [p.x as f32, p.y as f32, height as f32];
-        cloud.push(mean, [0.2f32.ln(), 0.2f32.ln(), 0.02f32.ln()], [1.0, 0.0, 0.0, 0.0], 6.0, &[0.3; 3]);
+        cloud.push(mean, [0.12f32.ln(), 0.12f32.ln(), 0.02f32.ln()], [1.0, 0.0, 0.0, 0.0], 6.0, &[0.3; 3]);
     }
     let intrinsics = Intrinsics { width: 400, height: 400, fx: 400.0, fy: 400.0, cx: 200.0, cy: 200.0 };
     let view = |east: f64| {
