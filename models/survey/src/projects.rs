@@ -112,6 +112,12 @@ fn onto_ground(project: &mut Reconstruction) {
     project.origin = Some(origin);
 }
 
+/// Whether a matrix only turns, to as many digits as files have.
+fn is_rotation(matrix: DMat3) -> bool {
+    let off = matrix * matrix.transpose() - DMat3::IDENTITY;
+    off.to_cols_array().iter().all(|v| v.abs() < 1e-3) && matrix.determinant() > 0.0
+}
+
 /// A camera whose axes are those of OpenGL (right, up, backwards), with OpenCV's (right, down, forwards).
 fn from_opengl(rotation: DMat3) -> DQuat {
     let turned = DMat3::from_cols(rotation.x_axis, -rotation.y_axis, -rotation.z_axis);

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use models::formats::FormatError;
 use models::formats::reconstruction::{Focal, LensDescription, Reconstruction};
 
-use super::{LIMIT, from_opengl, shot};
+use super::{LIMIT, from_opengl, is_rotation, shot};
 use crate::coordinates::text;
 
 const HEADER: &str = "# Bundle file v0.3";
@@ -59,7 +59,7 @@ pub(super) fn read(path: &Path) -> Result<Reconstruction, FormatError> {
         }
         // Row by row, from the world to the camera.
         let to_world = DMat3::from_cols_slice(&n[3..12]);
-        if !((to_world.determinant() - 1.0).abs() < 1e-3) {
+        if !is_rotation(to_world) {
             return Err(bad(format!("{what}: its matrix does not only turn")));
         }
         let center = -(to_world * DVec3::new(n[12], n[13], n[14]));

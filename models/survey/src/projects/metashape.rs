@@ -10,7 +10,7 @@ use models::formats::reconstruction::{Focal, LensDescription, Reconstruction};
 use models::formats::{FormatError, read_bounded};
 use roxmltree::Node;
 
-use super::{LIMIT, shot};
+use super::{LIMIT, is_rotation, shot};
 use crate::xml;
 
 /// A skew that moves no corner of a picture by more than this is left out, pixels.
@@ -57,7 +57,7 @@ pub(super) fn read(path: &Path) -> Result<Reconstruction, FormatError> {
         };
         let m: [f64; 16] = numbers(pose).ok_or_else(|| bad("its transform is not sixteen numbers"))?;
         let rotation = DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
-        if !((rotation.determinant() - 1.0).abs() < 1e-3) {
+        if !is_rotation(rotation) {
             return Err(bad("its transform does not only turn and move"));
         }
         let component = components.get(camera.attribute("component_id").unwrap_or_default()).copied().flatten();
@@ -101,13 +101,13 @@ fn similarity(node: Node<'_, '_>) -> Result<Option<Similarity>, &'static str> {
     let Some(transform) = node.children().find(|n| n.has_tag_name("transform")) else { return Ok(None) };
     let rotation: Option<[f64; 9]> = text_of(transform, "rotation").and_then(numbers);
     let translation: Option<[f64; 3]> = text_of(transform, "translation").and_then(numbers);
-    let scale = text_of(transform, "scale").map_or(Some(1.0), |s| s.parse().ok());
+    let scale = text_of(transform, "scale").map_or(Some(1.0), |s| s.parse::<f64>().ok());
     let (Some(r), Some(t), Some(scale)) = (rotation, translation, scale) else {
         // A chunk that was never placed has an empty one.
         return if transform.children().any(|n| n.is_element()) { Err("its transform is damaged") } else { Ok(None) };
     };
     let turn = DMat3::from_cols_array(&r).transpose();
-    if !((turn.determinant() - 1.0).abs() < 1e-3 && scale > 0.0) {
+    if !is_rotation(turn) || scale <= 0.0 || !scale.is_finite() {
         return Err("its transform does not only turn, scale and move");
     }
     Ok(Some(Similarity { turn, shift: t.into(), scale }))
@@ -117,7 +117,7 @@ fn similarity(node: Node<'_, '_>) -> Result<Option<Similarity>, &'static str> {
 fn lens(sensor: Node<'_, '_>) -> Result<Option<LensDescription>, String> {
     let calibrations = || sensor.children().filter(|n| n.has_tag_name("calibration"));
     let adjusted = calibrations().find(|n| n.attribute("class") == Some("adjusted"));
-    let Some(calibration) = adjusted.or_else(|| calibrations().last()) else { return Ok(None) };
+    let Some(calibration) = adjusted.or_else(|| calibrations().next_back()) else { return Ok(None) };
     let number = |name: &str| match text_of(calibration, name) {
         Some(text) => text.parse::<f64>().map_err(|_| format!("its {name} is no number")),
         None => Ok(0.0),
