@@ -38,11 +38,9 @@ pub use coder::Garbled;
 pub const ENCODING_BYTES: usize = 900;
 /// What a Gaussian takes on the disk at most: noise in every number needs 23 (the same test).
 pub const ENCODED_BYTES: usize = 32;
-/// And at least, beyond [`FREE_GAUSSIANS`]: what is read is bounded by the size of its file. Real scenes take 6 to 12; the words
+/// And at least: what is read is bounded by the size of its file. Real scenes take 6 to 12; the words
 /// of a scene that is more regular are filled up.
 const LEAST_BYTES: u64 = 2;
-/// Gaussians that any number of words may hold, of a cloud that is one piece.
-const FREE_GAUSSIANS: u64 = 1 << 10;
 
 /// Size classes at most; each is an octave.
 const MAX_CLASSES: usize = 40;
@@ -103,16 +101,6 @@ impl Rounding {
     }
 }
 
-/// How a stream of words is laid out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Form {
-    /// A cloud in one piece, as files of version 2 hold it.
-    Whole,
-    /// A cell among others: its grids lie in the frame of the scene and not in its own, so that what was rounded once comes back
-    /// as it is; its view basis is rounded, too.
-    Cell,
-}
-
 /// What an encoder takes from the whole cloud, so that a Gaussian is rounded the same in whichever cell it lies. It follows from
 /// rounded scales alone: a cloud that was rounded before gives the same.
 #[derive(Clone, Debug)]
@@ -147,17 +135,6 @@ struct Given<'a> {
     classes: Vec<Class>,
 }
 
-/// The words of the cloud in one piece, and how many Gaussians they hold. Rows that are not valid are left out.
-#[cfg(test)]
-fn encode(cloud: &GaussianCloud, views: &[View], rounding: &Rounding) -> Result<(Vec<u32>, usize), Garbled> {
-    let scope = Scope::of(cloud, rounding);
-    let (mut words, n) = (encode_rows(cloud, views, rounding, &scope, &scope.rows, Form::Whole)?, scope.rows.len());
-    if n as u64 > most_gaussians(Form::Whole, 4 * words.len() as u64) {
-        words.resize((n * LEAST_BYTES as usize).div_ceil(4), 0);
-    }
-    Ok((words, n))
-}
-
 /// The words of some rows of a cloud.
 fn encode_rows(
     cloud: &GaussianCloud,
@@ -165,32 +142,29 @@ fn encode_rows(
     rounding: &Rounding,
     scope: &Scope,
     rows: &[u32],
-    form: Form,
 ) -> Result<Vec<u32>, Garbled> {
-    let given = Given::new(cloud, views, *rounding, scope, rows, form);
+    let given = Given::new(cloud, views, *rounding, scope, rows);
     let mut encoder = Encoder::new();
-    code(&mut encoder, form, rows.len(), cloud.sh_degree, Some(&given))?;
+    code(&mut encoder, rows.len(), cloud.sh_degree, Some(&given))?;
     Ok(encoder.finish())
 }
 
 /// Gaussians that so many bytes of words may hold.
-pub fn most_gaussians(form: Form, bytes: u64) -> u64 {
-    let free = if form == Form::Whole { FREE_GAUSSIANS } else { 0 };
-    (bytes / LEAST_BYTES).max(free)
+pub fn most_gaussians(bytes: u64) -> u64 {
+    bytes / LEAST_BYTES
 }
 
 /// The cloud of `n` Gaussians in `words`. The caller bounds `n`.
 ///
 /// # Errors
 /// [`Garbled`] for words that no encoder wrote.
-pub fn decode(form: Form, words: Vec<u32>, n: usize, sh_degree: u8) -> Result<GaussianCloud, Garbled> {
-    code(&mut Decoder::new(words), form, n, sh_degree, None).map(|(cloud, _)| cloud)
+pub fn decode(words: Vec<u32>, n: usize, sh_degree: u8) -> Result<GaussianCloud, Garbled> {
+    code(&mut Decoder::new(words), n, sh_degree, None).map(|(cloud, _)| cloud)
 }
 
 /// Both directions: the cloud as a decoder has it, and an encoder's rows.
 fn code(
     coder: &mut impl Coder,
-    form: Form,
     n: usize,
     sh_degree: u8,
     given: Option<&Given<'_>>,
@@ -198,7 +172,7 @@ fn code(
     let rounding = given.map_or_else(Rounding::default, |g| g.rounding);
     let shape = rounding.shape.code(coder)?;
     let color = rounding.color.code(coder)?;
-    let (places, rows) = places(coder, form, n, given)?;
+    let (places, rows) = places(coder, n, given)?;
     let means: Vec<Vec3> = places.iter().map(|p| p.mean).collect();
     let classes: Vec<u8> = places.iter().map(|p| p.class).collect();
     let neighbours = Neighbours::new(&means);
@@ -225,7 +199,7 @@ fn code(
         Some(g) => ViewBasis::of(coefficients, &means, &weights, g.views),
         None => ViewBasis::of(coefficients, &[], &[], &[]),
     };
-    let basis = basis.code(coder, form)?;
+    let basis = basis.code(coder)?;
     let stride = 3 * (coefficients + 1);
     let columns: Option<Vec<f32>> = given.map(|g| {
         rows.iter().flat_map(|r| &g.cloud.sh[*r as usize * stride..(*r as usize + 1) * stride]).copied().collect()
@@ -251,12 +225,7 @@ struct Place {
 }
 
 /// Positions class by class, largest Gaussians first; gives them in the order of all that follows, with an encoder's rows.
-fn places(
-    coder: &mut impl Coder,
-    form: Form,
-    n: usize,
-    given: Option<&Given<'_>>,
-) -> Result<(Vec<Place>, Vec<u32>), Garbled> {
+fn places(coder: &mut impl Coder, n: usize, given: Option<&Given<'_>>) -> Result<(Vec<Place>, Vec<u32>), Garbled> {
     let bounds = given.map_or_else(|| Bounds::of(&[]), |g| g.bounds).code(coder)?;
     let classes = coder.bits(6, given.map_or(0, |g| g.classes.len() as u64))? as usize;
     let mut places: Vec<(u64, Place)> = Vec::with_capacity(n);
@@ -281,7 +250,7 @@ fn places(
             }
             put(mean);
         }
-        let grid = bounds.grid(form, step);
+        let grid = bounds.grid(step);
         for cell in tree.code(coder, &own.cells, members as u32, grid.bits())? {
             put(grid.center(cell).as_vec3());
         }
@@ -322,14 +291,7 @@ fn size(rounding: &Rounding, log_scales: [f32; 3]) -> f64 {
 }
 
 impl<'a> Given<'a> {
-    fn new(
-        cloud: &'a GaussianCloud,
-        views: &'a [View],
-        rounding: Rounding,
-        scope: &Scope,
-        rows: &[u32],
-        form: Form,
-    ) -> Self {
+    fn new(cloud: &'a GaussianCloud, views: &'a [View], rounding: Rounding, scope: &Scope, rows: &[u32]) -> Self {
         let class_of =
             |row: &u32| size(&rounding, cloud.log_scales[*row as usize]).round().clamp(scope.low, scope.high);
         let lowest = rows.iter().map(class_of).fold(scope.high, f64::min);
@@ -346,7 +308,7 @@ impl<'a> Given<'a> {
         for (row, mean) in rows.iter().zip(&means) {
             let class = (class_of(row) - lowest) as usize;
             if bounds.holds(*mean) {
-                members[class].push((bounds.grid(form, classes[class].step).cell(*mean), *row));
+                members[class].push((bounds.grid(classes[class].step).cell(*mean), *row));
             } else {
                 classes[class].outliers.push(*mean);
                 classes[class].rows.push(*row);

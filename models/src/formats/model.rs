@@ -3,16 +3,13 @@
 //! ```text
 //! magic "dgtr\r\n\x1a\n" (8) · version u32 · header bytes u32 · Gaussians u64 · SH degree u32
 //! header (postcard)
-//! version 1, exact:   means 3N f32 · log scales 3N · rotations 4N (w x y z) · opacity logits N · sh N·D·3
-//! version 2, rounded: u32 words of the delivery encoding (`super::delivery`)
+//! version 1, exact: means 3N f32 · log scales 3N · rotations 4N (w x y z) · opacity logits N · sh N·D·3
 //! BLAKE3 of everything before (32)
 //!
-//! version 3, in cells: side f32 · cells u32 · per cell, the most important first: level u8 · y i32 · x i32 · Gaussians u32 ·
-//!     words u32 · importance f32 · BLAKE3 of its words (32)
-//! BLAKE3 of everything before (32) · the cells' words, u32
-//!
-//! version 4, in layers: as version 3, but each cell of the index goes on: Gaussians u32 · words u32 · BLAKE3 (32) of its coarse layer; those words
-//!     come first, of all cells, so that whatever part of the file is there shows the whole scene ([`read_what_is_there`])
+//! version 4, quantised in cells: side f32 · cells u32 · per cell, the most important first: level u8 · y i32 · x i32 · Gaussians u32 ·
+//!     words u32 · importance f32 · BLAKE3 of its words (32) · of its coarse layer Gaussians u32 · words u32 · BLAKE3 (32)
+//! BLAKE3 of everything before (32) · the words of all coarse layers, u32 of the delivery encoding (`super::delivery`) · those of the cells.
+//!     Whatever part of the file is there shows the whole scene ([`read_what_is_there`])
 //! ```
 //!
 //! All little-endian. The magic's line ends betray a transfer as text, what is allocated follows from the fixed part and
@@ -25,7 +22,7 @@ use disk::Disk;
 use geometry::geodesy::Geodetic;
 use serde::{Deserialize, Serialize};
 
-use super::delivery::{self, Form, Rounding};
+use super::delivery::Rounding;
 use super::reconstruction::LocalFrame;
 use super::{FormatError, write_atomic};
 use crate::camera::View;
@@ -33,7 +30,7 @@ use crate::cloud::{GaussianCloud, sh_coefficients};
 use crate::light::PictureLight;
 use celled::Cells;
 use chunks::compare;
-use columns::{read_cloud, read_words, write_floats};
+use columns::{read_cloud, write_floats};
 use hashing::Hashing;
 use opening::{Body, Opened, open, read_header_of};
 
@@ -51,12 +48,8 @@ pub use partial::{Partial, read_what_is_there};
 const MAGIC: [u8; 8] = *b"dgtr\r\n\x1a\n";
 /// Columns as they are.
 const EXACT: u32 = 1;
-/// The delivery encoding in one piece: read, no longer written.
-const ROUNDED: u32 = 2;
-/// The delivery encoding, cell by cell: read, no longer written.
-const CELLED: u32 = 3;
-/// The same, the coarse layers of all cells before them.
-const LAYERED: u32 = 4;
+/// The delivery encoding, cell by cell, the coarse layers of all cells before them.
+const CELLED: u32 = 4;
 const FIXED: u64 = 28;
 const HASH: u64 = 32;
 /// A header holds 130 bytes per view; this is room for 100,000 of them and long names.
@@ -79,9 +72,8 @@ pub struct ModelHeader {
     pub views: Vec<(String, View)>,
     /// Optimiser steps taken so far, over all continuations.
     pub steps: u64,
-    /// Seconds of training, in files of earlier versions; 0 since: the same seed gives the same bytes, but not the same
-    /// seconds, which are in `run.json`.
-    pub train_seconds: f64,
+    /// Zeros.
+    pub reserved: [u8; 8],
     /// Seed of the random choices.
     pub seed: u64,
     /// Whether the job that writes this file had reached its goal; false in checkpoints.
@@ -231,12 +223,9 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
     let Opened { mut input, count, sh_degree, body, size, .. } = opened;
     let mut cloud = GaussianCloud { sh_degree, ..Default::default() };
     let failed = |e| FormatError::io(path, "reading", e);
-    let (mut coded, mut cells) = (Vec::new(), None);
+    let mut cells = None;
     match body {
-        Body::Words(words) => coded = read_words(&mut input, words, u32::from_le_bytes).map_err(failed)?,
-        Body::Cells { layered } => {
-            cells = Some(Cells::read(path, &mut input, layered, count, size - FIXED - header.len() as u64)?);
-        }
+        Body::Cells => cells = Some(Cells::read(path, &mut input, count, size - FIXED - header.len() as u64)?),
         Body::Columns => cloud = read_cloud(&mut input, sh_degree, count).map_err(failed)?,
     }
     let hash = compare(path, &mut input)?;
@@ -245,9 +234,6 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
             cloud.extend(&cell);
             Ok::<(), FormatError>(())
         })?;
-    } else if body != Body::Columns {
-        cloud = delivery::decode(Form::Whole, coded, count, sh_degree)
-            .map_err(|e| FormatError::invalid(path, e.to_string()))?;
     }
     let header = decode_header(path, &header)?;
     let dropped = cloud.drop_invalid();
@@ -286,10 +272,9 @@ fn exact_bytes(sh_degree: u8) -> u64 {
 /// # Errors
 /// [`FormatError::Invalid`]: it cannot be decoded, or a later stage could not work with it.
 pub fn decode_header(path: &Path, bytes: &[u8]) -> Result<ModelHeader, FormatError> {
-    // Files of earlier versions end before one of the last three fields: an empty list, "no" and nothing are one byte each.
-    let earlier = |missing: &[u8]| postcard::from_bytes(&[bytes, missing].concat());
+    // A header without a frame may end before it: "none" is one byte.
     let header: ModelHeader = postcard::from_bytes(bytes)
-        .or_else(|e| earlier(&[0]).or_else(|_| earlier(&[0; 2])).or_else(|_| earlier(&[0; 3])).map_err(|_| e))
+        .or_else(|e| postcard::from_bytes(&[bytes, &[0]].concat()).map_err(|_| e))
         .map_err(|e| FormatError::invalid(path, format!("its header cannot be decoded ({e})")))?;
     check_header(path, &header)?;
     Ok(header)
@@ -315,9 +300,6 @@ fn check_header(path: &Path, header: &ModelHeader) -> Result<(), FormatError> {
     if header.local.is_some_and(|local| !local.is_usable()) {
         return bad("its frame is no shift and scale".to_owned());
     }
-    if !header.train_seconds.is_finite() {
-        return bad("its training time is not a number".to_owned());
-    }
     Ok(())
 }
 
@@ -325,13 +307,7 @@ fn check_header(path: &Path, header: &ModelHeader) -> Result<(), FormatError> {
 mod tests {
     #[test]
     fn the_page_on_formats_states_these_versions() {
-        let row = format!(
-            "| `.dgtr` model file | {} exact, {} rounded (read only), {} rounded in cells (read only), {} in cells and layers |",
-            super::EXACT,
-            super::ROUNDED,
-            super::CELLED,
-            super::LAYERED
-        );
+        let row = format!("| `.dgtr` model file | {} exact, {} quantised in cells |", super::EXACT, super::CELLED);
         assert!(include_str!("../../FORMATS.md").contains(&row), "{row}");
     }
 }

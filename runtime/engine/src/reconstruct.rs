@@ -193,9 +193,8 @@ impl Reconstruction {
             return Ok(None);
         }
         tracing::info!("continuing {} ({gaussians} Gaussians) after {} steps", path.display(), header.steps);
-        // Models of earlier versions say it themselves.
         let told = RunReport::read(out).ok().and_then(|run| run.more.get("train_seconds")?.as_f64());
-        self.training.train_s = told.unwrap_or(header.train_seconds);
+        self.training.train_s = told.unwrap_or(0.0);
         self.delivery.continue_from(&header);
         self.training.begin_with(earlier);
         self.resumed = Resumed::of(header);

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::coder::{Encoder, Garbled};
-use super::{Form, Given, LEAST_BYTES, Rounding, Scope, code, encode_rows};
+use super::{Given, LEAST_BYTES, Rounding, Scope, code, encode_rows};
 use crate::camera::View;
 use crate::cloud::{GaussianCloud, coarser};
 use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
@@ -90,14 +90,14 @@ pub fn encode_cells(
 }
 
 impl Layer {
-    fn of(
+    pub(super) fn of(
         cloud: &GaussianCloud,
         views: &[View],
         rounding: &Rounding,
         scope: &Scope,
         rows: &[u32],
     ) -> Result<Self, Garbled> {
-        let mut words = encode_rows(cloud, views, rounding, scope, rows, Form::Cell)?;
+        let mut words = encode_rows(cloud, views, rounding, scope, rows)?;
         words.resize(words.len().max((rows.len() * LEAST_BYTES as usize).div_ceil(4)), 0);
         Ok(Self { count: rows.len() as u32, words })
     }
@@ -125,8 +125,8 @@ pub fn round_shapes(cloud: &GaussianCloud, rounding: &Rounding) -> Result<Gaussi
     let stride = cloud.sh_stride();
     let mut rounded = GaussianCloud::with_capacity(cloud.sh_degree, scope.rows.len());
     for (_, rows) in split(grid_of(cloud, &scope.rows), cloud, &scope.rows) {
-        let given = Given::new(cloud, &[], *rounding, &scope, &rows, Form::Cell);
-        let (mut cell, rows) = code(&mut Encoder::new(), Form::Cell, rows.len(), cloud.sh_degree, Some(&given))?;
+        let given = Given::new(cloud, &[], *rounding, &scope, &rows);
+        let (mut cell, rows) = code(&mut Encoder::new(), rows.len(), cloud.sh_degree, Some(&given))?;
         for (to, row) in cell.sh.chunks_exact_mut(stride).zip(rows) {
             to.copy_from_slice(&cloud.sh[row as usize * stride..][..stride]);
         }

@@ -1,7 +1,6 @@
 //! Positions: a grid as fine as the Gaussians of one size class need, its occupied cells in Morton order as the counts of a
 //! binary tree. Which Gaussian is which costs nothing: they are a set.
 
-use super::Form;
 use super::coder::{Coder, Counts, Garbled};
 use glam::{DVec3, Vec3};
 
@@ -57,13 +56,13 @@ impl Bounds {
         inside.cmpge(DVec3::ZERO).all() && inside.cmplt(DVec3::ONE).all()
     }
 
-    /// A grid of cells of at least `step` metres. That of a cell begins at a multiple of its step, whatever the bounds are.
-    pub fn grid(&self, form: Form, step: f64) -> Grid {
-        // What lies before the corner takes one more.
-        let more = u32::from(form == Form::Cell);
-        let step = step.max(self.edge / f64::from((1u32 << AXIS_BITS) - 1 - more));
-        let corner = if more > 0 { (self.corner / step).floor() * step } else { self.corner };
-        let last = (self.edge / step) as u32 + more;
+    /// A grid of cells of at least `step` metres. It begins at a multiple of its step, whatever the bounds are: what was rounded once comes
+    /// back as it is.
+    pub fn grid(&self, step: f64) -> Grid {
+        // What lies before the bounds' corner takes one more.
+        let step = step.max(self.edge / f64::from((1u32 << AXIS_BITS) - 2));
+        let corner = (self.corner / step).floor() * step;
+        let last = (self.edge / step) as u32 + 1;
         Grid { corner, step, axis_bits: 32 - last.leading_zeros() }
     }
 

@@ -26,9 +26,15 @@ pub(super) fn ground(n: usize, degree: u8) -> GaussianCloud {
     cloud
 }
 
+/// The words of the cloud as one cell, and how many Gaussians they hold.
+fn encode(cloud: &GaussianCloud, views: &[View], rounding: &Rounding) -> Result<(Vec<u32>, usize), Garbled> {
+    let scope = Scope::of(cloud, rounding);
+    Layer::of(cloud, views, rounding, &scope, &scope.rows).map(|layer| (layer.words, layer.count as usize))
+}
+
 fn there_and_back(cloud: &GaussianCloud, rounding: &Rounding) -> GaussianCloud {
     let (words, n) = encode(cloud, &[], rounding).unwrap();
-    decode(Form::Whole, words, n, cloud.sh_degree).unwrap()
+    decode(words, n, cloud.sh_degree).unwrap()
 }
 
 /// The row of `cloud` nearest to each mean of `rounded`.
@@ -88,8 +94,8 @@ fn a_cloud_of_equal_gaussians_is_filled_up_to_what_its_reader_takes() {
         cloud.push([1.0, 2.0, 3.0], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 1.0, &[0.2; 3]);
     }
     let (words, n) = encode(&cloud, &[], &Rounding::default()).unwrap();
-    assert!(n as u64 <= most_gaussians(Form::Whole, 4 * words.len() as u64), "{n} Gaussians in {} words", words.len());
-    assert_eq!(decode(Form::Whole, words, n, 0).unwrap().len(), n);
+    assert!(n as u64 <= most_gaussians(4 * words.len() as u64), "{n} Gaussians in {} words", words.len());
+    assert_eq!(decode(words, n, 0).unwrap().len(), n);
 }
 
 #[test]
@@ -128,7 +134,7 @@ fn colours_are_truest_from_where_the_scene_was_seen_and_cost_no_more() {
     let rounding = Rounding { position: 0.01, ..Rounding::default() };
     let [seen, unseen] = [&views[..], &[]].map(|views| {
         let (words, n) = encode(&cloud, views, &rounding).unwrap();
-        (words.len(), error_from_above(&cloud, &decode(Form::Whole, words, n, 3).unwrap()))
+        (words.len(), error_from_above(&cloud, &decode(words, n, 3).unwrap()))
     });
     assert!(seen.1 < 0.5 * unseen.1, "squared error {} with views, {} without", seen.1, unseen.1);
     assert!(seen.0 < unseen.0, "{} words with views, {} without", seen.0, unseen.0);
@@ -172,7 +178,7 @@ fn garbled_words_are_refused_or_give_a_cloud_of_the_stated_size() {
             1 => damaged[rng.random_range(0..words.len())] ^= 1 << rng.random_range(0..32),
             _ => damaged.iter_mut().for_each(|w| *w = rng.random()),
         }
-        match decode(Form::Whole, damaged, n, 1) {
+        match decode(damaged, n, 1) {
             Ok(cloud) => assert_eq!(cloud.len(), n),
             Err(Garbled) => refused += 1,
         }

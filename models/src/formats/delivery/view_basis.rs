@@ -4,7 +4,6 @@
 //! Gaussian's colour, averaged over its views, is dc + mᵀc; how much it varies with the view is cᵀGc, so c is rounded in G's
 //! eigenvectors, each as finely as its eigenvalue asks.
 
-use super::Form;
 use super::coder::{Coder, Garbled};
 use crate::camera::View;
 use crate::cloud::sh_basis;
@@ -84,26 +83,17 @@ impl ViewBasis {
         basis
     }
 
-    pub fn code(mut self, coder: &mut impl Coder, form: Form) -> Result<Self, Garbled> {
+    pub fn code(mut self, coder: &mut impl Coder) -> Result<Self, Garbled> {
         let n = self.coefficients;
         let (mean, values) = (&mut self.mean[..n], &mut self.values[..n]);
         let vectors = self.vectors[..n].iter_mut().flat_map(|row| &mut row[..n]);
-        match form {
-            Form::Whole => {
-                for v in mean.iter_mut().chain(values).chain(vectors) {
-                    *v = coder.f32(*v)?;
-                }
-            }
-            Form::Cell => {
-                for v in mean.iter_mut().chain(values) {
-                    // Half of a number's bits: sign, exponent and seven of its digits.
-                    *v = f32::from_bits((coder.bits(16, u64::from(v.to_bits() >> 16))? as u32) << 16);
-                }
-                for v in vectors {
-                    let step = ((*v + 1.0) * VECTOR_STEPS).round().clamp(0.0, 2.0 * VECTOR_STEPS);
-                    *v = coder.bits(VECTOR_BITS, step as u64)? as f32 / VECTOR_STEPS - 1.0;
-                }
-            }
+        for v in mean.iter_mut().chain(values) {
+            // Half of a number's bits: sign, exponent and seven of its digits.
+            *v = f32::from_bits((coder.bits(16, u64::from(v.to_bits() >> 16))? as u32) << 16);
+        }
+        for v in vectors {
+            let step = ((*v + 1.0) * VECTOR_STEPS).round().clamp(0.0, 2.0 * VECTOR_STEPS);
+            *v = coder.bits(VECTOR_BITS, step as u64)? as f32 / VECTOR_STEPS - 1.0;
         }
         let finite = self.mean[..n].iter().chain(self.vectors[..n].as_flattened()).all(|v| v.is_finite());
         if finite && self.values[..n].iter().all(|v| *v > 0.0 && v.is_finite()) { Ok(self) } else { Err(Garbled) }

@@ -1,5 +1,5 @@
-//! Versions 3 and 4 of the file: cells of ground, each in words of its own and named by their hash, behind an index of all of them; in
-//! version 4 a coarse layer of each comes before.
+//! Version 4 of the file: cells of ground, each in words of its own and named by their hash, behind an index of all of them and a coarse layer
+//! of each.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Write};
@@ -8,19 +8,19 @@ use std::path::Path;
 use disk::Disk;
 
 use super::hashing::Hashing;
-use super::{Body, FIXED, FormatError, HASH, LAYERED, ModelHeader, begin, check_columns, encode_header, finish, open};
+use super::{Body, CELLED, FIXED, FormatError, HASH, ModelHeader, begin, check_columns, encode_header, finish, open};
 use super::{columns::read_words, read_header_of};
 use crate::camera::View;
 use crate::cloud::GaussianCloud;
-use crate::formats::delivery::{self, CodedCells, Form, Layer, Rounding};
+use crate::formats::delivery::{self, CodedCells, Layer, Rounding};
 use crate::ground_cell::{CellKey, Grid, MOST_LEVEL};
 
 /// Cells of a file at most: what an offer on the wire can name, with two layers each.
 const MOST_CELLS: u64 = 1 << 14;
-/// Bytes of the index before its entries, of an entry, and of its coarse layer.
+/// Bytes of the index before its entries, of an entry, and of what says of the whole cell in it; the rest is its coarse layer's.
 const HEAD: u64 = 8;
-const ENTRY: u64 = 53;
-const LAYER: u64 = 40;
+const ENTRY: u64 = WHOLE + 40;
+const WHOLE: u64 = 53;
 
 /// Bytes below which a piece is not worth its name on the wire.
 const LEAST_PIECE: u64 = 8 << 10;
@@ -37,7 +37,7 @@ struct Entry {
     key: CellKey,
     importance: f32,
     whole: Piece,
-    coarse: Option<Piece>,
+    coarse: Piece,
 }
 
 /// The index of a file.
@@ -66,7 +66,7 @@ pub fn write_cells(
     let n = cells.iter().map(|cell| cell.whole.count as usize).sum();
     let bytes = |layer: &Layer| -> Vec<u8> { layer.words.iter().flat_map(|w| w.to_le_bytes()).collect() };
     disk.replace(path, |file| {
-        let mut out = begin(file, LAYERED, &head, n, cloud.sh_degree)?;
+        let mut out = begin(file, CELLED, &head, n, cloud.sh_degree)?;
         out.write_all(&grid.side.to_le_bytes())?;
         out.write_all(&(cells.len() as u32).to_le_bytes())?;
         for cell in &cells {
@@ -96,11 +96,11 @@ pub fn write_cells(
 /// As [`super::read_header`].
 pub fn pieces(path: &Path) -> Result<Option<Vec<u64>>, FormatError> {
     let mut opened = open(path)?;
-    let Body::Cells { layered } = opened.body else { return Ok(None) };
+    let Body::Cells = opened.body else { return Ok(None) };
     read_header_of(path, &mut opened)?;
     let before = FIXED + opened.header_len as u64;
-    let cells = Cells::read(path, &mut opened.input, layered, opened.count, opened.size - before)?;
-    let head = before + index_bytes(layered, cells.0.len() as u64) + HASH;
+    let cells = Cells::read(path, &mut opened.input, opened.count, opened.size - before)?;
+    let head = before + index_bytes(cells.0.len() as u64) + HASH;
     let mut pieces = vec![head];
     for layer in cells.layers() {
         let mut open = false;
@@ -115,8 +115,8 @@ pub fn pieces(path: &Path) -> Result<Option<Vec<u64>>, FormatError> {
     Ok(Some(pieces))
 }
 
-fn index_bytes(layered: bool, cells: u64) -> u64 {
-    HEAD + cells * (ENTRY + if layered { LAYER } else { 0 })
+fn index_bytes(cells: u64) -> u64 {
+    HEAD + cells * ENTRY
 }
 
 impl Cells {
@@ -124,11 +124,10 @@ impl Cells {
     pub fn read(
         path: &Path,
         input: &mut Hashing<BufReader<File>>,
-        layered: bool,
         count: usize,
         left: u64,
     ) -> Result<Self, FormatError> {
-        let (index, room) = Self::read_index(path, input, layered, count, left)?;
+        let (index, room) = Self::read_index(path, input, count, left)?;
         match index.layers().concat().into_iter().map(Piece::bytes).sum::<u64>() {
             bytes if bytes == room => Ok(index),
             bytes if bytes > room => Err(FormatError::Truncated { path: path.to_owned(), at: room, what: "its cells" }),
@@ -143,7 +142,6 @@ impl Cells {
     pub fn read_index(
         path: &Path,
         input: &mut Hashing<BufReader<File>>,
-        layered: bool,
         count: usize,
         left: u64,
     ) -> Result<(Self, u64), FormatError> {
@@ -153,7 +151,7 @@ impl Cells {
         input.read_exact(&mut head).map_err(failed)?;
         let [a, b, c, d, cells @ ..] = head;
         let (side, cells) = (f32::from_le_bytes([a, b, c, d]), u64::from(u32::from_le_bytes(cells)));
-        let room = left.checked_sub(HASH + index_bytes(layered, cells)).filter(|_| cells <= MOST_CELLS);
+        let room = left.checked_sub(HASH + index_bytes(cells)).filter(|_| cells <= MOST_CELLS);
         let Some(room) = room else {
             return bad(format!("its index names {cells} cells, for which it has no room"));
         };
@@ -164,14 +162,9 @@ impl Cells {
         for i in 0..cells {
             let mut bytes = [0; ENTRY as usize];
             input.read_exact(&mut bytes).map_err(failed)?;
-            let mut entry = Entry::of(&bytes);
-            if layered {
-                let mut bytes = [0; LAYER as usize];
-                input.read_exact(&mut bytes).map_err(failed)?;
-                entry.coarse = Some(Piece::of([&bytes[..8], &bytes[8..]]));
-            }
+            let entry = Entry::of(&bytes);
             let whole = &entry.whole;
-            let too_many = entry.coarse.iter().chain([whole]).any(Piece::is_absurd);
+            let too_many = [&entry.coarse, whole].into_iter().any(Piece::is_absurd);
             if entry.key.level > MOST_LEVEL || too_many || entry.importance.is_nan() {
                 let what = format!("cell {i} of level {} with {} Gaussians", entry.key.level, whole.count);
                 return bad(format!("{what} in {} words", whole.words));
@@ -185,9 +178,9 @@ impl Cells {
         }
     }
 
-    /// What lies in the file, in its order: coarse layers, where there are any, then whole cells.
+    /// What lies in the file, in its order: coarse layers, then whole cells.
     fn layers(&self) -> [Vec<&Piece>; 2] {
-        [self.0.iter().filter_map(|e| e.coarse.as_ref()).collect(), self.0.iter().map(|e| &e.whole).collect()]
+        [self.0.iter().map(|e| &e.coarse).collect(), self.0.iter().map(|e| &e.whole).collect()]
     }
 
     /// Gives the Gaussians of each cell to `each`.
@@ -201,7 +194,7 @@ impl Cells {
         sh_degree: u8,
         each: &mut dyn FnMut(GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
-        for coarse in self.0.iter().filter_map(|e| e.coarse.as_ref()) {
+        for coarse in self.0.iter().map(|e| &e.coarse) {
             coarse.words(path, input)?;
         }
         for entry in self.0 {
@@ -229,7 +222,7 @@ impl Cells {
             left = rest.unwrap_or(0);
             rest.is_some()
         };
-        for piece in self.0.iter().filter_map(|e| e.coarse.as_ref()) {
+        for piece in self.0.iter().map(|e| &e.coarse) {
             if !fits(piece) {
                 break;
             }
@@ -272,7 +265,7 @@ impl Piece {
 
     /// More Gaussians than its words can hold.
     fn is_absurd(&self) -> bool {
-        u64::from(self.count) > delivery::most_gaussians(Form::Cell, self.bytes())
+        u64::from(self.count) > delivery::most_gaussians(self.bytes())
     }
 
     /// Its words, when their hash is right.
@@ -291,7 +284,7 @@ impl Piece {
         if self.count == 0 {
             return Ok(GaussianCloud::with_capacity(sh_degree, 0));
         }
-        let cloud = delivery::decode(Form::Cell, words, self.count as usize, sh_degree);
+        let cloud = delivery::decode(words, self.count as usize, sh_degree);
         cloud.map_err(|e| FormatError::invalid(path, e.to_string()))
     }
 }
@@ -302,8 +295,8 @@ impl Entry {
         Self {
             key: CellKey { level: bytes[0], y: i32::from_le_bytes(word(1)), x: i32::from_le_bytes(word(5)) },
             importance: f32::from_le_bytes(word(17)),
-            whole: Piece::of([&bytes[9..17], &bytes[21..]]),
-            coarse: None,
+            whole: Piece::of([&bytes[9..17], &bytes[21..WHOLE as usize]]),
+            coarse: Piece::of([&bytes[WHOLE as usize..][..8], &bytes[WHOLE as usize + 8..]]),
         }
     }
 }

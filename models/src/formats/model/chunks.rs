@@ -12,7 +12,7 @@ use super::columns::{self, read_words, triples, write_floats};
 use super::hashing::Hashing;
 use super::opening::{Body, Opened, open, read_header_of};
 use super::{
-    EXACT, FIXED, FormatError, HASH, ModelHeader, begin, decode_header, encode_header, exact_bytes, finish, read,
+    EXACT, FIXED, FormatError, HASH, ModelHeader, begin, decode_header, encode_header, exact_bytes, finish,
     write_atomic,
 };
 use crate::cloud::{GaussianCloud, sh_coefficients};
@@ -72,8 +72,7 @@ impl Chunks {
         let header = read_header_of(&self.path, &mut opened)?;
         match opened.body {
             Body::Columns => self.columns(header.len(), &mut valid)?,
-            Body::Words(_) => valid(read(&self.path)?.1)?,
-            Body::Cells { layered } => self.cells(opened, layered, header.len(), &mut valid)?,
+            Body::Cells => self.cells(opened, header.len(), &mut valid)?,
         }
         Ok(dropped)
     }
@@ -134,12 +133,11 @@ impl Chunks {
     fn cells<E: From<FormatError>>(
         &self,
         opened: Opened,
-        layered: bool,
         header: usize,
         each: &mut dyn FnMut(GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
         let Opened { mut input, count, size, .. } = opened;
-        let cells = Cells::read(&self.path, &mut input, layered, count, size - FIXED - header as u64)?;
+        let cells = Cells::read(&self.path, &mut input, count, size - FIXED - header as u64)?;
         compare(&self.path, &mut input)?;
         cells.each(&self.path, &mut input.inner, self.sh_degree, each)
     }

@@ -5,8 +5,8 @@ use std::io::{BufReader, Read};
 use std::path::Path;
 
 use super::hashing::Hashing;
-use super::{CELLED, EXACT, FIXED, FormatError, HASH, LAYERED, MAGIC, MAX_HEADER, ROUNDED, exact_bytes};
-use crate::formats::delivery::{self, Form};
+use super::{CELLED, EXACT, FIXED, FormatError, HASH, MAGIC, MAX_HEADER, exact_bytes};
+use crate::formats::delivery;
 
 /// A file whose fixed part is read and holds with its size; the header comes next.
 pub(super) struct Opened {
@@ -23,10 +23,8 @@ pub(super) struct Opened {
 pub(super) enum Body {
     /// As exact columns.
     Columns,
-    /// In so many words of the delivery encoding.
-    Words(usize),
     /// In the delivery encoding, cell by cell; each with a coarse layer before all of them.
-    Cells { layered: bool },
+    Cells,
 }
 
 /// Opens a model and takes its fixed part; nothing is allocated yet for what it says.
@@ -37,7 +35,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     open_to(path, true)
 }
 
-/// As [`open`]; what is not `whole` may end before its Gaussians do, when they lie in layers.
+/// As [`open`]; what is not `whole` may end before its Gaussians do, when they lie in cells.
 pub(super) fn open_to(path: &Path, whole: bool) -> Result<Opened, FormatError> {
     let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
     let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
@@ -53,9 +51,9 @@ pub(super) fn open_to(path: &Path, whole: bool) -> Result<Opened, FormatError> {
     }
     let word = |at: usize| u32::from_le_bytes([fixed[at], fixed[at + 1], fixed[at + 2], fixed[at + 3]]);
     let version = word(8);
-    if ![EXACT, ROUNDED, CELLED, LAYERED].contains(&version) {
+    if ![EXACT, CELLED].contains(&version) {
         let what = format!(
-            "model file version {version}; this dgtr reads versions {EXACT} to {LAYERED}: use the dgtr that wrote it"
+            "model file version {version}; this dgtr reads versions {EXACT} and {CELLED}: use the dgtr that wrote it"
         );
         return Err(FormatError::invalid(path, what));
     }
@@ -74,20 +72,13 @@ pub(super) fn open_to(path: &Path, whole: bool) -> Result<Opened, FormatError> {
         let Some(coded) = size.checked_sub(FIXED + header_len as u64 + HASH) else {
             return Err(truncated("its header"));
         };
-        let form = if version == ROUNDED { Form::Whole } else { Form::Cell };
-        let limit = delivery::most_gaussians(form, coded);
-        if count > limit && (whole || version != LAYERED) {
+        let limit = delivery::most_gaussians(coded);
+        if count > limit && whole {
             let what = "its number of Gaussians";
             return Err(FormatError::TooLarge { path: path.to_owned(), what, size: count, limit });
         }
-        let body = match version {
-            ROUNDED => Body::Words(coded as usize / 4),
-            _ => Body::Cells { layered: version == LAYERED },
-        };
-        if version == ROUNDED && coded % 4 != 0 {
-            return Err(truncated("its Gaussians"));
-        }
-        return Ok(Opened { input, size, count: count as usize, sh_degree: degree as u8, header_len, body });
+        let (count, sh_degree) = (count as usize, degree as u8);
+        return Ok(Opened { input, size, count, sh_degree, header_len, body: Body::Cells });
     }
     let expected =
         count.checked_mul(exact_bytes(degree as u8)).and_then(|c| c.checked_add(FIXED + header_len as u64 + HASH));

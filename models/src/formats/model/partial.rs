@@ -34,11 +34,11 @@ pub fn read_what_is_there(path: &Path) -> Result<(ModelHeader, GaussianCloud, Op
 
 fn part(path: &Path) -> Result<Option<(ModelHeader, GaussianCloud, Option<Partial>)>, FormatError> {
     let mut opened = open_to(path, false)?;
-    let Body::Cells { layered: true } = opened.body else { return Ok(None) };
+    let Body::Cells = opened.body else { return Ok(None) };
     let header = read_header_of(path, &mut opened)?;
     let Opened { mut input, count, sh_degree, size, .. } = opened;
     let left = size - FIXED - header.len() as u64;
-    let (index, room) = Cells::read_index(path, &mut input, true, count, left)?;
+    let (index, room) = Cells::read_index(path, &mut input, count, left)?;
     compare(path, &mut input)?;
     let cells = index.count();
     let (mut cloud, [whole, coarse]) = index.there(path, &mut input.inner, sh_degree, room)?;

@@ -11,7 +11,7 @@ fn coded(cloud: &GaussianCloud) -> CodedCells {
 fn decoded(coded: &CodedCells, sh_degree: u8) -> GaussianCloud {
     let mut cloud = GaussianCloud { sh_degree, ..Default::default() };
     for cell in &coded.cells {
-        cloud.extend(&decode(Form::Cell, cell.whole.words.clone(), cell.whole.count as usize, sh_degree).unwrap());
+        cloud.extend(&decode(cell.whole.words.clone(), cell.whole.count as usize, sh_degree).unwrap());
     }
     cloud
 }
@@ -83,7 +83,7 @@ fn a_coarse_layer_is_a_sixteenth_of_its_cell_and_covers_the_same_ground_in_the_s
     let (mut coarse, mut bytes, mut all) = (GaussianCloud::with_capacity(0, 0), 0, 0);
     for CodedCell { coarse: layer, whole, .. } in &coded.cells {
         assert!(layer.count > 0 && 16 * layer.count <= whole.count + 16, "{} of {}", layer.count, whole.count);
-        coarse.extend(&decode(Form::Cell, layer.words.clone(), layer.count as usize, 0).unwrap());
+        coarse.extend(&decode(layer.words.clone(), layer.count as usize, 0).unwrap());
         (bytes, all) = (bytes + layer.words.len(), all + whole.words.len());
     }
     assert!(10 * bytes < all, "{bytes} of {all} words");
@@ -107,7 +107,7 @@ fn a_few_gaussians_are_one_cell_and_equal_ones_fill_what_their_reader_takes() {
         cloud.push([1.0, 2.0, 3.0], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 1.0, &[0.2; 3]);
     }
     let equal = coded(&cloud);
-    let least = |l: &Layer| u64::from(l.count) <= super::super::most_gaussians(Form::Cell, 4 * l.words.len() as u64);
+    let least = |l: &Layer| u64::from(l.count) <= super::super::most_gaussians(4 * l.words.len() as u64);
     assert!(equal.cells.iter().all(|cell| least(&cell.whole) && least(&cell.coarse)));
     assert_eq!(decoded(&equal, 0).len(), 20_000);
 }
