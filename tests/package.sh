@@ -63,17 +63,17 @@ sys.stdout.buffer.write(gzip.compress("".join(text).encode(), 9, mtime=0))
 ' > "$made/third-party.txt.gz"
 
 # The manual is written by the program of this machine, whatever architecture it is for.
-cargo build --release --locked -p runtime --bin dgtr --features v4l2
-here=${CARGO_TARGET_DIR:-target}/release/dgtr
+cargo build --profile dist --locked -p runtime --bin dgtr --features v4l2
+here=${CARGO_TARGET_DIR:-target}/dist/dgtr
 manual() { rm -rf "$made/manual" && "$here" manual --out "$made/manual" "$@"; }
 cp "$here" "$made/dgtr-here" && here=$made/dgtr-here
 
 [ ${#cross[@]} = 0 ] || cross_compiler "$target"
 mkdir -p target/debian && rm -f target/debian/dgtr*_"$arch".deb
 manual
-cargo deb -p runtime "${cross[@]}" --locked --output target/debian/
+cargo deb --profile dist -p runtime "${cross[@]}" --locked --output target/debian/
 manual --onboard
-cargo deb -p runtime --variant onboard "${cross[@]}" --locked --output target/debian/
+cargo deb --profile dist -p runtime --variant onboard "${cross[@]}" --locked --output target/debian/
 ls -l target/debian/
 
 debs=$(ls target/debian/dgtr*_"$arch".deb)
