@@ -4,6 +4,8 @@
 #![cfg_attr(not(feature = "std"), no_std)]
 
 #[cfg(feature = "std")]
+pub mod budget;
+#[cfg(feature = "std")]
 pub mod coverage;
 pub mod error;
 #[cfg(feature = "std")]

@@ -235,6 +235,6 @@ fn train_survey(info: &GpuInfo, steps: u32, folder: &Path) -> Result<Survey, Job
         wall_s: report.wall_s,
         gaussians: report.gaussians,
         psnr: report.psnr,
-        device_bytes: [report.device_bytes_planned, report.device_bytes_peak],
+        device_bytes: [report.memory.device_bytes_planned, report.memory.device_bytes_peak],
     })
 }

@@ -5,10 +5,11 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use config::budget::{Budget, Memory};
 use config::coverage::CoverageSettings;
 use config::failsafe::FailsafeSettings;
 use config::init::InitSettings;
-use config::mission::{DEVICE_MIB, KeyframeSettings, NetworkSettings};
+use config::mission::{KeyframeSettings, NetworkSettings};
 use config::refine::RefineSettings;
 use config::training::TrainSettings;
 use disk::Disk;
@@ -27,6 +28,7 @@ use job::run_json::RunReport;
 use models::formats::delivery::Rounding;
 use models::formats::model::ModelHeader;
 use models::onnx::metric::PerceptualMetric;
+use serde::Deserialize;
 use survey::card::CardOptions;
 use survey::dataset::{Dataset, PoseSource};
 use vulkan::trainer::RunBudget;
@@ -52,6 +54,72 @@ mod surveyed;
 /// Means that the heights of the ground are told by at most, where the scene is larger than the memory.
 const MOST_MEANS: usize = 1 << 20;
 
+/// The recipe tables of a mission file.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Recipe {
+    /// `[training]`.
+    pub training: TrainSettings,
+    /// `[init]`.
+    pub init: InitSettings,
+    /// `[refine]`.
+    pub refine: RefineSettings,
+    /// `[network]`: manifests of the user's own networks.
+    pub network: NetworkSettings,
+    /// `[keyframes]`: the rule by which a flight chooses them.
+    pub keyframes: KeyframeSettings,
+    /// `[failsafe]`: the thresholds by which a flight spares its computer.
+    pub failsafe: FailsafeSettings,
+    /// `[coverage]`.
+    pub coverage: CoverageSettings,
+}
+
+/// Which pictures are trained on, and how large.
+#[derive(Clone, Debug)]
+pub struct Chosen {
+    /// Name of the list of training pictures.
+    pub split: String,
+    /// Restricts the split.
+    pub region: Option<String>,
+    /// Whether a flight's rule chooses key frames among them.
+    pub by_rule: bool,
+    /// Image scale.
+    pub scale: PictureScale,
+}
+
+impl Chosen {
+    /// The region's corners; none where there is no region.
+    fn polygon(&self, set: &Dataset) -> Vec<[f64; 2]> {
+        let region = self.region.as_deref().and_then(|name| set.region(name));
+        region.map(|region| region.polygon.clone()).unwrap_or_default()
+    }
+}
+
+/// Where poses come from.
+#[derive(Clone, Copy, Debug)]
+pub struct PoseOrigin {
+    /// The data set's reconstruction, or telemetry.
+    pub source: PoseSource,
+    /// Whether telemetry poses are refined from the pictures.
+    pub refine: bool,
+}
+
+/// Where the results go.
+#[derive(Clone, Debug)]
+pub struct Output {
+    /// Folder of the model and its report.
+    pub folder: PathBuf,
+    /// Whether a model in it is ignored.
+    pub fresh: bool,
+    /// Seconds between checkpoints.
+    pub checkpoint_seconds: f64,
+}
+
+/// The number of Gaussians of a scene, of which a plan wants one at least.
+fn at_least_one(gaussians: usize) -> u32 {
+    u32::try_from(gaussians.max(1)).unwrap_or(u32::MAX)
+}
+
 /// Everything a training needs to know; see `dgtr train --help`.
 #[derive(Clone, Debug)]
 pub struct TrainJob {
@@ -59,60 +127,32 @@ pub struct TrainJob {
     pub folders: Vec<PathBuf>,
     /// What a card is read with.
     pub card: CardOptions,
-    /// Folder of the results.
-    pub out: PathBuf,
-    /// Name of the list of training pictures.
-    pub split: String,
-    /// Restricts the split.
-    pub region: Option<String>,
-    /// The rule by which a flight chooses key frames; `None` takes every picture.
-    pub keyframes: Option<KeyframeSettings>,
-    /// The thresholds by which a flight spares its computer; `None` trains whatever the computer says.
-    pub failsafe: Option<FailsafeSettings>,
+    /// Where the results go.
+    pub output: Output,
+    /// Which pictures.
+    pub pictures: Chosen,
+    /// Where their poses come from.
+    pub poses: PoseOrigin,
     /// First Gaussians.
     pub init: InitKind,
     /// The model that they are taken from, where `init` says so.
     pub from: Option<PathBuf>,
-    /// Poses.
-    pub poses: PoseSource,
-    /// Whether telemetry poses are refined from the pictures.
-    pub refine: bool,
-    /// Steps, over all continuations.
-    pub steps: Option<u32>,
-    /// Seconds, over all continuations.
-    pub seconds: Option<f64>,
+    /// Over all continuations.
+    pub budget: Budget,
+    /// Of device and scene.
+    pub memory: Memory,
     /// What is not given of memory, Gaussians, scale and seconds is chosen by what a step costs on the device.
     pub auto: bool,
-    /// Device memory, MiB.
-    pub budget_mib: Option<u32>,
-    /// Cap below what the budget holds.
-    pub max_gaussians: Option<usize>,
-    /// Gaussians of the whole scene; `None`: those on the device.
-    pub scene_gaussians: Option<usize>,
-    /// Views on the device at once; `None`: as [`config::plan::PlanRequest::slots`] says.
-    pub view_slots: Option<u32>,
-    /// Image scale.
-    pub scale: PictureScale,
+    /// Whether the computer is spared as in a flight.
+    pub spares: bool,
     /// Part of the Vulkan device's name.
     pub device: Option<String>,
-    /// `[network]`: manifests of the user's own networks.
-    pub network: NetworkSettings,
-    /// Seconds between checkpoints.
-    pub checkpoint_seconds: f64,
     /// As what encoding rounds them the last share of training has values.
     pub for_delivery: Option<Rounding>,
-    /// Whether a model in `out` is ignored.
-    pub fresh: bool,
     /// Whether the split `test` is scored at the end.
     pub evaluate: bool,
-    /// `[training]`.
-    pub training: TrainSettings,
-    /// `[coverage]`.
-    pub coverage: CoverageSettings,
-    /// `[init]`.
-    pub init_settings: InitSettings,
-    /// `[refine]`.
-    pub refine_settings: RefineSettings,
+    /// How it is trained.
+    pub recipe: Recipe,
 }
 
 /// How a job ended.
@@ -129,7 +169,7 @@ pub struct Outcome {
 impl TrainJob {
     /// The model file, written from the start on.
     pub fn model_path(&self) -> PathBuf {
-        model_path(&self.out)
+        model_path(&self.output.folder)
     }
 
     /// Runs the job to its goal, or until asked to stop.
@@ -139,7 +179,7 @@ impl TrainJob {
     pub fn run(&self) -> Result<Outcome, JobError> {
         let began = Instant::now();
         let stop = Interrupt::install()?;
-        let _held = identity::hold(&self.out)?;
+        let _held = identity::hold(&self.output.folder)?;
         let set = match self.folders.as_slice() {
             [folder] if self.card == CardOptions::default() => Dataset::open(folder)?,
             folders => Dataset::open_card(folders, &self.card)?,
@@ -159,81 +199,83 @@ impl TrainJob {
         chosen: Option<Choice>,
     ) -> Result<Outcome, JobError> {
         let go_on = || !stop.requested();
-        let from = self.from.as_deref().map(|path| first::open(path, &self.out, self.fresh)).transpose()?;
+        let from =
+            self.from.as_deref().map(|path| first::open(path, &self.output.folder, self.output.fresh)).transpose()?;
         from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
         let identity = Identity::of(self, &set)?;
-        let is_new = identity.is_new_in(&self.out, &self.model_path(), self.fresh)?;
+        let is_new = identity.is_new_in(&self.output.folder, &self.model_path(), self.output.fresh)?;
         let is_card = set.card.is_some();
         // Over a model that is replaced, the record follows when the new model is there: whoever stops the job before must not find the old
         // model taken for one of these pictures.
         let replaces = self.model_path().is_file();
         if is_card && is_new && !replaces {
-            identity.write(&self.out)?;
+            identity.write(&self.output.folder)?;
         }
         // A card's poses are settled by its pictures, held-out ones too, before anything is built of them.
-        let poses = if is_card { PoseSource::Dataset } else { self.poses };
+        let poses = if is_card { PoseSource::Dataset } else { self.poses.source };
         let picture_scale = self.picture_scale(&set, is_card)?;
-        let settings = self.refine.then_some(&self.refine_settings);
+        let settings = self.poses.refine.then_some(&self.recipe.refine);
         let opened = began.elapsed();
-        let Some(remarks) = card::settle(&mut set, &self.out, self.fresh, settings, &go_on)? else {
+        let Some(remarks) = card::settle(&mut set, &self.output.folder, self.output.fresh, settings, &go_on)? else {
             return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train") });
         };
         let settled = began.elapsed() - opened;
-        let frames = set.select(&self.split, self.region.as_deref())?;
+        let frames = set.select(&self.pictures.split, self.pictures.region.as_deref())?;
         // Matching sees telemetry's pictures whole; where nothing is matched they come at the size they are trained at.
-        let refine = self.refine && poses == PoseSource::Telemetry;
+        let refine = self.poses.refine && poses == PoseSource::Telemetry;
         let (load_scale, scale) = if refine { (1.0, picture_scale) } else { (picture_scale, 1.0) };
-        let (frames, chosen_by_rule) = match self.keyframes {
+        let (frames, chosen_by_rule) = match self.pictures.by_rule.then_some(self.recipe.keyframes) {
             Some(rule) => capture::choose(&set, frames, poses, rule)?,
             None => (frames, KeyframeCounters::default()),
         };
         if frames.is_empty() {
-            return Err(JobError::Request(format!("{}: split {:?} holds no pictures", set.root.display(), self.split)));
+            return Err(JobError::Request(format!(
+                "{}: split {:?} holds no pictures",
+                set.root.display(),
+                self.pictures.split
+            )));
         }
         let frames = large_enough(&set, frames, picture_scale)?;
         let mut source = Folder::new(&set, frames.clone(), load_scale, poses);
         let size = largest(&set, &frames, picture_scale)?;
         let crops = self.crops(&set, &frames, picture_scale)?;
-        let metric = self.network.metric.as_deref().filter(|_| self.evaluate);
+        let metric = self.recipe.network.metric.as_deref().filter(|_| self.evaluate);
         let mut metric = evaluate::open_metric(metric, size)?;
+        let of_model = from.as_ref().map(|model| at_least_one(model.count));
         let settings = EngineSettings {
             disk: Disk::default(),
             device: DeviceRequest {
                 device: self.device.clone(),
-                device_mib: self.budget_mib(),
+                memory: Memory { scene_gaussians: self.memory.scene_gaussians.or(of_model), ..self.memory },
                 size,
                 views: frames.len(),
                 crops,
-                view_slots: self.view_slots,
-                folder: Some(self.out.clone()),
-                max_gaussians: self.max_gaussians,
-                scene_gaussians: self.scene_gaussians.or(from.as_ref().map(|model| model.count.max(1))),
+                folder: Some(self.output.folder.clone()),
             },
-            host_mib: None,
             camera_pixels: frames.iter().map(|&i| set.frames[i].view.intrinsics.pixels() as u64).max().unwrap_or(0),
             ahead: 0,
             ahead_in_memory: false,
             delivers: self.for_delivery,
             map: None,
             scale,
-            network: self.network.clone(),
+            network: self.recipe.network.clone(),
             training: self.settings(frames.len()),
-            init: self.init_settings.clone(),
-            refine: refine.then(|| self.refine_settings.clone()),
+            init: self.recipe.init.clone(),
+            refine: refine.then(|| self.recipe.refine.clone()),
             start: self.init,
             incremental: false,
         };
         let header = ModelHeader {
             origin: set.origin,
             local: set.local,
-            region: self.region.as_deref().and_then(|r| set.region(r)).map(|r| r.polygon.clone()).unwrap_or_default(),
-            seed: self.training.seed,
+            region: self.pictures.polygon(&set),
+            seed: self.recipe.training.seed,
             ..Default::default()
         };
         let mut engine = Reconstruction::open(settings, header, "train")?;
         // What is written of a data set comes after all that can be refused.
         if !is_card && is_new && !replaces {
-            identity.write(&self.out)?;
+            identity.write(&self.output.folder)?;
         }
         engine.report.views = frames.len() as u64;
         if is_card {
@@ -247,10 +289,10 @@ impl TrainJob {
                 engine.hint_points(self.sparse_points(&set, &frames)?);
             }
             // A valid file from the first second on: no Gaussians yet, so a continuation starts with them.
-            engine.checkpoint(&self.out, false)?;
+            engine.checkpoint(&self.output.folder, false)?;
         }
         if is_new && replaces {
-            identity.write(&self.out)?;
+            identity.write(&self.output.folder)?;
         }
         let built = self.take(&mut engine, &mut source, &go_on)?
             && engine.build(&go_on).map_err(|e| cause::of(e, &set, &frames))?;
@@ -266,13 +308,13 @@ impl TrainJob {
         let covered = match finished {
             true => {
                 let means = engine.means(MOST_MEANS)?;
-                ground::coverage(engine.header(), &means, self.coverage)
+                ground::coverage(engine.header(), &means, self.recipe.coverage)
             }
             false => None,
         };
         let mut report = engine.report;
         if let Some(covered) = covered {
-            covered.write(&Disk::default(), &self.out)?;
+            covered.write(&Disk::default(), &self.output.folder)?;
             covered.note(&mut report);
             tracing::info!("covered {} %, {} holes", covered.percent(), covered.gaps.len());
         }
@@ -282,36 +324,33 @@ impl TrainJob {
         report.more.insert("pictures_decoded".to_owned(), source.decoded().into());
         let k = chosen_by_rule;
         for (name, count) in [("too_close", k.too_close), ("covered", k.covered), ("over_plan", k.full)] {
-            if self.keyframes.is_some() {
+            if self.pictures.by_rule {
                 report.skip(&format!("pictures_{name}"), count.into());
             }
         }
         if let Some(chosen) = chosen {
             chosen.note(&mut report);
         }
-        report.write(&self.out)?;
+        report.write(&self.output.folder)?;
         Ok(Outcome { finished, steps, report })
     }
 
-    /// Device memory, MiB.
-    fn budget_mib(&self) -> u32 {
-        self.budget_mib.unwrap_or(DEVICE_MIB)
-    }
-
+    /// The schedule for so many pictures.
     fn settings(&self, views: usize) -> TrainSettings {
-        let seconds = self.seconds.or(self.training.seconds);
-        let is_timed = seconds.is_some() || self.training.energy_wh.is_some();
-        let unasked = if is_timed { self.training.steps } else { self.training.steps_for(views) };
-        TrainSettings { steps: self.steps.unwrap_or(unasked), seconds, ..self.training.clone() }
+        let training = &self.recipe.training;
+        let Budget { steps, seconds, energy_wh } = self.budget.or(training);
+        let is_timed = seconds.is_some() || energy_wh.is_some();
+        let unasked = if is_timed { training.steps } else { training.steps_for(views) };
+        TrainSettings { steps: steps.unwrap_or(unasked), seconds, energy_wh, ..training.clone() }
     }
 
     /// Takes up the model in `out` when it is of the same pictures and holds Gaussians; a model of other pictures is an
     /// error rather than overwritten.
     fn resume(&self, engine: &mut Reconstruction, set: &Dataset, frames: &[usize]) -> Result<bool, JobError> {
-        if self.fresh {
+        if self.output.fresh {
             return Ok(false);
         }
-        let Some(views) = engine.resume(&self.out)? else { return Ok(false) };
+        let Some(views) = engine.resume(&self.output.folder)? else { return Ok(false) };
         let wanted: HashSet<&str> = frames.iter().map(|&i| set.frames[i].name.as_str()).collect();
         if views.len() == wanted.len() && wanted.iter().all(|name| views.contains_key(*name)) {
             return Ok(true);
@@ -358,16 +397,16 @@ impl TrainJob {
     fn optimise(&self, engine: &mut Reconstruction, views: usize, stop: &Interrupt) -> Result<bool, JobError> {
         self.save(engine, false)?;
         let settings = self.settings(views);
-        let failsafe = self.failsafe.as_ref().map(|limits| {
+        let failsafe = self.spares.then_some(&self.recipe.failsafe).map(|limits| {
             // Nothing bounds the host's memory here.
-            Failsafe::new(Health::new(*limits, u32::MAX, &self.out), limits)
+            Failsafe::new(Health::new(*limits, u32::MAX, &self.output.folder), limits)
         });
         let slices = Slices {
             budget: RunBudget {
-                steps: self.steps.or(if self.seconds.is_none() { Some(settings.steps) } else { None }),
+                steps: self.budget.steps.or(if self.budget.seconds.is_none() { Some(settings.steps) } else { None }),
                 seconds: settings.seconds,
             },
-            checkpoint_every: Duration::from_secs_f64(self.checkpoint_seconds),
+            checkpoint_every: Duration::from_secs_f64(self.output.checkpoint_seconds),
             steps_before: engine.header().steps,
             failsafe,
             clock: MonotonicClock::default(),
@@ -379,12 +418,12 @@ impl TrainJob {
     /// The model, and beside it what a continuation needs to know and the model does not say: the same seed gives the same
     /// file, but not the same seconds.
     fn save(&self, engine: &mut Reconstruction, finished: bool) -> Result<(), JobError> {
-        engine.checkpoint(&self.out, finished)?;
+        engine.checkpoint(&self.output.folder, finished)?;
         let (steps, train_s) = (engine.header().steps, engine.train_seconds());
         engine.report.outcome = "interrupted".to_owned();
         engine.report.more.insert("steps_total".to_owned(), steps.into());
         engine.report.more.insert("train_seconds".to_owned(), train_s.into());
-        engine.report.write(&self.out)?;
+        engine.report.write(&self.output.folder)?;
         Ok(())
     }
 
@@ -396,7 +435,7 @@ impl TrainJob {
         scale: f64,
         metric: Option<&mut PerceptualMetric>,
     ) -> Result<(), JobError> {
-        let Ok(held_out) = set.select("test", self.region.as_deref()) else { return Ok(()) };
+        let Ok(held_out) = set.select("test", self.pictures.region.as_deref()) else { return Ok(()) };
         let held_out: Vec<usize> = held_out.into_iter().filter(|i| !frames.contains(i)).collect();
         if held_out.is_empty() {
             return Ok(());

@@ -262,8 +262,10 @@ fn training_improves_on_naive_guesses_and_its_report_says_what_it_took() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let report = job::run_json::RunReport::read(&dir.path().join("out")).unwrap();
     assert_eq!((report.outcome.as_str(), report.steps, report.views), ("done", 150, 10));
-    assert!(report.device_bytes_peak > 0 && report.device_bytes_peak <= report.device_bytes_planned);
-    assert!(report.stage_ms.contains_key("train") && report.host_rss_peak > 0);
+    assert!(
+        report.memory.device_bytes_peak > 0 && report.memory.device_bytes_peak <= report.memory.device_bytes_planned
+    );
+    assert!(report.stage_ms.contains_key("train") && report.memory.host_rss_peak > 0);
     assert!(report.more["coverage"]["percent"].is_u64() && dir.path().join("out/coverage.geojson").is_file());
     let save = path("eval");
     let output = dgtr(&["eval", &path("out/model.dgtr"), &path("set"), "--json", "--baselines", "--save", &save]);

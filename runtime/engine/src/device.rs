@@ -4,6 +4,7 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use config::budget::Memory;
 use config::mission::Mission;
 use config::plan::{Lanes, Plan, PlanError, PlanRequest};
 use config::training::{ShSettings, TrainSettings};
@@ -46,37 +47,31 @@ fn crops_of_flight(mission: &Mission) -> u32 {
 pub struct DeviceRequest {
     /// Part of the Vulkan device's name.
     pub device: Option<String>,
-    /// Device memory, MiB.
-    pub device_mib: u32,
+    /// What the plan is made from.
+    pub memory: Memory,
     /// Width and height of the largest picture, pixels; the trainer fits the others in.
     pub size: (u32, u32),
     /// Training views.
     pub views: usize,
     /// Crops of larger pictures at the most.
     pub crops: usize,
-    /// How many of both are on the device at once; `None`: as [`PlanRequest::slots`] says.
-    pub view_slots: Option<u32>,
     /// Where the file of the others lies; absent: the system's temporary folder.
     pub folder: Option<PathBuf>,
-    /// Cap below what the budget holds.
-    pub max_gaussians: Option<usize>,
-    /// Gaussians of the whole scene; `None`: those on the device.
-    pub scene_gaussians: Option<usize>,
 }
 
 impl DeviceRequest {
     /// The request that [`Plan`] is made of; `lanes` are the device's.
     pub fn plan_request(&self, sh: &ShSettings, lanes: Lanes) -> PlanRequest {
         PlanRequest {
-            device_mib: self.device_mib,
+            device_mib: self.memory.device_mib(),
             width: self.size.0,
             height: self.size.1,
             views: self.views as u32,
             crops: self.crops as u32,
-            view_slots: self.view_slots,
+            view_slots: self.memory.view_slots,
             sh_degree: sh.degree,
-            max_gaussians: self.max_gaussians,
-            scene_gaussians: self.scene_gaussians,
+            max_gaussians: self.memory.max_gaussians.map(|n| n as usize),
+            scene_gaussians: self.memory.scene_gaussians.map(|n| n as usize),
             half_moments: sh.half_moments,
             lanes,
         }
@@ -87,14 +82,11 @@ impl DeviceRequest {
         let (memory, lens) = (&mission.memory, training_lens(mission));
         Self {
             device: None,
-            device_mib: memory.device_mib(),
+            memory: memory.into(),
             size: (lens.width, lens.height),
             views: mission.keyframes.max as usize,
             crops: crops_of_flight(mission) as usize,
-            view_slots: memory.view_slots,
             folder,
-            max_gaussians: memory.max_gaussians.map(|n| n as usize),
-            scene_gaussians: memory.scene_gaussians.map(|n| n as usize),
         }
     }
 
@@ -238,14 +230,11 @@ fn empty_renderer(
     settings.sh.degree = sh_degree;
     let request = DeviceRequest {
         device: None,
-        device_mib: u32::MAX,
+        memory: Memory::for_gaussians(u32::MAX, gaussians),
         size: (width, height),
         views: 0,
         crops: 0,
-        view_slots: None,
         folder: None,
-        max_gaussians: Some(gaussians),
-        scene_gaussians: None,
     };
     let request = request.plan_request(&settings.sh, gpu.info().lanes());
     let pixels = width as usize * height as usize;

@@ -58,8 +58,6 @@ pub struct EngineSettings {
     pub disk: Disk,
     /// Device and budget.
     pub device: DeviceRequest,
-    /// `memory.host_mib`: bound on the host's memory, MiB.
-    pub host_mib: Option<u32>,
     /// Pixels of a picture as it leaves the camera.
     pub camera_pixels: u64,
     /// Pictures that the source decodes ahead.

@@ -6,6 +6,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use config::budget::Memory;
 use config::plan::{Lanes, Plan, WORKING_SIDE};
 use config::preset::{DENSITIES, SECONDS, SHOWN_BY, VISITS};
 use config::training::{ResolutionSettings, ShSettings};
@@ -187,8 +188,8 @@ impl Wanted {
     }
 
     fn request(&self, scale: f64, gaussians: u32, device_mib: u32) -> DeviceRequest {
-        let (size, max_gaussians) = (self.size(scale), Some(gaussians as usize));
-        DeviceRequest { size, max_gaussians, device_mib, ..self.device.clone() }
+        let sizes = Memory { device_mib: Some(device_mib), max_gaussians: Some(gaussians), ..self.device.memory };
+        DeviceRequest { size: self.size(scale), memory: sizes, ..self.device.clone() }
     }
 
     fn point(&self, scale: f64, density: f64, means: (&CostModel, &Room, Lanes)) -> Option<Point> {

@@ -164,7 +164,7 @@ impl Reconstruction {
         report.more.insert("host_bytes_planned".into(), host.total_bytes().into());
         report.device = trainer.device().gpu().info().name.clone();
         report.seed = header.seed;
-        (report.device_bytes_planned, report.device_bytes_peak) =
+        (report.memory.device_bytes_planned, report.memory.device_bytes_peak) =
             (trainer.plan().total_bytes, trainer.device().bytes());
         Ok(Self {
             poses,

@@ -1,5 +1,6 @@
 //! What the tests of the engine begin with.
 
+use config::budget::Memory;
 use config::mission::NetworkSettings;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
@@ -13,16 +14,12 @@ pub fn settings() -> EngineSettings {
         disk: Default::default(),
         device: DeviceRequest {
             device: None,
-            device_mib: 64,
+            memory: Memory { device_mib: Some(64), max_gaussians: Some(300), ..Memory::default() },
             size: (32, 24),
             views: 3,
             crops: 0,
-            view_slots: None,
             folder: None,
-            max_gaussians: Some(300),
-            scene_gaussians: None,
         },
-        host_mib: None,
         camera_pixels: 32 * 24,
         ahead: 0,
         ahead_in_memory: false,

@@ -74,15 +74,16 @@ pub(super) fn place(
         Ok::<_, EngineError>(scratch_file(&folder, bytes)?)
     };
     let mut host = planned(&initialiser, much(kept));
-    if let (Some(own), true) = (&mut initialiser, host.fits(settings.host_mib).is_err() && !much(frames)) {
+    if let (Some(own), true) = (&mut initialiser, host.fits(settings.device.memory.host_mib).is_err() && !much(frames))
+    {
         own.keep_frames_in(file(frames)?);
         host = planned(&initialiser, much(kept));
     }
-    if let (Some(refiner), true) = (&mut refiner, host.fits(settings.host_mib).is_err() && !much(kept)) {
+    if let (Some(refiner), true) = (&mut refiner, host.fits(settings.device.memory.host_mib).is_err() && !much(kept)) {
         refiner.keep_frames_in(file(kept)?);
         host = planned(&initialiser, true);
     }
-    host.fits(settings.host_mib)?;
+    host.fits(settings.device.memory.host_mib)?;
     Ok(host)
 }
 

@@ -284,7 +284,6 @@ fn open(
             device: aircraft.device.clone(),
             ..DeviceRequest::of_flight(mission, Some(options.out.clone()))
         },
-        host_mib: Some(mission.memory.host_mib),
         camera_pixels: u64::from(mission.camera.width) * u64::from(mission.camera.height),
         ahead: DECODED_AHEAD + handover::AHEAD,
         // Until they are kept on disk; those that are files already wait there.

@@ -10,6 +10,7 @@
 use std::ops::ControlFlow;
 use std::time::Instant;
 
+use config::budget::Memory;
 use config::training::{RateSettings, Strategy, TrainSettings};
 use engine::device::DeviceRequest;
 use image::RgbImage;
@@ -270,15 +271,12 @@ fn open(
     let side = |of: fn(&Intrinsics) -> u32| lessons.iter().map(|l| of(&l.view.intrinsics)).max().unwrap_or(1);
     let request = DeviceRequest {
         device: device.map(str::to_owned),
-        device_mib: recipe.device_mib,
+        // Their targets are in the host's memory anyway.
+        memory: Memory { view_slots: Some(lessons.len() as u32), ..Memory::for_gaussians(recipe.device_mib, largest) },
         size: (side(|k| k.width), side(|k| k.height)),
         views: lessons.len(),
         crops: 0,
-        // Their targets are in the host's memory anyway.
-        view_slots: Some(lessons.len() as u32),
         folder: None,
-        max_gaussians: Some(largest),
-        scene_gaussians: None,
     };
     request.open::<AggregateError>(&training(recipe, sh_degree))
 }

@@ -6,10 +6,11 @@ use geometry::geodesy::Geodetic;
 use models::formats::model::MAX_HEADER;
 use models::ground_cell::CellKey;
 use serde::{Deserialize, Serialize};
+use uplink::offer::hex;
 
 use super::region::Region;
 use super::squares::Squares;
-use super::store::{Store, StoreError, hex};
+use super::store::{Store, StoreError};
 
 mod inputs;
 #[cfg(test)]

@@ -12,6 +12,17 @@ const SCHEMA: u32 = 1;
 /// A report has a few KiB.
 const LIMIT: u64 = 16 << 20;
 
+/// Memory that a job took.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MemoryUse {
+    /// Bytes of the memory plan.
+    pub device_bytes_planned: u64,
+    /// Bytes really allocated on the device at most.
+    pub device_bytes_peak: u64,
+    /// Largest resident set of the process, bytes.
+    pub host_rss_peak: u64,
+}
+
 /// One job's figures.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RunReport {
@@ -35,12 +46,9 @@ pub struct RunReport {
     pub psnr: Option<f64>,
     /// Mean SSIM over the evaluated views; null when none was evaluated.
     pub ssim: Option<f64>,
-    /// Bytes of the memory plan.
-    pub device_bytes_planned: u64,
-    /// Bytes really allocated on the device at most.
-    pub device_bytes_peak: u64,
-    /// Largest resident set of the process, bytes.
-    pub host_rss_peak: u64,
+    /// What was taken of device and host.
+    #[serde(flatten)]
+    pub memory: MemoryUse,
     /// How often each kind of work was skipped, or each kind of input left out.
     pub skipped: BTreeMap<String, u64>,
     /// Name of the Vulkan device; empty when none was used.
@@ -73,7 +81,7 @@ impl RunReport {
     /// # Errors
     /// The folder cannot be written to.
     pub fn write(&mut self, dir: &Path) -> Result<PathBuf, FormatError> {
-        self.host_rss_peak = crate::resources::peak_rss_bytes().unwrap_or(0);
+        self.memory.host_rss_peak = crate::resources::peak_rss_bytes().unwrap_or(0);
         let path = dir.join("run.json");
         write_atomic(&path, |out| {
             serde_json::to_writer_pretty(&mut *out, self)?;
@@ -130,6 +138,6 @@ mod tests {
         let back = RunReport::read(dir.path()).unwrap();
         assert_eq!(back, report);
         assert_eq!(back.skipped["frustum"], 5);
-        assert!(back.host_rss_peak > 0);
+        assert!(back.memory.host_rss_peak > 0);
     }
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use config::budget::Memory;
 use config::init::InitSettings;
 use config::map::MapSettings;
 use config::mission::{MemorySettings, Mission, NetworkSettings};
@@ -40,9 +41,8 @@ pub struct Args {
     /// Image scale, above 0 and at most 1 [default: whole, or 640 pixels of the longer side where that is less].
     #[arg(long)]
     pub scale: Option<f64>,
-    /// Device memory, MiB.
-    #[arg(long, default_value_t = 512)]
-    pub budget_mib: u32,
+    #[command(flatten)]
+    pub memory: Memory,
     /// Picture width, pixels.
     #[arg(long, default_value_t = 640)]
     pub width: u32,
@@ -52,18 +52,9 @@ pub struct Args {
     /// Training views.
     #[arg(long, default_value_t = 64)]
     pub views: u32,
-    /// Views on the device at once, the others waiting in a file [default: all while they leave half of the memory].
-    #[arg(long, value_name = "N")]
-    pub view_slots: Option<u32>,
     /// Highest SH degree, 0 to 3.
     #[arg(long, default_value_t = 3)]
     pub sh_degree: u8,
-    /// Most Gaussians wanted.
-    #[arg(long)]
-    pub max_gaussians: Option<usize>,
-    /// Gaussians of the whole scene; those that the device does not hold wait in a file.
-    #[arg(long)]
-    pub scene_gaussians: Option<usize>,
     /// Adam's moments of SH in 16 bits each (`training.sh.half_moments`).
     #[arg(long)]
     pub half_moments: bool,
@@ -225,14 +216,11 @@ impl Job {
         let crops = u64::from(settings.planned(picture, size)) * views as u64;
         let device = DeviceRequest {
             device: None,
-            device_mib: args.budget_mib,
+            memory: args.memory,
             size,
             views,
             crops: crops.min(settings.most.into()) as usize,
-            view_slots: args.view_slots,
             folder: None,
-            max_gaussians: args.max_gaussians,
-            scene_gaussians: args.scene_gaussians,
         };
         let sh = ShSettings { degree: args.sh_degree, half_moments: args.half_moments, ..ShSettings::default() };
         let (init, network) = (InitSettings::default(), NetworkSettings::default());

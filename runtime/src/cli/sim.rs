@@ -23,8 +23,7 @@ use job::interrupt::Interrupt;
 use super::CliError;
 use crate::cli::output::outln;
 
-/// Headings of the options.
-const FLIGHT: &str = "Flight";
+/// Heading of the options.
 const INSTEAD: &str = "Instead of a simulated survey flight";
 
 /// A simulated autopilot and camera over a ray-cast world: real MAVLink on a pseudo-terminal or socket, JPEG files in
@@ -57,32 +56,39 @@ pub struct Args {
     /// Fly this plan (QGroundControl's `.plan`, as `dgtr fly` writes it) instead of a survey.
     #[arg(long, value_name = "FILE", help_heading = INSTEAD, conflicts_with_all = ["height", "forward_overlap", "side_overlap", "cross"])]
     plan: Option<PathBuf>,
+    #[command(flatten, next_help_heading = "Flight")]
+    flight: FlightArgs,
+}
+
+/// The simulated flight.
+#[derive(Debug, clap::Args)]
+struct FlightArgs {
     /// Seconds of flight per second of wall clock.
-    #[arg(long, help_heading = FLIGHT, value_name = "X", default_value_t = 1.0)]
+    #[arg(long, value_name = "X", default_value_t = 1.0)]
     speed: f64,
     /// Height of the flight, metres.
-    #[arg(long, help_heading = FLIGHT, value_name = "M", default_value_t = 40.0)]
+    #[arg(long, value_name = "M", default_value_t = 40.0)]
     height: f64,
     /// Share of a picture seen again by the next one on the line.
-    #[arg(long, help_heading = FLIGHT, value_name = "SHARE", default_value_t = 0.75)]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.75)]
     forward_overlap: f64,
     /// Share of a picture seen again from the next line.
-    #[arg(long, help_heading = FLIGHT, value_name = "SHARE", default_value_t = 0.6)]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
     side_overlap: f64,
     /// Pitch of the camera, degrees; −90 looks straight down.
-    #[arg(long, help_heading = FLIGHT, value_name = "DEG", default_value_t = -90.0, allow_hyphen_values = true)]
+    #[arg(long, value_name = "DEG", default_value_t = -90.0, allow_hyphen_values = true)]
     pitch: f64,
     /// Messages that announce exposures.
-    #[arg(long, help_heading = FLIGHT, value_enum, default_value_t = Triggers::Ardupilot)]
+    #[arg(long, value_enum, default_value_t = Triggers::Ardupilot)]
     triggers: Triggers,
     /// Fly a second set of lines across the first.
-    #[arg(long, help_heading = FLIGHT)]
+    #[arg(long)]
     cross: bool,
     /// Leave out wind, noise and bias.
-    #[arg(long, help_heading = FLIGHT)]
+    #[arg(long)]
     perfect: bool,
     /// Seconds to go on speaking after the flight.
-    #[arg(long, help_heading = FLIGHT, value_name = "S", default_value_t = 5.0)]
+    #[arg(long, value_name = "S", default_value_t = 5.0)]
     linger: f64,
 }
 
@@ -142,23 +148,27 @@ pub fn run(args: Args) -> Result<(), CliError> {
         origin: mission.origin,
         lens,
         region: mission.region(aircraft),
-        route: plan.map(|plan| route(&plan, mission.origin, args.pitch)),
+        route: plan.map(|plan| route(&plan, mission.origin, args.flight.pitch)),
         survey: SurveySettings {
-            height_m: args.height,
-            forward_overlap: args.forward_overlap,
-            side_overlap: args.side_overlap,
-            gimbal_pitch_deg: args.pitch,
-            cross: args.cross,
+            height_m: args.flight.height,
+            forward_overlap: args.flight.forward_overlap,
+            side_overlap: args.flight.side_overlap,
+            gimbal_pitch_deg: args.flight.pitch,
+            cross: args.flight.cross,
             ..SurveySettings::default()
         },
-        imperfections: if args.perfect { Imperfections::none() } else { Imperfections::default() },
+        imperfections: if args.flight.perfect { Imperfections::none() } else { Imperfections::default() },
         autopilot: AutopilotSettings {
             system_id: aircraft.system_id,
             faults: mission.faults,
-            announcing: args.triggers.into(),
+            announcing: args.flight.triggers.into(),
             ..AutopilotSettings::default()
         },
-        session: SessionSettings { speed: args.speed, linger_s: args.linger, ..SessionSettings::default() },
+        session: SessionSettings {
+            speed: args.flight.speed,
+            linger_s: args.flight.linger,
+            ..SessionSettings::default()
+        },
         prefix,
     };
     let stop = stop_flag()?;

@@ -4,23 +4,17 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use config::coverage::CoverageSettings;
-use config::failsafe::FailsafeSettings;
-use config::init::InitSettings;
-use config::mission::{KeyframeSettings, NetworkSettings};
+use config::budget::{Budget, Memory};
 use config::preset::Preset;
-use config::refine::RefineSettings;
-use config::training::TrainSettings;
 use engine::InitKind;
 use models::formats::delivery::Rounding;
 use models::formats::{FormatError, read_bounded};
-use serde::Deserialize;
 use survey::card::CardOptions;
 use survey::dataset::PoseSource;
 
 use super::CliError;
 use crate::cli::output::outln;
-use crate::train_job::{PictureScale, TrainJob, log};
+use crate::train_job::{Chosen, Output, PictureScale, PoseOrigin, Recipe, TrainJob, log};
 
 /// A settings file has a few KiB.
 const SETTINGS_LIMIT: u64 = 1 << 20;
@@ -81,82 +75,89 @@ pub struct Args {
     /// Seconds between two checkpoints.
     #[arg(long, default_value_t = 30.0)]
     checkpoint_seconds: f64,
+    #[command(flatten, next_help_heading = "Pictures")]
+    pictures: PictureArgs,
+    #[command(flatten, next_help_heading = "Poses and places")]
+    poses: PoseArgs,
+    #[command(flatten, next_help_heading = "First Gaussians")]
+    start: StartArgs,
+    #[command(flatten, next_help_heading = "Time and energy")]
+    budget: Budget,
+    #[command(flatten, next_help_heading = "Time and energy")]
+    limits: LimitArgs,
+    #[command(flatten, next_help_heading = "Memory and device")]
+    memory: Memory,
+    /// Vulkan device whose name contains this.
+    #[arg(long, help_heading = "Memory and device")]
+    device: Option<String>,
+    #[command(flatten, next_help_heading = "Recipe")]
+    recipe: RecipeArgs,
+}
 
+#[derive(Debug, clap::Args)]
+struct PictureArgs {
     /// Which pictures, by split.json; without that file every 8th is held out.
-    #[arg(long, default_value = "train", help_heading = PICTURES)]
+    #[arg(long, default_value = "train")]
     split: String,
     /// Only the pictures of this region.
-    #[arg(long, help_heading = PICTURES)]
+    #[arg(long)]
     region: Option<String>,
     /// Only key frames by a flight's rule: [keyframes] of --settings, or its defaults.
-    #[arg(long, help_heading = PICTURES)]
+    #[arg(long)]
     keyframes: bool,
     /// Image scale, above 0 and at most 1 [default: as large as the budget holds].
-    #[arg(long, help_heading = PICTURES)]
+    #[arg(long)]
     scale: Option<f64>,
+}
 
+#[derive(Debug, clap::Args)]
+struct PoseArgs {
     /// Where camera poses come from.
-    #[arg(long, value_enum, default_value = "dataset", help_heading = POSES)]
+    #[arg(long, value_enum, default_value = "dataset")]
     poses: Poses,
     /// Take telemetry poses as they are.
-    #[arg(long, help_heading = POSES)]
+    #[arg(long)]
     no_refine: bool,
     #[command(flatten)]
     card: CardArgs,
+}
 
+#[derive(Debug, clap::Args)]
+struct StartArgs {
     /// Where the first Gaussians come from.
-    #[arg(long, value_enum, default_value = "feed-forward", help_heading = START)]
+    #[arg(long, value_enum, default_value = "feed-forward")]
     init: Init,
     /// Begin with the Gaussians of this model, which lies in the data set's frame; the schedule begins anew.
-    #[arg(long, value_name = "MODEL", conflicts_with = "init", help_heading = START)]
+    #[arg(long, value_name = "MODEL", conflicts_with = "init")]
     from: Option<PathBuf>,
     /// Manifest of your own feed-forward network.
-    #[arg(long = "model", value_name = "FILE", help_heading = START)]
+    #[arg(long = "model", value_name = "FILE")]
     network: Option<PathBuf>,
+}
 
-    /// Optimiser steps [default: a hundred visits to each picture].
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..), help_heading = BUDGET)]
-    steps: Option<u32>,
-    /// Seconds of training; with --steps, whichever comes first.
-    #[arg(long, help_heading = BUDGET)]
-    seconds: Option<f64>,
-    /// Watt-hours that training may take, by what the board measures or --watts says.
-    #[arg(long, help_heading = BUDGET)]
-    energy_wh: Option<f64>,
+#[derive(Debug, clap::Args)]
+struct LimitArgs {
     /// Watts that this computer takes while it trains, where it does not say so itself.
-    #[arg(long, requires = "energy_wh", help_heading = BUDGET)]
+    #[arg(long, requires = "energy_wh")]
     watts: Option<f32>,
     /// Budgets of a size of job, for whatever of --budget-mib, --max-gaussians, --scale and --seconds is not given.
-    #[arg(long, value_parser = presets(), help_heading = BUDGET)]
+    #[arg(long, value_parser = presets())]
     preset: Option<Preset>,
     /// Pause or slow down as a flight does when this computer is hot, throttled or weakly fed.
-    #[arg(long, help_heading = BUDGET)]
+    #[arg(long)]
     failsafe: bool,
+}
 
-    /// Device memory, MiB, allocated once [default: 512].
-    #[arg(long, help_heading = MEMORY)]
-    budget_mib: Option<u32>,
-    /// Most Gaussians on the device [default: what the budget holds].
-    #[arg(long, help_heading = MEMORY)]
-    max_gaussians: Option<usize>,
-    /// Gaussians of the whole scene, when the device holds fewer; the others wait in a file in --out.
-    #[arg(long, value_name = "N", help_heading = MEMORY)]
-    scene_gaussians: Option<usize>,
-    /// Pictures on the device at once; the others wait in a file in --out [default: what half of the budget holds].
-    #[arg(long, value_name = "N", help_heading = MEMORY)]
-    view_slots: Option<u32>,
-    /// Vulkan device whose name contains this.
-    #[arg(long, help_heading = MEMORY)]
-    device: Option<String>,
-
+#[derive(Debug, clap::Args)]
+struct RecipeArgs {
     /// Seed of everything random; the same seed on the same device gives the same model.
-    #[arg(long, help_heading = RECIPE)]
+    #[arg(long)]
     seed: Option<u64>,
     /// Prune what the loss needs least and train with quantised values, for `dgtr export --to delivery`.
-    #[arg(long, value_enum, num_args = 0..=1, require_equals = true, default_missing_value = "coarse", help_heading = RECIPE)]
+    #[arg(long, value_enum, num_args = 0..=1, require_equals = true, default_missing_value = "coarse")]
     for_delivery: Option<Fineness>,
     /// TOML file with any of the mission file's tables [training], [init], [refine], [network], [keyframes], [failsafe].
-    #[arg(long, value_name = "FILE", help_heading = RECIPE)]
+    #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
 }
 
@@ -164,19 +165,19 @@ pub struct Args {
 #[derive(Debug, clap::Args)]
 struct CardArgs {
     /// Positions of a card's pictures: OpenDroneMap's geo.txt, Mission Planner's list, geotags.csv of `dgtr fly`, a film's .SRT.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    #[arg(long, value_name = "FILE")]
     geotags: Option<PathBuf>,
     /// The flight's log beside a card, MAVLink (.tlog) or ArduPilot (.BIN), matched by order and time.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
     /// Surveyed points marked in a card's pictures; a gcp_list.txt beside them is found without this.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    #[arg(long, value_name = "FILE")]
     gcp: Option<PathBuf>,
     /// Of a card with several bands or lenses the one of this name [default: natural colours].
-    #[arg(long, value_name = "NAME", help_heading = PICTURES)]
+    #[arg(long, value_name = "NAME", help_heading = "Pictures")]
     band: Option<String>,
     /// Surveyed points in a file of that form that measure the finished model instead of helping it.
-    #[arg(long, value_name = "FILE", help_heading = POSES)]
+    #[arg(long, value_name = "FILE")]
     check: Option<PathBuf>,
 }
 
@@ -192,25 +193,26 @@ impl CardArgs {
     }
 }
 
-/// Headings of the options.
-const PICTURES: &str = "Pictures";
-const POSES: &str = "Poses and places";
-const START: &str = "First Gaussians";
-const BUDGET: &str = "Time and energy";
-const MEMORY: &str = "Memory and device";
-const RECIPE: &str = "Recipe";
-
-/// The recipe tables of a mission file.
-#[derive(Clone, Debug, Default, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct Settings {
-    training: TrainSettings,
-    init: InitSettings,
-    refine: RefineSettings,
-    network: NetworkSettings,
-    keyframes: KeyframeSettings,
-    failsafe: FailsafeSettings,
-    coverage: CoverageSettings,
+impl RecipeArgs {
+    /// The tables of the settings file, and its seed unless another is given.
+    fn read(&self) -> Result<Recipe, CliError> {
+        let mut recipe = match &self.settings {
+            None => Recipe::default(),
+            Some(path) => {
+                let bad = |what: String| CliError::from(FormatError::Invalid { path: path.clone(), what });
+                let bytes = read_bounded(path, SETTINGS_LIMIT)?;
+                let text = String::from_utf8(bytes).map_err(|_| bad("not UTF-8 text".to_owned()))?;
+                let mut recipe: Recipe = config::settings::parse(&text).map_err(|e| bad(e.to_string()))?;
+                recipe.network.anchor(path.parent().unwrap_or(Path::new("")));
+                recipe
+            }
+        };
+        recipe.keyframes.check()?;
+        recipe.failsafe.check()?;
+        recipe.coverage.check()?;
+        recipe.training.seed = self.seed.unwrap_or(recipe.training.seed);
+        Ok(recipe)
+    }
 }
 
 /// The presets as clap shows them, each with its budgets.
@@ -229,80 +231,63 @@ pub(super) fn presets() -> impl TypedValueParser<Value = Preset> {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    for (name, value) in [("--seconds", args.seconds), ("--checkpoint-seconds", Some(args.checkpoint_seconds))] {
+    for (name, value) in [("--seconds", args.budget.seconds), ("--checkpoint-seconds", Some(args.checkpoint_seconds))] {
         if value.is_some_and(|v| !(v > 0.0 && v.is_finite())) {
             return Err(CliError::input(format!("{name} must be a positive number of seconds")));
         }
     }
-    let mut settings = match &args.settings {
-        None => Settings::default(),
-        Some(path) => {
-            let bad = |what: String| CliError::from(FormatError::Invalid { path: path.clone(), what });
-            let bytes = read_bounded(path, SETTINGS_LIMIT)?;
-            let text = String::from_utf8(bytes).map_err(|_| bad("not UTF-8 text".to_owned()))?;
-            let mut settings: Settings = config::settings::parse(&text).map_err(|e| bad(e.to_string()))?;
-            settings.network.anchor(path.parent().unwrap_or(Path::new("")));
-            settings
-        }
-    };
-    settings.keyframes.check()?;
-    settings.failsafe.check()?;
-    settings.coverage.check()?;
-    if args.network.is_some() {
-        settings.network.pair = args.network;
+    let mut recipe = args.recipe.read()?;
+    if args.start.network.is_some() {
+        recipe.network.pair = args.start.network;
     }
-    let training = &mut settings.training;
-    training.seed = args.seed.unwrap_or(training.seed);
-    (training.energy_wh, training.watts) = (args.energy_wh.or(training.energy_wh), args.watts.or(training.watts));
+    let training = &mut recipe.training;
+    training.energy_wh = args.budget.energy_wh.or(training.energy_wh);
+    training.watts = args.limits.watts.or(training.watts);
     training.check()?;
-    let preset = args.preset.and_then(Preset::values);
+    let preset = args.limits.preset.and_then(Preset::values);
     // A schedule in steps, in watt-hours or in a settings file is not cut short by a preset.
-    let is_said = settings.training.seconds.is_some() || settings.training.energy_wh.is_some();
-    let seconds = match args.steps.is_some() || is_said {
-        true => args.seconds,
-        false => args.seconds.or(preset.map(|p| p.seconds)),
-    };
+    let is_said = args.budget.steps.is_some() || training.seconds.is_some() || training.energy_wh.is_some();
+    let of_preset = preset.filter(|_| !is_said).map(|p| p.seconds);
     let job = TrainJob {
         folders: args.folders,
-        card: args.card.options()?,
-        out: args.out,
-        split: args.split,
-        region: args.region,
-        keyframes: args.keyframes.then_some(settings.keyframes),
-        failsafe: args.failsafe.then_some(settings.failsafe),
-        init: match args.init {
-            _ if args.from.is_some() => InitKind::Model,
+        card: args.poses.card.options()?,
+        output: Output { folder: args.out, fresh: args.fresh, checkpoint_seconds: args.checkpoint_seconds },
+        pictures: Chosen {
+            split: args.pictures.split,
+            region: args.pictures.region,
+            by_rule: args.pictures.keyframes,
+            scale: match (args.pictures.scale, preset) {
+                (Some(scale), _) => PictureScale::Exactly(scale),
+                (None, Some(preset)) => PictureScale::OfJob(preset.image_scale.into()),
+                (None, None) => PictureScale::AsHeld,
+            },
+        },
+        poses: PoseOrigin {
+            source: match args.poses.poses {
+                Poses::Dataset => PoseSource::Dataset,
+                Poses::Telemetry => PoseSource::Telemetry,
+            },
+            refine: !args.poses.no_refine,
+        },
+        init: match args.start.init {
+            _ if args.start.from.is_some() => InitKind::Model,
             Init::FeedForward => InitKind::FeedForward,
             Init::Sfm => InitKind::SparsePoints,
             Init::Random => InitKind::Random,
         },
-        from: args.from,
-        poses: match args.poses {
-            Poses::Dataset => PoseSource::Dataset,
-            Poses::Telemetry => PoseSource::Telemetry,
+        from: args.start.from,
+        budget: Budget { seconds: args.budget.seconds.or(of_preset), ..args.budget },
+        memory: Memory {
+            device_mib: args.memory.device_mib.or(preset.map(|p| p.device_mib)),
+            max_gaussians: args.memory.max_gaussians.or(preset.map(|p| p.max_gaussians)),
+            ..args.memory
         },
-        refine: !args.no_refine,
-        for_delivery: args.for_delivery.map(Fineness::rounding),
-        steps: args.steps,
-        seconds,
-        auto: args.preset == Some(Preset::Auto),
-        budget_mib: args.budget_mib.or(preset.map(|p| p.device_mib)),
-        max_gaussians: args.max_gaussians.or(preset.map(|p| p.max_gaussians as usize)),
-        scene_gaussians: args.scene_gaussians,
-        view_slots: args.view_slots,
-        scale: args
-            .scale
-            .map(PictureScale::Exactly)
-            .unwrap_or_else(|| preset.map_or(PictureScale::AsHeld, |p| PictureScale::OfJob(p.image_scale.into()))),
+        auto: args.limits.preset == Some(Preset::Auto),
+        spares: args.limits.failsafe,
         device: args.device,
-        network: settings.network,
-        checkpoint_seconds: args.checkpoint_seconds,
-        fresh: args.fresh,
+        for_delivery: args.recipe.for_delivery.map(Fineness::rounding),
         evaluate: !args.no_eval,
-        training: settings.training,
-        coverage: settings.coverage,
-        init_settings: settings.init,
-        refine_settings: settings.refine,
+        recipe,
     };
     let ended = job.run()?;
     let model = job.model_path();

@@ -99,7 +99,7 @@ pub fn write(
     for figure in figures {
         let folder = out.join(figure.name);
         let run = RunReport::read(&folder.join("out")).map_err(|e| report(&e))?;
-        peak_bytes = peak_bytes.max(run.host_rss_peak);
+        peak_bytes = peak_bytes.max(run.memory.host_rss_peak);
         let model = folder.join("out/model.dgtr");
         let naive = figure.local.baselines.as_ref();
         let uploaded = run.more.get("bytes_sent").and_then(|n| n.as_u64()).unwrap_or(0);
@@ -144,7 +144,7 @@ pub fn write(
         rows.push(row);
     }
     let ground = RunReport::read(&out.join("ground/out")).map_err(|e| report(&e))?;
-    peak_bytes = peak_bytes.max(ground.host_rss_peak);
+    peak_bytes = peak_bytes.max(ground.memory.host_rss_peak);
     let mean = |pick: fn(&Row) -> f64| rows.iter().map(pick).sum::<f64>() / rows.len().max(1) as f64;
     data.models.push(ModelRow {
         name: "global".into(),

@@ -1,6 +1,7 @@
 //! Milliseconds per stage from the device's own timestamps, beside the work counted for that stage and the least time the
 //! device could do it in.
 
+use config::budget::Memory;
 use config::plan::{Plan, sh_columns};
 use engine::device::DeviceRequest;
 use models::camera::PosedImage;
@@ -105,14 +106,14 @@ pub fn measure(
     };
     let request = DeviceRequest {
         device: None,
-        device_mib: MOST_MIB,
+        memory: Memory {
+            view_slots: Some(scene.pictures.len() as u32),
+            ..Memory::for_gaussians(MOST_MIB, scene.cloud.len())
+        },
         size: (width, height),
         views: scene.pictures.len(),
         crops: 0,
-        view_slots: Some(scene.pictures.len() as u32),
         folder: None,
-        max_gaussians: Some(scene.cloud.len()),
-        scene_gaussians: None,
     };
     let plan = Plan::new(&request.plan_request(&settings().sh, gpu.info().lanes()))?;
     let mut watch = Stopwatch::new(gpu, config, &plan, &scene.pictures)?;

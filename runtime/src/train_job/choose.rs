@@ -27,17 +27,17 @@ impl TrainJob {
         if !self.auto {
             return Ok(None);
         }
-        let frames = set.select(&self.split, self.region.as_deref())?;
+        let frames = set.select(&self.pictures.split, self.pictures.region.as_deref())?;
         let picture = largest(set, &frames, 1.0)?;
         let of_these = |kept: &Choice| (kept.picture, kept.views) == (picture, frames.len());
-        if let Some(kept) = Choice::kept(&self.out).filter(|kept| !self.fresh && of_these(kept)) {
+        if let Some(kept) = Choice::kept(&self.output.folder).filter(|kept| !self.output.fresh && of_these(kept)) {
             tracing::info!("{kept} (as this training began)");
             return Ok(Some(kept));
         }
         let choice = self.measured(set, &frames, picture)?;
         match &choice {
             Some(choice) => {
-                choice.keep(&self.out)?;
+                choice.keep(&self.output.folder)?;
                 tracing::info!("{choice}");
             }
             None => tracing::warn!("auto: what a step costs here is not known; the defaults of dgtr train are used"),
@@ -51,18 +51,15 @@ impl TrainJob {
         }
         let gpu = devices::open(self.device.as_deref()).map_err(vulkan::trainer::TrainError::from)?;
         let Some(cost) = cost::of(&gpu, kernels::config_of(&gpu)) else { return Ok(None) };
-        let by_energy = Meter::of(&self.training)?.map(|meter| meter.seconds());
-        let seconds = shorter(self.seconds.or(self.training.seconds), by_energy);
+        let training = self.settings(frames.len());
+        let seconds = shorter(training.seconds, Meter::of(&training)?.map(|meter| meter.seconds()));
         let device = DeviceRequest {
             device: None,
-            device_mib: self.budget_mib(),
+            memory: self.memory,
             size: picture,
             views: frames.len(),
             crops: 1,
-            view_slots: self.view_slots,
             folder: None,
-            max_gaussians: self.max_gaussians,
-            scene_gaussians: self.scene_gaussians,
         };
         let wanted = Wanted {
             picture,
@@ -70,26 +67,26 @@ impl TrainJob {
             views: frames.len(),
             share: share(set, frames)?,
             device,
-            sh: self.training.sh,
-            resolution: self.training.resolution,
-            schedule: self.training.steps_for(frames.len()),
-            steps: self.steps,
+            sh: training.sh,
+            resolution: training.resolution,
+            schedule: self.recipe.training.steps_for(frames.len()),
+            steps: self.budget.steps,
             seconds,
-            max_gaussians: self.max_gaussians.map(|n| u32::try_from(n).unwrap_or(u32::MAX)),
-            image_scale: self.scale.exact(),
+            max_gaussians: self.memory.max_gaussians,
+            image_scale: self.pictures.scale.exact(),
         };
-        Ok(wanted.choose(&cost, &Room::of(gpu.info(), self.budget_mib, None), gpu.info().lanes()))
+        Ok(wanted.choose(&cost, &Room::of(gpu.info(), self.memory.device_mib, None), gpu.info().lanes()))
     }
 
     /// What was said stays.
     pub(super) fn fill(&mut self, choice: &Choice) {
-        self.budget_mib = self.budget_mib.or(Some(choice.device_mib));
-        self.max_gaussians = self.max_gaussians.or(Some(choice.max_gaussians as usize));
-        if self.scale.exact().is_none() {
-            self.scale = PictureScale::Exactly(choice.image_scale);
+        self.memory.device_mib = self.memory.device_mib.or(Some(choice.device_mib));
+        self.memory.max_gaussians = self.memory.max_gaussians.or(Some(choice.max_gaussians));
+        if self.pictures.scale.exact().is_none() {
+            self.pictures.scale = PictureScale::Exactly(choice.image_scale);
         }
-        if self.training.seconds.is_none() {
-            self.seconds = self.seconds.or(choice.seconds);
+        if self.recipe.training.seconds.is_none() {
+            self.budget.seconds = self.budget.seconds.or(choice.seconds);
         }
     }
 }

@@ -82,12 +82,14 @@ impl Identity {
             put(&mut poses, &(&card.control, card.floats));
         }
         // How long it goes on and what is said of it at the end change nothing that was learnt before.
-        let training = TrainSettings { steps: 1, seconds: None, energy_wh: None, watts: None, ..job.training.clone() };
+        let (memory, rule) = (&job.memory, job.pictures.by_rule.then_some(&job.recipe.keyframes));
+        let training =
+            TrainSettings { steps: 1, seconds: None, energy_wh: None, watts: None, ..job.recipe.training.clone() };
         let mut settings = blake3::Hasher::new();
-        put(&mut settings, &(&training, &job.init_settings, &job.network, job.scale, job.for_delivery));
-        put(&mut settings, &(job.budget_mib, job.max_gaussians, job.scene_gaussians, job.init, &job.from));
-        put(&mut poses, &(job.poses, job.refine, &job.refine_settings));
-        put(&mut names, &(&job.split, &job.region, &job.keyframes));
+        put(&mut settings, &(&training, &job.recipe.init, &job.recipe.network, job.pictures.scale, job.for_delivery));
+        put(&mut settings, &(memory.device_mib, memory.max_gaussians, memory.scene_gaussians, job.init, &job.from));
+        put(&mut poses, &(job.poses.source, job.poses.refine, &job.recipe.refine));
+        put(&mut names, &(&job.pictures.split, &job.pictures.region, rule));
         let of = [
             ("pictures", names),
             ("picture sizes", sizes),

@@ -1,5 +1,6 @@
 //! At which size pictures are trained, and how many crops of them: what the device's plan holds.
 
+use config::budget::Memory;
 use config::plan::{Lanes, Plan, WORKING_SIDE};
 use engine::device::DeviceRequest;
 use engine::preset::SCALES;
@@ -72,29 +73,32 @@ impl TrainJob {
     /// The scale asked for; else the largest, up to that of the size of job, for which the device holds all pictures and, for a card,
     /// Gaussians worth the name; for more pictures than that a working size, and some of them wait in a file.
     pub(super) fn picture_scale(&self, set: &Dataset, is_card: bool) -> Result<f64, JobError> {
-        let named = match self.scale {
+        let named = match self.pictures.scale {
             PictureScale::Exactly(scale) => return Ok(scale),
             PictureScale::OfJob(scale) => Some(scale),
             PictureScale::AsHeld => None,
         };
-        let frames = set.select(&self.split, self.region.as_deref())?;
-        let wanted = if is_card { self.max_gaussians.unwrap_or(usize::MAX).min(GAUSSIANS_OF_A_CARD) } else { 0 };
+        let frames = set.select(&self.pictures.split, self.pictures.region.as_deref())?;
+        let most_gaussians = self.memory.max_gaussians.map_or(usize::MAX, |n| n as usize);
+        let wanted = if is_card { most_gaussians.min(GAUSSIANS_OF_A_CARD) } else { 0 };
         let most = named.unwrap_or(1.0);
         for scale in SCALES.into_iter().rev().filter(|scale| *scale <= most) {
             let all_on_device = DeviceRequest {
                 device: None,
-                device_mib: self.budget_mib(),
+                memory: Memory {
+                    view_slots: self.memory.view_slots.or(Some(frames.len() as u32)),
+                    scene_gaussians: None,
+                    ..self.memory
+                },
                 size: largest(set, &frames, scale)?,
                 views: frames.len(),
                 crops: 0,
-                view_slots: self.view_slots.or(Some(frames.len() as u32)),
                 folder: None,
-                max_gaussians: self.max_gaussians,
-                scene_gaussians: None,
             };
-            let some_in_file = DeviceRequest { view_slots: self.view_slots, ..all_on_device.clone() };
+            let some_in_file = Memory { view_slots: self.memory.view_slots, ..all_on_device.memory };
+            let some_in_file = DeviceRequest { memory: some_in_file, ..all_on_device.clone() };
             let holds = |request: &DeviceRequest| {
-                let plan = Plan::new(&request.plan_request(&self.training.sh, MOST_LANES));
+                let plan = Plan::new(&request.plan_request(&self.recipe.training.sh, MOST_LANES));
                 plan.is_ok_and(|p| p.gaussians >= wanted)
             };
             let (w, h) = all_on_device.size;
@@ -102,7 +106,8 @@ impl TrainJob {
             let may_wait = w.max(h) <= WORKING_SIDE || named.is_some();
             if holds(&all_on_device) || (may_wait && holds(&some_in_file)) {
                 if is_card || scale < most {
-                    tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {} MiB hold", self.budget_mib());
+                    let mib = self.memory.device_mib();
+                    tracing::info!("pictures of {w}x{h} (scale {scale}), as large as {mib} MiB hold");
                 }
                 return Ok(scale);
             }
@@ -113,7 +118,7 @@ impl TrainJob {
 
     /// Crops that find use: all of all pictures, at the most as many as the settings say.
     pub(super) fn crops(&self, set: &Dataset, frames: &[usize], scale: f64) -> Result<usize, JobError> {
-        let settings = &self.training.crops;
+        let settings = &self.recipe.training.crops;
         let mut all = 0;
         for &i in frames {
             let (whole, small) = (&set.frames[i].view.intrinsics, scaled(&set.frames[i].view.intrinsics, scale)?);

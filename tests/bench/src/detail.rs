@@ -72,7 +72,7 @@ pub fn measure(
             steps: report.steps,
             seconds: report.more.get("train_seconds").and_then(|s| s.as_f64()).unwrap_or(0.0),
             gaussians: cloud.len(),
-            device_bytes: report.device_bytes_peak,
+            device_bytes: report.memory.device_bytes_peak,
             small: at(scale)?,
             full: at(1.0)?,
         });

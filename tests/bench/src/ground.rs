@@ -145,7 +145,7 @@ fn scores(field: &Field, [first, second]: [&RunReport; 2], out: &Path) -> Result
         joined_fits: first_and_last("joined_fits"),
         compared,
         stage_s: second.stage_ms.iter().map(|(name, ms)| (name.clone(), ms / 1e3)).collect(),
-        rss_mib: first.host_rss_peak.max(second.host_rss_peak) as f64 / (1 << 20) as f64,
+        rss_mib: first.memory.host_rss_peak.max(second.memory.host_rss_peak) as f64 / (1 << 20) as f64,
         apart_m: [apart_before(field), apart_after(field, &header)],
         least_region: least_region(field, &cloud),
     })

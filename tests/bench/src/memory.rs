@@ -68,9 +68,9 @@ pub fn measure(budget_mib: u32, recipe: &Recipe, out: &Path) -> Result<BudgetFig
     Ok(BudgetFigures {
         budget_mib,
         limit_mib,
-        planned_bytes: r.device_bytes_planned,
-        allocated_bytes: r.device_bytes_peak,
-        resident_bytes: r.host_rss_peak,
+        planned_bytes: r.memory.device_bytes_planned,
+        allocated_bytes: r.memory.device_bytes_peak,
+        resident_bytes: r.memory.host_rss_peak,
         gaussians: r.gaussians,
         steps: r.steps,
         psnr: r.psnr,

@@ -40,6 +40,34 @@ pub const USUAL_REGIONS: usize = 4;
 /// A result has a few KiB.
 const LIMIT: u64 = 16 << 20;
 
+/// Manifests of the user's own networks.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Networks {
+    /// Manifest of your own pair network.
+    #[arg(long = "model", value_name = "MANIFEST")]
+    pub pair: Option<PathBuf>,
+    /// Manifest of your own depth network for the depth loss [default: the pair network's depth].
+    #[arg(long, value_name = "MANIFEST")]
+    pub depth: Option<PathBuf>,
+    /// Also measure a perceptual distance: manifest of a network of contract `metric`.
+    #[arg(long, value_name = "MANIFEST")]
+    pub metric: Option<PathBuf>,
+}
+
+/// Device and memory of each aircraft.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Onboard {
+    /// Gaussians of each aircraft at most.
+    #[arg(long, default_value_t = 60_000, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000_000))]
+    pub max_gaussians: usize,
+    /// Device memory of each aircraft, MiB.
+    #[arg(long, default_value_t = 512)]
+    pub budget_mib: u32,
+    /// Vulkan device whose name contains this.
+    #[arg(long)]
+    pub device: Option<String>,
+}
+
 /// What to compare, and what all methods share.
 #[derive(Clone, Debug)]
 pub struct Request {
@@ -55,24 +83,16 @@ pub struct Request {
     pub steps: Option<u32>,
     /// Seconds of each aircraft.
     pub seconds: Option<f64>,
-    /// Gaussians of each aircraft at most.
-    pub max_gaussians: usize,
-    /// Device memory of each aircraft, MiB.
-    pub budget_mib: u32,
+    /// Device and memory of each aircraft.
+    pub onboard: Onboard,
     /// Size of the pictures, above 0 and at most 1, in training and in the comparison.
     pub scale: f64,
     /// Seed of everything random.
     pub seed: u64,
     /// The methods, in this order.
     pub methods: Vec<&'static Method>,
-    /// Manifests of the user's own networks: pairs, depths, perceptual metric.
-    pub pair: Option<PathBuf>,
-    /// See `pair`.
-    pub depth: Option<PathBuf>,
-    /// See `pair`.
-    pub metric: Option<PathBuf>,
-    /// Part of the Vulkan device's name.
-    pub device: Option<String>,
+    /// The user's own networks.
+    pub networks: Networks,
     /// Whether what is in `out` already is done again.
     pub again: bool,
 }
@@ -158,7 +178,7 @@ pub fn measure(
         regions,
         steps: request.steps,
         seconds: request.seconds,
-        max_gaussians: request.max_gaussians,
+        max_gaussians: request.onboard.max_gaussians,
         scale: request.scale,
         seed: request.seed,
         methods,
@@ -206,7 +226,7 @@ impl<'a> Field<'a> {
             "trainings": trainings.iter().map(Training::key).collect::<Vec<_>>(),
             "merge": format!("{:?}", method.merge),
             "ground": ground,
-            "metric": request.metric,
+            "metric": request.networks.metric,
         });
         if let Some(result) = earlier(&kept).filter(|r| r.plan == plan && !request.again) {
             tracing::info!("{}: measured before ({})", method.name, kept.display());
@@ -266,9 +286,9 @@ impl<'a> Field<'a> {
             config::settings::parse(text).map_err(|e| JobError::Request(format!("{}: {e}", method.name)))?;
         let aircraft = self.territories.len();
         ground.register = false;
-        ground.device.clone_from(&self.request.device);
-        ground.device_mib = self.request.budget_mib.saturating_mul(aircraft as u32);
-        ground.max_gaussians = Some(self.request.max_gaussians * aircraft);
+        ground.device.clone_from(&self.request.onboard.device);
+        ground.device_mib = self.request.onboard.budget_mib.saturating_mul(aircraft as u32);
+        ground.max_gaussians = Some(self.request.onboard.max_gaussians * aircraft);
         ground.seed = self.request.seed;
         Ok(Some(ground))
     }
@@ -299,9 +319,9 @@ impl<'a> Field<'a> {
         let sizes = self.held_out.iter().map(|&i| scaled(&set.frames[i].view.intrinsics, request.scale));
         let sizes = sizes.collect::<Result<Vec<_>, _>>()?;
         let (width, height) = sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height));
-        let mut metric = open_metric(request.metric.as_deref(), (width, height))?;
+        let mut metric = open_metric(request.networks.metric.as_deref(), (width, height))?;
         let (header, cloud) = model::read(path)?;
-        let mut trainer = renderer(request.device.as_deref(), &cloud, width, height)?;
+        let mut trainer = renderer(request.onboard.device.as_deref(), &cloud, width, height)?;
         let into = IntoModel::of(set, &header);
         let scores = evaluate(&mut trainer, set, &self.held_out, request.scale, &into, metric.as_mut(), None)?;
         Ok((Quality::of(&scores, set, &self.held_out, &self.territories, self.ground_m), cloud.len()))

@@ -4,6 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use config::budget::Memory;
 use config::plan::{Lanes, Plan};
 use config::training::TrainSettings;
 use disk::Disk;
@@ -106,7 +107,8 @@ pub fn measure(request: &Request, out: &Path) -> Result<Figures, JobError> {
     write_scene(&file, request.gaussians, request.sh_degree)?;
     let written = clock.lap();
     let settings = settings(request);
-    let wanted = device_request(request, out, (ALONG * ALONG) as usize, Some(request.gaussians));
+    let gaussians = u32::try_from(request.gaussians).unwrap_or(u32::MAX);
+    let wanted = device_request(request, out, (ALONG * ALONG) as usize, Some(gaussians));
     let (mut trainer, mut trained_on): (Trainer, _) = wanted.open::<JobError>(&settings)?;
     pieces::load(&mut trainer, &Chunks::open(&file)?)?;
     let loaded = clock.lap();
@@ -175,17 +177,14 @@ fn settings(request: &Request) -> TrainSettings {
     settings
 }
 
-fn device_request(request: &Request, out: &Path, views: usize, scene_gaussians: Option<usize>) -> DeviceRequest {
+fn device_request(request: &Request, out: &Path, views: usize, scene_gaussians: Option<u32>) -> DeviceRequest {
     DeviceRequest {
         device: request.device.clone(),
-        device_mib: request.device_mib,
+        memory: Memory { device_mib: Some(request.device_mib), scene_gaussians, ..Memory::default() },
         size: SIZE.into(),
         views,
         crops: 0,
-        view_slots: None,
         folder: Some(out.to_owned()),
-        max_gaussians: None,
-        scene_gaussians,
     }
 }
 
@@ -248,7 +247,7 @@ fn compare(
     })?;
     // As much of the device as it takes: the paged one is what is bounded.
     let wanted =
-        DeviceRequest { device_mib: UNPAGED_MIB, max_gaussians: Some(seen), ..device_request(request, out, 1, None) };
+        DeviceRequest { memory: Memory::for_gaussians(UNPAGED_MIB, seen), ..device_request(request, out, 1, None) };
     let settings = settings(request);
     if seen == 0 || Plan::new(&wanted.plan_request(&settings.sh, Lanes::CARD))?.gaussians < seen {
         return Ok((seen, None));

@@ -9,9 +9,10 @@ use crate::testing::{picture, settings};
 use crate::{EngineSettings, InitKind, Reconstruct, Reconstruction};
 
 /// Of 300 Gaussians so many are on the device at once.
-fn engine(on_device: usize, start: InitKind) -> Reconstruction {
+fn engine(on_device: u32, start: InitKind) -> Reconstruction {
     let mut settings = EngineSettings { start, ..settings() };
-    (settings.device.max_gaussians, settings.device.scene_gaussians) = (Some(on_device), Some(300));
+    let memory = &mut settings.device.memory;
+    (memory.max_gaussians, memory.scene_gaussians) = (Some(on_device), Some(300));
     Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens")
 }
 

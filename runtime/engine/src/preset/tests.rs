@@ -14,14 +14,11 @@ fn room(device_mib: u32) -> Room {
 fn survey(views: usize, picture: (u32, u32), seconds: Option<f64>) -> Wanted {
     let device = DeviceRequest {
         device: None,
-        device_mib: 0,
+        memory: Memory { device_mib: Some(0), ..Memory::default() },
         size: picture,
         views,
         crops: 1,
-        view_slots: None,
         folder: None,
-        max_gaussians: None,
-        scene_gaussians: None,
     };
     Wanted {
         picture,

@@ -13,6 +13,7 @@ use models::cloud::GaussianCloud;
 use models::formats::model::columns::{self, write_floats};
 use models::formats::model::encode_header;
 use models::ground_cell::CellKey;
+use uplink::offer::hex;
 
 use crate::AggregateError;
 use crate::block::{Block, column_bytes};
@@ -26,7 +27,7 @@ use crate::register::edge::Edges;
 use crate::register::fit::RenderedFitter;
 use crate::register::{Registered, Registrar};
 use crate::squares::Squares;
-use crate::store::{Store, hex};
+use crate::store::Store;
 
 /// Gaussians farther from what their model shows than this many times its longer side show no ground, as in a streamed scene.
 const STRAY_SPANS: f64 = 20.0;

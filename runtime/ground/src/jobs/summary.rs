@@ -37,7 +37,7 @@ pub fn run_report(command: &str, outcome: &Outcome, seed: u64) -> RunReport {
         run.skip("views_without_seam", (d.learnt.views - d.learnt.used) as u64);
         run.skip("gaussians_transparent", d.learnt.pruned as u64);
         run.device = d.device.clone();
-        [run.device_bytes_planned, run.device_bytes_peak] = d.device_bytes;
+        [run.memory.device_bytes_planned, run.memory.device_bytes_peak] = d.device_bytes;
         run.more.insert("seam_share".into(), d.learnt.seam_share.into());
         let cells = serde_json::json!({
             "met": d.learnt.cells, "accepted": d.learnt.accepted, "over_plan": d.learnt.over_plan, "views_kept_back": d.learnt.kept_back

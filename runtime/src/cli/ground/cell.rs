@@ -5,9 +5,10 @@ use std::str::FromStr;
 use ground::AggregateError;
 use ground::jobs::{join, make};
 use ground::plan::Plan;
-use ground::store::{Store, hex};
+use ground::store::Store;
 use job::interrupt::Interrupt;
 use models::ground_cell::CellKey;
+use uplink::offer::hex;
 
 use super::CliError;
 use crate::cli::ending::within_bounds;

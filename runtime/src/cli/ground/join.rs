@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use ground::jobs::join::{header_in, join};
 use ground::plan::{Hash, Plan};
-use ground::store::{Store, hex};
+use ground::store::Store;
+use uplink::offer::hex;
 
 use super::CliError;
 use crate::cli::output::outln;

@@ -6,7 +6,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use job::interrupt::Interrupt;
 
 use crate::methods::presets::{METHODS, Method};
-use crate::methods::{Request, measure, survey, table};
+use crate::methods::{Networks, Onboard, Request, measure, survey, table};
 use runtime::cli::CliError;
 use runtime::cli::output::{out, outln};
 use runtime::figures::{markdown, write_json, write_text};
@@ -41,30 +41,16 @@ pub struct Args {
     /// Methods, separated by commas [default: all but the ablations].
     #[arg(long, value_delimiter = ',', value_parser = methods())]
     pub methods: Vec<&'static Method>,
-    /// Gaussians of each aircraft at most.
-    #[arg(long, default_value_t = 60_000, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000_000))]
-    pub max_gaussians: usize,
-    /// Device memory of each aircraft, MiB.
-    #[arg(long, default_value_t = 512)]
-    pub budget_mib: u32,
+    #[command(flatten)]
+    pub onboard: Onboard,
     /// Size of the pictures, above 0 and at most 1, in training and comparison.
     #[arg(long, default_value_t = 1.0)]
     pub scale: f64,
     /// Seed of the survey and of the training.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Manifest of your own pair network.
-    #[arg(long = "model", value_name = "MANIFEST")]
-    pub pair: Option<PathBuf>,
-    /// Manifest of your own depth network for the depth loss [default: the pair network's depth].
-    #[arg(long, value_name = "MANIFEST")]
-    pub depth: Option<PathBuf>,
-    /// Also measure a perceptual distance: manifest of a network of contract `metric`.
-    #[arg(long, value_name = "MANIFEST")]
-    pub metric: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
-    #[arg(long)]
-    pub device: Option<String>,
+    #[command(flatten)]
+    pub networks: Networks,
     /// Do again what is in --out already.
     #[arg(long)]
     pub again: bool,
@@ -111,15 +97,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
         regions: args.regions.map(|n| n as usize),
         steps: args.steps.or(args.seconds.is_none().then_some(STEPS)),
         seconds: args.seconds,
-        max_gaussians: args.max_gaussians,
-        budget_mib: args.budget_mib,
+        onboard: args.onboard,
         scale: args.scale,
         seed: args.seed,
         methods: chosen,
-        pair: args.pair,
-        depth: args.depth,
-        metric: args.metric,
-        device: args.device,
+        networks: args.networks,
         again: args.again,
     };
     let comparison = measure(&request, &|| !stop.requested(), &mut |m| {

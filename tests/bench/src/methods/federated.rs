@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
+use config::budget::Memory;
 use config::training::{LossSettings, RateSettings, Strategy, TrainSettings};
 use engine::device::DeviceRequest;
 use engine::error::EngineError;
@@ -94,14 +95,11 @@ pub fn merge(
     let side = |of: fn(&Intrinsics) -> u32| views.iter().map(|v| of(&v.2.intrinsics)).max().unwrap_or(1);
     let request = DeviceRequest {
         device: ground.device.clone(),
-        device_mib: ground.device_mib,
+        memory: Memory { view_slots: Some(views.len() as u32), ..Memory::for_gaussians(ground.device_mib, all.len()) },
         size: (side(|k| k.width), side(|k| k.height)),
         views: views.len(),
         crops: 0,
-        view_slots: Some(views.len() as u32),
         folder: None,
-        max_gaussians: Some(all.len()),
-        scene_gaussians: None,
     };
     let recipe = recipe(ground.seed, degree);
     let (mut trainer, mut pictures): (Trainer, _) = request.open::<JobError>(&recipe)?;

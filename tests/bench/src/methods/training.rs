@@ -61,18 +61,18 @@ impl Training {
         if let Some(seconds) = request.seconds {
             argue("--seconds", (seconds * f64::from(shares)).to_string());
         }
-        argue("--max-gaussians", (request.max_gaussians * shares as usize).to_string());
-        argue("--budget-mib", (request.budget_mib.saturating_mul(shares)).to_string());
+        argue("--max-gaussians", (request.onboard.max_gaussians * shares as usize).to_string());
+        argue("--budget-mib", (request.onboard.budget_mib.saturating_mul(shares)).to_string());
         argue("--seed", request.seed.to_string());
         argue("--scale", request.scale.to_string());
-        if let Some(pair) = &request.pair {
+        if let Some(pair) = &request.networks.pair {
             argue("--model", pair.display().to_string());
         }
-        if let Some(device) = &request.device {
+        if let Some(device) = &request.onboard.device {
             argue("--device", device.clone());
         }
         let mut settings = method.settings.to_owned();
-        if let Some(depth) = &request.depth {
+        if let Some(depth) = &request.networks.depth {
             let depth = std::path::absolute(depth).unwrap_or_else(|_| depth.clone());
             settings += &format!("[network]\ndepth = {}\n", toml::Value::from(depth.to_string_lossy().into_owned()));
         }

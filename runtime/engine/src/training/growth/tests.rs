@@ -2,6 +2,7 @@
 
 use std::ops::ControlFlow;
 
+use config::budget::Memory;
 use config::refine::RefineSettings;
 use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
@@ -59,7 +60,7 @@ fn engine() -> Option<Reconstruction> {
 }
 
 /// The same in so much of the host's memory, MiB, on a device that holds so many Gaussians of them all.
-fn engine_in(host_mib: Option<u32>, on_device: Option<usize>) -> Option<Result<Reconstruction, EngineError>> {
+fn engine_in(host_mib: Option<u32>, on_device: Option<u32>) -> Option<Result<Reconstruction, EngineError>> {
     if Gpu::list().is_err() {
         needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
         return None;
@@ -69,7 +70,6 @@ fn engine_in(host_mib: Option<u32>, on_device: Option<usize>) -> Option<Result<R
         return None;
     }
     let mut settings = EngineSettings {
-        host_mib,
         camera_pixels: LENS.pixels() as u64,
         refine: Some(RefineSettings::default()),
         start: InitKind::FeedForward,
@@ -78,7 +78,8 @@ fn engine_in(host_mib: Option<u32>, on_device: Option<usize>) -> Option<Result<R
     };
     let (size, views, all) = ((LENS.width, LENS.height), LINE * LINES, 30_000);
     let (max_gaussians, scene_gaussians) = (on_device.or(Some(all)), on_device.map(|_| all));
-    settings.device = DeviceRequest { device_mib: 96, size, views, max_gaussians, scene_gaussians, ..settings.device };
+    let memory = Memory { device_mib: Some(96), host_mib, max_gaussians, scene_gaussians, view_slots: None };
+    settings.device = DeviceRequest { memory, size, views, ..settings.device };
     let region = vec![[-78.0, -27.0], [78.0, -27.0], [78.0, 27.0], [-78.0, 27.0]];
     Some(Reconstruction::open(settings, ModelHeader { region, ..ModelHeader::default() }, "fly"))
 }
