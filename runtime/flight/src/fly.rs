@@ -29,24 +29,31 @@ mod show;
 
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/fault_table/mod.rs"]
 mod fault_table;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/heat.rs"]
 mod heat;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/killed.rs"]
 mod killed;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/outrun.rs"]
 mod outrun;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/power_cut.rs"]
 mod power_cut;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/reflown.rs"]
 mod reflown;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/rehearsal.rs"]
 mod rehearsal;
 
 use engine::device::{DeviceRequest, training_lens};

@@ -15,6 +15,7 @@ pub mod admission;
 pub mod binding;
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
+#[path = "../../../tests/uplink/chaos.rs"]
 mod chaos;
 pub mod disk_error;
 pub mod flight_number;
@@ -35,6 +36,7 @@ pub mod receipt;
 pub mod receive;
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
+#[path = "../../../tests/uplink/slow_link.rs"]
 mod slow_link;
 pub mod store;
 mod territory;

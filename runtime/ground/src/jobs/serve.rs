@@ -202,6 +202,7 @@ pub fn merge(
 
 #[cfg(test)]
 #[cfg(feature = "zenoh")]
+#[path = "../../../../tests/ground/fault_table.rs"]
 mod fault_table;
 #[cfg(test)]
 mod tests;
