@@ -7,6 +7,7 @@ use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
+use config::keys::to_hex;
 use config::link::{LinkSettings, Signing};
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
 use geometry::geodesy::Geodetic;
@@ -115,10 +116,6 @@ fn talk(python: &Path, signing: Signing, peer_key: Option<&str>) -> (serde_json:
     (serde_json::from_slice(&output.stdout).expect("its report"), seen)
 }
 
-fn hex(key: [u8; 32]) -> String {
-    key.iter().map(|b| format!("{b:02x}")).collect()
-}
-
 /// What must hold whenever the two may talk.
 fn assert_conversation(report: &serde_json::Value, seen: &Seen) {
     assert!(seen.poses > 20, "{} poses", seen.poses);
@@ -148,7 +145,7 @@ fn pymavlink_and_we_understand_each_other_unsigned() {
 #[test]
 fn pymavlink_and_we_understand_each_other_signed() {
     let Some(python) = python() else { return };
-    let (report, seen) = talk(&python, Signing::Require, Some(&hex(KEY)));
+    let (report, seen) = talk(&python, Signing::Require, Some(&to_hex(&KEY)));
     assert_conversation(&report, &seen);
     assert_eq!((report["unsigned"].as_u64(), seen.unsigned, seen.wrong_key), (Some(0), 0, 0));
 }
@@ -156,7 +153,7 @@ fn pymavlink_and_we_understand_each_other_signed() {
 #[test]
 fn a_peer_with_another_key_is_heard_by_neither_side() {
     let Some(python) = python() else { return };
-    let (report, seen) = talk(&python, Signing::Require, Some(&hex([1; 32])));
+    let (report, seen) = talk(&python, Signing::Require, Some(&to_hex(&[1; 32])));
     assert!(seen.poses == 0 && seen.triggers.is_empty() && seen.wrong_key > 50, "{} {}", seen.poses, seen.wrong_key);
     assert_eq!((report["cameras"].as_u64(), report["information"].is_null()), (Some(0), true), "{report}");
     let (_, seen) = talk(&python, Signing::Require, None);

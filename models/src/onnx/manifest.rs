@@ -6,6 +6,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use config::keys::to_hex;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -284,7 +285,7 @@ impl Manifest {
     /// They differ.
     pub fn check_hash(&self, bytes: &[u8]) -> Result<(), OnnxError> {
         let blake3 = |bytes: &[u8]| blake3::hash(bytes).to_hex().to_string();
-        let sha256 = |bytes: &[u8]| Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect();
+        let sha256 = |bytes: &[u8]| to_hex(&Sha256::digest(bytes).into());
         let hashes: [fn(&[u8]) -> String; 2] = [blake3, sha256];
         for ((field, expected), hash) in [("blake3", &self.blake3), ("sha256", &self.sha256)].into_iter().zip(hashes) {
             let Some(expected) = expected else { continue };

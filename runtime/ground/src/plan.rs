@@ -1,12 +1,12 @@
 //! What is global about a merge, in one file: where each model lies and in what light, who answers for which ground, and the cells with
 //! the hash of all that each depends on. Whoever has it and the models' pieces can make any cell, in any order, on any machine.
 
+use config::keys::to_hex;
 use config::ground::GroundSettings;
 use geometry::geodesy::Geodetic;
 use models::formats::model::MAX_HEADER;
 use models::ground_cell::CellKey;
 use serde::{Deserialize, Serialize};
-use uplink::offer::hex;
 
 use super::region::Region;
 use super::squares::Squares;
@@ -167,12 +167,12 @@ pub const MODELS: &str = "models";
 
 /// Name of the cell with this input.
 pub fn cell_name(input: &Hash) -> String {
-    format!("{CELLS}/{}", hex(input))
+    format!("{CELLS}/{}", to_hex(input))
 }
 
 /// Name of a model's pieces.
 pub fn model_name(object: &Hash) -> String {
-    format!("{MODELS}/{}", hex(object))
+    format!("{MODELS}/{}", to_hex(object))
 }
 
 impl Plan {

@@ -187,10 +187,5 @@ impl Store {
     }
 }
 
-/// A hash as names have it.
-pub fn hex(hash: &[u8; 32]) -> String {
-    blake3::Hash::from_bytes(*hash).to_hex().to_string()
-}
-
 #[cfg(test)]
 mod tests;

@@ -43,9 +43,7 @@ const MAX_NAME: usize = 64;
 pub type Hash = [u8; 32];
 
 /// Lower-case hexadecimal, as used in keys and file names.
-pub fn hex(hash: &Hash) -> String {
-    blake3::Hash::from_bytes(*hash).to_hex().to_string()
-}
+pub use config::keys::to_hex as hex;
 
 /// The order of one aircraft's models. Clocks do not enter: one that went back would hide every model that follows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
+use config::keys::to_hex;
 use config::ground::GroundSettings;
 use disk::Disk;
 use geometry::geodesy::Geodetic;
@@ -13,7 +14,6 @@ use models::cloud::GaussianCloud;
 use models::formats::model::columns::{self, write_floats};
 use models::formats::model::encode_header;
 use models::ground_cell::CellKey;
-use uplink::offer::hex;
 
 use crate::AggregateError;
 use crate::block::{Block, column_bytes};
@@ -273,7 +273,7 @@ pub fn lay_out(
 /// Leaves in a folder only what the plan's cells came to: the models' pieces are made again from the models when they are wanted. Only
 /// where nobody else works.
 pub fn tidy(store: &Store, cells: &[Hash]) {
-    let names: HashSet<String> = cells.iter().map(hex).collect();
+    let names: HashSet<String> = cells.iter().map(to_hex).collect();
     store.keep_only(MODELS, &|_| false);
     store.keep_only(CELLS, &|name| names.contains(name));
 }

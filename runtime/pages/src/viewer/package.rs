@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use config::keys::to_hex;
 use models::formats::read_bounded;
 use sha2::{Digest, Sha256};
 
@@ -62,7 +63,7 @@ fn checked(folder: &Path, file: &str) -> Result<String, ViewerError> {
     let path = folder.join(file);
     let bytes = read_bounded(&path, MAX_FILE)?;
     let pinned = PIN.lines().find_map(|line| line.strip_prefix("sha256 ")?.strip_suffix(file)?.strip_suffix(' '));
-    let hash: String = Sha256::digest(&bytes).iter().map(|b| format!("{b:02x}")).collect();
+    let hash = to_hex(&Sha256::digest(&bytes).into());
     let text = String::from_utf8(bytes).ok().filter(|_| pinned == Some(hash.as_str()));
     text.ok_or(ViewerError::Other { path, name: name() })
 }

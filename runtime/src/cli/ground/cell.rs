@@ -2,13 +2,13 @@
 
 use std::str::FromStr;
 
+use config::keys::to_hex;
 use ground::AggregateError;
 use ground::jobs::{join, make};
 use ground::plan::Plan;
 use ground::store::Store;
 use job::interrupt::Interrupt;
 use models::ground_cell::CellKey;
-use uplink::offer::hex;
 
 use super::CliError;
 use crate::cli::ending::within_bounds;
@@ -81,7 +81,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
             },
         };
         let how = if is_new { "made" } else { "was there" };
-        outln!("{} {} {} Gaussians, {how}", cell.key, hex(&head.content), head.count);
+        outln!("{} {} {} Gaussians, {how}", cell.key, to_hex(&head.content), head.count);
         if stop.requested() {
             return Err(CliError::interrupted("stopped on request; run the same command again"));
         }

@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
+use config::keys::to_hex;
 use ground::jobs::join::{header_in, join};
 use ground::plan::{Hash, Plan};
 use ground::store::Store;
-use uplink::offer::hex;
 
 use super::CliError;
 use crate::cli::output::outln;
@@ -30,6 +30,6 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
     let path = args.out.join("global.dgtr");
     let joined = join(&store, &plan, &inputs, header, &path)?;
     outln!("{}: {} Gaussians out of {} models", path.display(), joined.gaussians, plan.models.len());
-    outln!("{}", hex(&joined.content));
+    outln!("{}", to_hex(&joined.content));
     Ok(())
 }
