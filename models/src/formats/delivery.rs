@@ -17,7 +17,7 @@ use crate::camera::View;
 use crate::cloud::GaussianCloud;
 use coder::{Coder, Decoder, Encoder};
 use color::{ColorSteps, Colors};
-use positions::{Bounds, Tree};
+use positions::{GridBounds, Tree};
 use predict::Neighbours;
 use shape::ShapeSteps;
 use view_basis::ViewBasis;
@@ -131,7 +131,7 @@ struct Given<'a> {
     cloud: &'a GaussianCloud,
     views: &'a [View],
     rounding: Rounding,
-    bounds: Bounds,
+    bounds: GridBounds,
     classes: Vec<Class>,
 }
 
@@ -226,7 +226,7 @@ struct Place {
 
 /// Positions class by class, largest Gaussians first; gives them in the order of all that follows, with an encoder's rows.
 fn places(coder: &mut impl Coder, n: usize, given: Option<&Given<'_>>) -> Result<(Vec<Place>, Vec<u32>), Garbled> {
-    let bounds = given.map_or_else(|| Bounds::of(&[]), |g| g.bounds).code(coder)?;
+    let bounds = given.map_or_else(|| GridBounds::of(&[]), |g| g.bounds).code(coder)?;
     let classes = coder.bits(6, given.map_or(0, |g| g.classes.len() as u64))? as usize;
     let mut places: Vec<(u64, Place)> = Vec::with_capacity(n);
     let mut tree = Tree::new();
@@ -298,7 +298,7 @@ impl<'a> Given<'a> {
         let highest = rows.iter().map(class_of).fold(lowest, f64::max);
         let count = (highest - lowest) as usize + 1;
         let means: Vec<Vec3> = rows.iter().map(|i| Vec3::from(cloud.means[*i as usize])).collect();
-        let bounds = Bounds::of(&means);
+        let bounds = GridBounds::of(&means);
         let step = |class: usize| {
             let octaves = scope.middle + (lowest + class as f64 - scope.middle) * rounding.position_power;
             f64::from((rounding.position * octaves.exp2()) as f32)

@@ -23,7 +23,7 @@ mod sight;
 use cell::Cell;
 pub use cell::CellReport;
 pub use ground::Heights;
-pub use region::Region;
+pub use region::CoverageRegion;
 use sight::{Seen, Sight};
 
 use models::camera::View;
@@ -125,7 +125,7 @@ impl CoverageMap {
     ///
     /// # Errors
     /// [`CoverageError::NoArea`].
-    pub fn new(region: &Region, ground_m: f64, rules: CoverageSettings) -> Result<Self, CoverageError> {
+    pub fn new(region: &CoverageRegion, ground_m: f64, rules: CoverageSettings) -> Result<Self, CoverageError> {
         let (low, high) = region.bounds();
         let finest = region.area_m2().sqrt() / FINEST;
         let grid = Grid::over(low, high, f64::from(rules.cell_m).min(finest));

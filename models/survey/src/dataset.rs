@@ -33,7 +33,7 @@ mod values;
 pub use error::DatasetError;
 pub use frame::DatasetFrame;
 pub use points::SparsePoint;
-pub use selection::{Region, Split};
+pub use selection::{FlownRegion, Split};
 use sources::{frames, reconstruction};
 
 /// What a pose from bundle adjustment is worth: never exact, but far better than any GPS.

@@ -264,7 +264,7 @@ mod tests {
     /// Straight down from 40 m on a lens of 90°: 80 m of ground across.
     fn over_ground(max: u32) -> KeyframeSelector {
         let corners = [[-5.0, -5.0], [17.0, -5.0], [17.0, 5.0], [-5.0, 5.0]].map(glam::DVec2::from).to_vec();
-        let region = survey::coverage::Region::new(corners).expect("an area");
+        let region = survey::coverage::CoverageRegion::new(corners).expect("an area");
         let map = CoverageMap::new(&region, 0.0, config::coverage::CoverageSettings::default()).expect("a map");
         let mut s = selector(max);
         s.over(map, Intrinsics { width: 80, height: 80, fx: 40.0, fy: 40.0, cx: 40.0, cy: 40.0 });

@@ -1,8 +1,8 @@
 //! What is global about a merge, in one file: where each model lies and in what light, who answers for which ground, and the cells with
 //! the hash of all that each depends on. Whoever has it and the models' pieces can make any cell, in any order, on any machine.
 
-use config::keys::to_hex;
 use config::ground::GroundSettings;
+use config::keys::to_hex;
 use geometry::geodesy::Geodetic;
 use models::formats::model::MAX_HEADER;
 use models::ground_cell::CellKey;

@@ -6,7 +6,7 @@ use geometry::polygon::hull;
 use glam::{DVec2, Vec3};
 use models::camera::View;
 use models::formats::model::ModelHeader;
-use survey::coverage::{CoverageMap, Heights, Region};
+use survey::coverage::{CoverageMap, CoverageRegion, Heights};
 
 use flight::coverage::Coverage;
 
@@ -25,7 +25,7 @@ pub(super) fn coverage(header: &ModelHeader, means: &[[f32; 3]], rules: Coverage
         0..3 => hull(views.iter().map(|v| v.pose.center.truncate()).collect()),
         _ => header.region.iter().map(|c| DVec2::from(*c)).collect(),
     };
-    let region = Region::new(corners).ok()?;
+    let region = CoverageRegion::new(corners).ok()?;
     let mut map = CoverageMap::new(&region, rules.ground_m.unwrap_or(0.0).into(), rules).ok()?;
     if rules.ground_m.is_none() {
         let points: Vec<Vec3> = means.iter().map(|m| Vec3::from(*m)).collect();

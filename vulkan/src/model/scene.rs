@@ -18,7 +18,7 @@ pub(super) use cell::Sight;
 pub(super) use page::Places;
 pub(crate) use window::Choice;
 
-use cell::Bounds;
+use cell::CellBounds;
 use config::plan::Plan;
 use config::training::TrainSettings;
 use models::cloud::GaussianCloud;
@@ -53,7 +53,7 @@ type Visit<'a, E> = &'a dyn Fn(&mut dyn FnMut(&Geometry)) -> Result<(), E>;
 /// One cell.
 pub(super) struct Cell {
     key: CellKey,
-    pub bounds: Bounds,
+    pub bounds: CellBounds,
     /// Gaussians.
     pub count: usize,
     /// Where its Gaussians lie in the file, or lay before they came to the device.
@@ -69,7 +69,7 @@ impl Cell {
     fn empty(key: CellKey) -> Self {
         Self {
             key,
-            bounds: Bounds::EMPTY,
+            bounds: CellBounds::EMPTY,
             count: 0,
             chain: Chain::EMPTY,
             on_device: false,

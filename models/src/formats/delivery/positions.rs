@@ -13,12 +13,12 @@ const STEPS: u32 = 16;
 
 /// The box that all grids begin in: a corner and an edge, metres.
 #[derive(Clone, Copy, Debug)]
-pub struct Bounds {
+pub struct GridBounds {
     pub corner: DVec3,
     pub edge: f64,
 }
 
-impl Bounds {
+impl GridBounds {
     /// Four times the box that holds all but the outermost thousandth of each side: what lies beyond is not worth a finer
     /// grid for all others.
     pub fn of(means: &[Vec3]) -> Self {

@@ -67,7 +67,7 @@ mod tests {
     use tiff::decoder::{Decoder, DecodingResult};
     use tiff::tags::Tag;
 
-    use super::super::Region;
+    use super::super::CoverageRegion;
     use super::*;
     use models::camera::{Intrinsics, Pose, View};
 
@@ -75,7 +75,7 @@ mod tests {
     fn another_program_finds_each_square_where_it_lies() {
         let origin = Geodetic { lat_deg: 53.38, lon_deg: -1.47, alt_m: 60.0 };
         let square = [[0.0, 0.0], [80.0, 0.0], [80.0, 60.0], [0.0, 60.0]];
-        let region = Region::new(square.map(DVec2::from).to_vec()).unwrap();
+        let region = CoverageRegion::new(square.map(DVec2::from).to_vec()).unwrap();
         let mut map = CoverageMap::new(&region, 0.0, CoverageSettings::default()).unwrap();
         let down = DQuat::from_mat3(&DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z));
         let intrinsics = Intrinsics { width: 640, height: 480, fx: 480.0, fy: 480.0, cx: 320.0, cy: 240.0 };

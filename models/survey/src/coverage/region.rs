@@ -7,12 +7,12 @@ use super::CoverageError;
 
 /// A polygon, concave or not, with an area.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Region {
+pub struct CoverageRegion {
     corners: Vec<DVec2>,
     area_m2: f64,
 }
 
-impl Region {
+impl CoverageRegion {
     /// From corners in order, metres east and north.
     ///
     /// # Errors

@@ -3,7 +3,7 @@
 use config::coverage::CoverageSettings;
 use glam::{DVec2, DVec3};
 
-use super::{CoverageMap, Region};
+use super::{CoverageMap, CoverageRegion};
 use models::camera::{Intrinsics, Pose, View};
 use models::formats::telemetry::dji_rotation;
 
@@ -15,11 +15,11 @@ pub(super) fn view(center: DVec3, yaw_deg: f64, pitch_deg: f64) -> View {
 }
 
 /// A rectangle with its south-west corner at `at`.
-pub(super) fn rectangle(at: DVec2, size: DVec2) -> Region {
-    Region::new(vec![at, at + size * DVec2::X, at + size, at + size * DVec2::Y]).expect("an area")
+pub(super) fn rectangle(at: DVec2, size: DVec2) -> CoverageRegion {
+    CoverageRegion::new(vec![at, at + size * DVec2::X, at + size, at + size * DVec2::Y]).expect("an area")
 }
 
-pub(super) fn map(region: &Region) -> CoverageMap {
+pub(super) fn map(region: &CoverageRegion) -> CoverageMap {
     CoverageMap::new(region, 0.0, CoverageSettings::default()).expect("a map")
 }
 

@@ -102,7 +102,7 @@ fn regions_without_area_are_refused_and_all_others_fit_the_memory_set_aside() {
     let line =
         |k: f64| vec![DVec2::new(5e6, 4e6), DVec2::new(5e6 + k, 4e6 + k), DVec2::new(5e6 + 2.0 * k, 4e6 + 2.0 * k)];
     for corners in [vec![], line(0.0), line(100.0), vec![DVec2::NAN; 3], vec![DVec2::ZERO, DVec2::X]] {
-        assert_eq!(Region::new(corners.clone()), Err(CoverageError::NoArea), "{corners:?}");
+        assert_eq!(CoverageRegion::new(corners.clone()), Err(CoverageError::NoArea), "{corners:?}");
     }
     for size in [DVec2::new(1.0, 1.0), DVec2::new(5000.0, 3.0), DVec2::new(3e4, 2e4), DVec2::new(1e6, 0.5)] {
         let map = map(&rectangle(DVec2::new(5e5, 5e6), size));

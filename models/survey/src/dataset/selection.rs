@@ -13,7 +13,7 @@ const TEST_EVERY: usize = 8;
 
 /// An area flown by one aircraft.
 #[derive(Clone, Debug)]
-pub struct Region {
+pub struct FlownRegion {
     /// Its name (`--region`).
     pub name: String,
     /// Corners counter-clockwise, ENU metres.
@@ -28,7 +28,7 @@ pub struct Split {
     /// `train`, `test`, …
     pub lists: BTreeMap<String, Vec<usize>>,
     /// May be empty.
-    pub regions: Vec<Region>,
+    pub regions: Vec<FlownRegion>,
 }
 
 impl Dataset {
@@ -78,7 +78,7 @@ impl Dataset {
     }
 
     /// The region of this name.
-    pub fn region(&self, name: &str) -> Option<&Region> {
+    pub fn region(&self, name: &str) -> Option<&FlownRegion> {
         self.split.regions.iter().find(|r| r.name == name)
     }
 
@@ -127,7 +127,7 @@ impl Dataset {
                 self.local.map_or(p, |local| local.into_own(p)).truncate().to_array()
             };
             let polygon = vec![[r.min[0], r.min[1]], [r.max[0], r.min[1]], [r.max[0], r.max[1]], [r.min[0], r.max[1]]];
-            regions.push(Region { name: r.name, polygon: polygon.into_iter().map(own).collect(), lists });
+            regions.push(FlownRegion { name: r.name, polygon: polygon.into_iter().map(own).collect(), lists });
         }
         Ok(Split { lists: lists(file.lists)?, regions })
     }

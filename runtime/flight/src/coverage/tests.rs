@@ -12,7 +12,7 @@ use sim::autopilot::AutopilotSettings;
 use sim::reference::{Lens, flown_views};
 use sim::survey::SurveySettings;
 use sim::world::{World, WorldSettings};
-use survey::coverage::Region;
+use survey::coverage::CoverageRegion;
 
 use super::*;
 
@@ -63,7 +63,7 @@ fn flown(settings: &SimSettings) -> Vec<View> {
 
 /// What views see of the region over the world's ground.
 fn found(world: &World, views: &[View]) -> Coverage {
-    let region = Region::new(REGION.map(DVec2::from).to_vec()).expect("an area");
+    let region = CoverageRegion::new(REGION.map(DVec2::from).to_vec()).expect("an area");
     let map = CoverageMap::new(&region, 0.0, CoverageSettings::default()).expect("a map");
     let mut map = map.over(|p| world.ground_height(p.x, p.y));
     views.iter().for_each(|v| map.add(v));

@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
-use config::keys::to_hex;
 use config::ground::GroundSettings;
+use config::keys::to_hex;
 use disk::Disk;
 use geometry::geodesy::Geodetic;
 use glam::DVec2;

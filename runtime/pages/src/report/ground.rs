@@ -189,7 +189,7 @@ impl Ortho {
 mod tests {
     use glam::{DQuat, DVec2};
     use models::camera::{Intrinsics, Pose};
-    use survey::coverage::Region;
+    use survey::coverage::CoverageRegion;
 
     use super::*;
 
@@ -211,7 +211,7 @@ mod tests {
     #[test]
     fn squares_say_what_is_covered_and_pictures_are_bounded() {
         let corners = [[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]].map(DVec2::from).to_vec();
-        let region = Region::new(corners).expect("an area");
+        let region = CoverageRegion::new(corners).expect("an area");
         let mut map = CoverageMap::new(&region, 0.0, Default::default()).expect("a map");
         let mut ground = Ground::default();
         assert_eq!(ground.survey(0, &map), 0.0);

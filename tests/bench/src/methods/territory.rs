@@ -85,7 +85,7 @@ pub fn divide(set: &Dataset, split: &str, wanted: Option<usize>, usual: usize) -
 }
 
 fn of_data_set(set: &Dataset) -> Vec<Territory> {
-    let of = |r: &survey::dataset::Region| {
+    let of = |r: &survey::dataset::FlownRegion| {
         let corners = r.polygon.iter().map(|c| DVec2::from(*c));
         let (low, high) = corners
             .fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(low, high): (DVec2, DVec2), c| (low.min(c), high.max(c)));

@@ -3,7 +3,7 @@
 
 use models::cloud::GaussianCloud;
 
-use super::cell::{self, Bounds};
+use super::cell::{self, CellBounds};
 use super::store::Rewritten;
 use super::{Cell, Scene};
 use crate::error::TrainError;
@@ -11,7 +11,7 @@ use crate::model::amend::{BoundingBox, Fate, SAMPLED, donor_of, pull_of};
 use crate::model::parameters::{Geometry, Parameters, record_of};
 use config::plan::BLOCK_GAUSSIANS;
 
-impl Bounds {
+impl CellBounds {
     /// Whether a mean of the cell may lie in `within`.
     fn meets(&self, within: &BoundingBox) -> bool {
         (0..3).all(|k| self.low[k] <= within.high[k] && self.high[k] >= within.low[k])
@@ -80,7 +80,7 @@ impl Scene {
         let mut left = self.away;
         let (store, cells) = self.cells_of(within);
         for cell in cells {
-            let mut bounds = Bounds::EMPTY;
+            let mut bounds = CellBounds::EMPTY;
             store.rewrite(&mut cell.chain, |record| {
                 let mut g = Geometry::of_record(record);
                 let fate = if within.holds(g.mean) { fate(&g) } else { Fate::Stays };

@@ -23,13 +23,13 @@ fn standard_deviations() -> f32 {
 
 /// Box around the means of a cell's Gaussians, and how far the widest reaches beyond.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Bounds {
+pub(crate) struct CellBounds {
     pub low: Vec3,
     pub high: Vec3,
     pub reach: f32,
 }
 
-impl Bounds {
+impl CellBounds {
     pub const EMPTY: Self = Self { low: Vec3::INFINITY, high: Vec3::NEG_INFINITY, reach: 0.0 };
 
     pub fn add(&mut self, g: &Geometry) {
@@ -141,7 +141,7 @@ impl Sight {
     }
 
     /// The blocks in which Gaussians of a cell may show; `None` when none of them can.
-    pub fn blocks(&self, bounds: &Bounds) -> Option<Blocks> {
+    pub fn blocks(&self, bounds: &CellBounds) -> Option<Blocks> {
         let [x, y] = [0, 1].map(|axis| self.along(axis, bounds));
         match (x, y) {
             (Some(x), Some(y)) if self.is_in_front(bounds) => Some(Blocks { x, y }),
@@ -150,19 +150,19 @@ impl Sight {
     }
 
     /// Whether Gaussians of a cell may show in a part: quicker than [`Self::blocks`].
-    pub fn shows_in(&self, part: Blocks, bounds: &Bounds) -> bool {
+    pub fn shows_in(&self, part: Blocks, bounds: &CellBounds) -> bool {
         let along = |axis: usize, [first, end]: [u8; 2]| {
             self.beyond(axis, bounds, -1.0, usize::from(end)) && self.beyond(axis, bounds, 1.0, usize::from(first))
         };
         along(0, part.x) && along(1, part.y) && self.is_in_front(bounds)
     }
 
-    fn is_in_front(&self, bounds: &Bounds) -> bool {
+    fn is_in_front(&self, bounds: &CellBounds) -> bool {
         bounds.most(self.axes[2]) + self.shift.z >= self.near
     }
 
     /// First block and one past the last along an axis.
-    fn along(&self, axis: usize, bounds: &Bounds) -> Option<[u8; 2]> {
+    fn along(&self, axis: usize, bounds: &CellBounds) -> Option<[u8; 2]> {
         let beyond = |side: f32, edge: u8| self.beyond(axis, bounds, side, usize::from(edge));
         if !beyond(-1.0, SIDE) || !beyond(1.0, 0) {
             return None;
@@ -173,7 +173,7 @@ impl Sight {
     }
 
     /// Whether something of a cell lies on that side, -1 or 1, of the plane through the camera and a boundary between blocks.
-    fn beyond(&self, axis: usize, bounds: &Bounds, side: f32, edge: usize) -> bool {
+    fn beyond(&self, axis: usize, bounds: &CellBounds, side: f32, edge: usize) -> bool {
         let (reach, edge) = (bounds.reach * self.slant[axis], self.edges[axis][edge]);
         let (per_depth, constant) =
             if self.perspective { (self.blur[axis] - side * edge, 0.0) } else { (0.0, self.blur[axis] - side * edge) };
@@ -210,7 +210,7 @@ mod tests {
 
     #[test]
     fn a_large_gaussian_is_near_to_wherever_it_reaches() {
-        let mut bounds = Bounds::EMPTY;
+        let mut bounds = CellBounds::EMPTY;
         bounds.add(&gaussian([10.0, 0.0, 0.0], 0.0));
         bounds.add(&gaussian([14.0, 2.0, 0.0], 0.0));
         let reach = reach_of(&gaussian([0.0; 3], 0.0));

@@ -3,7 +3,7 @@
 //! Where Gaussians lie on the device decides bits of what follows, so it depends on steps alone: those that leave make room, in order,
 //! for those that come, and what a drawing pages out comes back to where it was.
 
-use super::cell::{self, Bounds};
+use super::cell::{self, CellBounds};
 use super::{Cell, Scene};
 use crate::arena::Arena;
 use crate::error::TrainError;
@@ -101,7 +101,7 @@ impl Scene {
     /// Counts and bounds the cells on the device, and those to which Gaussians came from there.
     pub fn measure(&mut self, arena: &Arena, parameters: &Parameters) {
         for cell in self.cells.iter_mut().filter(|cell| cell.on_device) {
-            (cell.bounds, cell.count) = (Bounds::EMPTY, 0);
+            (cell.bounds, cell.count) = (CellBounds::EMPTY, 0);
         }
         for (g, tag) in parameters.geometry(arena).iter().zip(&self.tags) {
             let cell = &mut self.cells[*tag as usize];

@@ -5,7 +5,7 @@ use hal::camera::Picture;
 use hal::error::HalError;
 use hal::mavlink::dialect::MavSeverity;
 use hal::traits::{Camera, Clock, Link};
-use survey::coverage::{CoverageMap, Region};
+use survey::coverage::{CoverageMap, CoverageRegion};
 
 use super::Intake;
 use crate::coverage::Coverage;
@@ -23,7 +23,7 @@ where
         }
         let corners = self.plan.region.iter().map(|c| DVec2::from(*c)).collect();
         let height_m = self.plan.coverage.ground_m.map(f64::from).or(self.vehicle.home_m()).unwrap_or(0.0);
-        match Region::new(corners).and_then(|region| CoverageMap::new(&region, height_m, self.plan.coverage)) {
+        match CoverageRegion::new(corners).and_then(|region| CoverageMap::new(&region, height_m, self.plan.coverage)) {
             Ok(map) => self.selector.over(map, self.plan.intrinsics),
             Err(e) => tracing::debug!("no map of the ground: {e}"),
         }
