@@ -294,7 +294,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if !ended.finished && !model.is_file() {
         return Err(CliError::interrupted(format!(
             "interrupted before there was a model in {}; the same command begins again",
-            job.out.display()
+            job.output.folder.display()
         )));
     }
     if !ended.finished {

@@ -24,21 +24,14 @@ impl Size {
 }
 
 /// Types that are still larger, and how large they may be. The list may only become shorter, and its numbers smaller.
-const LARGER: [(&str, Size); 14] = [
+const LARGER: [(&str, Size); 7] = [
     ("models: init::initialiser::Initialiser", Size(14, 32, 6)),
     ("models: refine::Refiner", Size(21, 90, 12)),
     ("models: refine::keyframe::KeyFrame", Size(23, 7, 1)),
     ("models: refine::report::RefineReport", Size(29, 1, 1)),
     ("models: refine::report::SharedEstimate", Size(18, 0, 0)),
-    ("runtime/job: run_json::RunReport", Size(17, 5, 1)),
     ("runtime/pages: report::craft::Craft", Size(18, 3, 1)),
     ("runtime/uplink: receive::ReceiveCounters", Size(16, 2, 1)),
-    ("runtime: cli::plan::Args", Size(17, 0, 0)),
-    ("runtime: cli::sim::Args", Size(17, 0, 0)),
-    ("runtime: cli::train::Args", Size(29, 0, 0)),
-    ("runtime: train_job::TrainJob", Size(29, 16, 3)),
-    ("tests/bench: cli::methods::Args", Size(18, 0, 0)),
-    ("tests/bench: methods::Request", Size(16, 0, 0)),
 ];
 
 /// A type as it is found.

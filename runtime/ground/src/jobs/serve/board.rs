@@ -9,7 +9,7 @@ use models::formats::model::{self, ModelHeader};
 use pages::report::Thumbnail;
 use pages::report::ground::Shot;
 use pages::watch::Watch;
-use survey::coverage::{CoverageMap, Region};
+use survey::coverage::{CoverageMap, CoverageRegion};
 
 use super::{Progress, Received};
 
@@ -120,7 +120,7 @@ impl<'a> Board<'a> {
         let rules = self.mission.coverage;
         // Where the aircraft took off the ground does not know.
         let ground_m = rules.ground_m.map_or(0.0, f64::from);
-        let map = Region::new(region.into_iter().map(Into::into).collect())
+        let map = CoverageRegion::new(region.into_iter().map(Into::into).collect())
             .and_then(|region| CoverageMap::new(&region, ground_m, rules))
             .map(|mut map| {
                 header.views.iter().for_each(|(_, view)| map.add(view));
