@@ -158,7 +158,7 @@ table! {
 ///
 /// 3DGS takes 1.1 × the radius of the camera circle, which is 0 for one view and says nothing about a straight
 /// flight line. The distance to the camera is proportional to what one pixel covers, which is what a step in
-/// position must be measured by. At most 4,096 Gaussians, evenly spaced, are looked at; non-finite ones are
+/// position must be measured by. At most 4,096 Gaussians, evenly spaced, are sampled; non-finite ones are
 /// ignored; 1 when nothing remains.
 pub fn scene_extent(means: &[[f32; 3]], centers: &[[f64; 3]]) -> f32 {
     let stride = means.len().div_ceil(4096).max(1);

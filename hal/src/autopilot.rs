@@ -213,7 +213,7 @@ impl Autopilot {
     /// As [`PoseSource::pose_at`], but takes what there is when nothing better will come.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`PoseSource::pose_at`].
     pub fn pose_near(&self, boot_ns: u64) -> Result<BodyPose, PoseError> {
         self.track.pose_near(boot_ns)
     }

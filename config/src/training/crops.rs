@@ -12,7 +12,7 @@ table! {
             from "about as many as a flight has time to look at; 0.6 GB of 640 × 480";
         /// Scale of the pictures they are cut out of; absent = the largest half of the camera's size whose crops find room.
         pub scale: Option<f32> = None, in Limits::within(0.001, 1.0);
-        /// Progress from which on crops are looked at.
+        /// Progress from which on crops are visited.
         pub from: f32 = 0.5, in Limits::within(0.0, 1.0),
             from "sheffield_cross at half its size: 0.2 gains 0.24 dB at full size, 0.5 gains 0.38 (0ee6a83)";
         /// Share of the steps from then on that look at a crop, not at a whole picture.

@@ -153,7 +153,7 @@ impl Track {
     /// and attitude, the uncertainty grown accordingly.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`PoseSource::pose_at`].
     pub fn pose_near(&self, boot_ns: u64) -> Result<BodyPose, PoseError> {
         self.pose(boot_ns, MAX_EXTRAPOLATION_NS)
     }

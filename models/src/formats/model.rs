@@ -238,7 +238,7 @@ pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 3
     let header = decode_header(path, &header)?;
     let dropped = cloud.drop_invalid();
     if dropped > 0 {
-        tracing::warn!("{}: {dropped} Gaussians hold numbers that are not finite and were left out", path.display());
+        tracing::warn!("{}: {dropped} Gaussians hold numbers that are not finite and were dropped", path.display());
     }
     Ok((header, cloud, hash))
 }

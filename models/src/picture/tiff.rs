@@ -4,7 +4,7 @@
 use std::io::{BufReader, Read, Result, Seek, SeekFrom};
 use std::path::Path;
 
-/// Directories looked at; the first is the picture, others are previews and pyramids.
+/// Directories read; the first is the picture, others are previews and pyramids.
 const DIRECTORIES: usize = 16;
 
 /// Whether every tag of the file fits into it; true for what is no TIFF.

@@ -11,6 +11,7 @@ use config::error::{Error, ErrorKind};
 use glam::{DVec2, DVec3};
 
 mod cell;
+mod frustum;
 pub mod gaps;
 pub mod geojson;
 mod ground;
@@ -18,13 +19,12 @@ mod outline;
 pub mod raster;
 pub mod reflight;
 mod region;
-mod sight;
 
 use cell::Cell;
 pub use cell::CellReport;
+use frustum::{Frustum, Seen};
 pub use ground::Heights;
 pub use region::CoverageRegion;
-use sight::{Seen, Sight};
 
 use models::camera::View;
 
@@ -163,18 +163,18 @@ impl CoverageMap {
 
     /// Notes what a picture sees; one without a usable lens and pose is only counted.
     pub fn add(&mut self, view: &View) {
-        match Sight::of(view, Seen::Whole) {
-            Some(sight) => {
+        match Frustum::of(view, Seen::Whole) {
+            Some(frustum) => {
                 self.pictures += 1;
-                self.note(&sight);
+                self.note(&frustum);
             }
             None => self.dropped += 1,
         }
     }
 
-    fn note(&mut self, sight: &Sight) {
-        for i in self.in_reach(sight) {
-            if let Some(ray) = sight.ray(self.point(i)) {
+    fn note(&mut self, frustum: &Frustum) {
+        for i in self.in_reach(frustum) {
+            if let Some(ray) = frustum.ray(self.point(i)) {
                 self.cells[i].add(&ray);
             }
         }
@@ -182,13 +182,13 @@ impl CoverageMap {
 
     /// Whether a picture would bring something to ground that is not covered yet.
     pub fn wants(&self, view: &View) -> bool {
-        let Some(sight) = Sight::of(view, Seen::Whole) else { return false };
-        self.in_reach(&sight).any(|i| self.gain(i, &sight) > 0)
+        let Some(frustum) = Frustum::of(view, Seen::Whole) else { return false };
+        self.in_reach(&frustum).any(|i| self.gain(i, &frustum) > 0)
     }
 
     /// The squares, in the region or not, that may be in sight.
-    fn in_reach(&self, sight: &Sight) -> impl Iterator<Item = usize> + use<> {
-        let (low, high) = sight.bounds(self.extremes);
+    fn in_reach(&self, frustum: &Frustum) -> impl Iterator<Item = usize> + use<> {
+        let (low, high) = frustum.bounds(self.extremes);
         let Grid { corner, side_m, columns, rows } = self.grid;
         let (low, high) = ((low - corner) / side_m, (high - corner) / side_m);
         let within = |v: f64, count: usize| v.clamp(0.0, count as f64) as usize;
@@ -198,12 +198,12 @@ impl CoverageMap {
     }
 
     /// What a square gains by a picture: a picture that it lacks, a direction that it lacks.
-    fn gain(&self, i: usize, sight: &Sight) -> u32 {
+    fn gain(&self, i: usize, frustum: &Frustum) -> u32 {
         let cell = &self.cells[i];
         if !cell.is_inside() || cell.is_covered(&self.rules) {
             return 0;
         }
-        sight.ray(self.point(i)).map_or(0, |ray| cell.gain(&ray, &self.rules))
+        frustum.ray(self.point(i)).map_or(0, |ray| cell.gain(&ray, &self.rules))
     }
 
     /// Middle of a square on the ground.

@@ -137,7 +137,7 @@ impl Delivery {
             ..rates
         })?;
         self.rounded = true;
-        tracing::info!("rounded for delivery: colours go on");
+        tracing::info!("places and shapes are quantised for delivery; colours are trained on");
         Ok(())
     }
 

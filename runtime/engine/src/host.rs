@@ -41,7 +41,7 @@ pub struct HostRequest<'a> {
     pub ahead: u64,
     /// The camera's own pictures wait in memory beside them (those of a folder wait there).
     pub ahead_in_memory: bool,
-    /// Models are rounded for delivery, beside all else.
+    /// Models are quantised for delivery, beside all else.
     pub delivers: bool,
     /// The first Gaussians come out of a model's file and go into the next one piece by piece: two pieces take the place of the cloud and
     /// its checkpoint.

@@ -64,7 +64,7 @@ pub struct EngineSettings {
     pub ahead: usize,
     /// Their camera's own pictures wait in memory with them.
     pub ahead_in_memory: bool,
-    /// To what models are rounded for delivery while the job goes on.
+    /// To what models are quantised for delivery while the job goes on.
     pub delivers: Option<Rounding>,
     /// `[map]`: what is drawn after each build; `None` draws nothing.
     pub map: Option<MapSettings>,

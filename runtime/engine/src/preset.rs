@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::device::DeviceRequest;
-use tuning::loads::{Footprint, Sight};
+use tuning::loads::{Footprint, Visibility};
 use tuning::model::CostModel;
 
 mod flight;
@@ -207,7 +207,7 @@ impl Wanted {
         }
         let step_ms = self.mean_ms((width, height), |divisor| {
             let pixels = pixels / u64::from(divisor * divisor);
-            cost.step_ms(&Sight { gaussians: held.into(), share, pixels }.load(Footprint::TRAINED))
+            cost.step_ms(&Visibility { gaussians: held.into(), share, pixels }.load(Footprint::TRAINED))
         });
         // A number that was said stays, whatever the memory holds of it: the plan says so.
         let gaussians = self.max_gaussians.unwrap_or(held);

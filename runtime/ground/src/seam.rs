@@ -8,7 +8,7 @@ use models::camera::View;
 use super::merge::Merged;
 use super::squares::{HALO, REACH, Seam as Cell, seam};
 
-/// Gaussians looked at per view; more would not change a share in the percents.
+/// Gaussians sampled per view; more would not change a share in the percents.
 const SAMPLE: usize = 20_000;
 
 /// The seams of a merged scene.

@@ -13,7 +13,7 @@ use models::onnx::{OnnxError, features::FeatureNetwork, session};
 use tuning::cost;
 use tuning::devices;
 use tuning::kernels::{self, Source};
-use tuning::loads::{Footprint, Sight};
+use tuning::loads::{Footprint, Visibility};
 use vulkan::gpu::{Gpu, GpuInfo};
 use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 
@@ -263,12 +263,12 @@ fn step_cost(info: &GpuInfo, autotune: bool) -> Finding {
         return Finding::note("what it costs is not measured yet", how);
     };
     // The point of the presets of whole pictures.
-    let sight = Sight { gaussians: 100_000, share: 0.29, pixels: 640 * 480 };
+    let visibility = Visibility { gaussians: 100_000, share: 0.29, pixels: 640 * 480 };
     let threads = match cost::threads(info) {
         0 => String::new(),
         n => format!(" with {n} threads"),
     };
-    let ms = cost.step_ms(&sight.load(Footprint::TRAINED));
+    let ms = cost.step_ms(&visibility.load(Footprint::TRAINED));
     Finding::Ok(format!("{ms:.1} ms forecast{threads} for 100,000 Gaussians and pictures of 640x480"))
 }
 

@@ -14,7 +14,7 @@ use super::TrainJob;
 use super::scale::{PictureScale, largest};
 use crate::error::JobError;
 
-/// Points and pictures that are looked at for the share of a scene that a picture shows, at the most; and the least of points that says
+/// Points and pictures sampled for the share of a scene that a picture shows, at the most; and the least of points that says
 /// something.
 const MOST_POINTS: usize = 2000;
 const MOST_PICTURES: usize = 64;

@@ -21,7 +21,7 @@ use super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::transport::{Inlet, Outlet, Patience, TransportError};
 use crate::keys::{Domain, Identity};
 
-/// Most aircraft folders looked at; more than any mission has.
+/// Most aircraft folders visited; more than any mission has.
 const MAX_ENTRIES: usize = 4 * MAX_AIRCRAFT;
 
 /// The ground's word on its session, beside the aircraft's folders, none of which can have this name.

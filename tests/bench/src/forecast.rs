@@ -4,7 +4,7 @@ use pages::report::Table;
 use serde::Serialize;
 use tuning::cost::synthetic::IN_VIEW;
 use tuning::cost::{measure, threads};
-use tuning::loads::{Footprint, Sight};
+use tuning::loads::{Footprint, Visibility};
 use tuning::model::{CostModel, load};
 use vulkan::gpu::Gpu;
 use vulkan::kernel_config::KernelConfig;
@@ -56,7 +56,7 @@ pub fn measured(
     let mut all = Vec::new();
     for (gaussians, size) in SIZES.into_iter().take(sizes) {
         let pixels = u64::from(size.0) * u64::from(size.1);
-        let before = Sight { gaussians: gaussians as u64, share: IN_VIEW, pixels }.load(Footprint::SYNTHETIC);
+        let before = Visibility { gaussians: gaussians as u64, share: IN_VIEW, pixels }.load(Footprint::SYNTHETIC);
         let taken = measure_stages(gpu, config, &none, &Scene::synthetic(gaussians, size.0, size.1, 1), steps)?;
         let counted = load(taken.gaussians, taken.visible, taken.instances, taken.evaluations, pixels);
         let after = measure::measure(gpu, config)?;

@@ -1,6 +1,6 @@
 //! Which Gaussians of a scene in cells are on the device: those of the window that is trained, or those that a drawing shows.
 
-use super::scene::{Choice, Places, Scene, Sight};
+use super::scene::{Choice, Frustum, Places, Scene};
 use super::{Model, common_degree};
 use crate::device::Device;
 use crate::error::TrainError;
@@ -107,7 +107,7 @@ impl Model {
     /// Has all cells on the device that may show in the region of the frame; returns how many Gaussians they have where those are
     /// too many. What is drawn has the same bits as from a device that holds the whole scene.
     pub fn hold_region(&mut self, device: &mut Device) -> Result<Option<usize>, TrainError> {
-        let sight = Sight::of_region(&device.frame);
+        let frustum = Frustum::of_region(&device.frame);
         if !self.scene.drawing {
             // A window that is over ends as it would have without the drawing.
             self.end_window(device)?;
@@ -118,7 +118,7 @@ impl Model {
         drawn.clear();
         let (mut needed, mut away) = (0, false);
         for (i, cell) in self.scene.cells.iter().enumerate() {
-            if sight.blocks(&cell.bounds).is_some() {
+            if frustum.blocks(&cell.bounds).is_some() {
                 drawn.push(i as u32);
                 needed += cell.count;
                 away |= !(cell.on_device || cell.copied);

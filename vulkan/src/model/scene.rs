@@ -14,7 +14,7 @@ mod store;
 mod window;
 
 pub(crate) use cell::Blocks;
-pub(super) use cell::Sight;
+pub(super) use cell::Frustum;
 pub(super) use page::Places;
 pub(crate) use window::Choice;
 

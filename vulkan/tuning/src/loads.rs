@@ -36,7 +36,7 @@ impl Footprint {
 
 /// What one picture looks at.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sight {
+pub struct Visibility {
     /// Gaussians of the scene.
     pub gaussians: u64,
     /// Share of them that one picture sees, 0…1.
@@ -45,7 +45,7 @@ pub struct Sight {
     pub pixels: u64,
 }
 
-impl Sight {
+impl Visibility {
     /// The work of a step.
     pub fn load(&self, footprint: Footprint) -> Load {
         let visible = (self.gaussians as f64 * self.share.clamp(0.0, 1.0)).max(1.0);
@@ -92,7 +92,7 @@ mod tests {
         let all = [of(synthetic, Footprint::SYNTHETIC), of(trained, Footprint::TRAINED)].concat();
         for ((gaussians, visible, pixels, instances), footprint) in all {
             let share = visible as f64 / gaussians as f64;
-            let load = Sight { gaussians, share, pixels }.load(footprint);
+            let load = Visibility { gaussians, share, pixels }.load(footprint);
             assert!(
                 near(load.instances, instances as f64, 0.25),
                 "{gaussians} at {pixels}: {} {instances}",
@@ -103,9 +103,9 @@ mod tests {
 
     #[test]
     fn nothing_to_see_and_a_share_that_is_none_are_a_step_all_the_same() {
-        let load = Sight { gaussians: 0, share: f64::NAN, pixels: 0 }.load(Footprint::TRAINED);
+        let load = Visibility { gaussians: 0, share: f64::NAN, pixels: 0 }.load(Footprint::TRAINED);
         assert!(load.visible <= 1 && load.instances <= 2, "{load:?}");
-        let all = Sight { gaussians: 10, share: 7.0, pixels: 64 }.load(Footprint::TRAINED);
+        let all = Visibility { gaussians: 10, share: 7.0, pixels: 64 }.load(Footprint::TRAINED);
         assert_eq!(all.visible, 10);
     }
 }

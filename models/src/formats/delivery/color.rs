@@ -1,4 +1,4 @@
-//! Colours: the mean over the directions that the scene was looked at from, and how they vary with the view.
+//! Colours: the mean over the directions that the scene was seen from, and how they vary with the view.
 
 use super::coder::{Coder, Garbled, Residuals};
 use super::predict::{Linear, Neighbours, half_power, log2};

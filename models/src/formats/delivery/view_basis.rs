@@ -1,4 +1,4 @@
-//! The directions that a scene was looked at from: SH coefficients are only worth what they change in those.
+//! The directions that a scene was seen from: SH coefficients are only worth what they change in those.
 //!
 //! Mean m of the SH basis above degree 0 and its covariance G over (Gaussian, view) pairs, one for the whole scene. A
 //! Gaussian's colour, averaged over its views, is dc + mᵀc; how much it varies with the view is cᵀGc, so c is rounded in G's

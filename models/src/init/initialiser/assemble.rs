@@ -142,13 +142,15 @@ impl Initialiser {
         let [differ, left] = [found.solved.before, found.solved.after].map(|log| 100.0 * log.exp_m1());
         match &found.light {
             None => {
-                tracing::info!("the light is even: colours of a place differ by {differ:.1} %, by {left:.1} at best")
+                tracing::info!(
+                    "exposure correction is not needed: colours of a place differ by {differ:.1} %, by {left:.1} at best"
+                )
             }
             Some(light) => {
                 let gains = light.gains.values().flatten().fold([0.0f32; 2], |[a, b], g| [a.min(*g), b.max(*g)]);
                 let [low, high, corner] = [gains[0], gains[1], light.corner()].map(|log| 100.0 * log.exp_m1());
                 tracing::info!(
-                    "the light is uneven: pictures {low:+.0} to {high:+.0} %, corners {corner:+.0} %; colours of a place differ by {differ:.1} %, by {left:.1} with that taken out"
+                    "exposure correction: pictures {low:+.0} to {high:+.0} %, corners {corner:+.0} %; colours of a place differ by {differ:.1} %, by {left:.1} with that taken out"
                 );
             }
         }

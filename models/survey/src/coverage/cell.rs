@@ -4,7 +4,7 @@ use config::coverage::CoverageSettings;
 use glam::DVec2;
 
 use super::State;
-use super::sight::Ray;
+use super::frustum::Ray;
 
 /// Directions along which the spread of the rays is kept; the widest pair lies within 22.5° of one of them.
 const AXES: [DVec2; 4] = [

@@ -6,7 +6,7 @@ use super::Grid;
 
 /// Squares along a block's side: wide enough to hold the ground beside a house, narrow enough to follow a hillside.
 const BLOCK: usize = 8;
-/// Points looked at, evenly spread over the list.
+/// Points sampled, evenly spread over the list.
 const MOST_POINTS: usize = 1 << 18;
 /// Fewer in a block say nothing.
 const LEAST_POINTS: usize = 8;

@@ -7,8 +7,8 @@ use std::collections::BinaryHeap;
 use config::coverage::CoverageSettings;
 use glam::{DVec2, DVec3};
 
+use super::frustum::{Frustum, Seen};
 use super::gaps::Gap;
-use super::sight::{Seen, Sight};
 use super::{CoverageMap, State};
 use models::camera::{Intrinsics, Pose, View};
 use models::formats::telemetry::dji_rotation;
@@ -131,31 +131,31 @@ fn take_nearest<T>(items: &mut Vec<T>, here: DVec2, place: impl Fn(&T) -> DVec2)
 fn close(map: &mut CoverageMap, gap: &Gap, manner: &Manner, least_m: f64, room: usize) -> Vec<Station> {
     let mut wanted = vec![false; map.cells.len()];
     gap.squares.iter().for_each(|&i| wanted[i as usize] = true);
-    let gain = |map: &CoverageMap, sight: &Sight| {
-        map.in_reach(sight).filter(|&i| wanted[i]).map(|i| map.gain(i, sight)).sum::<u32>()
+    let gain = |map: &CoverageMap, frustum: &Frustum| {
+        map.in_reach(frustum).filter(|&i| wanted[i]).map(|i| map.gain(i, frustum)).sum::<u32>()
     };
     let places = places(map, gap, manner, least_m);
-    let sights: Vec<(Station, Sight)> = places
+    let frusta: Vec<(Station, Frustum)> = places
         .iter()
         .flat_map(|&center| manner.headings.iter().map(move |&heading| (center, heading)))
         .filter_map(|(center, heading)| {
-            Some((manner.station(center, heading), Sight::of(&manner.view(center, heading), manner.seen)?))
+            Some((manner.station(center, heading), Frustum::of(&manner.view(center, heading), manner.seen)?))
         })
         .collect();
     let mut best: BinaryHeap<(u32, Reverse<usize>)> =
-        sights.iter().enumerate().map(|(i, (_, sight))| (gain(map, sight), Reverse(i))).collect();
+        frusta.iter().enumerate().map(|(i, (_, frustum))| (gain(map, frustum), Reverse(i))).collect();
     let mut chosen = Vec::new();
     while let Some((_, Reverse(i))) = best.pop()
         && chosen.len() < room
     {
-        let (station, sight) = &sights[i];
-        let now = gain(map, sight);
+        let (station, frustum) = &frusta[i];
+        let now = gain(map, frustum);
         if best.peek().is_some_and(|next| next.0 > now) {
             best.push((now, Reverse(i)));
         } else if now == 0 {
             break;
         } else {
-            map.note(sight);
+            map.note(frustum);
             chosen.push(*station);
         }
     }

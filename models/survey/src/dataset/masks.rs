@@ -13,7 +13,7 @@ use models::camera::Intrinsics;
 use models::mask::{CORNERS, Mask};
 use models::picture::PictureError;
 
-/// Names looked at in one folder of masks; no survey has more pictures.
+/// Names read in one folder of masks; no survey has more pictures.
 const MAX_FILES: usize = 200_000;
 const FOLDER: &str = "masks";
 const EXTENSIONS: [&str; 6] = [".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff"];

@@ -13,7 +13,7 @@ const CELLS: usize = 64;
 /// Of the height between the ground and the lowest camera over it, this share is looked at. What floats above is seen by no
 /// camera well, and in the way of all.
 const LOOKED_AT: f64 = 0.8;
-/// Gaussians looked at, at most, evenly over the cloud: medians do not need more.
+/// Gaussians sampled, at most, evenly over the cloud: medians do not need more.
 pub const SAMPLE: usize = 100_000;
 /// Gaussians beyond these quantiles of their own coordinates do not stretch a map that has no views to go by.
 const QUANTILE: f64 = 0.01;

@@ -26,7 +26,7 @@ pub(crate) const CONTRADICTED_PX: f64 = 1.5;
 const WORTH_KEEPING: f32 = 0.5;
 
 /// Where the schedule goes on from after a growth, and begins after a landing that keeps most Gaussians. What is there has been trained and
-/// would be shaken by the rates of its beginning each time; pictures are still looked at in half their size. 0.2 to 0.7 dB on a flight of 150
+/// would be shaken by the rates of its beginning each time; pictures are still visited in half their size. 0.2 to 0.7 dB on a flight of 150
 /// pictures (tests/results/TRIED.md).
 pub(crate) const RENEWED_AT: f32 = 0.3;
 

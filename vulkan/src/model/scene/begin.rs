@@ -3,7 +3,7 @@
 use rand::Rng;
 
 use super::Cell;
-use super::cell::{Blocks, SIDE, Sight};
+use super::cell::{Blocks, Frustum, SIDE};
 use super::parts::grown_around;
 use super::window::{BLOCKS, Choice, NEVER, Window};
 use crate::error::TrainError;
@@ -28,7 +28,7 @@ impl Window {
             let places = newest.and_then(|view| self.least_visited::<PLACES>(view, by.sampler.rng()));
             let places = places.or_else(|| self.least_visited(0..views, by.sampler.rng()));
             for (view, block) in places.into_iter().flatten() {
-                let here = share_at_work(cells, &by.sight_of(Picture::View(view)), block);
+                let here = share_at_work(cells, &by.frustum_of(Picture::View(view)), block);
                 if best.is_none_or(|(most, ..)| here > most) {
                     best = Some((here, view, block));
                 }
@@ -37,10 +37,10 @@ impl Window {
                 let least = TrainError::TooCrowded { needed: fewest, gaussians: by.capacity };
                 return Err(if fewest == usize::MAX { TrainError::NothingInView } else { least });
             };
-            let (picture, sight) = (Picture::View(view), by.sight_of(Picture::View(view)));
+            let (picture, frustum) = (Picture::View(view), by.frustum_of(Picture::View(view)));
             match self
-                .part_around(cells, &sight, block, first)
-                .or_else(|_| self.part_around(cells, &sight, block, by.capacity))
+                .part_around(cells, &frustum, block, first)
+                .or_else(|_| self.part_around(cells, &frustum, block, by.capacity))
             {
                 Ok((part, needed)) if needed > 0 => return Ok((picture, part)),
                 Ok(_) => {}
@@ -62,13 +62,13 @@ impl Window {
         for _ in 0..if crops == 0 { 0 } else { PLACES } {
             let rng = by.sampler.rng();
             let (crop, block) = (rng.random_range(0..crops), (rng.random_range(0..SIDE), rng.random_range(0..SIDE)));
-            let here = share_at_work(cells, &by.sight_of(Picture::Crop(crop)), block);
+            let here = share_at_work(cells, &by.frustum_of(Picture::Crop(crop)), block);
             if best.is_none_or(|(most, ..)| here > most) {
                 best = Some((here, crop, block));
             }
         }
         let (_, crop, block) = best?;
-        let (part, needed) = self.part_around(cells, &by.sight_of(Picture::Crop(crop)), block, room).ok()?;
+        let (part, needed) = self.part_around(cells, &by.frustum_of(Picture::Crop(crop)), block, room).ok()?;
         (needed > 0).then_some((Picture::Crop(crop), part))
     }
 
@@ -76,14 +76,14 @@ impl Window {
     fn part_around(
         &mut self,
         cells: &[Cell],
-        sight: &Sight,
+        frustum: &Frustum,
         block: (u8, u8),
         room: usize,
     ) -> Result<(Blocks, usize), usize> {
         let shown = &mut self.shown;
         shown.clear();
         for (i, cell) in cells.iter().enumerate().filter(|(_, cell)| cell.count > 0) {
-            shown.extend(sight.blocks(&cell.bounds).map(|blocks| (i as u32, blocks.mask())));
+            shown.extend(frustum.blocks(&cell.bounds).map(|blocks| (i as u32, blocks.mask())));
         }
         grown_around(block, room, |part| {
             let mask = part.mask();
@@ -93,10 +93,10 @@ impl Window {
 }
 
 /// How much of what may show in a block of a picture is on the device, 0…1.
-fn share_at_work(cells: &[Cell], sight: &Sight, (x, y): (u8, u8)) -> f32 {
+fn share_at_work(cells: &[Cell], frustum: &Frustum, (x, y): (u8, u8)) -> f32 {
     let block = Blocks { x: [x, x + 1], y: [y, y + 1] };
     let (mut all, mut here) = (0, 0);
-    for cell in cells.iter().filter(|cell| cell.count > 0 && sight.shows_in(block, &cell.bounds)) {
+    for cell in cells.iter().filter(|cell| cell.count > 0 && frustum.shows_in(block, &cell.bounds)) {
         all += cell.count;
         here += if cell.at_work { cell.count } else { 0 };
     }

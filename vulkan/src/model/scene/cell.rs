@@ -90,7 +90,7 @@ impl Blocks {
 
 /// A camera as it decides which blocks of its picture a cell may show in: exact where it says no.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Sight {
+pub(crate) struct Frustum {
     axes: [Vec3; 3],
     shift: Vec3,
     perspective: bool,
@@ -103,7 +103,7 @@ pub(crate) struct Sight {
     blur: [f32; 2],
 }
 
-impl Sight {
+impl Frustum {
     /// Of a whole picture.
     pub fn of(camera: &View) -> Self {
         let mut frame: Frame = bytemuck::Zeroable::zeroed();

@@ -11,7 +11,7 @@ use rand::Rng;
 use std::ops::Range;
 
 use super::Cell;
-use super::cell::{Blocks, SIDE, Sight};
+use super::cell::{Blocks, Frustum, SIDE};
 use super::parts::largest_rectangle;
 use crate::error::TrainError;
 use crate::pictures::sampler::Sampler;
@@ -53,8 +53,8 @@ pub(crate) struct Choice<'a> {
 }
 
 impl Choice<'_> {
-    pub(super) fn sight_of(&self, picture: Picture) -> Sight {
-        Sight::of(&self.pictures.camera(picture))
+    pub(super) fn frustum_of(&self, picture: Picture) -> Frustum {
+        Frustum::of(&self.pictures.camera(picture))
     }
 }
 
@@ -74,7 +74,7 @@ pub(crate) struct Window {
     pub until: u32,
     /// Updates that visited each block of each view.
     pub(super) visits: Vec<u32>,
-    sights: Vec<Sight>,
+    frusta: Vec<Frustum>,
     by_distance: Vec<(f32, u32)>,
     /// Of the picture that a window begins with: the cells that may show in it, and in which blocks.
     pub(super) shown: Vec<(u32, u64)>,
@@ -92,7 +92,7 @@ impl Window {
             least_visits: 0,
             until: 0,
             visits: vec![0; views * BLOCKS],
-            sights: Vec::with_capacity(views + crops),
+            frusta: Vec::with_capacity(views + crops),
             by_distance: Vec::with_capacity(plan.cells()),
             shown: Vec::with_capacity(plan.cells()),
         }
@@ -160,8 +160,8 @@ impl Window {
         self.begin(cells, picture, part);
         self.fill_up(cells, capacity, updates > 1);
         if updates > 1 {
-            self.sights.clear();
-            self.sights.extend(by.pictures.all().map(|picture| by.sight_of(picture)));
+            self.frusta.clear();
+            self.frusta.extend(by.pictures.all().map(|picture| by.frustum_of(picture)));
             self.choose_items(cells, by.pictures.len());
         }
         let blocks: u32 = self.items.iter().map(|item| item.part.count()).sum();
@@ -243,10 +243,10 @@ impl Window {
 
     /// Besides the first part, of every picture the largest rectangle that sees no cell which is away.
     fn choose_items(&mut self, cells: &[Cell], views: usize) {
-        for (i, sight) in self.sights.iter().enumerate() {
+        for (i, frustum) in self.frusta.iter().enumerate() {
             let (mut free, mut shown) = (u64::MAX, 0);
             for (cell, wanted) in cells.iter().zip(&self.wanted).filter(|(c, _)| c.count > 0) {
-                let Some(blocks) = sight.blocks(&cell.bounds) else { continue };
+                let Some(blocks) = frustum.blocks(&cell.bounds) else { continue };
                 match wanted {
                     true => shown |= blocks.mask(),
                     false => free &= !blocks.mask(),

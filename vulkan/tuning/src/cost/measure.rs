@@ -13,7 +13,7 @@ use vulkan::trainer::{Counters, PictureStore, RunBudget, TrainError, Trainer};
 use super::synthetic;
 use crate::model::{CostModel, SH_DEGREE, Sample, load};
 
-/// Gaussians of the scenes, and pictures that each is looked at with: so that neither grows with the other. The largest of both takes
+/// Gaussians of the scenes, and pictures that each is rendered with: so that neither grows with the other. The largest of both takes
 /// 110 MiB of the device.
 const CLOUDS: [usize; 2] = [6000, 48_000];
 const PICTURES: [(u32, u32); 3] = [(128, 96), (256, 192), (480, 360)];

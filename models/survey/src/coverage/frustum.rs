@@ -30,13 +30,13 @@ pub(super) struct Ray {
 
 /// A usable picture.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sight {
+pub(super) struct Frustum {
     camera: Pinhole,
     size: DVec2,
     seen: Seen,
 }
 
-impl Sight {
+impl Frustum {
     /// `None` for a lens or a pose that is no number.
     pub(super) fn of(view: &View, seen: Seen) -> Option<Self> {
         if !view.is_usable() {
