@@ -234,7 +234,7 @@ fn who_trickles_is_cut_off_in_time_and_holds_up_neither_the_others_nor_the_job()
     let mut longest = Duration::ZERO;
     for i in 0..100_000u32 {
         let before = Instant::now();
-        watch.craft(0, |craft| craft.curve.push(f64::from(i), 1.0));
+        watch.craft(0, |craft| craft.plot.curve.push(f64::from(i), 1.0));
         longest = longest.max(before.elapsed());
     }
     assert!(get(at, "/").0.contains("200"));

@@ -29,7 +29,9 @@ fn a_region_half_flown_is_told_to_the_ground_and_completed_by_the_flight_that_is
     assert_eq!((craft.covered, craft.key_frames), (Some(before.percent()), Some(first.names.len() as u64)));
     assert_eq!((ground.shots.len(), craft.thumbnail.serial as usize), (first.names.len(), first.names.len()));
     assert!(craft.at.is_some_and(|p| p[0].abs() < 60.0 && p[1].abs() < 40.0), "near the region: {:?}", craft.at);
-    assert!(craft.steps > Some(0) && craft.curve.points().len() as u64 <= craft.steps.unwrap_or(0));
+    assert!(
+        craft.schedule.steps > Some(0) && craft.plot.curve.points().len() as u64 <= craft.schedule.steps.unwrap_or(0)
+    );
     before.write(&Disk::default(), &out).expect("written");
     let plan = flight_plan::read(&out.join(REFLIGHT)).expect("a plan");
     assert!((plan.home.alt_m - ORIGIN.alt_m).abs() < 1.0, "home is where the autopilot says");

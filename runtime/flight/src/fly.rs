@@ -261,7 +261,7 @@ fn outcome(
         !interrupt.requested()
     };
     if finished {
-        watch.craft(0, |craft| (craft.state, craft.left_s) = ("delivering the model", None));
+        watch.craft(0, |craft| (craft.state, craft.schedule.left_s) = ("delivering the model", None));
     }
     let delivered = finished && offerer.wait_delivered(DELIVERY, go_on);
     watch.craft(0, |craft| {

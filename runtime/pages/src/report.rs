@@ -16,7 +16,7 @@ mod page;
 pub mod picture;
 mod text;
 
-pub use craft::{Craft, Thumbnail};
+pub use craft::{Craft, Plot, Schedule, Thumbnail};
 use ground::Ground;
 pub use page::{SCRIPT, STYLE, live as live_page};
 pub use text::{bytes, count, seconds};

@@ -107,10 +107,10 @@ impl ShownJob {
         self.steps += 1;
         let (steps, done) = (self.steps, f64::from(report.progress));
         self.watch.craft(0, |craft| {
-            (craft.steps, craft.gaussians) = (Some(steps), Some(report.gaussians as u64));
-            craft.progress = Some(report.progress);
-            craft.left_s = (done >= PACE_FROM).then(|| report.elapsed_s * (1.0 - done) / done);
-            craft.curve.push(steps as f64, report.loss.into());
+            (craft.schedule.steps, craft.gaussians) = (Some(steps), Some(report.gaussians as u64));
+            craft.schedule.progress = Some(report.progress);
+            craft.schedule.left_s = (done >= PACE_FROM).then(|| report.elapsed_s * (1.0 - done) / done);
+            craft.plot.curve.push(steps as f64, report.loss.into());
         });
     }
 

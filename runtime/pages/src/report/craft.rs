@@ -34,22 +34,42 @@ pub struct Craft {
     pub covered: Option<u32>,
     /// Gaussians.
     pub gaussians: Option<u64>,
-    /// Optimiser steps.
-    pub steps: Option<u64>,
-    /// Share of the schedule that is over, 0…1.
-    pub progress: Option<f32>,
-    /// What is left of it, seconds.
-    pub left_s: Option<f64>,
+    /// How far it is.
+    pub schedule: Schedule,
     /// Bytes that went to the ground, or came from the aircraft.
     pub bytes: Option<u64>,
     /// Chunks here and chunks wanted of a model that is under way.
     pub chunks: Option<(usize, usize)>,
-    /// What the training curve shows: its axes.
-    pub axes: [&'static str; 2],
     /// The training curve.
-    pub curve: Curve,
+    pub plot: Plot,
     /// The last key frame.
     pub thumbnail: Thumbnail,
+}
+
+/// How far a training or a transfer is.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Schedule {
+    /// Optimiser steps.
+    pub steps: Option<u64>,
+    /// Share that is over, 0…1.
+    pub progress: Option<f32>,
+    /// What is left, seconds.
+    pub left_s: Option<f64>,
+}
+
+/// A curve with its axes.
+#[derive(Clone, Debug)]
+pub struct Plot {
+    /// What goes to the right and what goes up.
+    pub axes: [&'static str; 2],
+    /// Its points.
+    pub curve: Curve,
+}
+
+impl Default for Plot {
+    fn default() -> Self {
+        Self { axes: ["step", "loss"], curve: Curve::default() }
+    }
 }
 
 /// A small picture in memory that is taken once.
@@ -88,7 +108,7 @@ impl Craft {
         // Three bytes a pixel; all that a card will ever need.
         let rgb = Vec::with_capacity(3 * (THUMBNAIL * THUMBNAIL) as usize);
         let thumbnail = Thumbnail { rgb, ..Thumbnail::default() };
-        Self { name: name.into(), state, thumbnail, axes: ["step", "loss"], ..Self::default() }
+        Self { name: name.into(), state, thumbnail, ..Self::default() }
     }
 
     /// Label and value of what is known, in reading order.
@@ -102,8 +122,8 @@ impl Craft {
             ("key frames", self.key_frames.map(count)),
             ("covered", self.covered.map(|p| format!("{p} %"))),
             ("Gaussians", self.gaussians.map(count)),
-            ("steps", self.steps.map(count)),
-            ("time left", self.left_s.map(seconds)),
+            ("steps", self.schedule.steps.map(count)),
+            ("time left", self.schedule.left_s.map(seconds)),
             ("model under way", self.chunks.map(|(n, of)| format!("{n} of {of} chunks"))),
             ("transferred", self.bytes.map(bytes)),
         ];
@@ -121,10 +141,10 @@ impl Craft {
             "state": self.state,
             "trouble": self.trouble.map(|(rung, cause)| format!("{rung} ({cause})")),
             "at": self.at,
-            "progress": self.progress,
+            "progress": self.schedule.progress,
             "facts": self.facts(),
-            "axes": self.axes,
-            "curve": self.curve.points(),
+            "axes": self.plot.axes,
+            "curve": self.plot.curve.points(),
             "thumbnail": thumbnail,
         }))
     }
@@ -138,7 +158,7 @@ mod tests {
     fn a_card_says_only_what_is_known_and_takes_no_memory_while_it_is_filled() {
         let mut craft = Craft::new("west", "listening");
         assert!(craft.facts().is_empty());
-        (craft.left_s, craft.at) = (Some(95.0), Some([f64::NAN; 3]));
+        (craft.schedule.left_s, craft.at) = (Some(95.0), Some([f64::NAN; 3]));
         assert_eq!(craft.facts(), [("time left", "95 s".to_owned())]);
         let room = craft.thumbnail.rgb.capacity();
         for size in [(4056, 3040), (640, 480), (3, 2), (193, 1)] {

@@ -124,7 +124,11 @@ fn strange_numbers_do_not_break_the_page() {
     data.map[0].cameras.push([f64::NAN, f64::INFINITY]);
     data.timings[0].seconds = f64::NAN;
     data.models[0].psnr = Some(f64::INFINITY);
-    data.aircraft.push(Craft { at: Some([f64::NAN; 3]), left_s: Some(f64::INFINITY), ..Craft::new("west", "done") });
+    data.aircraft.push(Craft {
+        at: Some([f64::NAN; 3]),
+        schedule: Schedule { left_s: Some(f64::INFINITY), ..Schedule::default() },
+        ..Craft::new("west", "done")
+    });
     let state = embedded(&data.to_html().expect("page"), "state").to_string();
     assert!(!state.contains("NaN") && !state.contains("inf\""), "{state}");
     data.comparisons[0].panels[0].1 = RgbImage::new(0, 0);

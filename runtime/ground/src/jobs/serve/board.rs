@@ -35,7 +35,7 @@ impl<'a> Board<'a> {
         watch.update(|page| {
             page.title = format!("Mission {}: ground", mission.name);
             for craft in &mut page.aircraft {
-                craft.axes = ["seconds", "steps of the models that arrived"];
+                craft.plot.axes = ["seconds", "steps of the models that arrived"];
                 // No picture comes to the ground: its room, times all aircraft, is given back.
                 craft.thumbnail = Thumbnail::default();
             }
@@ -74,9 +74,9 @@ impl<'a> Board<'a> {
             let under_way = transfers.get(aircraft.id.as_str()).copied();
             let left_s = self.left_s(i, under_way);
             self.watch.craft(i, |craft| {
-                (craft.chunks, craft.left_s) = (under_way, left_s);
+                (craft.chunks, craft.schedule.left_s) = (under_way, left_s);
                 craft.bytes = here.map(|r| r.size);
-                craft.progress = under_way.map(|(n, of)| n as f32 / of.max(1) as f32);
+                craft.schedule.progress = under_way.map(|(n, of)| n as f32 / of.max(1) as f32);
                 craft.link = if under_way.is_some() { "receiving" } else { "idle" };
                 craft.state = match (here, under_way) {
                     (Some(r), None) if r.finished => "final model is here",
@@ -134,8 +134,8 @@ impl<'a> Board<'a> {
             let Some(craft) = page.aircraft.get_mut(i) else { return };
             craft.covered = covered.map(|share| (100.0 * share) as u32);
             craft.key_frames = Some(header.views.len() as u64);
-            (craft.gaussians, craft.steps) = (Some(gaussians), Some(header.steps));
-            craft.curve.push(elapsed_s, header.steps as f64);
+            (craft.gaussians, craft.schedule.steps) = (Some(gaussians), Some(header.steps));
+            craft.plot.curve.push(elapsed_s, header.steps as f64);
         });
     }
 }
