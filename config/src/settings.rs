@@ -29,7 +29,7 @@ impl SettingError {
         Self { field: field.to_owned(), value, wanted: wanted.to_string() }
     }
 
-    /// The same seen from the table that holds this one as `name`.
+    /// This error as the table sees it that holds this one as `name`.
     pub fn at(mut self, name: &str) -> Self {
         let dot = if self.field.is_empty() || self.field.starts_with('[') { "" } else { "." };
         self.field = format!("{name}{dot}{}", self.field);

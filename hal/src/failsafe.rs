@@ -111,7 +111,7 @@ pub enum Cause {
 pub enum ClearCondition {
     /// Once its flag was down for [`Timing::recovery_ms`], or at the landing.
     WhenConditionClears,
-    /// As above, but the landing changes nothing: what is short or hot in the air is so on the ground.
+    /// Once its flag was down for [`Timing::recovery_ms`]; the landing changes nothing: what is short or hot in the air is so on the ground.
     OutlastsLanding,
     /// Not before the program starts afresh.
     Never,

@@ -96,7 +96,7 @@ impl GaussianCloud {
         }
     }
 
-    /// The same with its memory taken from the system at once: what is planned for a flight cannot be refused in the midst of it.
+    /// An empty cloud with its memory taken from the system at once: what is planned for a flight cannot be refused in the midst of it.
     pub fn with_memory(sh_degree: u8, capacity: usize) -> Self {
         let mut cloud = Self::with_capacity(sh_degree, capacity);
         cloud.means.resize(capacity, [1.0; 3]);

@@ -95,7 +95,7 @@ pub fn write(model: &Chunks, folder: &Path, sh_degree: u8) -> Result<Report, For
     write_and_see(model, folder, sh_degree, &mut |_| Ok(()))
 }
 
-/// The same; `see` is given the levels of each leaf as they are before they are packed, the finest first.
+/// Writes the levels of a model; `see` is given the levels of each leaf as they are before they are packed, the finest first.
 ///
 /// # Errors
 /// As [`write()`]; those of `see`.

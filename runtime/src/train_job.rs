@@ -190,7 +190,7 @@ impl TrainJob {
         job.run_on(set, began, &stop, Some(chosen))
     }
 
-    /// The same, with every number known that anybody will say.
+    /// Runs the job once its sizes are chosen.
     fn run_on(
         &self,
         mut set: Dataset,

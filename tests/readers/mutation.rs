@@ -48,7 +48,7 @@ const WORDS: [u64; 18] = [
     0x7FF0_0000_0000_0000, // infinity
 ];
 
-/// The same in text.
+/// Numbers worth trying in text.
 const NUMBERS: [&str; 16] = [
     "0",
     "-1",

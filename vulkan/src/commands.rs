@@ -293,7 +293,7 @@ impl Recording<'_> {
     /// As [`Self::submit`]; the host looks at the sections of these names next, which a mirror then has at once.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`Self::submit`].
     pub fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
         let c = self.commands;
         // SAFETY: the buffer is being recorded, and every kernel ends with a barrier.

@@ -34,7 +34,7 @@ pub struct KernelConfig {
 const WIDE: [u32; 4] = [32, 64, 128, 256];
 const NARROW: [u32; 3] = [8, 16, 32];
 const TILES: [u32; 3] = [8, 16, 32];
-/// The same where a tile's lanes meet in shared memory, where all of a workgroup wait for each other. So few as the first are never
+/// Tiles worth trying where their lanes meet in shared memory and all of a workgroup wait for each other. So few as the first are never
 /// blended otherwise: where lanes can read each other, it says that they meet nevertheless.
 const MEETING_TILES: [u32; 2] = [2, 8];
 

@@ -33,7 +33,7 @@ pub(crate) const DEPTH_LANES: u32 = 1024;
 pub(crate) struct Spirv {
     /// What it only reads, it fetches as texels.
     pub texels: &'static [u8],
-    /// The same from storage buffers; none where it fetches nothing.
+    /// The kernel that reads from storage buffers instead; none where nothing is fetched.
     pub storage: Option<&'static [u8]>,
 }
 

@@ -25,7 +25,7 @@ const FMA_PER_TURN: u64 = 16 * 8 * 2;
 pub struct Roofline {
     /// Bytes read plus bytes written per second by a compute kernel that copies.
     pub kernel_bytes_per_s: f64,
-    /// The same by the device's own copy command.
+    /// Bytes read plus bytes written per second by the device's own copy command.
     pub command_bytes_per_s: f64,
     /// Floating-point operations per second, a fused multiply-add counted as two.
     pub operations_per_s: f64,

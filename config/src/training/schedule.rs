@@ -58,7 +58,7 @@ impl ResolutionSettings {
         [4, 2].into_iter().find(|d| *d <= wanted && least / d >= self.least_side.max(1)).unwrap_or(1)
     }
 
-    /// The same as shares of a schedule: how much of it pictures of `width` × `height` are reduced by how much.
+    /// Shares of a schedule, and by how much pictures of `width` × `height` are reduced in each.
     pub fn phases(&self, width: u32, height: u32) -> [(f32, u32); 3] {
         let quarter = self.quarter_until.clamp(0.0, 1.0);
         let half = self.half_until.clamp(quarter, 1.0);

@@ -176,7 +176,7 @@ impl<L: Link> Channel<L> {
         self.next_frame_if(|_| true)
     }
 
-    /// The same, of a sender whom `admit` believes. Nothing is remembered of other frames, of which a stranger may send copies.
+    /// The next good frame of a sender whom `admit` believes. Nothing is remembered of other frames, of which a stranger may send copies.
     pub fn next_frame_if(&mut self, mut admit: impl FnMut(&Frame<'_>) -> bool) -> Option<Frame<'_>> {
         // Two steps because a frame borrows the framer: first whether it is acceptable, then its bytes.
         loop {

@@ -22,7 +22,7 @@ use super::edges;
 /// Floats that the embedded network's session holds per pixel of a picture while it runs, inputs and outputs included
 /// (measured: 53).
 const EMBEDDED_FLOATS_PER_PIXEL: u64 = 64;
-/// The same of a user's network; IterMVS with three views takes 397.
+/// Floats per pixel of a user's network; IterMVS with three views takes 397.
 const OTHER_FLOATS_PER_PIXEL: u64 = 420;
 /// What opening a session takes beside its weights: the graph's nodes and plans (measured: 24 MiB for the plane sweep).
 const SESSION_BYTES: u64 = 28 << 20;

@@ -31,7 +31,7 @@ const ODD: f32 = 0.35;
 const QUANTILE: f32 = 0.04;
 /// Beyond those percentiles, to hold what no feature sat on (tree tops, ditches).
 const MARGIN: [f32; 2] = [0.8, 1.2];
-/// The same where the ground says how far the picture's corners are.
+/// Margin where the ground says how far the picture's corners are.
 const GROUND_MARGIN: [f32; 2] = [0.9, 1.08];
 /// Points kept; the oldest make way.
 pub const MAX_POINTS: usize = 20_000;

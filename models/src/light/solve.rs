@@ -9,7 +9,7 @@ const ROUNDS: usize = 6;
 const OUTLIER: f64 = 2.0;
 /// What holds gains near 0 where nothing else does, in ratios.
 const GAIN_PRIOR: f64 = 0.05;
-/// The same of the fall-off's terms at the reach.
+/// What holds the fall-off's terms near 0 at the reach.
 const FALLOFF_PRIOR: f64 = 1.0;
 /// Steps of conjugate gradients at most, and the share of the residual at which they end.
 const STEPS: usize = 400;
@@ -37,7 +37,7 @@ pub struct Solved {
     pub reach: f32,
     /// Median difference between the pictures' colours of a place, natural logarithm.
     pub before: f32,
-    /// The same with gains and fall-off taken out.
+    /// Median difference after gains and fall-off are taken out.
     pub after: f32,
 }
 

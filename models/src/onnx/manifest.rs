@@ -15,7 +15,7 @@ use crate::formats::{FormatError, one_line, read_bounded};
 
 /// Networks larger than this are refused before they are read: nothing a companion computer can run is larger.
 const MAX_NETWORK_BYTES: u64 = 4 << 30;
-/// The same of manifests.
+/// Manifests larger than this are refused before they are read.
 const MAX_MANIFEST_BYTES: u64 = 1 << 16;
 
 /// Which inputs and outputs a network promises.

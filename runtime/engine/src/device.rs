@@ -24,7 +24,7 @@ use tuning::kernels;
 
 /// Gaussian–tile instances that a renderer holds at once, per pixel; pictures with more are rendered in bands.
 const INSTANCES_PER_PIXEL: usize = 8;
-/// The same of a map's block.
+/// Gaussian–tile instances per pixel that the renderer of a map's block holds.
 const INSTANCES_PER_MAP_PIXEL: usize = 2;
 
 /// The lens of the pictures that a flight trains on.
@@ -149,8 +149,8 @@ pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height:
     Ok(trainer)
 }
 
-/// The same of a model's file, of which the host never holds more than a piece (a cell of one that is rounded; one of version 2 whole);
-/// what the file says about itself. Of a file that is cut short: what is there.
+/// A renderer of a model's file, and its header. The host never holds more than a piece of the file, or a cell of a quantised one. Of a file
+/// that is cut short it shows what is there.
 ///
 /// # Errors
 /// Those of [`renderer`], and of [`model::read_what_is_there`].
@@ -173,7 +173,7 @@ pub fn file_renderer(
     }
 }
 
-/// The same for the blocks of a map, in less memory: where more Gaussians meet, a block is drawn in bands.
+/// A renderer of the blocks of a map, in less memory: where more Gaussians meet, a block is drawn in bands.
 ///
 /// # Errors
 /// Those of [`renderer`]; the model cannot be read any more.

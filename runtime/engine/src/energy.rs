@@ -51,7 +51,7 @@ impl Meter {
         spent_s + (self.allowed_j - self.used_j).max(0.0) / now
     }
 
-    /// The same before anything is trained.
+    /// Seconds that the energy lasts, before anything is trained.
     pub fn seconds(&self) -> f64 {
         self.allowed_j / self.watts
     }

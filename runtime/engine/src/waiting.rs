@@ -25,7 +25,7 @@ pub(super) fn file_bytes(pictures: u64, each: u64) -> u64 {
     Some(pictures * each).filter(|waiting| *waiting > FRAMES_IN_MEMORY).unwrap_or(0)
 }
 
-/// The same of the file for what matching keeps.
+/// Bytes of the file for what matching keeps of so many pictures.
 pub fn matching_file_bytes(pictures: u64, refine: &RefineSettings) -> u64 {
     file_bytes(pictures, refine.kept_bytes())
 }

@@ -17,7 +17,7 @@ pub fn exit_code(kind: ErrorKind) -> ExitCode {
     ExitCode::from(code_of(kind))
 }
 
-/// The same as a number.
+/// The exit code of an error of this kind, as a number.
 pub(super) fn code_of(kind: ErrorKind) -> u8 {
     EXIT_CODES.iter().find(|row| row.0 == kind).map_or(1, |row| row.1)
 }

@@ -29,7 +29,7 @@ pub struct DetailScores {
     pub device_bytes: u64,
     /// Held-out pictures at the size of whole training pictures.
     pub small: Scores,
-    /// The same at full size.
+    /// Held-out pictures at full size.
     pub full: Scores,
 }
 

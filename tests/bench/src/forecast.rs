@@ -24,7 +24,7 @@ pub struct Forecast {
     pub size: (u32, u32),
     /// Milliseconds of a step by what is known beforehand: Gaussians, size, share in view.
     pub forecast_ms: f64,
-    /// The same by the work that was counted.
+    /// Milliseconds of a step by the work that was counted.
     pub by_work_ms: f64,
     /// What it took.
     pub measured_ms: f64,

@@ -168,7 +168,7 @@ fn apart_before(field: &Field) -> f64 {
     rms_apart(field, |i, p| field.error(i).point(p) - p)
 }
 
-/// The same where the global model has the aircraft's cameras: their places and headings say where the aircraft went.
+/// How far apart they are where the global model has the aircraft's cameras: their places and headings say where the aircraft went.
 fn apart_after(field: &Field, header: &ModelHeader) -> f64 {
     let place = |i: usize| {
         let mut all = header.views.iter().filter(|(name, _)| name.starts_with(&id(i)));

@@ -49,7 +49,7 @@ pub struct MapScores {
     pub squares: usize,
     /// Heights on bare ground and roofs, away from steps.
     pub heights: HeightScores,
-    /// The same from the fused depth maps alone.
+    /// Heights from the fused depth maps alone.
     pub fused_depth: HeightScores,
 }
 

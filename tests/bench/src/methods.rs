@@ -112,7 +112,7 @@ pub struct MethodResult {
     pub ground_s: f64,
     /// Bytes that left the aircraft: exact models, or pictures.
     pub sent_bytes: u64,
-    /// The same with models in the delivery encoding.
+    /// Bytes that left the aircraft with models in the delivery encoding.
     pub delivery_bytes: u64,
     /// Pictures that left the aircraft that took them.
     pub pictures_sent: usize,

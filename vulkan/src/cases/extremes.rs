@@ -85,7 +85,7 @@ pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike(gpu: &Gpu
     Ok(counted.said())
 }
 
-/// The same on the reference, three steps each.
+/// Scenes of all sizes on the reference, three steps each.
 pub fn scenes_a_centimetre_and_a_hundred_kilometres_across_train_alike_in_the_reference() -> Outcome {
     let mut counted = Tally::default();
     let v = view(21, 17);
@@ -124,7 +124,7 @@ pub fn cameras_far_from_the_origin_see_the_same_picture(gpu: &Gpu) -> Outcome {
     Ok(counted.said())
 }
 
-/// The same on the reference.
+/// Cameras far from the origin, on the reference.
 pub fn cameras_far_from_the_origin_see_the_same_picture_in_the_reference() -> Outcome {
     let mut counted = Tally::default();
     let at_origin = view(21, 17);

@@ -59,7 +59,7 @@ pub fn answer(cloud: &GaussianCloud, view: &View, photo: &[[f32; 3]], settings: 
     answer_in(cloud, view, photo, settings)
 }
 
-/// The same in the arithmetic of choice.
+/// The reference's full step before the optimiser, in the arithmetic of choice.
 pub fn answer_in<R: Real>(
     cloud: &GaussianCloud,
     view: &View,
@@ -95,7 +95,7 @@ pub fn trainer(gpu: &Gpu, cloud: &GaussianCloud, view: &View, settings: &TrainSe
     Ok(trainer)
 }
 
-/// The same with nothing loaded yet.
+/// A trainer with room for `capacity` Gaussians, none of them loaded.
 ///
 /// # Errors
 /// The device refuses the plan.

@@ -14,7 +14,7 @@ pub fn trainer(cloud: &GaussianCloud, view: &View, settings: &TrainSettings) -> 
     Some(vulkan::cases::scenes::trainer(&open()?, cloud, view, settings).unwrap())
 }
 
-/// The same with nothing loaded yet.
+/// A trainer with room for `capacity` Gaussians, none of them loaded.
 pub fn empty_trainer(sh_degree: u8, capacity: usize, view: &View, settings: &TrainSettings) -> Option<Fixture> {
     Some(vulkan::cases::scenes::empty_trainer(&open()?, sh_degree, capacity, view, settings).unwrap())
 }

@@ -22,10 +22,10 @@ struct Kept {
     /// The one measured last comes last.
     #[serde(default)]
     device: Vec<Entry>,
-    /// The same.
+    /// Steps, the one measured last comes last.
     #[serde(default)]
     step: Vec<Step>,
-    /// The same.
+    /// Costs, the one measured last comes last.
     #[serde(default)]
     cost: Vec<Cost>,
 }

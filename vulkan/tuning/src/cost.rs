@@ -31,7 +31,7 @@ pub fn known(info: &GpuInfo, config: KernelConfig) -> Option<CostModel> {
     kept(cache::path()?, info, config)
 }
 
-/// The same, measured now and kept where it was not; `None` (and a warning) where it cannot be measured, and where
+/// What steps cost on this device, measured now and kept where it is not known; `None` (and a warning) where it cannot be measured, and where
 /// [`config::kernels::VARIABLE`] says that nothing is. Call it before anything that must not wait: it takes seconds.
 pub fn of(gpu: &Gpu, config: KernelConfig) -> Option<CostModel> {
     if choice() == KernelChoice::Standard {

@@ -24,7 +24,7 @@ pub fn open(name: Option<&str>) -> Result<Gpu, GpuError> {
     open_by(name, &measured)
 }
 
-/// The same without measuring: the first hardware device until they were.
+/// Opens a device without measuring: the first hardware device until they were.
 ///
 /// # Errors
 /// Those of [`Gpu::open`].
@@ -54,7 +54,7 @@ pub fn known(info: &GpuInfo) -> Option<f64> {
     })
 }
 
-/// The same, measured and kept where it was not.
+/// Milliseconds of a step on this device, measured and kept where it is not known.
 pub fn measured(info: &GpuInfo) -> Option<f64> {
     known(info).or_else(|| {
         tracing::info!("{}: measuring a step (once), to choose among the devices", info.name);

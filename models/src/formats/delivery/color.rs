@@ -10,7 +10,7 @@ const FROM_RGB: [[f64; 3]; 3] = [[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.
 const TO_RGB: [[f64; 3]; 3] = [[1.0, 1.0, -1.0], [1.0, 0.0, 1.0], [1.0, -1.0, -1.0]];
 /// Half powers of two that a mean colour's step may shrink and grow by where a Gaussian is seen much or little.
 const MEAN_HALVES: (i32, i32) = (-2, 6);
-/// The same of its variation.
+/// Half powers of two for the step of a colour's variation.
 const VARIATION_HALVES: (i32, i32) = (-4, 8);
 /// Classes of the logarithm of an eigenvalue, 2^-9 to 2^2.
 const BY_VALUE: (f64, f64) = (-9.0, 2.0);

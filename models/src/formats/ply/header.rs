@@ -215,12 +215,12 @@ impl Row {
         self.values[at] as f32
     }
 
-    /// The same with all its digits.
+    /// The value of property number `at` with all its digits.
     pub(super) fn number(&self, at: usize) -> f64 {
         self.values[at]
     }
 
-    /// The same as a whole number.
+    /// The value of property number `at` as a whole number.
     pub(super) fn word(&self, at: usize) -> u32 {
         self.values[at] as u32
     }

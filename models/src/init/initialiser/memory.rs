@@ -42,7 +42,7 @@ impl Initialiser {
         self.planned(pixels, pictures, max_gaussians)
     }
 
-    /// The same before the first picture, for pictures of `size`.
+    /// The planned bytes before the first picture, for pictures of `size`.
     pub fn planned_bytes_at(&self, size: (u32, u32), pictures: usize, max_gaussians: usize) -> u64 {
         let (width, height) = self.network_size(size);
         self.planned(u64::from(width) * u64::from(height), pictures, max_gaussians)

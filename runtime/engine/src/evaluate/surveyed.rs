@@ -27,7 +27,7 @@ pub struct SurveyedScores {
     pub unseen: usize,
     /// Root mean square over the points of the mean horizontal distance of their marks, metres.
     pub horizontal_rmse_m: f64,
-    /// The same of heights.
+    /// Root mean square over the points of the mean height error of their marks, metres.
     pub vertical_rmse_m: f64,
     /// Mean of the heights' errors, positive where the model is too high, metres.
     pub vertical_bias_m: f64,

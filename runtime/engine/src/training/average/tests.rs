@@ -12,12 +12,12 @@ use super::*;
 use crate::testing::{picture, settings};
 use crate::{EngineSettings, Reconstruct, Reconstruction};
 
-/// An engine that has built its model from three pictures and averages from progress 0.5 on where a schedule has so many looks at each.
+/// An engine that has built its model from three pictures and averages from progress 0.5 on where a schedule has so many visits to each.
 fn built(visits: u32) -> Option<Reconstruction> {
     built_with(visits, |_| ())
 }
 
-/// The same with other settings.
+/// An engine as [`built`] makes it, with other settings.
 fn built_with(visits: u32, change: impl Fn(&mut EngineSettings)) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
         needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");

@@ -59,7 +59,7 @@ fn engine() -> Option<Reconstruction> {
     engine_in(None, None).map(|engine| engine.expect("opens"))
 }
 
-/// The same in so much of the host's memory, MiB, on a device that holds so many Gaussians of them all.
+/// An engine in flight in so much of the host's memory, MiB, on a device that holds so many of all Gaussians.
 fn engine_in(host_mib: Option<u32>, on_device: Option<u32>) -> Option<Result<Reconstruction, EngineError>> {
     if Gpu::list().is_err() {
         needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");
