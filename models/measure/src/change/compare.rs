@@ -69,8 +69,10 @@ pub fn compare(old: &Heights, new: &Heights, registration: &Registration) -> Dif
             }
         })
         .collect();
-    let reach = [old, new].map(|m| Noise::of(m).map_or(m.gsd(), |n| n.reach_m)).into_iter().fold(new.gsd(), f64::max);
-    Difference { grid: new.clone(), metres, sigma, beyond, reach_m: reach, bias_m: registration.sigma_m[2] }
+    // In the difference the ground itself is gone: what is left is noise, and little that changed.
+    let apart = new.with_values(metres.clone());
+    let reach_m = Noise::of(&apart).map_or(new.gsd(), |noise| noise.reach_m);
+    Difference { grid: new.clone(), metres, sigma, beyond, reach_m, bias_m: registration.sigma_m[2] }
 }
 
 /// How far each height of `a` lies outside of those that `b` has within a distance of pixels.

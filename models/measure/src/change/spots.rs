@@ -12,6 +12,12 @@ const BEGINS: f32 = 3.0;
 const GOES_ON: f32 = 1.0;
 /// A mean of less than this many of its own standard deviations may be noise.
 const SURE: f64 = 5.0;
+/// Squares of so many pixels a side tell how far means are off that nothing changed: errors of models reach far.
+const SIDES: [usize; 7] = [1, 2, 4, 8, 16, 32, 64];
+/// Nine in ten of such means are nearer to zero than this many of their standard deviations, where errors are normal.
+const NINE_IN_TEN: f64 = 1.645;
+/// Fewer squares tell nothing.
+const FEWEST_SQUARES: usize = 50;
 /// Independent patches that a spot has at the least.
 const LEAST_PATCHES: f64 = 2.0;
 /// Pixels that a spot has beyond [`BEGINS`] at the least.
@@ -45,6 +51,7 @@ pub fn find(difference: &Difference) -> Vec<Spot> {
         let beyond = difference.beyond[i] / difference.sigma[i];
         if beyond.is_finite() && beyond.abs() >= BEGINS { beyond } else { 0.0 }
     };
+    let spreads = spreads(difference);
     let mut of = vec![0u32; w * h];
     let mut spots = Vec::new();
     let mut queue: Vec<usize> = Vec::new();
@@ -73,15 +80,33 @@ pub fn find(difference: &Difference) -> Vec<Spot> {
             }
         }
         if seeds >= LEAST_PIXELS {
-            spots.extend(spot(difference, &pixels, seeds));
+            spots.extend(spot(difference, &spreads, &pixels, seeds));
         }
     }
     spots.sort_by(|a, b| b.volume_m3.value.abs().total_cmp(&a.volume_m3.value.abs()));
     spots
 }
 
+/// Standard deviations of mean differences over squares of [`SIDES`], as nine in ten of them say; the rest may have changed.
+fn spreads(difference: &Difference) -> Vec<f64> {
+    let all = difference.grid.with_values(difference.metres.clone());
+    let mut spreads: Vec<f64> = Vec::new();
+    for side in SIDES {
+        let means = all.coarser(side);
+        let [w, h] = means.size();
+        let mut off: Vec<f64> = (0..w * h).filter_map(|i| means.at(i % w, i / w)).map(f64::abs).collect();
+        if off.len() < FEWEST_SQUARES {
+            break;
+        }
+        let at = off.len() * 9 / 10;
+        let (_, spread, _) = off.select_nth_unstable_by(at, f64::total_cmp);
+        spreads.push(*spread / NINE_IN_TEN);
+    }
+    spreads
+}
+
 /// A spot of its pixels; `None` where noise alone may make it.
-fn spot(difference: &Difference, pixels: &[usize], seeds: usize) -> Option<Spot> {
+fn spot(difference: &Difference, spreads: &[f64], pixels: &[usize], seeds: usize) -> Option<Spot> {
     let grid = &difference.grid;
     let w = grid.size()[0];
     let pixel_m2 = grid.pixel_m2();
@@ -90,7 +115,9 @@ fn spot(difference: &Difference, pixels: &[usize], seeds: usize) -> Option<Spot>
     let mean = pixels.iter().map(|i| f64::from(difference.metres[*i])).sum::<f64>() / count;
     let variance = pixels.iter().map(|i| f64::from(difference.sigma[*i]).powi(2)).sum::<f64>() / count;
     let patches = (area_m2 / difference.reach_m.powi(2)).max(1.0);
-    let sigma = (variance / patches + difference.bias_m.powi(2)).sqrt();
+    let alike = SIDES.iter().zip(spreads).take_while(|(side, _)| side.pow(2) as f64 <= count).last();
+    let of_squares = alike.map_or(0.0, |(_, spread)| *spread);
+    let sigma = (variance / patches + difference.bias_m.powi(2)).sqrt().max(of_squares);
     let core = seeds as f64 * pixel_m2 / difference.reach_m.powi(2);
     if mean.abs() < SURE * sigma || core < LEAST_PATCHES {
         return None;
