@@ -55,64 +55,103 @@ pub fn admit(mission: &Mission, aircraft: &str, path: &Path) -> Result<LocalMode
     header.region = mission.region(known);
     to_own.corners(&mut header.region);
     header.aircraft = aircraft.into();
-    match place(&model, mission.ground.cell_m.into()) {
-        Some(Place { near: 0, .. }) | None => refuse("none of its Gaussians lies near its aircraft's region".into()),
-        Some(Place { far, gaussians, .. }) if 2 * far > gaussians => refuse(format!(
-            "{far} of its {gaussians} Gaussians lie farther from its aircraft's region than {FAR_LENGTHS:.0} times its length"
-        )),
-        Some(Place { squares, most_squares, .. }) if squares > most_squares => refuse(format!(
-            "its Gaussians are strewn over {squares} squares of ground.cell_m, its aircraft's region makes {most_squares} likely at most"
-        )),
-        Some(_) => Ok(model),
+    let Some(reach) = Reach::of(&model) else {
+        return refuse("the mission declares no region for its aircraft".into());
+    };
+    let place = reach.place(&model, mission.ground.cell_m.into());
+    let gaussians = model.cloud.len();
+    if place.near == 0 {
+        return refuse("none of its Gaussians lies near its aircraft's region".into());
     }
+    if 2 * place.far > gaussians {
+        return refuse(format!(
+            "{} of its {gaussians} Gaussians lie farther from its aircraft's region than {FAR_LENGTHS:.0} times its length",
+            place.far
+        ));
+    }
+    if place.squares > place.most_squares {
+        return refuse(format!(
+            "its Gaussians are strewn over more than {} squares of ground.cell_m, the most that its aircraft's region makes likely",
+            place.most_squares
+        ));
+    }
+    // Each of them would be a square of its own.
+    let is_far: Vec<bool> = model.cloud.means.iter().map(|mean| reach.is_far(mean)).collect();
+    model.cloud.retain(|i| !is_far[i]);
+    Ok(model)
 }
 
 /// From its aircraft's region a model shows little beyond so many times the region's length: the horizon behind what was flown over.
 const FAR_LENGTHS: f64 = 20.0;
-/// Squares of ground that the Gaussians of the horizon and of false matches may lie in, beyond those around the region.
+/// Squares of ground that the Gaussians of the horizon and of false matches may lie in, beyond those around the region; and one more for
+/// so many Gaussians.
 const STRAY_SQUARES: f64 = 256.0;
+const PER_STRAY: f64 = 1000.0;
 
 /// Where the Gaussians of a model lie beside its aircraft's region.
 struct Place {
-    gaussians: usize,
     /// No farther from it than it is long.
     near: usize,
-    /// Farther than [`FAR_LENGTHS`] times that.
+    /// Farther than [`FAR_LENGTHS`] times that: they are left out.
     far: usize,
-    /// Squares of ground with one of them, those that are far left out, and how many there may be: each is a job of the merge.
+    /// Squares of ground with one of the others, and how many there may be: each is a job of the merge.
     squares: usize,
     most_squares: usize,
+}
+
+/// The region of a model's aircraft, and how far it reaches.
+struct Reach {
+    region: Region,
+    low: DVec2,
+    high: DVec2,
+}
+
+impl Reach {
+    /// Of a model whose region the mission declares; `None` where it has none.
+    fn of(model: &LocalModel) -> Option<Self> {
+        // No height is asked for.
+        let region = Region::of(&model.header, 0.0)?;
+        let low = region.corners.iter().copied().fold(DVec2::INFINITY, DVec2::min);
+        let high = region.corners.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
+        Some(Self { region, low, high })
+    }
+
+    fn length(&self) -> f64 {
+        self.low.distance(self.high)
+    }
+
+    fn distance(&self, mean: &[f32; 3]) -> f64 {
+        self.region.distance(Vec3::from(*mean).as_dvec3().truncate())
+    }
+
+    /// What is no number is nowhere.
+    fn is_far(&self, mean: &[f32; 3]) -> bool {
+        let distance = self.distance(mean);
+        distance.is_nan() || distance > FAR_LENGTHS * self.length()
+    }
+
+    fn place(&self, model: &LocalModel, cell_m: f64) -> Place {
+        let around = ((self.high - self.low + 2.0 * self.length()) / cell_m).ceil() + 1.0;
+        let most_squares = (around.x * around.y + STRAY_SQUARES + model.cloud.len() as f64 / PER_STRAY) as usize;
+        let (mut near, mut far, mut squares) = (0, 0, HashSet::new());
+        for mean in &model.cloud.means {
+            near += usize::from(self.distance(mean) <= self.length());
+            if self.is_far(mean) {
+                far += 1;
+            } else if squares.len() <= most_squares {
+                // More than the bound are not counted on.
+                let at = Vec3::from(*mean).as_dvec3().truncate();
+                squares.insert((at / cell_m).floor().as_i64vec2());
+            }
+        }
+        Place { near, far, squares: squares.len(), most_squares }
+    }
 }
 
 /// From the mission's frame to the model's own, if they belong together.
 fn motion(mission: Geodetic, own: Geodetic) -> Option<Motion> {
     let motion = own.is_valid().then(|| Motion::between(mission, own))?;
     (motion.point(DVec3::ZERO).length() <= MAX_APART_M).then_some(motion)
-}
-
-/// Of a model whose region the mission declares; `None` where it has none.
-fn place(model: &LocalModel, cell_m: f64) -> Option<Place> {
-    // No height is asked for.
-    let region = Region::of(&model.header, 0.0)?;
-    let low = region.corners.iter().copied().fold(DVec2::INFINITY, DVec2::min);
-    let high = region.corners.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
-    let length = low.distance(high);
-    let around = ((high - low + 2.0 * length) / cell_m).ceil() + 1.0;
-    let most_squares = (around.x * around.y + STRAY_SQUARES) as usize;
-    let (mut near, mut far, mut squares) = (0, 0, HashSet::new());
-    for mean in &model.cloud.means {
-        let at = Vec3::from(*mean).as_dvec3().truncate();
-        let distance = region.distance(at);
-        near += usize::from(distance <= length);
-        match distance <= FAR_LENGTHS * length {
-            // More than the bound are not counted on.
-            true if squares.len() <= most_squares => _ = squares.insert((at / cell_m).floor().as_i64vec2()),
-            true => {}
-            // What is no number is nowhere.
-            false => far += 1,
-        }
-    }
-    Some(Place { gaussians: model.cloud.len(), near, far, squares: squares.len(), most_squares })
 }
 
 #[cfg(test)]

@@ -87,6 +87,7 @@ fn a_view_larger_than_the_missions_camera_costs_its_own_model_only() {
 fn a_model_strewn_over_more_ground_than_its_aircraft_can_have_seen_is_refused_before_it_is_merged() {
     let dir = tempfile::tempdir().expect("temp dir");
     let mission = mission(dir.path());
+    let all = carpet([-40.0, -20.0], [40.0, 20.0], 1.0).len();
     let strewn = |share: f64, reach: f32| {
         let path = written(dir.path(), "west", |m| {
             let n = m.cloud.len();
@@ -97,11 +98,12 @@ fn a_model_strewn_over_more_ground_than_its_aircraft_can_have_seen_is_refused_be
                 *mean = [along(0.754_877_666), along(0.569_840_291), 0.0];
             }
         });
-        admit(&mission, "west", &path).map_or_else(|e| e.to_string(), |_| "admitted".into())
+        admit(&mission, "west", &path)
+            .map_or_else(|e| e.to_string(), |m| format!("{} of 100", 100 * m.cloud.len() / all))
     };
-    assert_eq!(strewn(0.0, 0.0), "admitted");
-    assert_eq!(strewn(0.02, 1000.0), "admitted", "a horizon");
-    assert_eq!(strewn(0.02, 1e6), "admitted", "and false matches, which the merge leaves out");
+    assert_eq!(strewn(0.0, 0.0), "100 of 100");
+    assert_eq!(strewn(0.02, 400.0), "100 of 100", "a horizon");
+    assert_eq!(strewn(0.5, 1e6), "50 of 100", "false matches far away are left out");
     assert!(strewn(0.9, 1e6).contains("farther from its aircraft's region"), "{}", strewn(0.9, 1e6));
     assert!(strewn(0.9, 10_000.0).contains("farther from its aircraft's region"));
     let mut mission = mission.clone();
