@@ -104,7 +104,8 @@ impl Drop for Seat {
 impl Room {
     /// A place among those who hear of changes.
     pub(super) fn listen(&self) -> Option<Place<'_>> {
-        take(&self.listeners, LISTENERS).then_some(Place(&self.listeners))
+        // Not `then_some`: a place that was made and let go would free somebody else's.
+        take(&self.listeners, LISTENERS).then(|| Place(&self.listeners))
     }
 
     /// Whether nobody is connected.

@@ -161,12 +161,14 @@ fn connection(stream: &TcpStream, token: Option<&Token>, watch: &Watch, guest: &
         }
     };
     guest.has_spoken();
-    let Some(seat) = guest.seat() else {
-        turn_away(stream);
-        return Ok(());
-    };
     match (judge(&asked, token), token) {
-        (Verdict::Welcome, _) => answer(stream, asked.route, watch, seat.room()),
+        (Verdict::Welcome, _) => match guest.seat() {
+            Some(seat) => answer(stream, asked.route, watch, seat.room()),
+            None => {
+                turn_away(stream);
+                Ok(())
+            }
+        },
         (Verdict::Keep, Some(token)) => keep_token(stream, token),
         (Verdict::Keep | Verdict::Stranger, _) => status(stream, "401 Unauthorized", "WWW-Authenticate: Bearer\r\n"),
         (Verdict::Rebound, _) => status(stream, "403 Forbidden", ""),
