@@ -11,7 +11,7 @@ use config::mission::CameraSettings;
 use disk::plan::picture_bytes;
 use disk::{Damaged, Disk, previous};
 use geometry::geodesy::Geodetic;
-use hal::camera::Picture;
+use hal::camera::{Picture, is_complete};
 use hal::error::HalError;
 use image::RgbImage;
 use models::camera::{Intrinsics, Pose, PosedImage, View};
@@ -197,8 +197,7 @@ impl KeyframeStore {
     /// A picture that is missing, damaged or of another size.
     pub fn load(&self, i: usize) -> Result<PosedImage, StoreError> {
         let entry = &self.list.frames[i];
-        let path = self.folder.join(&entry.file_path);
-        let image = Picture::Path(path).load(&self.camera).map_err(StoreError::Camera)?;
+        let image = self.picture(entry)?;
         Ok(PosedImage {
             name: name(&entry.file_path),
             time_ns: entry.dgtr.time_ns,
@@ -207,6 +206,16 @@ impl KeyframeStore {
             mask: None,
             sigma: entry.dgtr.sigma(),
         })
+    }
+
+    /// The undistorted picture, read to its end: a decoder makes grey of what is missing.
+    fn picture(&self, entry: &Entry) -> Result<RgbImage, StoreError> {
+        let path = self.folder.join(&entry.file_path);
+        let wrong = |why: String| StoreError::Camera(HalError::Picture { path: path.clone(), why });
+        if !is_complete(&path).map_err(|e| wrong(e.to_string()))? {
+            return Err(wrong("is cut off (its end marker is missing)".into()));
+        }
+        Picture::Path(path.clone()).load(&self.camera).map_err(StoreError::Camera)
     }
 
     /// Width and height of the pictures as the camera gives them.
@@ -220,7 +229,7 @@ impl KeyframeStore {
     /// A picture that is missing, damaged or of another size.
     pub fn whole(&self, name: &str, scale: f64) -> Result<Option<RgbImage>, StoreError> {
         let Some(entry) = self.list.frames.iter().find(|f| list::name(&f.file_path) == name) else { return Ok(None) };
-        let image = Picture::Path(self.folder.join(&entry.file_path)).load(&self.camera).map_err(StoreError::Camera)?;
+        let image = self.picture(entry)?;
         let edge = |side: u32| ((f64::from(side) * scale).round() as u32).max(1);
         Ok(Some(picture::resized(image, (edge(self.camera.width), edge(self.camera.height)))))
     }

@@ -83,6 +83,26 @@ fn half_a_picture_is_set_aside_and_the_flight_goes_on_with_the_others() {
     assert_eq!(line(&Disk::default(), dir.path(), 0).len(), 2);
 }
 
+/// A decoder fills up with grey what is missing of a JPEG.
+#[test]
+fn a_jpeg_that_is_cut_anywhere_is_set_aside() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let mut jpeg = Vec::new();
+    let noise = image::RgbImage::from_fn(4, 3, |x, y| image::Rgb([(91 * x) as u8, (77 * y) as u8, (13 * x * y) as u8]));
+    noise.write_to(&mut std::io::Cursor::new(&mut jpeg), image::ImageFormat::Jpeg).expect("encoded");
+    for cut in 2..30 {
+        let folder = dir.path().join(cut.to_string());
+        let mut store = open(&Disk::default(), &folder);
+        store.add(&KeyFrame { file: Picture::Jpeg(jpeg.clone()), ..frame("a.jpg", 5.0) }).expect("add");
+        assert!(store.load(0).is_ok());
+        let picture = folder.join(&store.list.frames[0].file_path);
+        let whole = std::fs::read(&picture).expect("picture");
+        std::fs::write(&picture, &whole[..whole.len() - cut]).expect("cut");
+        assert!(store.load(0).is_err_and(|e| e.to_string().contains("cut off")), "{cut}");
+        assert!(store.sound(0).is_none());
+    }
+}
+
 #[test]
 fn a_damaged_list_is_set_aside_and_the_one_before_is_used() {
     let dir = tempfile::tempdir().expect("tempdir");
