@@ -90,7 +90,8 @@ pub fn error(line: &str) {
         }
         _ => format!("dgtr: {line}"),
     };
-    console().bars.suspend(|| eprintln!("{line}"));
+    // A log line that cannot be written has nowhere to be reported.
+    drop(Line(line.into_bytes()));
 }
 
 /// Warnings that are kept for the page, and characters of each.
@@ -168,9 +169,23 @@ impl Drop for Line {
     fn drop(&mut self) {
         // A log line that cannot be written has nowhere to be reported.
         console().bars.suspend(|| {
-            let _ = std::io::stderr().write_all(&self.0);
+            let _ = std::io::stderr().write_all(&one_line(&self.0));
         });
     }
+}
+
+/// An event as one line: a line end in the name of a file would begin another, which nobody logged.
+fn one_line(event: &[u8]) -> Vec<u8> {
+    let mut line = Vec::with_capacity(event.len());
+    for byte in event.strip_suffix(b"\n").unwrap_or(event) {
+        match byte {
+            b'\n' => line.extend(b"\\n"),
+            b'\r' => line.extend(b"\\r"),
+            _ => line.push(*byte),
+        }
+    }
+    line.push(b'\n');
+    line
 }
 
 /// Progress of one long stage.
@@ -233,6 +248,12 @@ impl Drop for Progress {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_line_end_in_a_name_forges_no_log_line() {
+        assert_eq!(one_line(b" INFO key frame 1: a\nINFO forged\r\n\n"), b" INFO key frame 1: a\\nINFO forged\\r\\n\n");
+        assert_eq!(one_line(b" INFO plain\n"), b" INFO plain\n");
+    }
 
     #[test]
     fn the_last_warnings_are_kept_and_repeated_ones_are_counted() {
