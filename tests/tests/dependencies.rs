@@ -37,15 +37,16 @@ const BANNED: [(&str, &str); 5] = [
 const LIVED_WITH: [(&str, &str); 3] = [
     (
         "RUSTSEC-2026-0041",
-        "zenoh-transport 1.10 asks for lz4_flex 0.10 and calls it with its feature transport_compression only, which is off",
+        "zenoh-transport 1.10.2, the newest, asks for lz4_flex 0.10 and calls it with its feature transport_compression only, which is off",
     ),
     (
         "RUSTSEC-2024-0436",
-        "paste, a macro that simba (of nalgebra) runs while it is compiled; nobody maintains it, nothing is wrong with it",
+        "paste, a macro that token-cell (of zenoh 1.10.2, the newest) and simba (of nalgebra 0.34; 0.35 needs a newer Rust than 1.88) run while \
+         they are compiled; nobody maintains it, nothing is wrong with it",
     ),
     (
         "RUSTSEC-2025-0134",
-        "rustls-pemfile, with which zenoh-link-tls reads our own certificates; nobody maintains it, nothing is wrong with it",
+        "rustls-pemfile, with which zenoh-link-tls 1.10.2, the newest, reads our own certificates; nobody maintains it, nothing is wrong with it",
     ),
 ];
 
