@@ -12,11 +12,13 @@ pub enum ErrorKind {
     Device,
     /// Stopped on request or by a time limit; what is saved is valid and can be continued.
     Interrupted,
+    /// Done, but of less than half of what was given.
+    Partial,
 }
 
 impl ErrorKind {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::Failed, Self::Input, Self::Device, Self::Interrupted];
+    pub const ALL: [Self; 5] = [Self::Failed, Self::Input, Self::Device, Self::Interrupted, Self::Partial];
 }
 
 /// An error that knows its kind. Its text is one line: what, where, how to mend.

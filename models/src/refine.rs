@@ -9,11 +9,17 @@
 //! when not.
 
 mod adjust;
+mod agreement;
 mod bootstrap;
 mod calibration;
+mod certainty;
 mod control;
+mod covisible;
+mod discovery;
+mod fivepoint;
 mod gauge;
 mod grey;
+mod growth;
 mod intake;
 mod joining;
 mod keyframe;
@@ -23,9 +29,12 @@ mod matching;
 mod motion;
 mod near;
 mod overlap;
+mod overview;
+mod p3p;
 mod part;
 mod photometric;
 mod placing;
+mod positions;
 mod problem;
 mod radial;
 mod reduced;
@@ -38,11 +47,14 @@ mod solving;
 mod tracks;
 mod triangulate;
 mod twoview;
+mod untied;
 mod upright;
 
 pub use bootstrap::BootstrapReport;
 pub use control::ControlPoint;
+pub use positions::PositionsReport;
 pub use report::{AddReport, ControlResidual, NearReport, RefineReport, RefinedPoint, SharedEstimate};
+pub use untied::Untied;
 
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use crate::frame_file::FrameFile;
@@ -55,9 +67,9 @@ use geometry::lens::Distortion;
 use glam::DVec3;
 use grey::Grey;
 use intake::invalid;
-use keyframe::{DESCRIPTOR, KeyFrame};
+use keyframe::{DESCRIPTOR, KeyFrame, belongs};
 use linking::Pair;
-use problem::Shared;
+use problem::{SHARED, Shared};
 use std::collections::HashMap;
 use std::fs::File;
 use std::sync::Arc;
@@ -109,6 +121,19 @@ impl config::error::Error for RefineError {
     }
 }
 
+/// What holds the scene where it is.
+#[derive(Clone, Copy, Debug, Default)]
+struct Standing {
+    /// The poses are pictures' alone: nothing says where, how large and which way the scene is.
+    floating: bool,
+    /// The pictures alone said how they lie to each other.
+    by_pictures: bool,
+    /// The poses have been brought to surveyed points.
+    anchored: bool,
+    /// Those alone say where the scene is.
+    fixed: bool,
+}
+
 /// Refines the poses of key frames; see the module's text.
 pub struct Refiner {
     settings: RefineSettings,
@@ -121,6 +146,8 @@ pub struct Refiner {
     union: Union,
     pairs: Vec<Pair>,
     shared: Shared,
+    /// Which of them the last solve estimated.
+    freed: [bool; SHARED],
     /// Height of the ground, world metres, overall and under each frame.
     ground: Option<f64>,
     grounds: Vec<Option<f64>>,
@@ -132,12 +159,9 @@ pub struct Refiner {
     solved_frames: usize,
     solved_pairs: usize,
     solves: u32,
-    /// The poses are pictures' alone: nothing says where, how large and which way the scene is.
-    floating: bool,
-    /// Surveyed points, whether the poses have been brought to them, and whether they alone say where the scene is.
+    /// Surveyed points.
     control: Vec<ControlPoint>,
-    anchored: bool,
-    fixed: bool,
+    standing: Standing,
     totals: RefineReport,
 }
 
@@ -168,6 +192,7 @@ impl Refiner {
             union: Union::with_capacity(settings.max_keyframes * settings.max_features),
             pairs: Vec::new(),
             shared: Shared::default(),
+            freed: [false; SHARED],
             ground: None,
             grounds: Vec::with_capacity(settings.max_keyframes),
             pair_grounds: Vec::new(),
@@ -176,10 +201,8 @@ impl Refiner {
             solved_frames: 0,
             solved_pairs: 0,
             solves: 0,
-            floating: false,
             control: Vec::new(),
-            anchored: false,
-            fixed: false,
+            standing: Standing::default(),
             totals: RefineReport::default(),
         })
     }
@@ -236,6 +259,24 @@ impl Refiner {
         self.finish(report)
     }
 
+    /// Takes a key frame without linking it to any: for pictures whose priors are no guide, which [`Refiner::place_all`] then places.
+    ///
+    /// # Errors
+    /// As [`Refiner::add`].
+    pub fn collect(&mut self, image: &PosedImage) -> Result<AddReport, RefineError> {
+        self.check(&image.name, &image.view, &image.sigma)?;
+        let lens = image.view.intrinsics;
+        if (image.image.width(), image.image.height()) != (lens.width, lens.height) {
+            return Err(invalid(&image.name, "picture and intrinsics differ in size"));
+        }
+        let mut report = AddReport::default();
+        let grey = image.mask.as_ref().map(|mask| Grey::new(&image.image, Some(mask), self.settings.feature_side));
+        let features = self.extract(&image.image, image.image.dimensions(), 0, grey.as_ref(), &mut report)?;
+        self.insert(&image.name, image.time_ns, &image.view, &image.sigma);
+        self.set_features(features, 0, Some(image), &mut report);
+        self.finish(report)
+    }
+
     /// As [`Refiner::add`], with features found elsewhere (64 floats per descriptor, best first).
     ///
     /// # Errors
@@ -261,12 +302,99 @@ impl Refiner {
         self.finish(report)
     }
 
+    /// As [`Refiner::collect`], with features found elsewhere.
+    ///
+    /// # Errors
+    /// As [`Refiner::add_features`].
+    pub fn collect_features(
+        &mut self,
+        name: &str,
+        time_ns: u64,
+        view: &View,
+        sigma: &PoseSigma,
+        features: Features,
+    ) -> Result<AddReport, RefineError> {
+        self.check(name, view, sigma)?;
+        if features.descriptors.len() != features.keypoints.len() * DESCRIPTOR {
+            return Err(invalid(name, "features do not hold 64 values per key point"));
+        }
+        let mut report = AddReport::default();
+        self.insert(name, time_ns, view, sigma);
+        self.set_features(features, 0, None, &mut report);
+        self.finish(report)
+    }
+
     /// Optimises all poses from where they are, within the time that the settings allow.
     ///
     /// # Errors
     /// None at present beyond those of the type; a problem without enough links returns telemetry's poses.
     pub fn solve(&mut self) -> Result<RefineReport, RefineError> {
         self.solve_all()
+    }
+
+    /// Places the key frames from their pairs alone, whatever their priors say; those that never find a place are not
+    /// [tied](Refiner::is_tied) after [`Refiner::relink`]. Call it once, after the last [`Refiner::add`] and before
+    /// [`Refiner::solve`]. The world is level, its ground at height 0 and the pictures 50 above it.
+    ///
+    /// # Errors
+    /// The network failed.
+    pub fn bootstrap(&mut self) -> Result<BootstrapReport, RefineError> {
+        bootstrap::bootstrap(self)
+    }
+
+    /// Finds the pairs of all key frames anew and places them from these alone, whatever their priors say: for key frames that were
+    /// [collected](Refiner::collect). Otherwise as [`Refiner::bootstrap`].
+    ///
+    /// # Errors
+    /// The network failed.
+    pub fn place_all(&mut self) -> Result<BootstrapReport, RefineError> {
+        growth::place_all(self)
+    }
+
+    /// Brings a scene that pictures alone have placed to the positions that its pictures came with, which are its priors from
+    /// then on. `None`, and nothing changed, where more than half of them contradict it, or fewer than three do not.
+    pub fn take_positions(&mut self) -> Option<PositionsReport> {
+        positions::take_positions(self)
+    }
+
+    /// Tied pictures that lie further from the positions that they came with than these may be wrong, and how far, metres: either the scene
+    /// is bent, or they are wrong.
+    pub fn places_off(&self) -> Vec<(String, f64)> {
+        positions::places_off(self)
+    }
+
+    /// How far the solved heights of tied pictures are from those that they came with in the median, and the standard deviation that
+    /// these came with, metres; `None` of fewer than three.
+    pub fn height_off_m(&self) -> Option<(f64, f64)> {
+        positions::height_off_m(self)
+    }
+
+    /// Tells of every tied key frame how well its place is known. No longer takes those for tied that do not agree with the largest part of
+    /// the scene, or whose place is known to a tenth of the distance to what they show or worse. Call it after a [`Refiner::solve`].
+    pub fn judge(&mut self) {
+        certainty::judge(self);
+    }
+
+    /// Takes their places from key frames that do not agree with the scene, so that the next [`Refiner::solve`] is not bent by them; false
+    /// where there are none.
+    pub fn leave_out_apart(&mut self) -> bool {
+        let mut any = false;
+        for frame in self.frames.iter_mut().filter(|f| f.known.apart && !f.unplaced) {
+            (frame.unplaced, any) = (true, true);
+        }
+        any
+    }
+
+    /// Standard deviation of the key frame's place as [`Refiner::judge`] left it, in the scene's units: within the scene where nothing says
+    /// where that is.
+    pub fn certainty(&self, name: &str) -> Option<f64> {
+        self.by_name.get(name).and_then(|i| self.frames[*i as usize].known.certainty)
+    }
+
+    /// The key frames that are not part of the scene: those that nothing ties, and those that no chain of verified pairs joins to its
+    /// largest part. In the order they were added.
+    pub fn untied(&self) -> Vec<(&str, Untied)> {
+        untied::untied(self)
     }
 
     /// Best pose of a key frame so far: telemetry's (with the shared errors taken out) until it is linked.
@@ -276,7 +404,7 @@ impl Refiner {
 
     /// True when pictures, not only telemetry, hold the key frame in place.
     pub fn is_tied(&self, name: &str) -> bool {
-        self.by_name.get(name).is_some_and(|i| self.frames[*i as usize].tied)
+        self.by_name.get(name).is_some_and(|i| belongs(&self.frames[*i as usize]))
     }
 
     /// The key frame's lens with what was estimated of focal lengths and principal point.
@@ -294,7 +422,7 @@ impl Refiner {
     /// Depths between which 98 % of the key frame's points lie, widened by 15 %, metres along the optical axis;
     /// `None` with too few points.
     pub fn depth_range(&self, name: &str) -> Option<(f32, f32)> {
-        let (near, far) = self.frames[*self.by_name.get(name)? as usize].depths?;
+        let (near, far) = self.frames[*self.by_name.get(name)? as usize].known.depths?;
         Some((near / 1.15, far * 1.15))
     }
 

@@ -58,7 +58,7 @@ pub fn run(before: &[&str], arguments: &[String], out: &Path, limit_mib: Option<
     let last_line =
         said.lines().rfind(|l| !l.starts_with("note: ")).unwrap_or_default().trim_start_matches("dgtr: ").to_owned();
     match status.code() {
-        Some(0) => Ok(Ended { report: Some(RunReport::read(out)?), last_line, seconds }),
+        Some(0 | 5) => Ok(Ended { report: Some(RunReport::read(out)?), last_line, seconds }),
         Some(3) => Err(JobError::Child { kind: ErrorKind::Device, line: last_line }),
         Some(4) | Some(130) => {
             let line = "stopped on request; what was measured so far is kept".into();

@@ -164,6 +164,8 @@ pub struct Outcome {
     pub steps: u64,
     /// What `run.json` says.
     pub report: RunReport,
+    /// Pictures of a card that hold together, and those that it has, where they are fewer than half.
+    pub few: Option<(usize, usize)>,
 }
 
 impl TrainJob {
@@ -216,10 +218,11 @@ impl TrainJob {
         let picture_scale = self.picture_scale(&set, is_card)?;
         let settings = self.poses.refine.then_some(&self.recipe.refine);
         let opened = began.elapsed();
-        let Some(remarks) = card::settle(&mut set, &self.output.folder, self.output.fresh, settings, &go_on)? else {
-            return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train") });
+        let Some(card) = card::settle(&mut set, &self.output.folder, self.output.fresh, settings, &go_on)? else {
+            return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train"), few: None });
         };
         let settled = began.elapsed() - opened;
+        let few = card.used.filter(|(used, of)| 2 * used < *of);
         let frames = set.select(&self.pictures.split, self.pictures.region.as_deref())?;
         // Matching sees telemetry's pictures whole; where nothing is matched they come at the size they are trained at.
         let refine = self.poses.refine && poses == PoseSource::Telemetry;
@@ -281,7 +284,7 @@ impl TrainJob {
         if is_card {
             engine.report.stage_ms.insert("poses".into(), settled.as_secs_f64() * 1e3);
         }
-        engine.report.more.extend(remarks.into_iter().map(|(name, value)| (name.to_owned(), value)));
+        engine.report.more.extend(card.remarks.into_iter().map(|(name, value)| (name.to_owned(), value)));
         if !self.resume(&mut engine, &set, &frames)? {
             if let Some(model) = from {
                 engine.begin_with(model);
@@ -332,7 +335,7 @@ impl TrainJob {
             chosen.note(&mut report);
         }
         report.write(&self.output.folder)?;
-        Ok(Outcome { finished, steps, report })
+        Ok(Outcome { finished, steps, report, few })
     }
 
     /// The schedule for so many pictures.

@@ -38,12 +38,12 @@ impl Refiner {
     /// Takes surveyed points, which the next [`Refiner::solve`] holds the poses to; marks in unknown pictures are ignored.
     pub fn set_control(&mut self, points: Vec<ControlPoint>) {
         self.control = points;
-        self.anchored = false;
+        self.standing.anchored = false;
     }
 
     /// Whether surveyed points fix where, how large and which way a scene is of which no picture says it.
     pub fn is_fixed(&self) -> bool {
-        self.fixed
+        self.standing.fixed
     }
 
     /// A surveyed point as the pictures see it, with the marks that agree.
@@ -84,7 +84,7 @@ impl Refiner {
     pub(super) fn move_to_control(&mut self) {
         let pairs = self.control.iter().filter_map(|c| Some((self.seen(c)?.0.world, c.place)));
         let (from, to): (Vec<DVec3>, Vec<DVec3>) = pairs.unzip();
-        let by = match (self.floating, agreed(&from, &to)) {
+        let by = match (self.standing.floating, agreed(&from, &to)) {
             _ if from.is_empty() => return,
             (true, None) => {
                 let what = "fewer than three surveyed points that lie apart agree with the pictures";
@@ -101,7 +101,7 @@ impl Refiner {
         for frame in &mut self.frames {
             frame.pose.rotation = (by.rotation * frame.pose.rotation).normalize();
             frame.pose.center = by.apply(frame.pose.center);
-            if self.floating {
+            if self.standing.floating {
                 // The prior was a place in the scene before it had any other.
                 frame.prior.rotation = (by.rotation * frame.prior.rotation).normalize();
                 frame.prior.center = by.apply(frame.prior.center);
@@ -109,13 +109,13 @@ impl Refiner {
             }
         }
         self.ground = self.ground.map(|z| by.apply(DVec3::new(from[0].x, from[0].y, z)).z);
-        self.anchored = true;
-        self.fixed = self.floating;
+        self.standing.anchored = true;
+        self.standing.fixed = self.standing.floating;
     }
 
     /// Adds the surveyed points to an adjustment.
     pub(super) fn anchor(&self, problem: &mut Problem) {
-        if !self.anchored {
+        if !self.standing.anchored {
             return;
         }
         for point in &self.control {

@@ -1,7 +1,7 @@
 //! How a key frame is taken in: what is refused, its features, and its first links.
 
 use super::grey::Grey;
-use super::keyframe::{Descriptors, KeyFrame};
+use super::keyframe::{Descriptors, KeyFrame, Known, Told};
 use super::{AddReport, RefineError, Refiner, upright};
 use crate::camera::{Pose, PoseSigma, PosedImage, View};
 use crate::frame_file::Kept;
@@ -77,9 +77,9 @@ impl Refiner {
         self.grounds.push(None);
         self.frames.push(KeyFrame {
             name: name.to_owned(),
-            time_ns,
             intrinsics: view.intrinsics,
             prior,
+            told: Told { time_ns, pose: prior, sigma: *sigma },
             velocity: DVec3::ZERO,
             sigma: *sigma,
             pose: self.expect(&prior),
@@ -92,7 +92,7 @@ impl Refiner {
             tied: false,
             turns: 0,
             pairs: 0,
-            depths: None,
+            known: Known::default(),
             straight: Vec::new(),
             seen: Vec::new(),
             colors: Vec::new(),

@@ -42,13 +42,40 @@ impl AsBytes for Descriptors {
     }
 }
 
+/// What a key frame came with.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Told {
+    pub time_ns: u64,
+    pub pose: Pose,
+    pub sigma: PoseSigma,
+}
+
+/// What the points that a key frame sees say of it.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Known {
+    /// Depth below which 1 % and above which 1 % of them lie, metres.
+    pub depths: Option<(f32, f32)>,
+    /// Standard deviation of its place, once all have been judged.
+    pub certainty: Option<f64>,
+    /// Its place is known too badly to be one.
+    pub loose: bool,
+    /// It does not agree with the largest part of the scene.
+    pub apart: bool,
+}
+
+/// Whether a key frame is part of the scene, as far as that has been judged.
+pub(crate) fn belongs(frame: &KeyFrame) -> bool {
+    frame.tied && !frame.known.loose && !frame.known.apart
+}
+
 /// A key frame and what is known about it.
 pub(crate) struct KeyFrame {
     pub name: String,
-    pub time_ns: u64,
     pub intrinsics: Intrinsics,
-    /// The telemetry's word, never changed.
+    /// The telemetry's word; of a scene that pictures alone have placed, where it was before the adjustment.
     pub prior: Pose,
+    /// What it came with, whatever has become of `prior` since.
+    pub told: Told,
     /// Along-track velocity at it, as far as known when it was last placed.
     pub velocity: DVec3,
     pub sigma: PoseSigma,
@@ -70,8 +97,7 @@ pub(crate) struct KeyFrame {
     pub turns: u8,
     /// Verified pairs this frame takes part in.
     pub pairs: u32,
-    /// Depth below which 1 % and above which 1 % of the frame's points lie, metres.
-    pub depths: Option<(f32, f32)>,
+    pub known: Known,
     /// Key points, in pixels of the picture as it is: what the lens is estimated from.
     pub seen: Vec<[f32; 2]>,
     /// The same as a pinhole would have seen them; none while the lens bends nothing.

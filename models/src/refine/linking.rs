@@ -4,7 +4,7 @@
 use super::keyframe::KeyFrame;
 use super::matching::{Guide, Match, MatchLimits, match_frames};
 use super::overlap::{Ground, overlap, predict, search_radius};
-use super::photometric::{Side, align_patch};
+use super::photometric::{Side, align_patch, align_patch_at};
 use super::so3;
 use super::triangulate::triangulate;
 use super::twoview::{ROUNDS, RayPair, RelativePose, TwoView, TwoViewLimits, verify};
@@ -23,13 +23,14 @@ pub(crate) struct Pair {
 }
 
 /// What frame `a` and another one seem to have in common.
-struct Proposal {
-    a: usize,
+pub(super) struct Proposal {
+    pub a: usize,
     /// Where the other one stood, by what they have in common.
-    cb: Pinhole,
-    ground: Ground,
-    matches: Vec<Match>,
-    found: TwoView,
+    pub cb: Pinhole,
+    /// What lies where a match is seen; where it is not a plane, the two rays of a match tell.
+    pub ground: Option<Ground>,
+    pub matches: Vec<Match>,
+    pub found: TwoView,
 }
 
 /// Believed rotation error of a frame once it is linked to others, and once it is adjusted, radians: the drift
@@ -85,7 +86,7 @@ impl Refiner {
             let wanted = self.settings.max_pairs - report.pairs_verified;
             // Until an adjustment has placed the frame each pair tells where the next one is to be looked for; and what nothing but its
             // pairs holds together bends.
-            let placed = self.frames[b].adjusted && !self.floating;
+            let placed = self.frames[b].adjusted && !self.standing.floating;
             let at_once = if placed { wanted.min(waiting.len()) } else { 1 };
             let (now, later) = waiting.split_at(at_once);
             // Before anything is known of the ground a prediction is worthless.
@@ -152,7 +153,7 @@ impl Refiner {
         // The telemetry's weight is in the coarse pose already; its own error is what matters now.
         let fine = TwoViewLimits { rotation_sigma: 0.05, direction_sigma: 0.3, ..limits };
         let found = verify(&rays(&self.frames, (a, &ca), (b, &cb), &matches), coarse.pose, fine);
-        (matches.len(), found.map(|found| Proposal { a, cb, ground, matches, found }))
+        (matches.len(), found.map(|found| Proposal { a, cb, ground: Some(ground), matches, found }))
     }
 
     /// What may match between two frames, and what a relative pose of them must keep to.
@@ -200,7 +201,7 @@ impl Refiner {
 
     /// Drops inliers whose surroundings differ and moves the others' key points in `b` to where the pictures agree.
     /// A key point that an earlier pair has moved stays, so that a track has one place in every picture.
-    fn settle(&mut self, b: usize, proposal: Proposal) -> (usize, Vec<Match>, TwoView) {
+    pub(super) fn settle(&mut self, b: usize, proposal: Proposal) -> (usize, Vec<Match>, TwoView) {
         let Proposal { a, cb, ground, matches, mut found } = proposal;
         let (fa, fb) = (&self.frames[a], &self.frames[b]);
         let (Some(ga), Some(gb)) = (fa.grey(), fb.grey()) else { return (a, matches, found) };
@@ -212,7 +213,12 @@ impl Refiner {
             .map(|i| {
                 let m = matches[*i as usize];
                 let from = Side { grey: &ga, camera: &ca, at: fa.seen[m.a as usize] };
-                align_patch(&from, &Side { grey: &gb, camera: &cb, at: fb.seen[m.b as usize] }, ground)
+                let to = Side { grey: &gb, camera: &cb, at: fb.seen[m.b as usize] };
+                let Some(ground) = ground else {
+                    let views = [(ca, fa.keypoints()[m.a as usize]), (cb, fb.keypoints()[m.b as usize])];
+                    return align_patch_at(&from, &to, triangulate(&views, 0.0)?.world);
+                };
+                align_patch(&from, &to, ground)
             })
             .collect();
         let inliers = std::mem::take(&mut found.inliers);
@@ -301,13 +307,13 @@ impl Refiner {
     }
 }
 
-fn rays(frames: &[KeyFrame], a: (usize, &Pinhole), b: (usize, &Pinhole), matches: &[Match]) -> Vec<RayPair> {
+pub(super) fn rays(frames: &[KeyFrame], a: (usize, &Pinhole), b: (usize, &Pinhole), matches: &[Match]) -> Vec<RayPair> {
     let ray = |(i, camera): (usize, &Pinhole), k: u32| camera.ray(frames[i].keypoints()[k as usize]);
     matches.iter().map(|m| RayPair { a: ray(a, m.a), b: ray(b, m.b) }).collect()
 }
 
 /// Lines in `a` on which the key points of `b` must lie: unit normal and offset, pixels.
-fn epipolar_lines(pose: &RelativePose, a: &Pinhole, b: &Pinhole, keypoints: &[[f32; 2]]) -> Vec<DVec3> {
+pub(super) fn epipolar_lines(pose: &RelativePose, a: &Pinhole, b: &Pinhole, keypoints: &[[f32; 2]]) -> Vec<DVec3> {
     keypoints
         .iter()
         .map(|p| {

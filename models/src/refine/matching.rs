@@ -105,6 +105,12 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
     found
 }
 
+/// Sorts matches by how much their key points look alike, most first.
+pub(crate) fn likeliest_first(a: &KeyFrame, b: &KeyFrame, matches: &mut [Match]) {
+    let (of_a, of_b) = (a.descriptors(), b.descriptors());
+    matches.sort_by_cached_key(|m| std::cmp::Reverse(dot(of_a.of(m.a as usize), of_b.of(m.b as usize))));
+}
+
 fn dot(a: &[i8], b: &[i8]) -> i32 {
     // Fixed length and no check for overflow (64 · 127² is a million), so that the compiler makes multiply-add pairs of it.
     let (Some(a), Some(b)) = (a.first_chunk::<DESCRIPTOR>(), b.first_chunk::<DESCRIPTOR>()) else { return i32::MIN };

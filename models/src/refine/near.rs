@@ -95,7 +95,7 @@ impl Refiner {
     fn place_by_telemetry(&mut self, fresh: &[u32]) {
         let Some(first) = fresh.first() else { return };
         let from = (*first as usize).saturating_sub(PATH);
-        let path: Vec<_> = self.frames[from..].iter().map(|f| (f.time_ns, f.prior.center)).collect();
+        let path: Vec<_> = self.frames[from..].iter().map(|f| (f.told.time_ns, f.prior.center)).collect();
         let velocity = super::motion::velocities(&path);
         for i in fresh.iter().map(|i| *i as usize) {
             let frame = &mut self.frames[i];
@@ -167,7 +167,7 @@ impl Refiner {
             (frame.adjusted, frame.rotation_sigma) = (true, ADJUSTED_SIGMA);
             frame.position_sigma = frame.position_sigma.min(0.3);
             frame.tied = depths.len() >= TIED;
-            frame.depths = frame.tied.then(|| (quantile(&mut depths, 0.01), quantile(&mut depths, 0.99)));
+            frame.known.depths = frame.tied.then(|| (quantile(&mut depths, 0.01), quantile(&mut depths, 0.99)));
             self.grounds[f as usize] = frame.tied.then(|| median(&mut heights));
         }
         self.recent = points;

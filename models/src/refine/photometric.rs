@@ -5,7 +5,7 @@
 use super::grey::Grey;
 use super::overlap::{Ground, predict};
 use crate::camera::Pinhole;
-use glam::{DMat2, DVec2};
+use glam::{DMat2, DVec2, DVec3};
 
 /// Side of a patch, pixels.
 const SIDE: usize = 11;
@@ -53,9 +53,28 @@ pub(crate) struct Side<'a> {
 /// Where in `b` the surroundings of `a.at` really are, in original pixels; `None` when they are not within reach of
 /// `b.at`, or show nothing to hold on to.
 pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]> {
+    align_warped(a, b, &|pixel| predict(a.camera, b.camera, ground, pixel)).map(|(place, _)| place)
+}
+
+/// The same for what lies at `world`, be it level or facing the two cameras.
+pub(crate) fn align_patch_at(a: &Side, b: &Side, world: DVec3) -> Option<[f32; 2]> {
+    let facing = (a.camera.pose.center - world).normalize() + (b.camera.pose.center - world).normalize();
+    let on_plane = |normal: DVec3| {
+        align_warped(a, b, &|pixel| {
+            let ray = a.camera.world_ray(pixel);
+            let along = (world - a.camera.pose.center).dot(normal) / ray.dot(normal);
+            (along > 0.0).then(|| b.camera.project(a.camera.pose.center + ray * along)).flatten()
+        })
+    };
+    let tried = [DVec3::Z, facing.normalize_or(DVec3::Z)].into_iter().filter_map(on_plane);
+    tried.max_by(|x, y| x.1.total_cmp(&y.1)).map(|(place, _)| place)
+}
+
+/// The same with `to_b`, which says where a pixel of `a` lies in `b`; and how well the two patches correlate there.
+fn align_warped(a: &Side, b: &Side, to_b: &dyn Fn([f32; 2]) -> Option<DVec2>) -> Option<([f32; 2], f64)> {
     let place = |s: &Side| DVec2::new(s.at[0].into(), s.at[1].into());
     // How a step in a's picture looks in b's: the plane's derivative, good enough for a patch of 11 pixels.
-    let step = |dx: f32, dy: f32| predict(a.camera, b.camera, ground, [a.at[0] + dx, a.at[1] + dy]);
+    let step = |dx: f32, dy: f32| to_b([a.at[0] + dx, a.at[1] + dy]);
     let (right, left) = (step(2.0, 0.0)?, step(-2.0, 0.0)?);
     let (down, up) = (step(0.0, 2.0)?, step(0.0, -2.0)?);
     let warp = DMat2::from_cols((right - left) / 4.0, (down - up) / 4.0);
@@ -90,7 +109,7 @@ pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]
             break;
         }
     }
-    (correlation >= MIN_CORRELATION).then(|| (at / b.grey.scale).as_vec2().to_array())
+    (correlation >= MIN_CORRELATION).then(|| ((at / b.grey.scale).as_vec2().to_array(), correlation))
 }
 
 /// Sum of products, in lanes of its own that the compiler makes vectors of.

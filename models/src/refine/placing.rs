@@ -18,6 +18,12 @@ pub(super) struct Placed {
 }
 
 impl Refiner {
+    /// Sightings of a track by key frames that have a place.
+    pub(super) fn sightings(&self, tracks: &Tracks, track: u32) -> Vec<Sighting> {
+        let placed = |s: &&Sighting| !self.frames[s.frame as usize].unplaced;
+        tracks.get(track as usize).iter().filter(placed).copied().collect()
+    }
+
     /// Every one of these tracks by the sightings that `keeps` keeps, triangulated to below `max_px` at the present poses; on all cores,
     /// in their order.
     pub(super) fn placed(

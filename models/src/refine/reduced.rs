@@ -44,27 +44,38 @@ impl Reduced {
         Step { frames: self.gradient.iter().map(|g| -g).collect(), shared: -self.shared_gradient }
     }
 
-    fn solve_dense(&self, right: &Step) -> Option<Step> {
+    /// Lower triangle of the whole.
+    fn dense(&self) -> DMatrix<f64> {
         let n = self.border.len();
-        let size = 6 * n + SHARED;
-        let mut a = DMatrix::<f64>::zeros(size, size);
+        let mut a = DMatrix::<f64>::zeros(6 * n + SHARED, 6 * n + SHARED);
         for ((i, j), block) in self.pairs.iter().zip(&self.blocks) {
-            let (i, j) = (*i as usize * 6, *j as usize * 6);
-            // Only the lower triangle is read.
-            a.fixed_view_mut::<6, 6>(j, i).copy_from(&block.transpose());
+            a.fixed_view_mut::<6, 6>(*j as usize * 6, *i as usize * 6).copy_from(&block.transpose());
         }
-        let mut b = DVector::<f64>::zeros(size);
-        for i in 0..n {
-            a.fixed_view_mut::<SHARED, 6>(6 * n, 6 * i).copy_from(&self.border[i].transpose());
-            b.fixed_rows_mut::<6>(6 * i).copy_from(&right.frames[i]);
+        for (i, border) in self.border.iter().enumerate() {
+            a.fixed_view_mut::<SHARED, 6>(6 * n, 6 * i).copy_from(&border.transpose());
         }
         a.fixed_view_mut::<SHARED, SHARED>(6 * n, 6 * n).copy_from(&self.shared);
+        a
+    }
+
+    fn solve_dense(&self, right: &Step) -> Option<Step> {
+        let n = self.border.len();
+        let mut b = DVector::<f64>::zeros(6 * n + SHARED);
+        for i in 0..n {
+            b.fixed_rows_mut::<6>(6 * i).copy_from(&right.frames[i]);
+        }
         b.fixed_rows_mut::<SHARED>(6 * n).copy_from(&right.shared);
-        a.cholesky()?.solve_mut(&mut b);
+        self.dense().cholesky()?.solve_mut(&mut b);
         Some(Step {
             frames: (0..n).map(|i| b.fixed_rows::<6>(6 * i).into_owned()).collect(),
             shared: b.fixed_rows::<SHARED>(6 * n).into_owned(),
         })
+    }
+
+    /// The inverse as a whole, six rows a frame and then those of what all share.
+    pub fn inverse(&self) -> Option<DMatrix<f64>> {
+        let inverse = self.dense().cholesky()?.inverse();
+        inverse.iter().all(|x| x.is_finite()).then_some(inverse)
     }
 
     fn solve_sparse(&self, right: &Step) -> Option<Step> {

@@ -8,8 +8,7 @@ use std::borrow::Cow;
 use super::keyframe::KeyFrame;
 use super::level::HEIGHT;
 use super::linking::LINKED_SIGMA;
-use super::tracks::Union;
-use super::{AddReport, RefineError, RefineReport, Refiner, upright};
+use super::{AddReport, RefineError, RefineReport, Refiner, bootstrap, covisible, growth, joining, overview, upright};
 
 /// How far a chain of pictures without positions may have bent, a tenth of its height.
 const BENT: f64 = 0.1 * HEIGHT;
@@ -31,16 +30,23 @@ impl Refiner {
         if self.solves == 0 {
             return Ok(report);
         }
+        if self.standing.by_pictures {
+            self.look_again(&mut report);
+            return Ok(report);
+        }
+        for frame in self.frames.iter_mut().filter(|f| f.known.apart) {
+            (frame.unplaced, frame.tied) = (false, false);
+        }
         // What is doubted now may go back to where telemetry had it.
-        self.anchored = false;
-        match self.floating {
-            true => self.reach_untied(),
+        self.standing.anchored = false;
+        match self.standing.floating {
+            true => bootstrap::reach_untied(self),
             false => self.turn_untied(&mut report)?,
         }
         self.extract_upright(&mut report)?;
         for frame in &mut self.frames {
             doubt(frame);
-            if self.floating {
+            if self.standing.floating {
                 frame.position_sigma = frame.position_sigma.max(BENT);
             }
         }
@@ -48,20 +54,27 @@ impl Refiner {
         Ok(report)
     }
 
-    /// Forgets all pairs and links every key frame to those before it that should see the same ground.
-    pub(super) fn link_anew(&mut self, report: &mut AddReport) {
-        self.union = Union::with_capacity(self.settings.max_keyframes * self.settings.max_features);
-        self.pairs.clear();
-        self.solved_pairs = 0;
-        for (i, frame) in self.frames.iter_mut().enumerate() {
-            frame.first_node = self.union.grow(i as u32, frame.seen.len());
-            frame.pairs = 0;
-            frame.settled.fill(false);
-        }
-        // The pairs of the first look are gone, and so is their part in the counts.
+    /// The same where the pictures alone say where they were taken.
+    fn look_again(&mut self, report: &mut AddReport) {
+        self.forget_counts();
+        let clock = std::time::Instant::now();
+        covisible::link_covisible(self, report);
+        growth::grow_again(self);
+        report.match_seconds = clock.elapsed().as_secs_f64();
+        self.totals.absorb(report);
+    }
+
+    /// The pairs of an earlier look are gone, and so is their part in the counts.
+    fn forget_counts(&mut self) {
         let RefineReport { extract_seconds, match_seconds, frames_invalid, frames_over_cap, .. } = self.totals;
         self.totals =
             RefineReport { extract_seconds, match_seconds, frames_invalid, frames_over_cap, ..Default::default() };
+    }
+
+    /// Forgets all pairs and links every key frame to those before it that should see the same ground.
+    pub(super) fn link_anew(&mut self, report: &mut AddReport) {
+        overview::forget_pairs(self);
+        self.forget_counts();
         let clock = std::time::Instant::now();
         let unplaced: Vec<bool> = self.frames.iter().map(|f| f.unplaced).collect();
         for b in (1..self.frames.len()).filter(|b| !unplaced[*b]) {
@@ -93,7 +106,7 @@ impl Refiner {
             if around.is_empty() {
                 continue;
             }
-            if let Some(turn) = self.best_turn(i, &|_| around.clone(), report)? {
+            if let Some(turn) = joining::best_turn(self, i, &|_| around.clone(), report)? {
                 self.frames[i].pose.rotation = turn.rotation;
             }
         }

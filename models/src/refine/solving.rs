@@ -24,7 +24,10 @@ pub(super) const TIED: usize = 12;
 /// Sightings of one picture that count as independent when the lens is asked for. What no such lens holds (a rolling shutter,
 /// leaves in the wind, relief under a patch) shifts whole regions of a picture together: on brighton_beach (480 sightings per
 /// picture) a free focal length went 13 % off with a formal sigma of 1.3 %.
-const INDEPENDENT: f64 = 8.0;
+pub(super) const INDEPENDENT: f64 = 8.0;
+/// Share of the usual doubt that a focal length may leave where pictures alone tell it: on brighton_beach without positions it left 0.043
+/// and was 8 % off.
+const PICTURES_SURE: f64 = 0.6;
 /// Frames that shared parameters want at least, however few of them are asked for.
 const LEAST_TIED: usize = 7;
 
@@ -51,7 +54,7 @@ impl Refiner {
             let (all, whole) = ((0..self.frames.len() as u32).collect::<Vec<_>>(), Part::whole(self.frames.len()));
             report.replaced_frames = self.replace_strays((&whole, &all), &problem, &tracks, &chosen);
         }
-        if !self.anchored {
+        if !self.standing.anchored {
             self.move_to_control();
             self.note_velocities();
         }
@@ -63,10 +66,15 @@ impl Refiner {
         problem.free = [false; SHARED];
         let sigma = self.shared_sigma(&mut problem, limits.loss);
         problem.free = self.observable(&sigma);
+        // A second radial term that an earlier look took for known, and this one cannot tell, would bend what the first one has to hold.
+        if self.standing.by_pictures && !problem.free[RADIAL + 1] {
+            problem.shared.lens.radial.k2 = 0.0;
+        }
         let last = adjust(&mut problem, Limits { max_steps: 25, ..limits });
         report.steps += last.steps;
         report.converged = last.converged;
         self.take(&problem);
+        self.freed = problem.free;
         report.shared = self.shared_estimate(&problem, &sigma);
         self.harvest(&tracks, &mut report);
         report.control = self.control_residuals();
@@ -98,7 +106,7 @@ impl Refiner {
     }
 
     fn note_velocities(&mut self) {
-        let path: Vec<_> = self.frames.iter().map(|f| (f.time_ns, f.prior.center)).collect();
+        let path: Vec<_> = self.frames.iter().map(|f| (f.told.time_ns, f.prior.center)).collect();
         self.frames.iter_mut().zip(velocities(&path)).for_each(|(frame, v)| frame.velocity = v);
     }
 
@@ -218,7 +226,7 @@ impl Refiner {
 
     /// Standard deviation of every shared parameter if it were free. Of the lens as if few sightings of a picture said something of
     /// their own, beside priors that count in full.
-    fn shared_sigma(&self, problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
+    pub(super) fn shared_sigma(&self, problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
         let mut sigma = shared_sigma(problem, loss);
         let per_frame = problem.observations.len() as f64 / self.frames.len().max(1) as f64;
         let own = problem.pixel_sigma;
@@ -237,12 +245,15 @@ impl Refiner {
     }
 
     /// Shared parameters whose sigma the pictures cut below the wanted fraction of its prior.
-    fn observable(&self, sigma: &[f64; SHARED]) -> [bool; SHARED] {
+    pub(super) fn observable(&self, sigma: &[f64; SHARED]) -> [bool; SHARED] {
         let prior = self.shared_sigmas();
         let tied = self.frames.iter().filter(|f| f.pairs > 0).count();
         // Fewer frames than shared parameters cannot tell them from their own errors, whatever the formula says.
         let least = prior.iter().filter(|s| **s > 0.0).count().max(LEAST_TIED);
-        let tells = |k: usize| tied > least && prior[k] > 0.0 && sigma[k] < self.settings.observable_ratio * prior[k];
+        // Where nothing but the pictures says how large things are, a focal length that is off takes the whole scene with it.
+        let sure = |k: usize| if k == FOCAL && self.standing.by_pictures { PICTURES_SURE } else { 1.0 };
+        let wanted = |k: usize| self.settings.observable_ratio * sure(k) * prior[k];
+        let tells = |k: usize| tied > least && prior[k] > 0.0 && sigma[k] < wanted(k);
         // A focal length that is free answers for an aspect that is not, many times over.
         std::array::from_fn(|k| if k == ASPECT { prior[k] > 0.0 && tells(FOCAL) } else { tells(k) })
     }
@@ -318,7 +329,10 @@ impl Refiner {
         report.reprojection_median_px = median(&mut errors);
         for (i, frame) in self.frames.iter_mut().enumerate() {
             frame.tied = depths[i].len() >= TIED;
-            frame.depths = frame.tied.then(|| (quantile(&mut depths[i], 0.01), quantile(&mut depths[i], 0.99)));
+            frame.known.loose = false;
+            // What was left out for it is no longer asked.
+            frame.known.apart &= frame.unplaced;
+            frame.known.depths = frame.tied.then(|| (quantile(&mut depths[i], 0.01), quantile(&mut depths[i], 0.99)));
             self.grounds[i] = frame.tied.then(|| median(&mut heights[i]));
         }
         let mut grounds: Vec<f64> = self.grounds.iter().flatten().copied().collect();

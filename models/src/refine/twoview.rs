@@ -51,13 +51,13 @@ pub(crate) struct TwoViewLimits {
 
 /// Where the search starts and how firmly it is held there.
 #[derive(Clone, Copy)]
-struct Prior {
-    pose: RelativePose,
-    rotation_weight: f64,
-    direction_weight: f64,
+pub(super) struct Prior {
+    pub pose: RelativePose,
+    pub rotation_weight: f64,
+    pub direction_weight: f64,
     /// Noise of a match, ray units.
-    noise: f64,
-    threshold: f64,
+    pub noise: f64,
+    pub threshold: f64,
 }
 
 /// Rounds of sampling per start: with half the matches right, 1 − (1 − 0.5⁵)¹²⁰ = 98 % to draw a clean sample,
@@ -127,7 +127,7 @@ impl RelativePose {
 
     /// Squared distances over all matches, truncated at the threshold (MSAC), and from the prior, in units of
     /// their noise: lower is better.
-    fn cost(&self, matches: &[RayPair], prior: &Prior) -> f64 {
+    pub(super) fn cost(&self, matches: &[RayPair], prior: &Prior) -> f64 {
         let t2 = prior.threshold * prior.threshold;
         let sum: f64 = matches.iter().map(|m| self.distance2(m).min(t2)).sum();
         let (turn, shift) = self.away(&prior.pose);
@@ -137,7 +137,7 @@ impl RelativePose {
     }
 
     /// Point in front of both cameras along both rays.
-    fn in_front(&self, m: &RayPair) -> bool {
+    pub(super) fn in_front(&self, m: &RayPair) -> bool {
         let y = self.rotation * m.a;
         // Depths (p, q) of p·y + t = q·b in the least-squares sense; parallel rays are far away, not behind.
         let (yy, yb, bb) = (y.dot(y), y.dot(m.b), m.b.dot(m.b));
@@ -174,9 +174,32 @@ pub(crate) fn verify(matches: &[RayPair], prior: RelativePose, limits: TwoViewLi
             best = Some((cost, pose, start));
         }
     }
-    let (_, mut pose, start) = best?;
+    let (_, pose, start) = best?;
+    let found = judged(matches, pose, limits.threshold, limits.min_inliers, MIN_INLIER_SHARE)?;
+    let (turn, shift) = found.pose.away(&start.pose);
+    let far = turn.length() > GATE * limits.rotation_sigma + 0.02
+        || (!found.rotation_only && shift.length() > GATE * limits.direction_sigma + 0.02);
+    (!far).then_some(found)
+}
+
+/// A relative pose as the matches want it, from one that is nearly right, and what is wrong with it then: the sum over all matches of
+/// squared distances from their lines in units of the noise, each no more than the threshold's.
+pub(crate) fn adapted(matches: &[RayPair], pose: RelativePose, threshold: f64) -> (f64, RelativePose) {
+    let free = Prior { pose, rotation_weight: 0.0, direction_weight: 0.0, noise: threshold / 2.0, threshold };
+    let polished = polish(matches, pose, 3.0 * threshold, &free);
+    (polished.cost(matches, &free), polished)
+}
+
+/// Matches that agree with a relative pose, its direction turned so that they lie in front of both; `None` where they are too few.
+pub(super) fn judged(
+    matches: &[RayPair],
+    mut pose: RelativePose,
+    threshold: f64,
+    min_inliers: usize,
+    min_share: f64,
+) -> Option<TwoView> {
     // Both signs of the direction explain the lines; only one puts the points in front.
-    let t2 = limits.threshold * limits.threshold;
+    let t2 = threshold * threshold;
     let near: Vec<u32> = (0..matches.len() as u32).filter(|i| pose.distance2(&matches[*i as usize]) < t2).collect();
     let flipped = RelativePose { translation: -pose.translation, ..pose };
     let count = |p: &RelativePose| near.iter().filter(|i| p.in_front(&matches[**i as usize])).count();
@@ -187,7 +210,7 @@ pub(crate) fn verify(matches: &[RayPair], prior: RelativePose, limits: TwoViewLi
     let rotation = best_rotation(matches, &near);
     let turned = |q: DQuat, m: &RayPair| {
         let y = q * m.a;
-        y.z > 0.0 && (y / y.z - m.b).length() < 2.0 * limits.threshold
+        y.z > 0.0 && (y / y.z - m.b).length() < 2.0 * threshold
     };
     let by_rotation = rotation.map_or(0, |q| near.iter().filter(|i| turned(q, &matches[**i as usize])).count());
     let rotation_only = by_rotation * 10 >= near.len() * 8 && !near.is_empty();
@@ -198,14 +221,20 @@ pub(crate) fn verify(matches: &[RayPair], prior: RelativePose, limits: TwoViewLi
         }
         _ => near.into_iter().filter(|i| pose.in_front(&matches[*i as usize])).collect(),
     };
-    let (turn, shift) = pose.away(&start.pose);
-    let far = turn.length() > GATE * limits.rotation_sigma + 0.02
-        || (!rotation_only && shift.length() > GATE * limits.direction_sigma + 0.02);
-    if far {
-        return None;
-    }
-    let enough = inliers.len() >= limits.min_inliers && inliers.len() as f64 >= MIN_INLIER_SHARE * matches.len() as f64;
+    let enough = inliers.len() >= min_inliers && inliers.len() as f64 >= min_share * matches.len() as f64;
     enough.then_some(TwoView { pose, inliers, rotation_only })
+}
+
+/// All matches at a shrinking robust scale.
+pub(super) fn polish(matches: &[RayPair], start: RelativePose, first: f64, prior: &Prior) -> RelativePose {
+    let (mut pose, threshold) = (start, prior.threshold);
+    for scale in [first, first, first * 0.3, threshold, threshold, threshold] {
+        match pose.step(matches.iter(), scale.max(threshold), prior) {
+            Some(next) => pose = next,
+            None => break,
+        }
+    }
+    pose
 }
 
 /// Rotation that explains most of the matches at `near` without any translation: least squares, twice refitted to
@@ -233,17 +262,7 @@ fn search(matches: &[RayPair], prior: &Prior, rounds: usize, seed: u64) -> (f64,
         }
         cost
     };
-    let polish = |pose: RelativePose, first: f64| {
-        let mut pose = pose;
-        for scale in [first, first, first * 0.3, threshold, threshold, threshold] {
-            match pose.step(matches.iter(), scale.max(threshold), prior) {
-                Some(next) => pose = next,
-                None => break,
-            }
-        }
-        pose
-    };
-    consider(&mut best, polish(start, 10.0 * threshold));
+    consider(&mut best, polish(matches, start, 10.0 * threshold, prior));
     let mut random = SplitMix(seed ^ 0x9e37_79b9_7f4a_7c15);
     let all = matches.len() as f64 * (threshold / prior.noise).powi(2);
     for round in 0..rounds {
@@ -258,7 +277,7 @@ fn search(matches: &[RayPair], prior: &Prior, rounds: usize, seed: u64) -> (f64,
         if let Some(pose) = solved {
             let before = best.0;
             if consider(&mut best, pose) < before {
-                let polished = polish(pose, 2.0 * threshold);
+                let polished = polish(matches, pose, 2.0 * threshold, prior);
                 consider(&mut best, polished);
             }
         }
@@ -267,10 +286,16 @@ fn search(matches: &[RayPair], prior: &Prior, rounds: usize, seed: u64) -> (f64,
 }
 
 /// SplitMix64 (Steele, Lea, Flood 2014): the same matches give the same pose on every machine.
-struct SplitMix(u64);
+pub(super) struct SplitMix(u64);
+
+impl Default for SplitMix {
+    fn default() -> Self {
+        Self(0x9e37_79b9_7f4a_7c15)
+    }
+}
 
 impl SplitMix {
-    fn below(&mut self, n: usize) -> usize {
+    pub(super) fn below(&mut self, n: usize) -> usize {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -282,4 +307,4 @@ impl SplitMix {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a test may
 #[path = "twoview_tests.rs"]
-mod tests;
+pub(super) mod tests;

@@ -2,7 +2,7 @@ use super::*;
 use rand::{Rng, SeedableRng};
 
 /// Matches of a nearly flat scene 40 m below a nadir camera that moved by `baseline` and turned by `turn`.
-fn scene(baseline: DVec3, turn: DQuat, good: usize, wrong: usize, seed: u64) -> Vec<RayPair> {
+pub(crate) fn scene(baseline: DVec3, turn: DQuat, good: usize, wrong: usize, seed: u64) -> Vec<RayPair> {
     let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
     let mut noise = move |s: f64| rng.random_range(-s..s);
     let ray = |p: DVec3| p / p.z;
@@ -31,7 +31,7 @@ const LIMITS: TwoViewLimits = TwoViewLimits {
 /// Nothing is believed but that the camera looks down.
 const WIDE: TwoViewLimits = TwoViewLimits { any_heading: true, rotation_sigma: 0.3, direction_sigma: 2.0, ..LIMITS };
 
-fn angle(a: DQuat, b: DQuat) -> f64 {
+pub(crate) fn angle(a: DQuat, b: DQuat) -> f64 {
     so3::log(a.conjugate() * b).length().to_degrees()
 }
 

@@ -81,6 +81,8 @@ pub struct CardNotes {
     pub found: usize,
     /// No picture says where it was taken.
     pub floats: bool,
+    /// At least half of the pictures say how they were turned.
+    pub has_attitudes: bool,
     /// Surveyed points marked in pictures.
     pub control: Vec<SurveyedPoint>,
     /// Others, that the result is measured against and that are not used for it.
@@ -151,6 +153,7 @@ impl Dataset {
             distortion_unknown,
             found: card.found,
             floats: card.origin.is_none(),
+            has_attitudes: card.pictures.iter().filter(|p| p.has_attitude).count() * 2 >= card.pictures.len(),
             control: card.control,
             check: card.check,
         };

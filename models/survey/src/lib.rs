@@ -7,4 +7,5 @@ pub mod dataset;
 pub mod names;
 pub mod ortho;
 mod projects;
+pub mod settling;
 pub mod xml;

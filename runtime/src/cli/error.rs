@@ -5,11 +5,12 @@ use std::process::ExitCode;
 use config::error::{Error, ErrorKind};
 
 /// What the process returns for an error of each kind (0 is a job that is done). The one place that knows.
-pub const EXIT_CODES: [(ErrorKind, u8, &str); 4] = [
+pub const EXIT_CODES: [(ErrorKind, u8, &str); 5] = [
     (ErrorKind::Failed, 1, "failed"),
     (ErrorKind::Input, 2, "usage or bad input"),
     (ErrorKind::Device, 3, "device, driver or library missing"),
     (ErrorKind::Interrupted, 4, "interrupted with a valid checkpoint"),
+    (ErrorKind::Partial, 5, "done, but fewer than half of the pictures could be used"),
 ];
 
 /// The exit code of an error of this kind.
@@ -85,7 +86,7 @@ mod tests {
     #[test]
     fn every_kind_has_one_row_and_the_documented_code() {
         assert_eq!(EXIT_CODES.map(|row| row.0), ErrorKind::ALL);
-        assert_eq!(EXIT_CODES.map(|row| row.1), [1, 2, 3, 4]);
+        assert_eq!(EXIT_CODES.map(|row| row.1), [1, 2, 3, 4, 5]);
         let readme = include_str!("../../../README.md").split_whitespace().collect::<Vec<_>>().join(" ");
         for (kind, code, meaning) in EXIT_CODES {
             assert_eq!(exit_code(kind), ExitCode::from(code));

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::ValueEnum;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use config::budget::{Budget, Memory};
+use config::error::ErrorKind;
 use config::preset::Preset;
 use engine::InitKind;
 use models::formats::delivery::Rounding;
@@ -313,5 +314,14 @@ pub fn run(args: Args) -> Result<(), CliError> {
         ended.steps,
         report.wall_s
     );
-    Ok(())
+    match ended.few {
+        Some((used, of)) => Err(CliError::new(
+            ErrorKind::Partial,
+            format!(
+                "{} is of {used} of {of} pictures: the others could not be tied to them; take them with more overlap",
+                model.display()
+            ),
+        )),
+        None => Ok(()),
+    }
 }

@@ -2,7 +2,6 @@
 //! they settled on is kept as `transforms.json` beside the model, for the next start and for other programs.
 
 use std::collections::HashMap;
-use std::ops::ControlFlow;
 use std::path::Path;
 
 use config::refine::RefineSettings;
@@ -14,9 +13,10 @@ use job::console::Progress;
 use models::camera::View;
 use models::formats::reconstruction::Shot;
 use models::formats::transforms;
-use models::refine::Refiner;
+use models::refine::{Refiner, Untied};
 use survey::card::name_list;
-use survey::dataset::{CardNotes, Dataset, DatasetFrame, PoseSource, Settled, picture_names};
+use survey::dataset::{CardNotes, Dataset, DatasetFrame, Settled, picture_names};
+use survey::settling::{self, Needs, Settlement};
 
 use crate::error::JobError;
 
@@ -24,27 +24,20 @@ mod control;
 
 /// Poses of a card, in the folder of the model.
 pub(super) const FILE: &str = "transforms.json";
-/// Rotations that the pictures contradict by more than this many standard deviations, and this many degrees, are named.
-const CONTRADICTION: (f64, f64) = (5.0, 20.0);
-
-/// Radial distortion (k1, k2) of a lens that nothing is known of: the survey cameras of the reference data have up to 0.015.
-const UNKNOWN_RADIAL: f64 = 0.05;
-/// Principal point of such a lens, in focal lengths.
-const UNKNOWN_PRINCIPAL: f64 = 0.02;
-/// How much a rolling shutter stretches pictures: 5 m/s for 30 ms are 0.15 m of some 60 m of ground, a quarter of a percent; twice that.
-const ROLLING_SHUTTER: f64 = 0.005;
-/// A card's pictures are matched at this many times the size, and with as many more key points, than in flight, where the
-/// time is short: brighton_beach's card lies 0.80 m from its reference at 640 pixels and 0.07 m at 1,280.
-const DETAIL: u32 = 2;
-/// What `[refine]` allows of either.
-const MOST_DETAIL: u32 = 8192;
-
-/// Looks at pictures without positions after the first: each finds some from the places of the others (brighton_beach's 18
-/// without GPS: 15, 17, 17 and 18 tied).
-const FLOATING_LOOKS: usize = 3;
+/// Heights that differ from those stated by more than so many standard deviations are named.
+const HEIGHT_OFF: f64 = 3.0;
 
 /// What settling a card is to be remembered for, in run.json.
-pub(super) type Remarks = Vec<(&'static str, serde_json::Value)>;
+type Remarks = Vec<(&'static str, serde_json::Value)>;
+
+/// A settled card.
+#[derive(Default)]
+pub(super) struct Card {
+    /// For run.json.
+    pub remarks: Remarks,
+    /// Pictures that are trained on, and those that the card holds, where their poses were settled.
+    pub used: Option<(usize, usize)>,
+}
 
 /// Says what was taken from the card and what not.
 fn announce(set: &Dataset, notes: &CardNotes) {
@@ -64,21 +57,22 @@ fn announce(set: &Dataset, notes: &CardNotes) {
     notes.lines.iter().for_each(|line| tracing::warn!("{line}"));
 }
 
-/// Replaces the card's priors by poses that its pictures agree on; `None` when asked to stop.
+/// Replaces the card's priors by poses that its pictures agree on, and leaves those out that do not; `None` when asked to stop.
 pub(super) fn settle(
     set: &mut Dataset,
     out: &Path,
     fresh: bool,
     refine: Option<&RefineSettings>,
     go_on: &dyn Fn() -> bool,
-) -> Result<Option<Remarks>, JobError> {
-    let mut remarks = Remarks::new();
-    let Some(notes) = set.card.clone() else { return Ok(Some(remarks)) };
+) -> Result<Option<Card>, JobError> {
+    let mut card = Card::default();
+    let Some(notes) = set.card.clone() else { return Ok(Some(card)) };
     announce(set, &notes);
-    let file = out.join(FILE);
+    let (file, of) = (out.join(FILE), set.frames.len());
     if !fresh && let Some(settled) = known(set, &file)? {
+        card.used = Some((settled.len(), of));
         set.settle(&settled);
-        return Ok(Some(remarks));
+        return Ok(Some(card));
     }
     let settled = match refine {
         None if notes.floats => {
@@ -89,9 +83,14 @@ pub(super) fn settle(
             let stated = |f: &DatasetFrame| Settled { view: f.view, distortion: f.distortion };
             set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
         }
-        Some(settings) => match refined(set, &notes, settings, out, go_on, &mut remarks)? {
-            Some((settled, fixed)) => {
-                set.origin = set.origin.or(fixed);
+        Some(settings) => match refined(set, &notes, settings, out, go_on, &mut card.remarks)? {
+            Some((settled, place)) => {
+                set.origin = match place {
+                    Place::Stated => set.origin,
+                    Place::Surveyed(origin) => set.origin.or(Some(origin)),
+                    Place::None => None,
+                };
+                card.used = Some((settled.len(), of));
                 settled
             }
             None => return Ok(None),
@@ -100,7 +99,7 @@ pub(super) fn settle(
     set.settle(&settled);
     std::fs::create_dir_all(out).map_err(JobError::io(out))?;
     transforms::write(&file, &set.reconstruction())?;
-    Ok(Some(remarks))
+    Ok(Some(card))
 }
 
 /// What an earlier start settled on, when it was about the same pictures.
@@ -165,42 +164,49 @@ fn of_shot(frame: &DatasetFrame, shot: &Shot) -> Settled {
     Settled { view: View { intrinsics: lens.intrinsics(size), pose }, distortion: lens.distortion }
 }
 
-/// What the pictures say, as far as the refiner knows now.
-struct Found<'a> {
-    settled: HashMap<String, Settled>,
-    /// Those that are turned against what they say of themselves, and by how many degrees.
-    contradicted: Vec<(&'a String, f64)>,
-    /// Those that see too little of what others see.
-    untied: Vec<&'a String>,
-}
-
-impl<'a> Found<'a> {
-    fn in_pictures(set: &'a Dataset, refiner: &Refiner) -> Self {
-        let floats = set.card.as_ref().is_some_and(|c| c.floats);
-        let mut found =
-            Self { settled: HashMap::with_capacity(set.frames.len()), contradicted: Vec::new(), untied: Vec::new() };
-        for frame in &set.frames {
-            let name = &frame.name;
-            let (Some(pose), Some(intrinsics)) = (refiner.pose(name), refiner.intrinsics(name)) else { continue };
-            if !refiner.is_tied(name) {
-                found.untied.push(name);
-                if floats {
-                    continue;
-                }
-            } else if floats {
-                // Its prior says nothing.
-            } else if let Some(prior) = frame.prior {
-                let away = prior.pose.rotation.angle_between(pose.rotation).to_degrees();
-                let sigma = f64::from(prior.sigma.rotation_rad.iter().fold(0.0f32, |a, b| a.max(*b))).to_degrees();
-                if away > CONTRADICTION.1.max(CONTRADICTION.0 * sigma) {
-                    found.contradicted.push((name, away));
-                }
-            }
-            // Only a picture without a distortion of its own may have been given one.
-            let distortion = if frame.distortion.is_none() { refiner.distortion() } else { frame.distortion };
-            found.settled.insert(name.clone(), Settled { view: View { intrinsics, pose }, distortion });
+/// One line per reason for which pictures are left out, and what contradicts the others.
+fn announce_settled(found: &Settlement) {
+    for why in Untied::ALL {
+        let names: Vec<&String> = found.untied.iter().filter(|u| u.1 == why).map(|u| &u.0).collect();
+        if !names.is_empty() {
+            tracing::warn!("{}: {why}; left out", name_list(&names));
         }
-        found
+    }
+    if !found.contradicted.is_empty() {
+        let mut angles: Vec<f64> = found.contradicted.iter().map(|c| c.1).collect();
+        angles.sort_by(f64::total_cmp);
+        let names: Vec<&String> = found.contradicted.iter().map(|c| &c.0).collect();
+        tracing::warn!(
+            "{}: turned by about {:.0} degrees against what they say of themselves (the pictures are believed)",
+            name_list(&names),
+            angles[angles.len() / 2]
+        );
+    }
+    if found.positions_refused {
+        tracing::warn!(
+            "most stated positions contradict what the pictures show, so none is used: the scene has no place, north or scale"
+        );
+    }
+    if let Some(positions) = &found.positions {
+        let refused: Vec<&String> = positions.refused.iter().map(|r| &r.0).collect();
+        if let Some(worst) = positions.refused.iter().map(|r| r.1).max_by(f64::total_cmp) {
+            tracing::warn!(
+                "{}: stated positions contradict what {} pictures show, by up to {worst:.0} m; not used",
+                name_list(&refused),
+                positions.compared
+            );
+        }
+    }
+    if !found.places_off.is_empty() {
+        let names: Vec<&String> = found.places_off.iter().map(|p| &p.0).collect();
+        let most = found.places_off.iter().map(|p| p.1).fold(0.0, f64::max);
+        tracing::warn!(
+            "{}: solved places differ from stated positions by up to {most:.0} m: these are wrong, or the scene is bent",
+            name_list(&names)
+        );
+    }
+    if let Some((off, sigma)) = found.height_off_m.filter(|(off, sigma)| *off > HEIGHT_OFF * sigma) {
+        tracing::warn!("solved heights differ from those stated by {off:.0} m in the median (stated to {sigma:.0} m)");
     }
 }
 
@@ -214,10 +220,20 @@ fn scale_to_baselines(set: &Dataset, settled: &mut HashMap<String, Settled>) {
     }
 }
 
-/// What the pictures settle on, and where on Earth surveyed points put a scene that did not know it.
-type Agreed = (HashMap<String, Settled>, Option<Geodetic>);
+/// What says where on Earth the scene is.
+enum Place {
+    /// The pictures' positions.
+    Stated,
+    /// Surveyed points, of which this is one.
+    Surveyed(Geodetic),
+    /// Nothing.
+    None,
+}
 
-/// `None` when asked to stop.
+/// What the pictures settle on.
+type Agreed = (HashMap<String, Settled>, Place);
+
+/// The poses that the pictures agree on. `None` when asked to stop.
 fn refined(
     set: &Dataset,
     notes: &CardNotes,
@@ -226,107 +242,66 @@ fn refined(
     go_on: &dyn Fn() -> bool,
     remarks: &mut Remarks,
 ) -> Result<Option<Agreed>, JobError> {
-    let all: Vec<usize> = (0..set.frames.len()).collect();
-    let mut settings = settings.clone();
-    settings.max_keyframes = settings.max_keyframes.max(all.len());
-    settings.focal_sigma = settings.focal_sigma.max(notes.focal_sigma);
-    if notes.distortion_unknown {
-        settings.radial_sigma = settings.radial_sigma.max(UNKNOWN_RADIAL);
-        settings.principal_sigma = settings.principal_sigma.max(UNKNOWN_PRINCIPAL);
-    }
-    settings.aspect_sigma = settings.aspect_sigma.max(ROLLING_SHUTTER);
-    if notes.floats {
-        // Without telemetry there is nothing that could be off for all alike.
-        (settings.mount_sigma_deg, settings.delay_sigma_s) = (0.0, 0.0);
-    }
-    settings.feature_side = (settings.feature_side * DETAIL).min(MOST_DETAIL);
-    settings.max_features = (settings.max_features * DETAIL as usize).min(MOST_DETAIL as usize);
-    // The network sees no more of a picture than this; decoding more would be for nothing.
-    let longer = |i: &usize| set.frames[*i].view.intrinsics.width.max(set.frames[*i].view.intrinsics.height);
-    let largest = all.iter().map(longer).max().unwrap_or(1);
-    let scale = (f64::from(settings.feature_side) / f64::from(largest)).min(1.0);
-    let mut refiner = Refiner::open(&settings)?;
-    let file = waiting_file(out, matching_file_bytes(all.len() as u64, &settings))?;
-    let pixels = all.iter().map(|i| set.frames[*i].view.intrinsics.pixels() as u64).max().unwrap_or(0);
-    let planned = settling_bytes(&settings, all.len() as u64, file.is_some(), (settings.threads as u64 + 1, pixels));
+    let all = set.frames.len();
+    let pixels = set.frames.iter().map(|f| f.view.intrinsics.pixels() as u64).max().unwrap_or(0);
+    let mut planned = 0;
+    let mut open = |settings: &RefineSettings| -> Result<Refiner, JobError> {
+        let mut refiner = Refiner::open(settings)?;
+        let file = waiting_file(out, matching_file_bytes(all as u64, settings))?;
+        let ahead = (settings.threads as u64 + 1, pixels);
+        planned = planned.max(settling_bytes(settings, all as u64, file.is_some(), ahead));
+        if let Some(file) = file {
+            refiner.keep_frames_in(file);
+        }
+        Ok(refiner)
+    };
+    let mut progress = Progress::new("poses", all as u64);
+    let found = settling::settle(
+        set,
+        notes,
+        settings,
+        &mut Needs {
+            open: &mut open,
+            control: &|scale| surveyed::marked(set, &notes.control, scale),
+            taken: &mut |done, name| progress.set(done as u64, || name.to_owned()),
+            go_on,
+        },
+    )?;
+    let Some(mut found) = found else { return Ok(None) };
     remarks.push(("host_bytes_planned_poses", planned.into()));
-    if let Some(file) = file {
-        refiner.keep_frames_in(file);
-    }
-    let mut progress = Progress::new("poses", all.len() as u64);
-    let (mut done, mut stopped) = (0, false);
-    let mut skipped = Vec::new();
-    set.load_ahead(&all, scale, PoseSource::Telemetry, settings.threads, |i, picture| {
-        let name = &set.frames[i].name;
-        let added = picture.map_err(|e| e.to_string()).and_then(|p| refiner.add(&p).map_err(|e| e.to_string()));
-        if let Err(e) = added {
-            tracing::warn!("{e}");
-            skipped.push(name.clone());
-        }
-        done += 1;
-        progress.set(done, || name.clone());
-        stopped = !go_on();
-        if stopped { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
-    if stopped {
-        return Ok(None);
-    }
-    remarks.push(("pictures_not_decoded", serde_json::json!(skipped)));
-    refiner.set_control(surveyed::marked(set, &notes.control, scale));
-    if notes.floats {
-        let placed = refiner.bootstrap()?;
-        match placed.start {
-            Some(pair) => {
-                tracing::info!("{} of {} pictures placed, from {}", placed.placed, all.len(), pair.join(" and "));
-            }
-            None => {
-                tracing::warn!("none of {} pictures placed: no two show enough of the same from two places", all.len())
-            }
-        }
-    }
-    let (mut solved, mut found) = (refiner.solve()?, Found::in_pictures(set, &refiner));
-    for _ in 0..if notes.floats { FLOATING_LOOKS } else { 1 } {
-        refiner.relink()?;
-        let again = refiner.solve()?;
-        // A later look knows more than those before; where it ties fewer pictures together all the same, they are believed.
-        if again.frames_tied >= solved.frames_tied {
-            (solved, found) = (again, Found::in_pictures(set, &refiner));
-        }
-    }
     progress.finish(&format!(
-        "{} of {} pictures tied together, reprojection {:.2} px",
-        solved.frames_tied,
-        all.len(),
-        solved.reprojection_rms_px.max(0.0)
+        "{} of {all} pictures tied together, reprojection {:.2} px",
+        found.settled.len(),
+        found.solved.reprojection_rms_px.max(0.0)
     ));
-    let Found { mut settled, contradicted, untied } = found;
-    if !contradicted.is_empty() {
-        let mut angles: Vec<f64> = contradicted.iter().map(|c| c.1).collect();
-        angles.sort_by(f64::total_cmp);
-        let names: Vec<&String> = contradicted.iter().map(|c| c.0).collect();
-        tracing::warn!(
-            "{}: turned by about {:.0} degrees against what they say of themselves (the pictures are believed)",
-            name_list(&names),
-            angles[angles.len() / 2]
-        );
+    announce_settled(&found);
+    remarks.push(("pictures_not_decoded", serde_json::json!(found.skipped)));
+    let names: Vec<&String> = found.contradicted.iter().map(|c| &c.0).collect();
+    if !names.is_empty() {
         remarks.push(("pictures_turned", serde_json::json!(names)));
     }
-    if !untied.is_empty() {
-        let what = if notes.floats { "cannot be placed; left out" } else { "their stated poses are kept" };
-        tracing::warn!("{}: see too little of what others see; {what}", name_list(&untied));
+    let names: Vec<&String> = found.untied.iter().map(|u| &u.0).collect();
+    remarks.push(("pictures_not_placed", serde_json::json!(names)));
+    control::announce(&found.solved.control, &notes.control);
+    let place = match (found.floats, found.is_fixed) {
+        (_, true) => Place::Surveyed(notes.control[0].position),
+        (true, false) => Place::None,
+        (false, false) => Place::Stated,
+    };
+    if matches!(place, Place::None) {
+        scale_to_baselines(set, &mut found.settled);
     }
-    control::announce(&solved.control, &notes.control);
-    let fixed = refiner.is_fixed().then(|| notes.control[0].position);
-    if notes.floats {
-        remarks.push(("pictures_not_placed", serde_json::json!(untied)));
-        if fixed.is_none() {
-            scale_to_baselines(set, &mut settled);
-        }
-        if settled.len() < 2 {
-            let what = "its pictures cannot be placed by what they show; take them with more overlap, or give --geotags or --log";
-            return Err(JobError::Request(format!("{}: {what}", set.root.display())));
-        }
+    if found.settled.len() < 2 {
+        let what = match notes.floats {
+            true => {
+                "its pictures cannot be placed by what they show; take them with more overlap, or give --geotags or --log"
+            }
+            false => {
+                "its pictures show too little of the same to be tied together; take them with more overlap, or train from what they state with --no-refine"
+            }
+        };
+        return Err(JobError::Request(format!("{}: {what}", set.root.display())));
     }
-    remarks.push(("refine", serde_json::to_value(&solved)?));
-    Ok(Some((settled, fixed)))
+    remarks.push(("refine", serde_json::to_value(&found.solved)?));
+    Ok(Some((found.settled, place)))
 }

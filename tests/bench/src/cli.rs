@@ -8,6 +8,7 @@ mod levels;
 mod map;
 mod memory;
 mod methods;
+mod poses;
 mod scene;
 mod skips;
 mod stages;
@@ -54,6 +55,8 @@ enum Command {
     Memory(memory::Args),
     /// The field's methods beside ours, on the same pictures, poses, steps, Gaussians, memory and seed.
     Methods(methods::Args),
+    /// Cards settled as `dgtr train` settles them: tied pictures, seconds, errors against a reference and stated positions.
+    Poses(poses::Args),
     /// A scene larger than device and host: trained out of a file and into one, drawn, and compared with an unpaged rendering.
     Scene(scene::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
@@ -110,6 +113,7 @@ fn measure(command: Command) -> Result<(), CliError> {
         Command::Levels(args) => levels::run(args),
         Command::Memory(args) => memory::run(args),
         Command::Methods(args) => methods::run(args),
+        Command::Poses(args) => poses::run(args),
         Command::Scene(args) => scene::run(args),
         Command::Skips(args) => skips::run(args),
         Command::Stress(args) => stress::run(args),

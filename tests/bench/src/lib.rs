@@ -16,6 +16,7 @@ pub mod levels;
 pub mod map;
 pub mod memory;
 pub mod methods;
+pub mod poses;
 pub mod scene;
 pub mod skips;
 pub mod stages;

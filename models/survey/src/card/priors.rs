@@ -27,6 +27,8 @@ pub struct CardPicture {
     pub lens: LensDescription,
     /// Relative standard deviation of the focal length.
     pub focal_sigma: f64,
+    /// Whether anything says how it was turned; else it is taken to look down.
+    pub has_attitude: bool,
     /// Pose of the camera whose top is the picture's after [`CardPicture::orientation`].
     pub prior: PosePrior,
 }
@@ -94,6 +96,7 @@ pub(super) fn of(records: &[Record], frame: &EnuFrame, notes: &mut Notes) -> Vec
                 orientation: r.orientation,
                 lens: r.orientation.of_lens(&r.lens),
                 focal_sigma: r.focal_sigma,
+                has_attitude: !matches!(attitude.source, AttitudeSource::Course | AttitudeSource::Heading),
                 prior: PosePrior {
                     pose: Pose { rotation, center },
                     sigma: PoseSigma { position_m: [horizontal, horizontal, vertical], rotation_rad },
@@ -118,6 +121,7 @@ pub(super) fn without_positions(records: &[Record]) -> Vec<CardPicture> {
             orientation: r.orientation,
             lens: r.orientation.of_lens(&r.lens),
             focal_sigma: r.focal_sigma,
+            has_attitude: r.attitude.is_some(),
             prior: PosePrior {
                 pose,
                 sigma: PoseSigma { position_m: unknown, rotation_rad: unknown },

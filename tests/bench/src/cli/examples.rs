@@ -24,6 +24,13 @@ pub const EXAMPLES: &Examples = &[
             "cargo run --release -p bench -- methods --simulated 6 --methods dgtr,vastgaussian",
         ],
     ),
+    (
+        "poses",
+        &[
+            "cargo run --release -p bench -- poses DCIM other/DCIM",
+            "cargo run --release -p bench -- poses DCIM --reference transforms.json",
+        ],
+    ),
     ("scene", &["cargo run --release -p bench -- scene --gaussians 5000000 --device-mib 512 --out scene"]),
     ("skips", &["cargo run --release -p bench -- skips pictures"]),
     ("stress", &["cargo run --release -p bench -- stress"]),
