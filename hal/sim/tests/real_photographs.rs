@@ -99,6 +99,16 @@ fn every_real_photograph_gets_its_own_pose() {
                 _ => {}
             }
         }
+        // What still waits is told by the whole flight.
+        vehicle.finish();
+        for _ in 0..1000 {
+            match vehicle.poll(Duration::from_millis(1)) {
+                Ok(Some(Event::Posed(frame))) => frames.push(frame),
+                Ok(Some(Event::Unmatched(unmatched))) => println!("{unmatched}"),
+                _ if vehicle.is_finished() => break,
+                _ => {}
+            }
+        }
         println!("{:?}", vehicle.counters());
         let image = vehicle.load(&frames[0]).expect("a picture");
         assert_eq!(image.dimensions(), (640, 480));
