@@ -338,6 +338,8 @@ fn an_aircraft_whose_numbers_fell_behind_an_earlier_session_is_told_and_goes_on_
         let path = dir.path().join("m.dgtr");
         std::fs::write(&path, noise(100_000, seed)).expect("write");
         let source = Source { identity: ids[0].clone(), ..Source::unsigned("m", "a1") };
+        // The ground is there first, and sees what the day before left on the stick.
+        receive(&mut r, Duration::from_millis(500), |_| false);
         let o = Offerer::start(&settings, source).expect("offerer");
         o.offer_final(&path);
         assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{day}: {:?}", r.counters);

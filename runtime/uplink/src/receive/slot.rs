@@ -19,6 +19,8 @@ use crate::transport::{Inlet, Patience, TransportError};
 
 /// Remembered refusals of one aircraft.
 const MAX_REMEMBERED: usize = 256;
+/// Offers of one aircraft that it was told of as behind, the newest ones.
+const MOST_TOLD: usize = 16;
 /// On a slow link the wait for a chunk grows up to so many times `chunk_timeout_s`.
 const MOST_PATIENT: u32 = 32;
 
@@ -59,8 +61,8 @@ pub(super) struct Slot {
     behind: Vec<usize>,
     /// What it is told of, where an earlier session received it.
     remembered: Option<Offer>,
-    /// The order it was told about.
-    told_behind: Option<Order>,
+    /// Its offers that it was told of as behind.
+    told_behind: Vec<Hash>,
     /// A last model that is shown and is not of this session, in words.
     stale: Option<String>,
     /// Failures in a row.
@@ -88,7 +90,7 @@ impl Slot {
             target: None,
             behind: Vec::new(),
             remembered: None,
-            told_behind: None,
+            told_behind: Vec::new(),
             stale: None,
             failures: 0,
             source: 0,
@@ -134,6 +136,20 @@ impl Slot {
         (self.target.is_some() || !self.behind.is_empty()) && Instant::now() >= self.not_before
     }
 
+    /// Whether an offer's sender is to be told that its numbers fell behind: once for each offer, not for each number. An aircraft that
+    /// begins with the number of an older offer on the same stick has not been told yet.
+    fn tells_behind(&mut self, offer: &Offer) -> bool {
+        let digest = offer.digest();
+        if self.told_behind.contains(&digest) {
+            return false;
+        }
+        if self.told_behind.len() >= MOST_TOLD {
+            self.told_behind.remove(0);
+        }
+        self.told_behind.push(digest);
+        true
+    }
+
     /// Newest offer wins; but a transfer under way is finished first unless the newer one is the last of the flight or
     /// nobody holds the older one any more: over a slow link, chasing every checkpoint would never complete one.
     pub(super) fn choose(
@@ -162,13 +178,13 @@ impl Slot {
             self.stale = offer.finished.then(|| why.clone()).or(self.stale.take());
             refusals.count(why);
             if let Stale::Received(order) = stale
-                && self.told_behind != Some(offer.order)
+                && self.tells_behind(offer)
             {
                 // Its numbers may have fallen behind; then it should know.
                 let mut known = Offer::clone(offer);
                 known.order = order;
                 self.remembered = Some(known);
-                (self.behind, self.told_behind) = (vec![*inlet], Some(offer.order));
+                self.behind = vec![*inlet];
             }
         }
         let offers = offers.into_iter();
@@ -178,9 +194,8 @@ impl Slot {
             let older = |o: &Offer| o.order < done.order || (o.order == done.order && o.model != done.model);
             counters.stale += offers.clone().filter(|(o, _)| older(o)).count() as u64;
             if older(best) {
-                if self.told_behind != Some(best.order) {
+                if self.tells_behind(best) {
                     self.behind = offers.filter(|(o, _)| o.order == best.order).map(|&(_, i)| i).collect();
-                    self.told_behind = Some(best.order);
                 }
                 return;
             }
