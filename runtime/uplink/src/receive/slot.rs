@@ -12,7 +12,7 @@ use super::{ANSWER, ReceiveCounters, Received};
 use crate::admission::{Admission, ModelRefusal, Refusals};
 use crate::keys::{Domain, SignatureBytes};
 use crate::memory::Stale;
-use crate::offer::{Hash, Offer, Order};
+use crate::offer::{Hash, Offer};
 use crate::receipt::{Receipt, Verdict};
 use crate::store::{Store, StoreError};
 use crate::transport::{Inlet, Patience, TransportError};
