@@ -16,9 +16,13 @@ pub fn perimeter(corners: &[DVec2]) -> f64 {
 
 /// Whether a point lies inside a polygon (even-odd rule).
 pub fn contains(corners: &[DVec2], p: DVec2) -> bool {
-    let crosses =
-        |(a, b): &(DVec2, DVec2)| (a.y > p.y) != (b.y > p.y) && p.x < a.x + (p.y - a.y) / (b.y - a.y) * (b.x - a.x);
-    sides(corners).filter(crosses).count() % 2 == 1
+    crossings(corners, p.y).filter(|x| p.x < *x).count() % 2 == 1
+}
+
+/// Where the sides of a polygon cross a line of equal y, in no order.
+pub fn crossings(corners: &[DVec2], y: f64) -> impl Iterator<Item = f64> {
+    let crosses = move |(a, b): &(DVec2, DVec2)| (a.y > y) != (b.y > y);
+    sides(corners).filter(crosses).map(move |(a, b)| a.x + (y - a.y) / (b.y - a.y) * (b.x - a.x))
 }
 
 fn sides(corners: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {

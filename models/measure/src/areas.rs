@@ -14,7 +14,10 @@ use crate::MeasureError;
 
 /// Far more than anybody draws, bytes and corners.
 const LIMIT: u64 = 64 << 20;
-const MOST_CORNERS: usize = 1 << 20;
+const MOST_CORNERS: usize = 100_000;
+/// Lines on which an area is told once more, and the share by which that may differ from what its corners say.
+const LINES: usize = 2048;
+const CROSSED: f64 = 0.02;
 /// A name longer than this is cut.
 const MOST_LETTERS: usize = 80;
 /// The system that GeoJSON has by its standard (RFC 7946) and older files name.
@@ -41,6 +44,24 @@ impl Area {
     pub fn bounds(&self) -> [DVec2; 2] {
         let corners = self.outside.iter();
         corners.fold([DVec2::INFINITY, DVec2::NEG_INFINITY], |[low, high], p| [low.min(*p), high.max(*p)])
+    }
+
+    /// Its area by lines across it, where what lies inside an odd number of rings counts.
+    fn by_lines_m2(&self) -> f64 {
+        let [low, high] = self.bounds();
+        let step = (high.y - low.y) / LINES as f64;
+        let mut crossings = Vec::new();
+        let mut length = 0.0;
+        for line in 0..LINES {
+            let y = low.y + (line as f64 + 0.5) * step;
+            crossings.clear();
+            for ring in self.rings() {
+                crossings.extend(polygon::crossings(ring, y));
+            }
+            crossings.sort_unstable_by(f64::total_cmp);
+            length += crossings.as_chunks::<2>().0.iter().map(|[from, to]| to - from).sum::<f64>();
+        }
+        length * step
     }
 
     /// Its area without its holes, m².
@@ -86,7 +107,12 @@ pub fn read(path: &Path, epsg: Option<u16>) -> Result<Areas, MeasureError> {
         let wrong = |why: String| bad(format!("polygon {name:?}: {why}"));
         let outside = ring(rings.next().unwrap_or_else(|| Ok(Vec::new())).map_err(wrong)?).map_err(wrong)?;
         let holes: Result<Vec<_>, String> = rings.map(|r| ring(r?)).collect();
-        areas.push(Area { holes: holes.map_err(wrong)?, outside, name });
+        let area = Area { holes: holes.map_err(wrong)?, outside, name: name.clone() };
+        let (corners, lines) = (area.area_m2(), area.by_lines_m2());
+        if (corners - lines).abs() > CROSSED * corners.max(lines) {
+            return Err(wrong("its sides cross each other, or a hole is not inside of it".into()));
+        }
+        areas.push(area);
     }
     Ok(Areas { areas, others })
 }
@@ -310,6 +336,11 @@ mod tests {
             (r#"{"type":"Polygon","coordinates":[[[0,0],[1,1],[0,0]]]}"#, "fewer than three corners"),
             (r#"{"type":"Polygon","coordinates":[[[0,0],[1,"a"],[0,0]]]}"#, "no corner"),
             (r#"{"type":"Polygon","coordinates":7}"#, "without rings"),
+            (r#"{"type":"Polygon","coordinates":[[[0,0],[4,4],[4,0],[0,3],[0,0]]]}"#, "cross each other"),
+            (
+                r#"{"type":"Polygon","coordinates":[[[0,0],[4,0],[4,4],[0,0]],[[9,9],[11,9],[9,11],[9,9]]]}"#,
+                "a hole is not inside",
+            ),
             (nested.as_str(), "nested"),
             (
                 "<kml><Placemark><Polygon><outerBoundaryIs><coordinates>1 2</coordinates></outerBoundaryIs></Polygon></Placemark></kml>",

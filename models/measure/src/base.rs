@@ -62,7 +62,11 @@ pub struct Base {
 }
 
 enum Surface {
-    Level(f64),
+    /// A height, and by how many standard deviations the lowest of so many may lie too low.
+    Level {
+        height: f64,
+        extreme: f64,
+    },
     Plane {
         middle: DVec2,
         parameters: DVec3,
@@ -84,7 +88,7 @@ impl Base {
     pub fn of_rim(kind: Kind, area: &Area, heights: &Heights, noise: &Noise) -> Result<Self, MeasureError> {
         let samples = rim(area, heights, noise)?;
         let surface = match kind {
-            Kind::Lowest => Surface::Level(samples.iter().map(|s| s.around.height).fold(f64::INFINITY, f64::min)),
+            Kind::Lowest => lowest(&samples),
             Kind::Plane => plane(&samples, noise.sigma_m).ok_or_else(|| {
                 MeasureError::Request(format!("{}: its rim is one line: no plane goes through it", area.name))
             })?,
@@ -101,7 +105,7 @@ impl Base {
     /// Numbers that the surface depends on.
     pub fn parameters(&self) -> usize {
         match &self.surface {
-            Surface::Level(_) => 1,
+            Surface::Level { .. } => 1,
             Surface::Plane { .. } => 3,
             Surface::Triangles { samples, .. } => *samples,
         }
@@ -110,7 +114,7 @@ impl Base {
     /// Its height at a place, and what each parameter adds to it, which is given to `weigh`; `None` outside of the rim.
     pub fn at(&self, place: DVec2, mut weigh: impl FnMut(usize, f64)) -> Option<f64> {
         match &self.surface {
-            Surface::Level(height) => {
+            Surface::Level { height, .. } => {
                 weigh(0, 1.0);
                 Some(*height)
             }
@@ -146,7 +150,9 @@ impl Base {
     pub fn variance(&self, weights: &[f64]) -> f64 {
         let of_height = self.sigma_m * self.sigma_m;
         match &self.surface {
-            Surface::Level(_) => weights.iter().map(|w| w * w).sum::<f64>() * of_height,
+            Surface::Level { extreme, .. } => {
+                weights.iter().map(|w| w * w).sum::<f64>() * of_height * extreme * extreme
+            }
             Surface::Plane { covariance, .. } => match weights {
                 &[a, b, c] => DVec3::new(a, b, c).dot(*covariance * DVec3::new(a, b, c)),
                 _ => 0.0,
@@ -208,6 +214,13 @@ fn rim(area: &Area, heights: &Heights, noise: &Noise) -> Result<Vec<Sample>, Mea
         )));
     }
     Ok(samples)
+}
+
+/// The lowest of many independent errors lies about √(2 ln n) of their standard deviations below their mean.
+fn lowest(samples: &[Sample]) -> Surface {
+    let height = samples.iter().map(|s| s.around.height).fold(f64::INFINITY, f64::min);
+    let stretches = samples.iter().map(|s| s.stretch).collect::<BTreeSet<_>>().len();
+    Surface::Level { height, extreme: (2.0 * (stretches as f64).ln()).sqrt().max(1.0) }
 }
 
 /// Least squares. What the rim is off the plane counts as error, too: a rim is seldom one.

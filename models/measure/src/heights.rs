@@ -2,13 +2,19 @@
 
 use std::path::{Path, PathBuf};
 
+use geometry::geodesy::EnuFrame;
 use glam::DVec2;
+use models::formats::FormatError;
+use survey::coordinates::Reference;
 use survey::ortho::height_raster::Raster;
 
 use crate::MeasureError;
 
 /// Pixels held at most: a gigabyte of them.
 const MOST_PIXELS: u64 = 1 << 28;
+
+/// A map may stretch lengths by this much: UTM does by a thousandth.
+const MOST_STRETCH: f64 = 0.002;
 
 /// Heights in rows from north to south, metres. A pixel is an area; its height is that of its middle.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,9 +45,21 @@ impl HeightMap {
     /// Opens a GeoTIFF of one channel.
     ///
     /// # Errors
-    /// It cannot be read, or does not say where it lies.
+    /// It cannot be read, does not say where it lies, or a metre of it is none on the ground.
     pub fn open(path: &Path) -> Result<Self, MeasureError> {
-        Ok(Self { path: path.to_owned(), raster: Raster::open(path)? })
+        let map = Self { path: path.to_owned(), raster: Raster::open(path)? };
+        if let Some(code) = map.epsg() {
+            let bad = |what: String| FormatError::invalid(path, what);
+            let [low, high] = map.bounds();
+            let stretch = stretch(code, low.midpoint(high)).map_err(bad)?;
+            if (stretch - 1.0).abs() > MOST_STRETCH {
+                return Err(bad(format!(
+                    "a unit of EPSG:{code} is {stretch:.3} m on the ground here; gdalwarp -t_srs with the place's UTM zone brings it into metres"
+                ))
+                .into());
+            }
+        }
+        Ok(map)
     }
 
     /// EPSG code of its reference system; `None`: metres of its own.
@@ -99,6 +117,18 @@ impl HeightMap {
         self.raster.each(window, 1, |[x, y], z| values[(y - y0) as usize * w + (x - x0) as usize] = z as f32)?;
         Ok(Some(Heights { corner: corner + from * pixel, pixel, size: [w, h], values }))
     }
+}
+
+/// Metres on the ground to a unit of a reference system, at a place: the root of how it stretches areas.
+fn stretch(code: u16, place: DVec2) -> Result<f64, String> {
+    const STEP: f64 = 10.0;
+    let reference = Reference::named(&format!("EPSG:{code}")).ok_or("names no reference system")??;
+    let outside = || format!("lies outside of EPSG:{code}");
+    let ground = |p: DVec2| reference.geodetic(p.extend(0.0)).ok_or_else(outside);
+    let frame = EnuFrame::new(ground(place)?);
+    let east = frame.to_enu(ground(place + STEP * DVec2::X)?).truncate();
+    let north = frame.to_enu(ground(place + STEP * DVec2::Y)?).truncate();
+    Ok(east.perp_dot(north).abs().sqrt() / STEP)
 }
 
 impl Heights {
@@ -212,6 +242,18 @@ impl Heights {
 #[allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_metre_of_utm_is_one_and_a_metre_of_web_mercator_is_none() {
+        let utm = stretch(32_632, DVec2::new(500_000.0, 5_205_000.0)).unwrap();
+        assert!((utm - 1.0).abs() < 5e-4, "{utm}");
+        // 47° north: the cosine of the latitude.
+        let web = stretch(3857, DVec2::new(1_000_000.0, 5_942_074.0)).unwrap();
+        assert!((web - 47f64.to_radians().cos()).abs() < 5e-3, "{web}");
+        let feet = stretch(2263, DVec2::new(985_000.0, 200_000.0)).unwrap();
+        assert!((feet - 0.3048).abs() < 1e-3, "{feet}");
+        assert!(stretch(1, DVec2::ZERO).is_err());
+    }
 
     #[test]
     fn a_height_lies_between_those_around_it_and_holes_are_left_out() {

@@ -8,7 +8,7 @@ use crate::heights::Heights;
 const LAGS: [usize; 5] = [1, 2, 4, 8, 16];
 /// Errors count as independent from the lag on whose differences have this share of the variance of those at the largest.
 const SATURATED: f64 = 0.81;
-/// Places that are looked at for each lag, evenly spread.
+/// Places sampled for each lag, evenly spread.
 const SAMPLES: usize = 50_000;
 /// Pixels that two maps are compared in, at the least.
 const FEWEST: usize = 200;
@@ -32,13 +32,18 @@ impl Noise {
     /// Tells noise from the map's own roughness: how far each height is off the mean of two on opposite sides of it, by the distance
     /// of those. On rough ground it is an upper bound. `None` where the map is too small, or nearly empty.
     ///
+    /// Heights that are all alike say nothing of it: `None`, too.
+    ///
     /// An error that bends the whole map is not in it: that is the bias's.
     pub fn of(heights: &Heights) -> Option<Self> {
+        let step = step(heights)?;
         let variances: Vec<f64> = LAGS.iter().map_while(|lag| roughness(heights, *lag)).collect();
         let (last, before) = variances.split_last()?;
         let most = before.iter().fold(*last, |a, b| a.max(*b));
         let lag = LAGS.iter().zip(&variances).find(|(_, v)| **v >= SATURATED * most).map_or(LAGS[0], |(lag, _)| *lag);
-        Some(Self { sigma_m: most.sqrt(), reach_m: lag as f64 * heights.gsd(), bias_m: 0.0 })
+        // Whole metres, or centimetres, are off by up to half of one, evenly.
+        let rounded = step * step / 12.0;
+        Some(Self { sigma_m: (most + rounded).sqrt(), reach_m: lag as f64 * heights.gsd(), bias_m: 0.0 })
     }
 
     /// Pixels whose errors are one.
@@ -82,6 +87,14 @@ pub fn apart(a: &Heights, b: &Heights, noise: [&Noise; 2], mut counts: impl FnMu
     let reach = noise.map(|n| n.reach_m).into_iter().fold(a.gsd(), f64::max) / (step as f64 * a.gsd());
     let patches = (pixels as f64 / (reach * reach).max(1.0)).max(1.0);
     Some(Apart { offset_m, sigma_m: spread / patches.sqrt(), pixels })
+}
+
+/// The least difference between neighbours that are not alike: what heights were rounded to. `None` where all are alike: nothing tells
+/// what they are worth.
+fn step(heights: &Heights) -> Option<f64> {
+    let [w, h] = heights.size();
+    let beside = |i: usize| heights.at(i % w, i / w).zip(heights.at(i % w + 1, i / w)).map(|(a, b)| (a - b).abs());
+    (0..w * h).filter_map(beside).filter(|d| *d > 0.0).reduce(f64::min)
 }
 
 /// Variance of a height by second differences at a lag, robustly.
@@ -134,6 +147,15 @@ mod tests {
         }
         assert!(Noise::of(&Heights::new(DVec2::ZERO, 1.0, [2, 2], vec![0.0; 4]).unwrap()).is_none());
         assert!(Noise::of(&Heights::new(DVec2::ZERO, 1.0, [40, 40], vec![f32::NAN; 1600]).unwrap()).is_none());
+    }
+
+    #[test]
+    fn heights_in_whole_metres_are_worth_no_more_than_their_rounding_and_level_ones_say_nothing() {
+        let map =
+            |of: &dyn Fn(usize) -> f32| Heights::new(DVec2::ZERO, 1.0, [60, 60], (0..3600).map(of).collect()).unwrap();
+        let whole = Noise::of(&map(&|i| (0.07 * (i % 60) as f32).round())).unwrap();
+        assert!((whole.sigma_m - 1.0 / 12f64.sqrt()).abs() < 0.1, "{whole:?}");
+        assert_eq!(Noise::of(&map(&|_| 40.0)), None);
     }
 
     #[test]

@@ -21,11 +21,20 @@ const MOST_POINTS: f64 = 262_144.0;
 /// heights of 8 bytes.
 const MOST_INFLATED: u64 = 1032;
 const MOST_CHUNK: u64 = 64 << 20;
-/// GeoTIFF 1.1, keys and values: what a pixel is, the projected system, and "defined by the user".
+/// GeoTIFF 1.1, keys and values: what coordinates are, what a pixel is, the projected system, and "defined by the user".
+const MODEL_TYPE: u16 = 1024;
+const IN_DEGREES: u16 = 2;
+const AROUND_EARTHS_MIDDLE: u16 = 3;
 const RASTER_TYPE: u16 = 1025;
 const PIXEL_IS_POINT: u16 = 2;
 const PROJECTED: u16 = 3072;
 const USER_DEFINED: u16 = 32767;
+/// Units of the plane and of heights, and the metre.
+const LINEAR_UNITS: u16 = 3076;
+const VERTICAL_UNITS: u16 = 4099;
+const METRE: u16 = 9001;
+/// Heights that no place on Earth has, metres: a value that stands for none, and the file does not say so.
+const HEIGHTS: Range<f64> = -12_000.0..10_000.0;
 
 /// Reads the raster's heights in the model's frame, those within `bounds` (lower and upper corner, metres east and north) alone.
 /// `origin` is the model's; a raster of a model without one lies in the model's own metres.
@@ -129,9 +138,15 @@ impl Raster {
                 for y in (y0..y0 + h).filter(|y| rows.contains(y) && y % step == 0) {
                     for x in (x0..x0 + w).filter(|x| columns.contains(x) && x % step == 0) {
                         let at = (y - y0) as usize * w as usize + (x - x0) as usize;
-                        if let Some(z) = values.at(at).filter(|z| z.is_finite() && Some(*z) != self.placed.nothing) {
-                            take([x, y], z);
+                        let Some(z) = values.at(at).filter(|z| z.is_finite() && Some(*z) != self.placed.nothing) else {
+                            continue;
+                        };
+                        if !HEIGHTS.contains(&z) {
+                            let what =
+                                format!("holds heights of {z} m; gdal_edit -a_nodata {z} says that they are none");
+                            return Err(FormatError::invalid(&self.path, what));
                         }
+                        take([x, y], z);
                     }
                 }
             }
@@ -178,6 +193,18 @@ impl Placement {
         let keys = raster.get_tag_u16_vec(Tag::GeoKeyDirectoryTag).unwrap_or_default();
         // Four words of a head, then four of each key: its number, where its value is (0: here), how many, the value.
         let key = |id: u16| keys.as_chunks::<4>().0.iter().skip(1).find(|k| k[0] == id && k[1] == 0).map(|k| k[3]);
+        match key(MODEL_TYPE) {
+            Some(IN_DEGREES) => return Err(bad("is in degrees; gdalwarp -t_srs EPSG:… brings it into metres")),
+            Some(AROUND_EARTHS_MIDDLE) => {
+                return Err(bad("is geocentric; gdalwarp -t_srs EPSG:… brings it into a plane"));
+            }
+            _ => {}
+        }
+        if [LINEAR_UNITS, VERTICAL_UNITS].iter().any(|id| key(*id).is_some_and(|unit| unit != METRE)) {
+            return Err(bad(
+                "its plane or its heights are not in metres; gdalwarp -t_srs EPSG:… and gdal_calc make them so",
+            ));
+        }
         let half = if key(RASTER_TYPE) == Some(PIXEL_IS_POINT) { 0.5 } else { 0.0 };
         let nothing = raster.get_tag_ascii_string(Tag::GdalNodata).ok();
         Ok(Self {
@@ -280,6 +307,34 @@ mod tests {
         assert_eq!(read(&path, None, [DVec2::splat(500.0), DVec2::splat(600.0)]).unwrap(), []);
         let path = raster::<Gray32Float>(folder.path(), [2, 1], &[7.25, f32::NAN], true);
         assert_eq!(read(&path, None, EVERYWHERE).unwrap(), [DVec3::new(100.0, 50.0, 7.25)]);
+    }
+
+    #[test]
+    fn degrees_feet_and_heights_of_no_place_on_earth_are_refused_in_one_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |keys: &[[u16; 4]], value: i16| {
+            let path = folder.path().join("reference.tif");
+            let mut file = TiffEncoder::new(File::create(&path).unwrap()).unwrap();
+            let mut image = file.new_image::<GrayI16>(2, 2).unwrap();
+            image.encoder().write_tag(Tag::ModelPixelScaleTag, &[2.0, 2.0, 0.0][..]).unwrap();
+            image.encoder().write_tag(Tag::ModelTiepointTag, &[0.0, 0.0, 0.0, 100.0, 50.0, 0.0][..]).unwrap();
+            let head = [1, 1, 0, keys.len() as u16];
+            let keys: Vec<u16> = head.into_iter().chain(keys.iter().flatten().copied()).collect();
+            image.encoder().write_tag(Tag::GeoKeyDirectoryTag, &keys[..]).unwrap();
+            image.write_data(&[7, 8, value, 9]).unwrap();
+            path
+        };
+        for (keys, value, word) in [
+            (&[[MODEL_TYPE, 0, 1, IN_DEGREES]][..], 7, "in degrees"),
+            (&[[MODEL_TYPE, 0, 1, 3]][..], 7, "geocentric"),
+            (&[[LINEAR_UNITS, 0, 1, 9003]][..], 7, "not in metres"),
+            (&[[VERTICAL_UNITS, 0, 1, 9002]][..], 7, "not in metres"),
+            (&[[MODEL_TYPE, 0, 1, 1], [LINEAR_UNITS, 0, 1, METRE]][..], -32767, "gdal_edit -a_nodata -32767"),
+        ] {
+            let said = read(&write(keys, value), None, EVERYWHERE).unwrap_err().to_string();
+            assert!(said.contains(word) && !said.contains('\n'), "{said}");
+        }
+        assert_eq!(read(&write(&[[MODEL_TYPE, 0, 1, 1]], 7), None, EVERYWHERE).unwrap().len(), 4);
     }
 
     #[test]
