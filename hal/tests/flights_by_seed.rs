@@ -183,14 +183,11 @@ impl Given {
         }
     }
 
-    /// The comparison at the landing: what waits is paired, what the whole flight says otherwise of is doubted.
+    /// The comparison at the landing pairs what waits. What it says otherwise of stays as it was given out in flight.
     fn land(mut self, mut exposures: Vec<Trigger>) -> Vec<Posed> {
         exposures.sort_by_key(|t| t.time_ns);
         let waiting: Vec<PictureClues> = self.waiting.iter().map(|w| w.0).collect();
-        let (pairs, revised) = landing::settle(&exposures, &waiting, &self.known, MatcherSettings::default());
-        for k in revised {
-            self.posed[k].confidence = self.posed[k].confidence.min(0.49);
-        }
+        let (pairs, _) = landing::settle(&exposures, &waiting, &self.known, MatcherSettings::default());
         self.posed.extend(pairs.iter().map(|pair| Posed {
             picture: self.waiting[pair.picture].1,
             exposure: exposures[pair.exposure].sequence as usize - 1,

@@ -18,6 +18,8 @@ use super::twoview::RelativePose;
 use super::{RefineError, Refiner, joining};
 use crate::camera::{Pinhole, Pose, PoseSigma};
 
+/// The lens is not adjusted, however many pictures are placed.
+const NO_LENS: usize = usize::MAX;
 /// Pairs tried as a start; a flat scene has two explanations of any pair, of which one does not go on.
 const SEEDS: usize = 6;
 /// Rays of a start that meet at more than this gain nothing more, degrees.
@@ -193,7 +195,7 @@ fn grow(refiner: &mut Refiner, tracks: &Tracks, web: &Web) {
     let (mut placed, mut adjusted) = (2usize, 0usize);
     loop {
         if placed as f64 >= adjusted as f64 * (1.0 + GROWTH) {
-            adjust_placed(refiner, tracks, COARSE_PX);
+            adjust_placed(refiner, tracks, COARSE_PX, NO_LENS);
             adjusted = placed;
         }
         // A point is known when two placed pictures see it.
@@ -218,7 +220,7 @@ fn grow(refiner: &mut Refiner, tracks: &Tracks, web: &Web) {
         }
     }
     for max_px in [COARSE_PX, refiner.settings.outlier_px] {
-        adjust_placed(refiner, tracks, max_px);
+        adjust_placed(refiner, tracks, max_px, NO_LENS);
     }
 }
 
@@ -347,7 +349,8 @@ fn place(
 }
 
 /// Bundle adjustment of what is placed; its own poses hold it together weakly, for nothing else says where it is.
-fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64) {
+/// From `lens_from` placed pictures on the lens is adjusted with them, as far as they tell it.
+pub(super) fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64, lens_from: usize) {
     let placed: Vec<DVec3> = refiner.frames.iter().filter(|f| !f.unplaced).map(|f| f.pose.center).collect();
     let middle = placed.iter().sum::<DVec3>() / placed.len().max(1) as f64;
     let extent = placed.iter().map(|c| c.distance(middle)).fold(1e-3, f64::max) as f32;
@@ -361,6 +364,10 @@ fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64) {
     for (loss, max_steps) in [(Loss::Huber(3.0), 10), (Loss::Cauchy(2.0), 6)] {
         let mut problem = refiner.problem(tracks, &chosen, max_px);
         problem.free = [false; SHARED];
+        if placed.len() >= lens_from {
+            let sigma = refiner.shared_sigma(&mut problem, loss);
+            problem.free = refiner.observable(&sigma);
+        }
         adjust(&mut problem, Limits { loss, max_steps, deadline });
         refiner.take(&problem);
     }

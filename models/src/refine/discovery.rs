@@ -11,6 +11,8 @@ use super::twoview::{Prior, RayPair, RelativePose, SplitMix, TwoView, judged, po
 const DISCOVERIES: usize = 200;
 /// Matches that the first samples are drawn from.
 const FIRST_ASKED: usize = 24;
+/// Poses that are judged in the end.
+const CANDIDATES: usize = 4;
 /// Share of the matches that must agree where nothing guided them: the edges of two pictures may be all that they have in common.
 const LEAST_SHARE: f64 = 0.1;
 /// Decimal logarithm of the number of relative poses that as many matches would agree with by chance, all of them wrong, from which on
@@ -25,11 +27,12 @@ pub(crate) fn discover(matches: &[RayPair], size: DVec2, threshold: f64, min_inl
     }
     let anywhere = RelativePose { rotation: DQuat::IDENTITY, translation: DVec3::X };
     let free = Prior { pose: anywhere, rotation_weight: 0.0, direction_weight: 0.0, noise: threshold / 2.0, threshold };
-    let mut best = (f64::INFINITY, anywhere);
+    // The cheapest come first: a pose that agrees with many wrong matches by chance may cost less than the right one.
+    let mut best = [(f64::INFINITY, anywhere); CANDIDATES];
     let mut random = SplitMix::default();
     let all = matches.len() as f64 * 4.0;
     for round in 0..DISCOVERIES {
-        let share = (1.0 - best.0 / all).max(0.0);
+        let share = (1.0 - best[0].0 / all).max(0.0);
         if round as f64 * share.powi(5) > 4.0 {
             break; // e⁻⁴ = 2 % chance that no clean sample has been seen
         }
@@ -38,21 +41,25 @@ pub(crate) fn discover(matches: &[RayPair], size: DVec2, threshold: f64, min_inl
             (2 * matches.len() * (round + 1) / DISCOVERIES).clamp(FIRST_ASKED.min(matches.len()), matches.len());
         let sample: [RayPair; 5] = std::array::from_fn(|_| matches[random.below(asked)]);
         for pose in fivepoint::solve(&sample) {
-            let cost = pose.cost(matches, &free);
-            if cost < best.0 {
-                best = (cost, pose);
+            if pose.cost(matches, &free) < best[CANDIDATES - 1].0 {
                 let polished = polish(matches, pose, 2.0 * threshold, &free);
-                let cost = polished.cost(matches, &free);
-                if cost < best.0 {
-                    best = (cost, polished);
+                let candidate = [pose, polished].map(|pose| (pose.cost(matches, &free), pose));
+                let candidate = if candidate[1].0 < candidate[0].0 { candidate[1] } else { candidate[0] };
+                let at = best.partition_point(|b| b.0 <= candidate.0);
+                if at < CANDIDATES {
+                    best[at..].rotate_right(1);
+                    best[at] = candidate;
                 }
             }
         }
     }
     // A wrong match lies as near to a line by the share of the picture that is so near to it.
     let near = (2.0 * threshold * size.length() / (size.x * size.y)).min(1.0);
-    let found = judged(matches, best.1, threshold, min_inliers, LEAST_SHARE)?;
-    (by_chance(matches.len(), found.inliers.len(), near) < BY_CHANCE).then_some(found)
+    let judge = |(cost, pose): &(f64, RelativePose)| {
+        cost.is_finite().then(|| judged(matches, *pose, threshold, min_inliers, LEAST_SHARE)).flatten()
+    };
+    let sure = |found: &TwoView| by_chance(matches.len(), found.inliers.len(), near) < BY_CHANCE;
+    best.iter().filter_map(judge).find(sure)
 }
 
 /// Decimal logarithm of the number of relative poses, each of five of `all` matches, that `agree` of them would agree with if all were
@@ -68,6 +75,7 @@ fn by_chance(all: usize, agree: usize, near: f64) -> f64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
 mod tests {
     use super::*;
     use crate::refine::so3;
@@ -75,7 +83,6 @@ mod tests {
 
     #[test]
     fn a_strip_of_right_matches_is_found_among_many_wrong_ones_with_no_idea_beforehand_and_none_where_all_are_wrong() {
-        let mut strips = 0;
         let (baseline, turn) = (DVec3::new(9.0, 4.0, 0.5), so3::exp(DVec3::new(0.05, -0.1, 0.4)));
         let size = DVec2::new(1.2, 0.9);
         for seed in 0..6 {
@@ -84,13 +91,9 @@ mod tests {
             let mut matches: Vec<RayPair> = all[..40].iter().chain(&all[50..56]).copied().collect();
             matches.extend(&all[56..]);
             matches.extend(&all[40..50]);
-            if let Some(found) = discover(&matches, size, 2.0 / 400.0, 16) {
-                strips += 1;
-                assert!(angle(found.pose.rotation, turn) < 4.0, "{}", angle(found.pose.rotation, turn));
-            }
+            let found = discover(&matches, size, 2.0 / 400.0, 16).unwrap();
+            assert!(angle(found.pose.rotation, turn) < 4.0, "{}", angle(found.pose.rotation, turn));
             assert!(discover(&all[50..], size, 2.0 / 400.0, 16).is_none(), "{seed}");
         }
-        // Samples are drawn by chance: one strip in six may be missed, and then it is missed, not wrong.
-        assert!(strips >= 5, "{strips} of 6");
     }
 }

@@ -1,18 +1,14 @@
 //! Pictures are placed one by one from the points that three pictures see (P3P), after all pairs have been compared and the lens is
 //! roughly known: for cards whose pictures say nothing of how they were turned, and lenses that nobody has calibrated.
 
-use std::time::{Duration, Instant};
-
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::adjust::{Limits, adjust};
-use super::bootstrap::{BootstrapReport, COARSE_PX, GROWTH, RETRY, SIGMA, Web};
+use super::bootstrap::{BootstrapReport, COARSE_PX, GROWTH, RETRY, SIGMA, Web, adjust_placed};
 use super::keyframe::belongs;
-use super::problem::{Loss, SHARED};
 use super::tracks::Tracks;
 use super::{RefineError, Refiner, bootstrap, overview, p3p};
-use crate::camera::{Pinhole, Pose, PoseSigma};
+use crate::camera::{Pinhole, Pose};
 
 /// Placed pictures from which the lens is adjusted with them.
 const LENS_FROM: usize = 5;
@@ -50,7 +46,7 @@ fn grow(refiner: &mut Refiner, tracks: &Tracks) {
     let [narrow, wide] = [NARROW, WIDE].map(|times| times * refiner.settings.outlier_px);
     loop {
         if placed as f64 >= adjusted as f64 * (1.0 + GROWTH) {
-            adjust_placed(refiner, tracks, COARSE_PX);
+            adjust_placed(refiner, tracks, COARSE_PX, LENS_FROM);
             adjusted = placed;
         }
         if let Some(next) = next_to_place(refiner, tracks, &mut tried) {
@@ -65,8 +61,8 @@ fn grow(refiner: &mut Refiner, tracks: &Tracks) {
             let before: Vec<Pose> = refiner.frames.iter().map(|f| f.pose).collect();
             let lens = refiner.shared;
             (refiner.frames[next].pose, refiner.frames[next].unplaced) = (pose, false);
-            adjust_placed(refiner, tracks, wide);
-            adjust_placed(refiner, tracks, COARSE_PX);
+            adjust_placed(refiner, tracks, wide, LENS_FROM);
+            adjust_placed(refiner, tracks, COARSE_PX, LENS_FROM);
             // Once all have settled with it, it has to be found from the others' points as closely as any.
             refiner.frames[next].unplaced = true;
             if place(refiner, next, tracks, narrow).is_some() {
@@ -80,7 +76,7 @@ fn grow(refiner: &mut Refiner, tracks: &Tracks) {
         }
     }
     for max_px in [COARSE_PX, refiner.settings.outlier_px] {
-        adjust_placed(refiner, tracks, max_px);
+        adjust_placed(refiner, tracks, max_px, LENS_FROM);
     }
 }
 
@@ -151,28 +147,4 @@ fn next_to_place(refiner: &Refiner, tracks: &Tracks, tried: &mut [usize]) -> Opt
     let next = (0..refiner.frames.len()).filter(worth).max_by_key(|i| (known[*i], std::cmp::Reverse(*i)))?;
     tried[next] = known[next];
     Some(next)
-}
-
-/// Bundle adjustment of what is placed; its own poses hold it together weakly, for nothing else says where it is.
-fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64) {
-    let placed: Vec<DVec3> = refiner.frames.iter().filter(|f| !f.unplaced).map(|f| f.pose.center).collect();
-    let middle = placed.iter().sum::<DVec3>() / placed.len().max(1) as f64;
-    let extent = placed.iter().map(|c| c.distance(middle)).fold(1e-3, f64::max) as f32;
-    for frame in &mut refiner.frames {
-        frame.prior = frame.pose;
-        frame.sigma = PoseSigma { position_m: [extent; 3], rotation_rad: [0.5; 3] };
-    }
-    let known = |t: &u32| refiner.sightings(tracks, *t).len() >= 2;
-    let chosen: Vec<u32> = (0..tracks.len() as u32).filter(known).take(refiner.settings.max_tracks).collect();
-    let deadline = Instant::now() + Duration::from_secs_f64(refiner.settings.solve_seconds);
-    for (loss, max_steps) in [(Loss::Huber(3.0), 10), (Loss::Cauchy(2.0), 6)] {
-        let mut problem = refiner.problem(tracks, &chosen, max_px);
-        problem.free = [false; SHARED];
-        if placed.len() >= LENS_FROM {
-            let sigma = refiner.shared_sigma(&mut problem, loss);
-            problem.free = refiner.observable(&sigma);
-        }
-        adjust(&mut problem, Limits { loss, max_steps, deadline });
-        refiner.take(&problem);
-    }
 }
