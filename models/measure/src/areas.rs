@@ -230,16 +230,16 @@ fn from_kml(text: &str) -> Result<(Drawn, usize), String> {
     let document = xml::parse(text).map_err(|e| format!("no KML ({e})"))?;
     let mut drawn = Drawn { system: Some(DEGREES.into()), ..Drawn::default() };
     let mut others = 0;
-    for placemark in document.descendants().filter(|n| n.has_tag_name_of("Placemark")) {
-        let name = placemark.children().find(|n| n.has_tag_name_of("name")).and_then(|n| n.text()).unwrap_or_default();
-        let polygons: Vec<_> = placemark.descendants().filter(|n| n.has_tag_name_of("Polygon")).collect();
+    for placemark in document.descendants().filter(|n| is_called(n, "Placemark")) {
+        let name = placemark.children().find(|n| is_called(n, "name")).and_then(|n| n.text()).unwrap_or_default();
+        let polygons: Vec<_> = placemark.descendants().filter(|n| is_called(n, "Polygon")).collect();
         others += usize::from(polygons.is_empty());
         for (k, polygon) in polygons.iter().enumerate() {
-            let of = |kind: &'static str| polygon.children().filter(move |n| n.has_tag_name_of(kind));
+            let of = |kind: &'static str| polygon.children().filter(move |n| is_called(n, kind));
             let rings: Result<Vec<_>, String> = of("outerBoundaryIs")
                 .chain(of("innerBoundaryIs"))
                 .map(|boundary| {
-                    let corners = boundary.descendants().find(|n| n.has_tag_name_of("coordinates"));
+                    let corners = boundary.descendants().find(|n| is_called(n, "coordinates"));
                     corners.and_then(|n| n.text()).unwrap_or_default().split_whitespace().map(kml_corner).collect()
                 })
                 .collect();
@@ -261,15 +261,9 @@ fn kml_corner(text: &str) -> Result<DVec2, String> {
     }
 }
 
-/// Elements by their name whatever version of KML's namespace they are in.
-trait Named {
-    fn has_tag_name_of(&self, name: &str) -> bool;
-}
-
-impl Named for roxmltree::Node<'_, '_> {
-    fn has_tag_name_of(&self, name: &str) -> bool {
-        self.is_element() && self.tag_name().name() == name
-    }
+/// Whether an element has this name, whatever version of KML's namespace it is in.
+fn is_called(node: &roxmltree::Node<'_, '_>, name: &str) -> bool {
+    node.is_element() && node.tag_name().name() == name
 }
 
 #[cfg(test)]

@@ -16,6 +16,9 @@ use compare::Difference;
 use register::Registration;
 use spots::Spot;
 
+/// Pixels compared at most: a dozen numbers are held of each.
+pub const MOST_COMPARED: u64 = 1 << 26;
+
 /// What changed.
 pub struct Change {
     /// How the older map was moved.

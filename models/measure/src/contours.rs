@@ -11,6 +11,7 @@ use survey::coordinates::Reference;
 
 use crate::MeasureError;
 use crate::heights::Heights;
+use crate::written::{collection, place};
 
 /// Levels at most: more lines than pixels between them are no contours.
 const MOST_LEVELS: f64 = 10_000.0;
@@ -18,9 +19,6 @@ const MOST_LEVELS: f64 = 10_000.0;
 const MAIN: i64 = 5;
 /// Closed lines around fewer squares than this are noise.
 const LEAST_SQUARES: f64 = 16.0;
-/// Decimals of a degree (a centimetre on the ground) and of a metre.
-const DEGREE: f64 = 1e7;
-const METRE: f64 = 1e3;
 
 /// A line of equal height.
 #[derive(Clone, Debug, PartialEq)]
@@ -162,20 +160,10 @@ fn joined(segments: &[[(usize, DVec2); 2]]) -> Vec<(Vec<DVec2>, bool)> {
 /// # Errors
 /// Those of `out`, or a place outside of the reference system.
 pub fn write_geojson(out: &mut dyn Write, contours: &[Contour], reference: Option<&Reference>) -> io::Result<()> {
-    let outside = || io::Error::new(io::ErrorKind::InvalidData, "a place outside of the map's reference system");
-    let place = |p: &DVec2, z: f64| match reference {
-        Some(reference) => {
-            let at = reference.geodetic(p.extend(z)).ok_or_else(outside)?;
-            Ok([at.lon_deg, at.lat_deg].map(|v| (v * DEGREE).round() / DEGREE))
-        }
-        None => Ok([p.x, p.y].map(|v| (v * METRE).round() / METRE)),
-    };
-    let axes = if reference.is_some() { "" } else { "\"axes\":\"metres east and north\"," };
-    write!(out, "{{\"type\":\"FeatureCollection\",{axes}\"features\":[")?;
+    write!(out, "{}", collection(reference))?;
     for (k, contour) in contours.iter().enumerate() {
         let ends = contour.closed.then(|| contour.places.first()).flatten();
-        let places: io::Result<Vec<_>> =
-            contour.places.iter().chain(ends).map(|p| place(p, contour.height_m)).collect();
+        let places: io::Result<Vec<_>> = contour.places.iter().chain(ends).map(|p| place(p, reference)).collect();
         let feature = json!({
             "type": "Feature",
             "geometry": { "type": "LineString", "coordinates": places? },

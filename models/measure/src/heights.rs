@@ -10,8 +10,8 @@ use survey::ortho::height_raster::Raster;
 
 use crate::MeasureError;
 
-/// Pixels held at most: a gigabyte of them.
-const MOST_PIXELS: u64 = 1 << 28;
+/// Pixels held at most where little else is: a gigabyte of them.
+pub const MOST_PIXELS: u64 = 1 << 28;
 
 /// A map may stretch lengths by this much: UTM does by a thousandth.
 const MOST_STRETCH: f64 = 0.002;
@@ -88,11 +88,12 @@ impl HeightMap {
         low.cmplt(high).all().then_some([low, high])
     }
 
-    /// Reads the part within `bounds` (lower and upper corner, map coordinates); `None` where the map holds nothing of it.
+    /// Reads the part within `bounds` (lower and upper corner, map coordinates), of at most so many pixels; `None` where the map holds
+    /// nothing of it.
     ///
     /// # Errors
     /// It cannot be read, or the part is larger than is held in memory.
-    pub fn part(&mut self, [low, high]: [DVec2; 2]) -> Result<Option<Heights>, MeasureError> {
+    pub fn part(&mut self, [low, high]: [DVec2; 2], most_pixels: u64) -> Result<Option<Heights>, MeasureError> {
         let (corner, pixel) = self.raster.place();
         let size = self.raster.size();
         let [a, b] = [low, high].map(|p| (p - corner) / pixel);
@@ -105,9 +106,9 @@ impl HeightMap {
         if w == 0 || h == 0 {
             return Ok(None);
         }
-        if w as u64 * h as u64 > MOST_PIXELS {
+        if w as u64 * h as u64 > most_pixels {
             return Err(MeasureError::Request(format!(
-                "{}: {w} × {h} pixels are more than are measured at once ({MOST_PIXELS}); draw smaller areas or a coarser map",
+                "{}: {w} × {h} pixels are more than are measured at once ({most_pixels}); draw smaller areas or a coarser map",
                 self.path.display()
             )));
         }

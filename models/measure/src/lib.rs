@@ -11,5 +11,6 @@ mod error;
 pub mod heights;
 pub mod noise;
 pub mod volume;
+mod written;
 
 pub use error::MeasureError;

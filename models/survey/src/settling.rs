@@ -70,8 +70,8 @@ pub struct Needs<'a, E> {
     pub control: &'a dyn Fn(f64) -> Vec<ControlPoint>,
     /// Is told how many pictures have been taken in, and the last of them.
     pub taken: &'a mut dyn FnMut(usize, &str),
-    /// False ends it.
-    pub go_on: &'a dyn Fn() -> bool,
+    /// True ends it.
+    pub cancelled: &'a dyn Fn() -> bool,
 }
 
 /// What the pictures of a card agree on.
@@ -234,7 +234,7 @@ fn attempt<E: From<RefineError>>(
         }
         done += 1;
         (needs.taken)(done, name);
-        stopped = !(needs.go_on)();
+        stopped = (needs.cancelled)();
         if stopped { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     if stopped {
@@ -261,7 +261,7 @@ fn attempt<E: From<RefineError>>(
     };
     let mut found = look(&mut refiner)?;
     for _ in 0..start.looks_again() {
-        if !(needs.go_on)() {
+        if (needs.cancelled)() {
             return Ok(None);
         }
         refiner.relink()?;

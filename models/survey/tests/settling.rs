@@ -30,7 +30,7 @@ fn settled(set: &Dataset) -> Option<Settlement> {
             open: &mut |settings| Refiner::open(settings),
             control: &|_| Vec::new(),
             taken: &mut |_, _| {},
-            go_on: &|| true,
+            cancelled: &|| false,
         },
     );
     match found {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use disk::Disk;
-use measure::change::{Change, find, write};
+use measure::change::{Change, MOST_COMPARED, find, write};
 use measure::heights::HeightMap;
 use serde::Serialize;
 use survey::coordinates::Reference;
@@ -20,7 +20,8 @@ const PRINTED: usize = 20;
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Writes change.geojson, change.kml (where the map is on Earth), change.csv, change.tif (metres and standard \
-                        deviations) and change.json. Ground that one of the two did not see is no change."
+                  deviations) and change.json. Ground that one of the two did not see is no change. What a map has wrong, holes \
+                  and floaters of a model, is one."
 )]
 pub struct Args {
     /// The older date: a GeoTIFF of heights, the folder of a map, or a .dgtr model.
@@ -64,7 +65,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let apart = || CliError::input(format!("{} and {} have no ground in common", old.display(), new.display()));
     let common = before.common(&after).ok_or_else(apart)?;
-    let heights = before.part(common)?.zip(after.part(common)?).ok_or_else(apart)?;
+    let heights = before.part(common, MOST_COMPARED)?.zip(after.part(common, MOST_COMPARED)?).ok_or_else(apart)?;
     let change = find(&heights.0, &heights.1)?;
     let reference = after.epsg().and_then(|code| Reference::named(&format!("EPSG:{code}"))).transpose();
     let reference = reference.map_err(CliError::input)?;

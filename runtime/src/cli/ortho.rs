@@ -10,7 +10,7 @@ use engine::ortho::{Map, MapRequest, keep_scratch_in};
 use job::console;
 use job::interrupt;
 use measure::contours;
-use measure::heights::HeightMap;
+use measure::heights::{HeightMap, MOST_PIXELS};
 use measure::noise::Noise;
 use models::formats::model::Chunks;
 use survey::coordinates::Reference;
@@ -48,11 +48,16 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = MapRequest::default().min_views)]
     pub min_views: usize,
     /// Also draw lines of equal height every M metres: contours.geojson and contours.dxf.
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = above_zero)]
     pub contours: Option<f64>,
     /// Vulkan device whose name contains this.
     #[arg(long)]
     pub device: Option<String>,
+}
+
+fn above_zero(text: &str) -> Result<f64, String> {
+    let metres = text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0);
+    metres.ok_or_else(|| "a height above zero is needed, metres".to_owned())
 }
 
 fn ups() -> impl TypedValueParser<Value = Up> {
@@ -151,7 +156,7 @@ fn draw_contours(folder: &Path, interval: f64) -> Result<(), CliError> {
     let mut map = HeightMap::open(&folder.join("dsm.tif"))?;
     let reference = map.epsg().and_then(|code| Reference::named(&format!("EPSG:{code}"))).transpose();
     let reference = reference.map_err(CliError::input)?;
-    let Some(heights) = map.part(map.bounds())? else { return Ok(()) };
+    let Some(heights) = map.part(map.bounds(), MOST_PIXELS)? else { return Ok(()) };
     let reach = Noise::of(&heights).map_or(1.0, |noise| noise.reach_m / heights.gsd());
     let contours = contours::draw(&heights.coarser(reach.round() as usize), interval)?;
     let disk = Disk::default();

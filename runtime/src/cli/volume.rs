@@ -7,7 +7,7 @@ use geometry::polygon;
 use glam::DVec2;
 use measure::areas::{self, Area};
 use measure::base::Kind;
-use measure::heights::{HeightMap, Heights};
+use measure::heights::{HeightMap, Heights, MOST_PIXELS};
 use measure::noise::{Apart, Noise, apart};
 use measure::volume::{Below, Volume, measure, write_table};
 use serde::Serialize;
@@ -89,7 +89,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let nothing = |path: &Path| {
         CliError::input(format!("{}: holds nothing of the polygons of {}", path.display(), args.areas.display()))
     };
-    let heights = map.part(bounds)?.ok_or_else(|| nothing(&path))?;
+    let heights = map.part(bounds, MOST_PIXELS)?.ok_or_else(|| nothing(&path))?;
     let noise = worth(&args, &path, &heights)?;
     let mut answer = Answer {
         heights: &path,
@@ -122,7 +122,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
                     base.display()
                 )));
             }
-            let before = before.part(bounds)?.ok_or_else(|| nothing(&base))?;
+            let before = before.part(bounds, MOST_PIXELS)?.ok_or_else(|| nothing(&base))?;
             let base_noise = worth(&args, &base, &before)?;
             answer.base_noise = Some(base_noise);
             let (before, noise) = match args.bias {

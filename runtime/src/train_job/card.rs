@@ -264,7 +264,7 @@ fn refined(
             open: &mut open,
             control: &|scale| surveyed::marked(set, &notes.control, scale),
             taken: &mut |done, name| progress.set(done as u64, || name.to_owned()),
-            go_on,
+            cancelled: &|| !go_on(),
         },
     )?;
     let Some(mut found) = found else { return Ok(None) };

@@ -96,7 +96,7 @@ pub fn measure(
             open: &mut |settings| Ok(Refiner::open(settings)?),
             control: &|_| Vec::new(),
             taken: &mut |_, _| {},
-            go_on: &|| true,
+            cancelled: &|| false,
         },
     )?;
     let seconds = clock.elapsed().as_secs_f64();

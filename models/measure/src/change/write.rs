@@ -11,10 +11,7 @@ use survey::coordinates::Reference;
 use super::compare::Difference;
 use super::spots::Spot;
 use crate::MeasureError;
-
-/// Decimals of a degree (a centimetre on the ground) and of a metre.
-const DEGREE: f64 = 1e7;
-const METRE: f64 = 1e3;
+use crate::written::{collection, place};
 
 /// Side of a tile, pixels.
 const TILE: u32 = 256;
@@ -49,14 +46,6 @@ pub fn raster(difference: &Difference, epsg: Option<u16>) -> Result<Vec<u8>, Mea
     Ok(file.into_inner())
 }
 
-/// Corners in degrees with a reference system, in the map's own metres without one.
-fn place(p: &DVec2, reference: Option<&Reference>) -> io::Result<[f64; 2]> {
-    let Some(reference) = reference else { return Ok([p.x, p.y].map(|v| (v * METRE).round() / METRE)) };
-    let outside = || io::Error::new(io::ErrorKind::InvalidData, "a place outside of the map's reference system");
-    let at = reference.geodetic(p.extend(0.0)).ok_or_else(outside)?;
-    Ok([at.lon_deg, at.lat_deg].map(|v| (v * DEGREE).round() / DEGREE))
-}
-
 /// Its rings, each ending with the corner it begins with.
 fn rings(spot: &Spot, reference: Option<&Reference>) -> io::Result<Vec<Vec<[f64; 2]>>> {
     let ring = |corners: &Vec<DVec2>| corners.iter().chain(corners.first()).map(|p| place(p, reference)).collect();
@@ -68,8 +57,7 @@ fn rings(spot: &Spot, reference: Option<&Reference>) -> io::Result<Vec<Vec<[f64;
 /// # Errors
 /// Those of `out`, or a place outside of the reference system.
 pub fn geojson(out: &mut dyn Write, spots: &[Spot], reference: Option<&Reference>) -> io::Result<()> {
-    let axes = if reference.is_some() { "" } else { "\"axes\":\"metres east and north\"," };
-    write!(out, "{{\"type\":\"FeatureCollection\",{axes}\"features\":[")?;
+    write!(out, "{}", collection(reference))?;
     for (k, spot) in spots.iter().enumerate() {
         let feature = json!({
             "type": "Feature",
