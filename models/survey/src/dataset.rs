@@ -17,7 +17,7 @@ use crate::names::PictureNames;
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
 use models::formats::reconstruction::{LensDescription, LocalFrame, Reconstruction, Shot};
 use models::formats::telemetry;
-use models::picture::{PictureError, decode_shown};
+use models::picture::{PictureError, decode_shown, dimensions};
 use models::undistort::undistort;
 
 mod ahead;
@@ -38,6 +38,9 @@ use sources::{frames, reconstruction};
 
 /// What a pose from bundle adjustment is worth: never exact, but far better than any GPS.
 const RECONSTRUCTED_SIGMA: PoseSigma = PoseSigma { position_m: [0.02; 3], rotation_rad: [5e-4; 3] };
+
+/// A picture's edge is at most this many times what its description says.
+const MOST_LARGER: u32 = 8;
 
 /// Where a frame's pose is taken from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -262,22 +265,18 @@ impl Dataset {
         let (pose, sigma) = self.pose(i, source)?;
         let (w, h) = (intrinsics.width, intrinsics.height);
         let wanted = if frame.orientation.swaps() { (h, w) } else { (w, h) };
-        let (stored, opaque) = decode_shown(&frame.path, wanted, frame.values)?;
-        let mut image = frame.orientation.apply(stored);
         let full = &frame.view.intrinsics;
+        // Before a pixel of it is decoded: a few kilobytes may claim to be a gigabyte of them.
+        let (w, h) = dimensions(&frame.path)?;
+        let (w, h) = if frame.orientation.swaps() { (h, w) } else { (w, h) };
         // A description may speak of the full size while the folder holds a copy scaled down evenly.
-        let aspect =
-            f64::from(image.width()) * f64::from(full.height) / (f64::from(image.height()) * f64::from(full.width));
-        if (aspect - 1.0).abs() > 0.01 {
-            let what = format!(
-                "is {} x {}, its description says {} x {}",
-                image.width(),
-                image.height(),
-                full.width,
-                full.height
-            );
+        let aspect = f64::from(w) * f64::from(full.height) / (f64::from(h) * f64::from(full.width));
+        if (aspect - 1.0).abs() > 0.01 || w > MOST_LARGER.saturating_mul(full.width) {
+            let what = format!("is {w} x {h}, its description says {} x {}", full.width, full.height);
             return Err(PictureError { path: frame.path.clone(), what }.into());
         }
+        let (stored, opaque) = decode_shown(&frame.path, wanted, frame.values)?;
+        let mut image = frame.orientation.apply(stored);
         if !frame.distortion.is_none() {
             let k = full.resized(image.width(), image.height());
             image = undistort(&image, &k, &frame.distortion);

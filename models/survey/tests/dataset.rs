@@ -428,3 +428,32 @@ fn a_scene_in_a_maps_coordinates_or_of_an_odd_size_is_brought_near_and_its_poses
 fn frame_number(name: &str) -> usize {
     name.trim_end_matches(".png").rsplit('_').next().unwrap().parse().unwrap()
 }
+
+#[test]
+fn a_picture_that_is_not_what_its_description_says_is_refused_before_it_is_decoded() {
+    let folder = tempfile::tempdir().unwrap();
+    write_transforms(folder.path(), 3, "");
+    let set = Dataset::open(folder.path()).unwrap();
+    let path = folder.path().join("images/f01.png");
+    let small = std::fs::read(&path).unwrap();
+    // The size in the head of a PNG, and the checksum of the head behind it; no pixel follows that could be decoded.
+    for (w, h) in [(16_384u32, 16_384u32), (16_000, 12_000)] {
+        let mut head = small[..16].to_vec();
+        head.extend([w.to_be_bytes(), h.to_be_bytes()].concat());
+        head.extend([8, 0, 0, 0, 0]);
+        let checksum = crc(&head[12..]);
+        head.extend(checksum.to_be_bytes());
+        head.extend([0, 0, 0, 0]);
+        head.extend(b"IDAT");
+        std::fs::write(&path, head).unwrap();
+        let said = set.load(1, 1.0).unwrap_err().to_string();
+        assert!(said.contains(&format!("is {w} x {h}, its description says 16 x 12")), "{said}");
+    }
+}
+
+/// CRC-32 as PNG has it.
+fn crc(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(!0u32, |sum, byte| {
+        (0..8).fold(sum ^ u32::from(*byte), |sum, _| if sum & 1 == 1 { sum >> 1 ^ 0xedb8_8320 } else { sum >> 1 })
+    })
+}
