@@ -34,12 +34,12 @@ mod reference;
 mod validate;
 
 pub use camera::{CameraSettings, CameraSource, MountAttitude, MountSettings};
-pub use draft::Draft;
+pub use draft::{Draft, DraftArea};
 pub use error::MissionError;
 pub use keyframes::KeyframeSettings;
 pub use memory::{DEVICE_MIB, MemorySettings};
 pub use reference::reference;
-pub use validate::MAX_AIRCRAFT;
+pub use validate::{MAX_AIRCRAFT, MAX_CORNERS};
 
 /// A mission file larger than this is refused before it is parsed: room for [`MAX_AIRCRAFT`] with a region of 64 corners each.
 const MAX_FILE_BYTES: u64 = 4 << 20;

@@ -36,6 +36,7 @@ mod replay;
 mod serve;
 #[cfg(feature = "lab")]
 mod sim;
+mod survey;
 mod train;
 mod volume;
 
@@ -123,6 +124,8 @@ enum Command {
     Keys(keys::Args),
     /// Writes a mission file to start from, asking for what is not given, or prints the reference of all settings.
     Init(init::Args),
+    /// Deals an area to a fleet: regions of equal flight time, a mission, plans of all flights.
+    Survey(survey::Args),
     /// Prints what a memory budget holds, section by section.
     Plan(plan::Args),
     /// Checks device, driver, ONNX Runtime, ports: what is there, what is missing, how to mend it.
@@ -218,6 +221,7 @@ fn command(command: Command) -> Result<(), CliError> {
         Command::Import(args) => import::run(args),
         Command::Keys(args) => keys::run(args),
         Command::Init(args) => init::run(args),
+        Command::Survey(args) => survey::run(args),
         Command::Plan(args) => plan::run(args),
         Command::Doctor(args) => doctor::run(args),
         #[cfg(feature = "lab")]

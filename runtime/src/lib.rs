@@ -10,4 +10,5 @@ pub mod device_report;
 pub mod error;
 #[cfg(feature = "lab")]
 pub mod figures;
+pub mod survey_job;
 pub mod train_job;

@@ -38,6 +38,8 @@ mod observed;
 mod report;
 #[path = "commands/supervised.rs"]
 mod supervised;
+#[path = "commands/surveyed.rs"]
+mod surveyed;
 #[path = "commands/viewing.rs"]
 mod viewing;
 
@@ -149,9 +151,10 @@ fn a_plan_is_flown_by_the_simulator_with_a_picture_at_each_waypoint() {
     std::fs::write(path("m.toml"), mission).unwrap();
     let frame = geometry::geodesy::EnuFrame::new(origin);
     let places = [DVec3::new(0.0, 0.0, 35.0), DVec3::new(30.0, 0.0, 35.0), DVec3::new(30.0, 25.0, 45.0)];
-    let waypoint = |p: &DVec3| Waypoint { position: frame.to_geodetic(*p), yaw_deg: None, picture: true };
+    let waypoint =
+        |p: &DVec3| Waypoint { position: frame.to_geodetic(*p), yaw_deg: None, picture: true, every_m: None };
     let waypoints = places.iter().map(waypoint).collect();
-    let plan = FlightPlan { home: origin, speed_m_s: 5.0, pitch_deg: Some(-90.0), waypoints };
+    let plan = FlightPlan { home: origin, speed_m_s: 5.0, pitch_deg: Some(-90.0), waypoints, landing: None };
     plan.write(&mut std::fs::File::create(path("again.plan")).unwrap()).unwrap();
     let card = path("card");
     let flown =

@@ -19,12 +19,35 @@ pub struct Draft {
     pub picture: [u32; 2],
     /// Angle between the left and the right edge of a picture, degrees.
     pub fov_deg: f64,
-    /// Extent of the area east-west and north-south, metres; split among the aircraft from west to east.
-    pub area_m: [f64; 2],
+    /// What is flown.
+    pub area: DraftArea,
     /// Id and link of every aircraft.
     pub aircraft: Vec<(String, String)>,
     /// Budgets, unless the defaults of `[memory]` do.
     pub preset: Option<Preset>,
+}
+
+/// What the aircraft of a draft fly.
+#[derive(Clone, Debug)]
+pub enum DraftArea {
+    /// Extent east-west and north-south, metres; split among the aircraft from west to east.
+    Box([f64; 2]),
+    /// Corners of the region of each aircraft, metres east and north of the origin.
+    Regions(Vec<Vec<[f64; 2]>>),
+}
+
+impl DraftArea {
+    /// Corners of the region of one of `count` aircraft.
+    fn region(&self, aircraft: usize, count: usize) -> Vec<[f64; 2]> {
+        match self {
+            Self::Box([east, north]) => {
+                let stripe = east / count.max(1) as f64;
+                let (west, south) = (aircraft as f64 * stripe - east / 2.0, -north / 2.0);
+                vec![[west, south], [west + stripe, south], [west + stripe, -south], [west, -south]]
+            }
+            Self::Regions(regions) => regions.get(aircraft).cloned().unwrap_or_default(),
+        }
+    }
 }
 
 /// Pictures that the presets were measured with.
@@ -74,11 +97,8 @@ impl Draft {
                 _ => section(&mut out, &all, table, &[], true),
             }
         }
-        let [east, north] = self.area_m;
-        let stripe = east / self.aircraft.len().max(1) as f64;
         for (i, (id, link)) in self.aircraft.iter().enumerate() {
-            let (west, south) = (i as f64 * stripe - east / 2.0, -north / 2.0);
-            let region = [[west, south], [west + stripe, south], [west + stripe, -south], [west, -south]];
+            let region = self.area.region(i, self.aircraft.len());
             let given = [
                 ("id", quoted(id)),
                 ("system_id", (i + 1).to_string()),
@@ -132,7 +152,7 @@ mod tests {
             origin: Geodetic { lat_deg: 47.0, lon_deg: 8.5, alt_m: 400.0 },
             picture: [4056, 3040],
             fov_deg: 60.0,
-            area_m: [200.0, 100.0],
+            area: DraftArea::Box([200.0, 100.0]),
             aircraft: vec![("west".into(), "udpin:0.0.0.0:14550".into()), ("east".into(), "tcpin:0.0.0.0:1".into())],
             preset: Some(Preset::Tiny),
         }
@@ -146,6 +166,10 @@ mod tests {
         let regions = m.aircraft.iter().map(|a| m.region(a)).collect::<Vec<_>>();
         assert_eq!(regions[0], [[-100.0, -50.0], [0.0, -50.0], [0.0, 50.0], [-100.0, 50.0]]);
         assert_eq!(regions[1][0], [0.0, -50.0]);
+        let drawn = vec![vec![[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]], vec![[9.0, 0.0], [20.0, 0.0], [9.0, 9.0]]];
+        let text = Draft { area: DraftArea::Regions(drawn.clone()), ..draft() }.text();
+        let m = Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(m.aircraft.iter().map(|a| m.region(a)).collect::<Vec<_>>(), drawn);
         assert_eq!((m.memory.device_mib(), m.training.seconds), (96, Some(10.0)));
         assert_eq!((m.memory.image_scale, m.keyframes.max), (Some(0.0789), 48));
     }

@@ -9,7 +9,7 @@ const MAX_NAME: usize = 32;
 /// Most aircraft of one mission.
 pub const MAX_AIRCRAFT: usize = 1024;
 /// Most corners of a region.
-const MAX_CORNERS: usize = 256;
+pub const MAX_CORNERS: usize = 256;
 
 fn check_name(field: &str, name: &str) -> Result<(), SettingError> {
     let fits = !name.is_empty()

@@ -20,6 +20,8 @@ const ACCELERATION: f64 = 2.5;
 const LONGEST: f64 = 3600.0;
 /// A waypoint is reached this near to it, metres; ArduCopter slows down within its WPNAV_RADIUS of 2 m.
 const NEAR: f64 = 0.3;
+/// Most pictures along one leg: nobody's memory holds more.
+const MOST_SHOTS: usize = 10_000;
 /// A route begins this far before its first waypoint, metres, so that a picture may be taken there.
 const RUN_UP: f64 = 5.0;
 /// A heading is taken when it is off by no more than this, radians.
@@ -174,15 +176,30 @@ impl Leg {
         legs
     }
 
-    /// The legs of a route; pictures are taken at their ends.
+    /// The legs of a route; pictures are taken at their ends, or along them.
     pub fn of_route(route: &Route) -> Vec<Self> {
         let mut legs = Vec::with_capacity(route.waypoints.len());
         let mut from = route.waypoints.first().map_or(DVec3::ZERO, |w| w.position - DVec3::Y * RUN_UP);
+        // Metres between pictures, and from here to the next one.
+        let mut along: Option<(f64, f64)> = None;
         for waypoint in &route.waypoints {
             let to = waypoint.position;
-            let shot = (to - from).length() - NEAR;
-            let shots = if waypoint.picture { vec![shot] } else { Vec::new() };
+            let length = (to - from).length();
+            let end = length - NEAR;
+            let mut shots = Vec::new();
+            if let Some((every_m, next)) = &mut along {
+                while *next <= length && shots.len() < MOST_SHOTS {
+                    shots.push(next.min(end.max(0.0)));
+                    *next += *every_m;
+                }
+                *next -= length;
+            }
+            if waypoint.picture && shots.last().is_none_or(|last| *last < end) {
+                shots.push(end);
+            }
             legs.push(Self { from, to, shots, yaw: waypoint.yaw_deg.map(f64::to_radians) });
+            // The distance is counted anew where it changes.
+            along = waypoint.every_m.map(|m| along.filter(|a| a.0 == m).unwrap_or((m, 0.0)));
             from = to;
         }
         legs

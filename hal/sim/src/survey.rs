@@ -69,6 +69,8 @@ pub struct Waypoint {
     pub yaw_deg: Option<f64>,
     /// Whether a picture is taken there.
     pub picture: bool,
+    /// Metres between two pictures on the way from there to the next one, the first of them there; `None` = none are taken.
+    pub every_m: Option<f64>,
 }
 
 /// The lines over `region` (corners in metres east and north), in flying order; empty when the region has no area.

@@ -1,10 +1,10 @@
-//! Polygons that people draw: GeoJSON or KML, known by their content.
+//! Polygons that people draw: GeoJSON, KML or the fence of a QGroundControl plan, known by their content.
 
 use std::path::Path;
 
-use geometry::geodesy::Geodetic;
+use geometry::geodesy::{EnuFrame, Geodetic};
 use geometry::polygon;
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use models::formats::FormatError;
 use serde_json::Value;
 use survey::coordinates::{self, Reference};
@@ -22,6 +22,9 @@ const CROSSED: f64 = 0.02;
 const MOST_LETTERS: usize = 80;
 /// The system that GeoJSON has by its standard (RFC 7946) and older files name.
 const DEGREES: &str = "CRS84";
+/// Corners that stand for the circle of a fence, and its largest radius, metres.
+const CIRCLE: usize = 64;
+const WIDEST_M: f64 = 100_000.0;
 
 /// A polygon on a map.
 #[derive(Clone, Debug, PartialEq)]
@@ -80,26 +83,61 @@ pub struct Areas {
     pub others: usize,
 }
 
-/// Reads the polygons of a GeoJSON or KML file for a map in `epsg`. Of a map that names no reference system, corners are in its
-/// own metres.
+/// Reads the polygons of a file for a map in `epsg`. Of a map that names no reference system, corners are in its own metres.
 ///
 /// # Errors
-/// The file cannot be read, is neither, holds no polygon, or names a reference system that is not known.
+/// The file cannot be read, is none of those known, holds no polygon, or names a reference system that is not known.
 pub fn read(path: &Path, epsg: Option<u16>) -> Result<Areas, MeasureError> {
+    let drawn = drawn(path)?;
+    let bad = |what: String| MeasureError::File(FormatError::invalid(path, what));
+    let place = Placing::new(drawn.system.as_deref(), epsg).map_err(bad)?;
+    let areas = placed(path, drawn, &place)?;
+    for area in &areas.areas {
+        let (corners, lines) = (area.area_m2(), area.by_lines_m2());
+        if (corners - lines).abs() > CROSSED * corners.max(lines) {
+            let why = "its sides cross each other, or a hole is not inside of it";
+            return Err(bad(format!("polygon {:?}: {why}", area.name)));
+        }
+    }
+    Ok(areas)
+}
+
+/// Reads the polygons of a file as longitude (x) and latitude (y), degrees. Whether sides cross, and whether holes lie inside, is left
+/// to the caller.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_degrees(path: &Path) -> Result<Areas, MeasureError> {
+    let drawn = drawn(path)?;
+    let bad = |what: String| MeasureError::File(FormatError::invalid(path, what));
+    let place = Placing { through: Some((named(drawn.system.as_deref()).map_err(bad)?, None)) };
+    placed(path, drawn, &place)
+}
+
+/// What is drawn in a file.
+fn drawn(path: &Path) -> Result<Drawn, MeasureError> {
     let bad = |what: String| MeasureError::File(FormatError::invalid(path, what));
     let text = coordinates::text(path, LIMIT)?;
-    let (drawn, others) = match text.trim_start() {
-        text if text.starts_with('{') => from_geojson(text).map_err(bad)?,
+    let drawn = match text.trim_start() {
+        text if text.starts_with('{') => from_json(text).map_err(bad)?,
         text if text.starts_with('<') => from_kml(text).map_err(bad)?,
-        _ => return Err(bad("is neither GeoJSON nor KML (of a .kmz, unpack the .kml in it)".into())),
+        _ => {
+            return Err(bad(
+                "is neither GeoJSON, KML (of a .kmz, unpack the .kml in it) nor a .plan with a fence".into()
+            ));
+        }
     };
     if drawn.polygons.is_empty() {
-        return Err(bad(format!("holds no polygon ({others} features of other kinds)")));
+        return Err(bad(format!("holds no polygon ({} features of other kinds)", drawn.others)));
     }
     if drawn.polygons.iter().flat_map(|(_, rings)| rings).map(Vec::len).sum::<usize>() > MOST_CORNERS {
         return Err(bad(format!("has more than {MOST_CORNERS} corners")));
     }
-    let place = Placing::new(drawn.system.as_deref(), epsg).map_err(bad)?;
+    Ok(drawn)
+}
+
+fn placed(path: &Path, drawn: Drawn, place: &Placing) -> Result<Areas, MeasureError> {
+    let bad = |what: String| MeasureError::File(FormatError::invalid(path, what));
     let mut areas = Vec::with_capacity(drawn.polygons.len());
     for (k, (name, rings)) in drawn.polygons.into_iter().enumerate() {
         let name = tidy(&name).unwrap_or_else(|| (k + 1).to_string());
@@ -107,14 +145,9 @@ pub fn read(path: &Path, epsg: Option<u16>) -> Result<Areas, MeasureError> {
         let wrong = |why: String| bad(format!("polygon {name:?}: {why}"));
         let outside = ring(rings.next().unwrap_or_else(|| Ok(Vec::new())).map_err(wrong)?).map_err(wrong)?;
         let holes: Result<Vec<_>, String> = rings.map(|r| ring(r?)).collect();
-        let area = Area { holes: holes.map_err(wrong)?, outside, name: name.clone() };
-        let (corners, lines) = (area.area_m2(), area.by_lines_m2());
-        if (corners - lines).abs() > CROSSED * corners.max(lines) {
-            return Err(wrong("its sides cross each other, or a hole is not inside of it".into()));
-        }
-        areas.push(area);
+        areas.push(Area { holes: holes.map_err(wrong)?, outside, name: name.clone() });
     }
-    Ok(Areas { areas, others })
+    Ok(Areas { areas, others: drawn.others })
 }
 
 /// A name as one short line.
@@ -137,8 +170,8 @@ fn ring(mut corners: Vec<DVec2>) -> Result<Vec<DVec2>, String> {
 
 /// From the file's coordinates to the map's.
 struct Placing {
-    /// `None`: the file's are the map's.
-    through: Option<(Option<Reference>, Reference)>,
+    /// `None`: the file's are the map's. Degrees have no reference system of their own.
+    through: Option<(Option<Reference>, Option<Reference>)>,
 }
 
 impl Placing {
@@ -151,18 +184,7 @@ impl Placing {
             };
         };
         let map = Reference::named(&format!("EPSG:{code}")).ok_or("EPSG:… is not known")??;
-        let named = match system.filter(|name| !name.ends_with(DEGREES)) {
-            Some(name) => {
-                let spelled = name.rsplit_once("EPSG:").map_or(name, |(_, code)| code.trim_start_matches(':'));
-                let spelled = if spelled == name { name.to_owned() } else { format!("EPSG:{spelled}") };
-                Some(
-                    Reference::named(&spelled)
-                        .ok_or_else(|| format!("names a reference system ({name:?}) that is not known"))??,
-                )
-            }
-            None => None,
-        };
-        Ok(Self { through: Some((named, map)) })
+        Ok(Self { through: Some((named(system)?, Some(map))) })
     }
 
     fn put(&self, p: DVec2) -> Result<DVec2, String> {
@@ -174,8 +196,19 @@ impl Placing {
         let unit =
             if from.is_some() { "outside of its reference system" } else { "not longitude and latitude in degrees" };
         let place = place.ok_or_else(|| format!("{}, {} is {unit}", p.x, p.y))?;
+        let Some(to) = to else { return Ok(DVec2::new(place.lon_deg, place.lat_deg)) };
         to.plane(place).ok_or_else(|| format!("{}, {} is outside of the map's reference system", p.x, p.y))
     }
+}
+
+/// The reference system that a file names, unless it is in degrees.
+fn named(system: Option<&str>) -> Result<Option<Reference>, String> {
+    let Some(name) = system.filter(|name| !name.ends_with(DEGREES)) else { return Ok(None) };
+    let spelled = name.rsplit_once("EPSG:").map_or(name, |(_, code)| code.trim_start_matches(':'));
+    let spelled = if spelled == name { name.to_owned() } else { format!("EPSG:{spelled}") };
+    Reference::named(&spelled)
+        .ok_or_else(|| format!("names a reference system ({name:?}) that is not known"))?
+        .map(Some)
 }
 
 /// Polygons as they are written: names, rings (the outside first).
@@ -183,14 +216,60 @@ impl Placing {
 struct Drawn {
     system: Option<String>,
     polygons: Vec<(String, Vec<Vec<DVec2>>)>,
+    /// Features that are no polygons.
+    others: usize,
 }
 
-fn from_geojson(text: &str) -> Result<(Drawn, usize), String> {
+fn from_json(text: &str) -> Result<Drawn, String> {
     let file: Value = serde_json::from_str(text).map_err(|e| format!("no GeoJSON ({e})"))?;
+    match file["fileType"].as_str() {
+        Some("Plan") => from_fence(&file["geoFence"]),
+        _ => from_geojson(&file),
+    }
+}
+
+/// The fence of a plan ("Plan File Format" of QGroundControl's developer guide): what must not be flown over is cut out of each polygon
+/// that must not be left.
+fn from_fence(fence: &Value) -> Result<Drawn, String> {
+    let list = |name: &str| fence[name].as_array().map_or(&[][..], Vec::as_slice).iter();
+    let inclusion = |shape: &Value| shape["inclusion"].as_bool().ok_or("its fence does not say what is inside");
+    let (mut inside, mut cut) = (Vec::new(), Vec::new());
+    for shape in list("polygons") {
+        let corners = shape["polygon"].as_array().ok_or("a polygon of its fence has no corners")?;
+        let ring: Result<Vec<DVec2>, String> =
+            corners.iter().map(|p| corner(p).map(|p| DVec2::new(p.y, p.x))).collect();
+        if inclusion(shape)? { &mut inside } else { &mut cut }.push(ring?);
+    }
+    for shape in list("circles") {
+        let (center, radius) = (corner(&shape["circle"]["center"])?, shape["circle"]["radius"].as_f64());
+        let center = Geodetic { lat_deg: center.x, lon_deg: center.y, alt_m: 0.0 };
+        let radius = radius.filter(|r| *r > 0.0 && *r <= WIDEST_M && center.is_valid());
+        let radius = radius.ok_or("a circle of its fence has no place or radius")?;
+        let frame = EnuFrame::new(center);
+        let ring = (0..CIRCLE).map(|k| {
+            let way = DVec2::from_angle(std::f64::consts::TAU * k as f64 / CIRCLE as f64) * radius;
+            let at = frame.to_geodetic(DVec3::new(way.x, way.y, 0.0));
+            DVec2::new(at.lon_deg, at.lat_deg)
+        });
+        if inclusion(shape)? { &mut inside } else { &mut cut }.push(ring.collect());
+    }
+    if inside.is_empty() {
+        return Err("its fence holds no polygon or circle that must not be left; draw one in QGroundControl".into());
+    }
+    let corners = |rings: &[Vec<DVec2>]| rings.iter().map(|ring| ring.len() + 1).sum::<usize>();
+    if inside.len().saturating_mul(corners(&cut)).saturating_add(corners(&inside)) > MOST_CORNERS {
+        return Err(format!("has more than {MOST_CORNERS} corners"));
+    }
+    let polygon = |outside| (String::new(), std::iter::once(outside).chain(cut.iter().cloned()).collect());
+    let polygons: Vec<(String, Vec<Vec<DVec2>>)> = inside.into_iter().map(polygon).collect();
+    Ok(Drawn { system: Some(DEGREES.into()), polygons, others: 0 })
+}
+
+fn from_geojson(file: &Value) -> Result<Drawn, String> {
     let system = file.pointer("/crs/properties/name").and_then(Value::as_str).map(str::to_owned);
     let mut drawn = Drawn { system, ..Drawn::default() };
     let mut others = 0;
-    let alone = std::slice::from_ref(&file);
+    let alone = std::slice::from_ref(file);
     let features = file["features"].as_array().map_or(alone, Vec::as_slice);
     for feature in features {
         let geometry = if feature["geometry"].is_object() { &feature["geometry"] } else { feature };
@@ -214,19 +293,23 @@ fn from_geojson(text: &str) -> Result<(Drawn, usize), String> {
             _ => others += 1,
         }
     }
-    Ok((drawn, others))
+    drawn.others = others;
+    Ok(drawn)
+}
+
+fn corner(p: &Value) -> Result<DVec2, String> {
+    match (p[0].as_f64(), p[1].as_f64()) {
+        (Some(x), Some(y)) => Ok(DVec2::new(x, y)),
+        _ => Err(format!("{p} is no corner")),
+    }
 }
 
 fn rings(polygon: &Value) -> Result<Vec<Vec<DVec2>>, String> {
-    let corner = |p: &Value| match (p[0].as_f64(), p[1].as_f64()) {
-        (Some(x), Some(y)) => Ok(DVec2::new(x, y)),
-        _ => Err(format!("{p} is no corner")),
-    };
     let rings = polygon.as_array().ok_or("a polygon without rings")?;
     rings.iter().map(|ring| ring.as_array().ok_or("a ring without corners")?.iter().map(corner).collect()).collect()
 }
 
-fn from_kml(text: &str) -> Result<(Drawn, usize), String> {
+fn from_kml(text: &str) -> Result<Drawn, String> {
     let document = xml::parse(text).map_err(|e| format!("no KML ({e})"))?;
     let mut drawn = Drawn { system: Some(DEGREES.into()), ..Drawn::default() };
     let mut others = 0;
@@ -247,7 +330,8 @@ fn from_kml(text: &str) -> Result<(Drawn, usize), String> {
             drawn.polygons.push((name, rings?));
         }
     }
-    Ok((drawn, others))
+    drawn.others = others;
+    Ok(drawn)
 }
 
 /// `longitude,latitude[,height]`.
@@ -324,7 +408,7 @@ mod tests {
     fn what_is_no_polygon_is_refused_in_one_line() {
         let nested = format!("<kml>{}</kml>", "<a>".repeat(9000));
         for (text, word) in [
-            ("", "neither GeoJSON nor KML"),
+            ("", "neither GeoJSON, KML"),
             ("{", "no GeoJSON"),
             (r#"{"type":"FeatureCollection","features":[]}"#, "no polygon"),
             (r#"{"type":"Polygon","coordinates":[[[0,0],[1,1],[0,0]]]}"#, "fewer than three corners"),
@@ -343,6 +427,37 @@ mod tests {
         ] {
             let said = read_text(text, None).unwrap_err();
             assert!(said.contains(word) && !said.contains('\n'), "{said}");
+        }
+    }
+
+    #[test]
+    fn the_fence_of_a_plan_is_an_area_in_degrees_and_circles_are_polygons() {
+        let read_degrees = |text: &str| {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("fence.plan");
+            std::fs::write(&path, text).unwrap();
+            super::read_degrees(&path).map_err(|e| e.to_string())
+        };
+        let plan = |fence: &str| format!(r#"{{"fileType":"Plan","geoFence":{fence},"mission":{{"items":[]}}}}"#);
+        let square = r#"{"inclusion":true,"polygon":[[47.0,8.0],[47.0,8.01],[47.01,8.01],[47.01,8.0]],"version":1}"#;
+        let circle = |inclusion: bool, radius: &str| {
+            format!(r#"{{"circle":{{"center":[47.005,8.005],"radius":{radius}}},"inclusion":{inclusion},"version":1}}"#)
+        };
+        let both = plan(&format!(r#"{{"polygons":[{square}],"circles":[{}],"version":2}}"#, circle(false, "100")));
+        let areas = read_degrees(&both).unwrap().areas;
+        assert_eq!((areas.len(), areas[0].outside[1], areas[0].holes[0].len()), (1, DVec2::new(8.01, 47.0), CIRCLE));
+        // In metres the circle has its area.
+        let metres = read_text(&both, Some(32632)).unwrap().areas;
+        let hole = polygon::signed_area(&metres[0].holes[0]).abs();
+        assert!((hole / (std::f64::consts::PI * 1e4) - 1.0).abs() < 3e-3, "{hole}");
+        for (fence, word) in [
+            (r#"{"polygons":[],"circles":[]}"#.to_owned(), "holds no polygon or circle"),
+            (format!(r#"{{"circles":[{}]}}"#, circle(true, "-3")), "no place or radius"),
+            (r#"{"polygons":[{"polygon":[[1,2]]}]}"#.into(), "does not say what is inside"),
+            (r#"{"polygons":[{"inclusion":true,"polygon":[[1,2],["a"]]}]}"#.into(), "no corner"),
+        ] {
+            let said = read_degrees(&plan(&fence)).unwrap_err();
+            assert!(said.contains(word), "{said}");
         }
     }
 

@@ -166,9 +166,10 @@ fn flight_plans() {
         position: Geodetic { lat_deg: 47.4 + k * 1e-4, lon_deg: 8.5, alt_m: 470.0 },
         yaw_deg,
         picture,
+        every_m: (!picture).then_some(9.0),
     };
     let waypoints = vec![waypoint(0.0, None, true), waypoint(1.0, Some(90.0), true), waypoint(2.0, None, false)];
-    let plan = FlightPlan { home, speed_m_s: 5.0, pitch_deg: Some(-60.0), waypoints };
+    let plan = FlightPlan { home, speed_m_s: 5.0, pitch_deg: Some(-60.0), waypoints, landing: Some(home) };
     let mut whole = Vec::new();
     plan.write(&mut whole).expect("memory");
     let bare = r#"{
@@ -183,9 +184,18 @@ fn flight_plans() {
 }
 }
 "#;
+    let survey = r#"{"fileType": "Plan", "mission": {"plannedHomePosition": [-33, 151, 20], "items": [
+{"type": "ComplexItem", "complexItemType": "survey", "Altitude": 30, "TransectStyleComplexItem": {
+"HoverAndCapture": true, "VisualTransectPoints": [[-33, 151], [-33.001, 151]]}},
+{"type": "ComplexItem", "complexItemType": "CorridorScan", "TransectStyleComplexItem": {"Items": [
+{"type": "SimpleItem", "command": 206, "params": [25, 0, 1, 0, 0, 0, 0]},
+{"type": "SimpleItem", "command": 16, "frame": 0, "params": [0, 0, 0, null, -33.001, 151.001, 60]}]}}
+]}}
+"#;
+    let list = "QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t-33\t151\t20\t1\n1\t0\t3\t16\t0\t0\t0\t0\t-33.001\t151\t40\t1\n";
     survive(&Reader {
         name: "plan",
-        seeds: vec![whole, bare.into()],
+        seeds: vec![whole, bare.into(), survey.into(), list.into()],
         text: true,
         shell: None,
         memory: (64 << 10, 256),

@@ -119,12 +119,14 @@ impl Coverage {
             position: frame.to_geodetic(s.center),
             yaw_deg: s.yaw_deg,
             picture: true,
+            every_m: None,
         };
         Some(FlightPlan {
             home: frame.to_geodetic(first.truncate().extend(self.home_m)),
             speed_m_s: SPEED_M_S,
             pitch_deg: Some(reflight.pitch_deg),
             waypoints: reflight.stations.iter().map(waypoint).collect(),
+            landing: None,
         })
     }
 

@@ -44,6 +44,13 @@ pub(super) const EXAMPLES: &Examples = &[
     ("import", &["dgtr import scene.ply --out scene.dgtr"]),
     ("keys", &["dgtr keys --mission mission.toml", "dgtr keys --mission mission.toml --only west"]),
     ("init", &["dgtr init", "dgtr init --origin 47.4,8.5,430 --picture 4056x3040 --fov-deg 62"]),
+    (
+        "survey",
+        &[
+            "dgtr survey field.geojson --aircraft 3 --picture 4056x3040 --fov-deg 62 --gsd 2 --out survey",
+            "dgtr survey river.kml --aircraft 2 --picture 4056x3040 --fov-deg 62 --gsd 3 --endurance 25,18 --terrain dsm.tif --out survey",
+        ],
+    ),
     ("plan", &["dgtr plan --mission mission.toml", "dgtr plan --budget-mib 300 --json"]),
     ("doctor", &["dgtr doctor --mission mission.toml", "dgtr doctor --report board.json"]),
     ("demo", &["dgtr demo", "dgtr demo --seconds 20 --http 127.0.0.1:8080"]),

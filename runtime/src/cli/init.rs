@@ -3,7 +3,7 @@
 use std::io::{IsTerminal, stderr, stdin};
 use std::path::{Path, PathBuf};
 
-use config::mission::{Draft, Mission, reference};
+use config::mission::{Draft, DraftArea, Mission, reference};
 use config::preset::Preset;
 use geometry::geodesy::Geodetic;
 
@@ -46,17 +46,17 @@ pub struct Args {
     preset: Option<Preset>,
 }
 
-fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+pub(super) fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let read: Option<Vec<f64>> = text.split(',').map(|n| n.trim().parse().ok()).collect();
     read.and_then(|n| n.try_into().ok()).ok_or_else(|| format!("give {N} numbers with commas between them"))
 }
 
-fn size(text: &str) -> Result<[u32; 2], String> {
+pub(super) fn size(text: &str) -> Result<[u32; 2], String> {
     let read = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
     read.ok_or_else(|| "give width and height as in 4056x3040".to_owned())
 }
 
-fn field_of_view(text: &str) -> Result<f64, String> {
+pub(super) fn field_of_view(text: &str) -> Result<f64, String> {
     let within = |deg: &f64| *deg > 1.0 && *deg < 170.0;
     text.parse().ok().filter(within).ok_or_else(|| "give an angle of 1 to 170 degrees".to_owned())
 }
@@ -134,7 +134,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let Given { name, origin: [lat_deg, lon_deg, alt_m], picture, fov_deg, area_m, aircraft } = given;
     let origin = Geodetic { lat_deg, lon_deg, alt_m };
-    let text = Draft { name, origin, picture, fov_deg, area_m, aircraft, preset: args.preset }.text();
+    let text =
+        Draft { name, origin, picture, fov_deg, area: DraftArea::Box(area_m), aircraft, preset: args.preset }.text();
     Mission::parse(&text, Path::new(".")).map_err(CliError::input)?;
     write_new(&args.out, &text).map_err(|e| taken(&args.out, e))?;
     let file = args.out.display();

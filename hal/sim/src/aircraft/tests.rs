@@ -71,8 +71,32 @@ fn it_leans_into_the_wind_and_into_acceleration() {
 }
 
 #[test]
+fn pictures_along_a_route_are_as_far_apart_as_asked_also_around_its_corners() {
+    let waypoint =
+        |x, y, every_m| Waypoint { position: DVec3::new(x, y, 40.0), yaw_deg: None, picture: false, every_m };
+    let waypoints = vec![
+        waypoint(0.0, 0.0, Some(10.0)),
+        waypoint(95.0, 0.0, Some(10.0)),
+        waypoint(95.0, 30.0, None),
+        waypoint(0.0, 30.0, Some(20.0)),
+        waypoint(0.0, 90.0, None),
+    ];
+    let route = Route { waypoints, speed_ms: 5.0, gimbal_pitch_deg: -90.0 };
+    let manner = Manner { speed_ms: 5.0, gimbal_pitch_deg: -90.0 };
+    let flight = fly(ORIGIN, &Leg::of_route(&route), manner, &Imperfections::none(), "IMG_", 3).expect("a flight");
+    // 0 to 90; 5, 15 and 25 of the second leg; 0 to 60 of the last.
+    assert_eq!(flight.exposures.len(), 10 + 3 + 4);
+    let places: Vec<DVec3> = flight.exposures.iter().map(|e| flight.truth.at(e.middle_s).position).collect();
+    for (taken, wanted) in [(0, [0.0, 0.0]), (9, [90.0, 0.0]), (10, [95.0, 5.0]), (13, [0.0, 30.0]), (16, [0.0, 90.0])]
+    {
+        assert!((places[taken] - DVec3::new(wanted[0], wanted[1], 40.0)).length() < 1.5, "{taken}: {}", places[taken]);
+    }
+}
+
+#[test]
 fn a_route_is_flown_to_each_waypoint_with_its_height_and_heading_and_a_picture_where_one_is_asked_for() {
-    let waypoint = |x, y, z, yaw_deg, picture| Waypoint { position: DVec3::new(x, y, z), yaw_deg, picture };
+    let waypoint =
+        |x, y, z, yaw_deg, picture| Waypoint { position: DVec3::new(x, y, z), yaw_deg, picture, every_m: None };
     let waypoints = vec![
         waypoint(0.0, 0.0, 40.0, None, true),
         waypoint(30.0, 0.0, 40.0, Some(0.0), true),

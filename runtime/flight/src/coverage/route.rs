@@ -10,7 +10,12 @@ pub fn route(plan: &FlightPlan, origin: Geodetic, pitch_deg: f64) -> Route {
     let waypoints = plan.waypoints.iter();
     Route {
         waypoints: waypoints
-            .map(|w| Waypoint { position: frame.to_enu(w.position), yaw_deg: w.yaw_deg, picture: w.picture })
+            .map(|w| Waypoint {
+                position: frame.to_enu(w.position),
+                yaw_deg: w.yaw_deg,
+                picture: w.picture,
+                every_m: w.every_m,
+            })
             .collect(),
         speed_ms: plan.speed_m_s,
         gimbal_pitch_deg: plan.pitch_deg.unwrap_or(pitch_deg),

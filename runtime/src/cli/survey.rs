@@ -1,0 +1,175 @@
+//! `dgtr survey AREA --aircraft N --out DIR`: an area dealt to a fleet, with a mission and a plan for each flight.
+
+use std::path::PathBuf;
+
+use super::CliError;
+use crate::cli::init::{field_of_view, numbers, size};
+use crate::cli::output::outln;
+use crate::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Request};
+
+/// Deals an area to a fleet in regions that take equally long to fly, and writes the mission, a plan for each flight, a figure and a
+/// table.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Plans are for QGroundControl, ArduPilot and PX4. Flight times count turns, climbing and landing, in a wind from any \
+                  side. Aircraft cross others' ground at heights of their own. Check each plan against the place's rules and obstacles."
+)]
+pub struct Args {
+    /// The area: a polygon, with holes or without, as GeoJSON, KML, or the fence of a QGroundControl plan.
+    area: PathBuf,
+    /// Folder for mission.toml, the plans, survey.svg and survey.csv.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Number of aircraft.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    aircraft: usize,
+    /// Short name of the mission.
+    #[arg(long, default_value = "survey")]
+    name: String,
+    /// Link from each companion computer to its autopilot.
+    #[arg(long, value_name = "ADDRESS", default_value = "serial:/dev/ttyAMA0:921600")]
+    link: String,
+    #[command(flatten, next_help_heading = "Camera")]
+    camera: CameraArgs,
+    #[command(flatten, next_help_heading = "Pictures")]
+    pictures: PictureArgs,
+    #[command(flatten, next_help_heading = "Flight")]
+    flight: FlightArgs,
+}
+
+#[derive(Debug, clap::Args)]
+struct CameraArgs {
+    /// Width and height of the camera's pictures, pixels.
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    picture: [u32; 2],
+    /// The camera's horizontal field of view, degrees.
+    #[arg(long, value_name = "DEG", value_parser = field_of_view, required_unless_present = "focal_mm", conflicts_with = "focal_mm")]
+    fov_deg: Option<f64>,
+    /// Focal length, millimetres, with --sensor-mm.
+    #[arg(long, value_name = "MM", requires = "sensor_mm")]
+    focal_mm: Option<f64>,
+    /// Width of the sensor, millimetres.
+    #[arg(long, value_name = "MM", requires = "focal_mm")]
+    sensor_mm: Option<f64>,
+    /// Seconds that the camera needs from picture to picture.
+    #[arg(long, value_name = "S", default_value_t = 1.0)]
+    interval: f64,
+}
+
+#[derive(Debug, clap::Args)]
+struct PictureArgs {
+    /// Ground sampling distance, centimetres to a pixel.
+    #[arg(long, value_name = "CM")]
+    gsd: f64,
+    /// Share of a picture seen again by the next one on the line.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.75)]
+    forward_overlap: f64,
+    /// Share of a picture seen again from the next line.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.65)]
+    side_overlap: f64,
+}
+
+#[derive(Debug, clap::Args)]
+struct FlightArgs {
+    /// Speed over ground, m/s.
+    #[arg(long, value_name = "M/S", default_value_t = 8.0)]
+    speed: f64,
+    /// The fastest that an aircraft flies through the air, m/s.
+    #[arg(long, value_name = "M/S", default_value_t = 15.0)]
+    fastest: f64,
+    /// Wind from any side, m/s.
+    #[arg(long, value_name = "M/S", default_value_t = 5.0)]
+    wind: f64,
+    /// Minutes that a battery lasts, once or for each aircraft.
+    #[arg(long, value_name = "MIN", value_delimiter = ',', default_value = "25")]
+    endurance: Vec<f64>,
+    /// Share of the battery that is left at the landing.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.25)]
+    reserve: f64,
+    /// Where aircraft take off and land, once or for each [default: the area's corner nearest to its middle].
+    #[arg(long, value_name = "LAT,LON", allow_hyphen_values = true, value_parser = numbers::<2>)]
+    take_off: Vec<[f64; 2]>,
+    /// Height of the take-off places as the autopilot reports it, metres.
+    #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true, conflicts_with = "terrain")]
+    home_height: f64,
+    /// Height above ground that nobody exceeds, metres.
+    #[arg(long, value_name = "M", default_value_t = 120.0)]
+    highest: f64,
+    /// Heights of the ground, a GeoTIFF: lines follow it.
+    #[arg(long, value_name = "GEOTIFF")]
+    terrain: Option<PathBuf>,
+}
+
+/// Runs `dgtr survey`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let CameraArgs { picture, fov_deg, focal_mm, sensor_mm, interval } = args.camera;
+    let fov_deg = match (fov_deg, focal_mm, sensor_mm) {
+        (Some(fov), ..) => fov,
+        (_, Some(focal), Some(sensor)) if focal > 0.0 && sensor > 0.0 => {
+            2.0 * (sensor / (2.0 * focal)).atan().to_degrees()
+        }
+        _ => return Err(CliError::input("survey: --focal-mm and --sensor-mm must be lengths above zero")),
+    };
+    if args.aircraft > fleet::deal::MOST_CRAFT {
+        return Err(CliError::input(format!("--aircraft {}: must be 1 to {}", args.aircraft, fleet::deal::MOST_CRAFT)));
+    }
+    let flight = args.flight;
+    let request = Request {
+        area: args.area,
+        name: args.name,
+        aircraft: (1..=args.aircraft).map(|k| (format!("a{k}"), args.link.clone())).collect(),
+        camera: Camera { picture, fov_deg },
+        pictures: Pictures {
+            gsd_m: args.pictures.gsd / 100.0,
+            forward_overlap: args.pictures.forward_overlap,
+            side_overlap: args.pictures.side_overlap,
+            interval_s: interval,
+        },
+        flying: Flying {
+            speed_m_s: flight.speed,
+            fastest_m_s: flight.fastest,
+            wind_m_s: flight.wind,
+            endurance_min: flight.endurance,
+            reserve: flight.reserve,
+            take_off: flight.take_off,
+            highest_m: flight.highest,
+        },
+        home_m: flight.home_height,
+        terrain: flight.terrain,
+    };
+    let planned = survey_job::run(&request, &args.out)?;
+    print(&request, &planned);
+    let mission = args.out.join(MISSION);
+    outln!("next: load each plan into its aircraft; dgtr doctor --mission {}", mission.display());
+    Ok(())
+}
+
+fn print(request: &Request, planned: &Planned) {
+    outln!(
+        "{:.1} ha from {:.0} m above ground at {:.1} m/s, {:.1} cm a pixel, forward overlap {:.0} %",
+        planned.hectares,
+        planned.height_m,
+        planned.speed_m_s,
+        request.pictures.gsd_m * 100.0,
+        request.pictures.forward_overlap * 100.0
+    );
+    if planned.speed_m_s < request.flying.speed_m_s {
+        tracing::warn!(
+            "slower than --speed {} m/s, as the camera needs {} s from picture to picture or the wind leaves no more",
+            request.flying.speed_m_s,
+            request.pictures.interval_s
+        );
+    }
+    if let Some(at) = planned.take_off {
+        outln!("take-off and landing at {:.6},{:.6}, the area's corner nearest to its middle", at.lat_deg, at.lon_deg);
+    }
+    outln!("{:<20} {:>9} {:>8} {:>7} {:>6} {:>10}", "plan", "pictures", "min", "km", "side", "region ha");
+    for row in &planned.rows {
+        let plan = row.plan.file_name().unwrap_or_default().to_string_lossy();
+        let side = format!("{:.0} %", 100.0 * row.side_overlap);
+        outln!("{plan:<20} {:>9} {:>8.1} {:>7.2} {side:>6} {:>10.2}", row.pictures, row.minutes, row.km, row.hectares);
+    }
+}

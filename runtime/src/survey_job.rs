@@ -1,0 +1,499 @@
+//! From an area to a flight of many: regions of equal flight time, a mission, plans, a figure and a table, written into a folder.
+
+use std::path::{Path, PathBuf};
+
+use config::error::{Error, ErrorKind};
+use config::mission::{Draft, DraftArea, MAX_CORNERS, Mission, MissionError};
+use disk::{Disk, DiskError};
+use fleet::FleetError;
+use fleet::deal::{Share, deal};
+use fleet::figure;
+use fleet::flights::{Flights, crossings};
+use fleet::ground::{Ground, Ring};
+use fleet::pace::{Manner, Pace};
+use fleet::ring::ring;
+use fleet::sortie::Craft;
+use geometry::geodesy::{EnuFrame, Geodetic};
+use glam::{DVec2, DVec3};
+use measure::MeasureError;
+use measure::areas::{self, Area};
+use measure::heights::{HeightMap, Heights, MOST_PIXELS};
+use models::formats::FormatError;
+use survey::ortho::crs::Crs;
+
+/// Names in the folder.
+pub const MISSION: &str = "mission.toml";
+const FIGURE: &str = "survey.svg";
+const TABLE: &str = "survey.csv";
+/// Around the area as much terrain is read as this, metres: lines and ways reach beyond it.
+const AROUND_M: f64 = 500.0;
+/// Lines are longer than the ground by this many distances of pictures, at both ends, so that its border lies in as many pictures as
+/// its middle.
+const BEYOND: f64 = 1.5;
+/// Least distance of lines and of pictures on a line, metres.
+const NEAREST_M: f64 = 0.5;
+
+/// Why nothing was planned.
+#[derive(Debug, thiserror::Error)]
+pub enum SurveyError {
+    /// The area's file, or the terrain's.
+    #[error(transparent)]
+    Measure(#[from] MeasureError),
+    /// An area or settings that cannot be flown.
+    #[error("{path}: {source}", path = path.display())]
+    Area {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: FleetError,
+    },
+    /// Settings that cannot be flown.
+    #[error(transparent)]
+    Fleet(#[from] FleetError),
+    /// The mission that would be written.
+    #[error(transparent)]
+    Mission(#[from] MissionError),
+    /// A file that cannot be written.
+    #[error(transparent)]
+    File(#[from] FormatError),
+    /// What was asked for.
+    #[error("{0}")]
+    Request(String),
+}
+
+impl Error for SurveyError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Measure(e) => e.kind(),
+            Self::File(e) => e.kind(),
+            _ => ErrorKind::Input,
+        }
+    }
+}
+
+/// The camera: pixels, and the angle between the left and the right edge of a picture.
+#[derive(Clone, Copy, Debug)]
+pub struct Camera {
+    /// Width and height, pixels.
+    pub picture: [u32; 2],
+    /// Degrees.
+    pub fov_deg: f64,
+}
+
+/// How pictures are taken.
+#[derive(Clone, Copy, Debug)]
+pub struct Pictures {
+    /// Metres of ground to a pixel.
+    pub gsd_m: f64,
+    /// Share of a picture seen again by the next one on the line.
+    pub forward_overlap: f64,
+    /// Share of a picture seen again from the next line.
+    pub side_overlap: f64,
+    /// The camera needs so many seconds from picture to picture.
+    pub interval_s: f64,
+}
+
+/// How it is flown.
+#[derive(Clone, Debug)]
+pub struct Flying {
+    /// Over ground, m/s.
+    pub speed_m_s: f64,
+    /// The fastest through the air, m/s.
+    pub fastest_m_s: f64,
+    /// Wind, m/s.
+    pub wind_m_s: f64,
+    /// Minutes that a battery lasts, of all aircraft or of each.
+    pub endurance_min: Vec<f64>,
+    /// Share of it that is left at the landing.
+    pub reserve: f64,
+    /// Latitude and longitude of the take-off places: none, one for all, or one for each.
+    pub take_off: Vec<[f64; 2]>,
+    /// Metres above ground at most.
+    pub highest_m: f64,
+}
+
+/// What is asked for.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// The area's file.
+    pub area: PathBuf,
+    /// Name of the mission.
+    pub name: String,
+    /// Ids and links of the aircraft.
+    pub aircraft: Vec<(String, String)>,
+    /// The camera.
+    pub camera: Camera,
+    /// Pictures.
+    pub pictures: Pictures,
+    /// Flying.
+    pub flying: Flying,
+    /// Height of the take-off places as the autopilot reports it, metres, where no terrain says it.
+    pub home_m: f64,
+    /// A GeoTIFF of the ground's heights.
+    pub terrain: Option<PathBuf>,
+}
+
+/// A row of the table: one sortie.
+#[derive(Clone, Debug)]
+pub struct Row {
+    /// Who flies it.
+    pub aircraft: String,
+    /// Its plan.
+    pub plan: PathBuf,
+    /// From take-off to landing.
+    pub minutes: f64,
+    /// Pictures.
+    pub pictures: usize,
+    /// Kilometres from the take-off place and back.
+    pub km: f64,
+    /// Share of a picture seen again from the next line.
+    pub side_overlap: f64,
+    /// Hectares of the aircraft's region.
+    pub hectares: f64,
+}
+
+/// What was planned and written.
+#[derive(Clone, Debug)]
+pub struct Planned {
+    /// In the order of the aircraft.
+    pub rows: Vec<Row>,
+    /// Metres above ground.
+    pub height_m: f64,
+    /// Over ground, m/s.
+    pub speed_m_s: f64,
+    /// Hectares.
+    pub hectares: f64,
+    /// Where aircraft take off when nobody said it.
+    pub take_off: Option<Geodetic>,
+}
+
+/// Plans `request` and writes it into `out`.
+///
+/// # Errors
+/// An area, settings or terrain that cannot be flown; a folder that holds a mission already or cannot be written to.
+pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
+    if out.join(MISSION).exists() {
+        return Err(SurveyError::Request(format!(
+            "{} is there already; choose another folder with --out",
+            out.join(MISSION).display()
+        )));
+    }
+    let count = request.aircraft.len();
+    let (base_m, manner) = manner(&request.camera, &request.pictures, &request.flying)?;
+    let (area, middle) = area(&request.area)?;
+    let frame = EnuFrame::new(Geodetic { alt_m: request.home_m, ..middle });
+    let ground = placed(&request.area, &area, &frame)?;
+    let homes = homes(&request.flying, &frame, &ground, count)?;
+    let terrain = request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &ground, &homes)).transpose()?;
+    let height = |p: DVec2| terrain.as_ref().and_then(|t| t.height(p));
+    let home_m = match (&terrain, homes.first()) {
+        (Some(_), Some(home)) => height(*home).ok_or_else(|| {
+            SurveyError::Request(
+                "--terrain holds no height at the take-off place; give a map that reaches there".into(),
+            )
+        })?,
+        _ => request.home_m,
+    };
+    // Heights are kept around the ground of the take-off place.
+    let origin = Geodetic { alt_m: (home_m * 100.0).round() / 100.0, ..middle };
+    // Frames of another height have other metres, by a ten-thousandth for each 640 m.
+    let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
+    let ground = placed(&request.area, &area, &frame)?;
+    let craft = craft(request, &homes, &manner)?;
+    let shares = deal(&ground, &craft, &manner).map_err(|e| in_file(&request.area, e))?;
+    let text = mission(request, origin, &shares)?;
+    let terrain: Option<&dyn Fn(DVec2) -> Option<f64>> = if terrain.is_some() { Some(&height) } else { None };
+    let flights = Flights { frame, manner: &manner, base_m, terrain, home_m: origin.alt_m };
+    let disk = Disk::default();
+    let mut rows = Vec::new();
+    let mut plans = Vec::new();
+    let across = across_m(&request.camera, manner.height_m);
+    for (craft, share) in craft.iter().zip(&shares) {
+        for (k, sortie) in share.sorties.iter().enumerate() {
+            let name = match share.sorties.len() {
+                1 => format!("{}.plan", craft.id),
+                _ => format!("{}-{}.plan", craft.id, k + 1),
+            };
+            plans.push((out.join(name), flights.plan(craft, sortie)?));
+            rows.push(Row {
+                aircraft: craft.id.clone(),
+                plan: plans[plans.len() - 1].0.clone(),
+                minutes: sortie.seconds / 60.0,
+                pictures: flights.pictures(sortie),
+                km: sortie.metres(craft.home) / 1e3,
+                side_overlap: 1.0 - share.spacing_m / across,
+                hectares: share.ground.area_m2() / 1e4,
+            });
+        }
+    }
+    for (path, plan) in &plans {
+        disk.replace(path, |to| plan.write(to)).map_err(failed(path))?;
+    }
+    let path = out.join(FIGURE);
+    disk.replace(&path, |to| figure::write(to, &craft, &shares)).map_err(failed(&path))?;
+    let planned = Planned {
+        rows,
+        height_m: manner.height_m,
+        speed_m_s: manner.pace.speed_m_s,
+        hectares: ground.area_m2() / 1e4,
+        take_off: (request.flying.take_off.is_empty()).then(|| frame.to_geodetic(homes[0].extend(0.0))),
+    };
+    let path = out.join(TABLE);
+    disk.replace(&path, |to| table(to, request, &planned)).map_err(failed(&path))?;
+    // Last: a folder with a mission is whole.
+    let path = out.join(MISSION);
+    disk.replace(&path, |to| to.write_all(text.as_bytes())).map_err(failed(&path))?;
+    Ok(planned)
+}
+
+fn failed(path: &Path) -> impl FnOnce(DiskError) -> SurveyError {
+    move |e| FormatError::disk(path, e).into()
+}
+
+fn in_file(path: &Path, source: FleetError) -> SurveyError {
+    match source {
+        FleetError::Area(_) => SurveyError::Area { path: path.into(), source },
+        source => source.into(),
+    }
+}
+
+fn setting(what: &'static str, value: impl ToString, wanted: impl Into<String>) -> SurveyError {
+    FleetError::Setting { what, value: value.to_string(), wanted: wanted.into() }.into()
+}
+
+/// Width of a picture on the ground, metres.
+fn across_m(camera: &Camera, height_m: f64) -> f64 {
+    2.0 * height_m * (camera.fov_deg / 2.0).to_radians().tan()
+}
+
+/// Metres between pictures of a line, and how the area is photographed. Pictures lie with their longer side across the lines.
+fn manner(camera: &Camera, pictures: &Pictures, flying: &Flying) -> Result<(f64, Manner), SurveyError> {
+    let [width, height] = camera.picture.map(f64::from);
+    if !(width >= 1.0 && height >= 1.0 && width <= 65_536.0 && height <= 65_536.0) {
+        return Err(setting("--picture", format!("{width}x{height}"), "1 to 65536 pixels each way"));
+    }
+    if !(1.0..170.0).contains(&camera.fov_deg) {
+        return Err(setting("--fov-deg", camera.fov_deg, "1 to 170 degrees"));
+    }
+    if !(0.001..=10.0).contains(&pictures.gsd_m) {
+        return Err(setting("--gsd", pictures.gsd_m * 100.0, "0.1 to 1000 cm"));
+    }
+    for (what, share) in [("--forward-overlap", pictures.forward_overlap), ("--side-overlap", pictures.side_overlap)] {
+        if !(0.0..=0.95).contains(&share) {
+            return Err(setting(what, share, "0 to 0.95"));
+        }
+    }
+    if !(0.0..=60.0).contains(&pictures.interval_s) {
+        return Err(setting("--interval", pictures.interval_s, "0 to 60 seconds"));
+    }
+    let across = width * pictures.gsd_m;
+    let height_m = across / (2.0 * (camera.fov_deg / 2.0).to_radians().tan());
+    let spacing_m = across * (1.0 - pictures.side_overlap);
+    let base_m = height * pictures.gsd_m * (1.0 - pictures.forward_overlap);
+    if spacing_m.min(base_m) < NEAREST_M {
+        let wanted = format!(
+            "such that lines and pictures lie {NEAREST_M} m apart or more; ask for less overlap or coarser pixels"
+        );
+        return Err(setting("--gsd", format!("{} cm", pictures.gsd_m * 100.0), wanted));
+    }
+    // The camera keeps up.
+    let most = if pictures.interval_s > 0.0 { base_m / pictures.interval_s } else { f64::INFINITY };
+    if most < 0.5 {
+        return Err(setting(
+            "--interval",
+            pictures.interval_s,
+            format!("{:.2} s or less, as pictures lie {base_m:.1} m apart", base_m / 0.5),
+        ));
+    }
+    let pace = Pace::new(flying.speed_m_s.min(most), flying.wind_m_s, flying.fastest_m_s)?;
+    Ok((base_m, Manner { spacing_m, beyond_m: BEYOND * base_m, height_m, pace }))
+}
+
+/// The area in degrees, and its middle.
+fn area(path: &Path) -> Result<(Area, Geodetic), SurveyError> {
+    let mut drawn = areas::read_degrees(path)?;
+    if drawn.others > 0 {
+        tracing::warn!("{}: {} features are no polygons and are left out", path.display(), drawn.others);
+    }
+    let (Some(area), 1) = (drawn.areas.first(), drawn.areas.len()) else {
+        let names: Vec<&str> = drawn.areas.iter().take(3).map(|a| a.name.as_str()).collect();
+        return Err(SurveyError::Request(format!(
+            "{}: holds {} polygons ({}, …), and one is surveyed at a time; save that one by itself",
+            path.display(),
+            drawn.areas.len(),
+            names.join(", ")
+        )));
+    };
+    let [low, high] = area.bounds();
+    let middle = low.midpoint(high);
+    // A hundredth of a millionth of a degree is a millimetre.
+    let [lon_deg, lat_deg] = [middle.x, middle.y].map(|v| (v * 1e7).round() / 1e7);
+    Ok((drawn.areas.swap_remove(0), Geodetic { lat_deg, lon_deg, alt_m: 0.0 }))
+}
+
+/// The area in metres.
+fn placed(path: &Path, area: &Area, frame: &EnuFrame) -> Result<Ground, SurveyError> {
+    let put = |corners: &Vec<DVec2>| -> Ring { corners.iter().map(|p| flat(frame, p.y, p.x)).collect() };
+    let holes: Vec<Ring> = area.holes.iter().map(put).collect();
+    Ground::new(put(&area.outside), &holes).map_err(|e| in_file(path, e))
+}
+
+fn flat(frame: &EnuFrame, lat_deg: f64, lon_deg: f64) -> DVec2 {
+    frame.to_enu(Geodetic { lat_deg, lon_deg, alt_m: frame.origin().alt_m }).truncate()
+}
+
+/// Places of one frame in another.
+fn moved(from: &EnuFrame, to: &EnuFrame, places: Vec<DVec2>) -> Vec<DVec2> {
+    let place = |p: DVec2| {
+        let at = from.to_geodetic(DVec3::new(p.x, p.y, 0.0));
+        flat(to, at.lat_deg, at.lon_deg)
+    };
+    places.into_iter().map(place).collect()
+}
+
+/// Where each aircraft takes off.
+fn homes(flying: &Flying, frame: &EnuFrame, ground: &Ground, count: usize) -> Result<Vec<DVec2>, SurveyError> {
+    let place = |[lat_deg, lon_deg]: &[f64; 2]| {
+        let valid = Geodetic { lat_deg: *lat_deg, lon_deg: *lon_deg, alt_m: 0.0 }.is_valid();
+        match valid.then(|| flat(frame, *lat_deg, *lon_deg)).filter(|p| p.length() < 50_000.0) {
+            Some(p) => Ok(p),
+            None => Err(setting(
+                "--take-off",
+                format!("{lat_deg},{lon_deg}"),
+                "latitude and longitude near the area, degrees",
+            )),
+        }
+    };
+    match flying.take_off.as_slice() {
+        [] => {
+            // The corner with the shortest way to all of the area.
+            let middle = ground.middle();
+            let corners = ground.parts.first().and_then(|part| part.first()).into_iter().flatten();
+            let nearest = corners.min_by(|a, b| a.distance(middle).total_cmp(&b.distance(middle)));
+            Ok(vec![nearest.copied().unwrap_or(middle); count])
+        }
+        [one] => Ok(vec![place(one)?; count]),
+        each if each.len() == count => each.iter().map(place).collect(),
+        each => Err(setting(
+            "--take-off",
+            format!("was given {} times", each.len()),
+            format!("given once, or once for each of {count} aircraft"),
+        )),
+    }
+}
+
+fn craft(request: &Request, homes: &[DVec2], manner: &Manner) -> Result<Vec<Craft>, SurveyError> {
+    let Flying { endurance_min, reserve, highest_m, .. } = &request.flying;
+    let count = request.aircraft.len();
+    let fits = |minutes: &f64| (1.0..=1440.0).contains(minutes);
+    if !(endurance_min.len() == 1 || endurance_min.len() == count) || !endurance_min.iter().all(fits) {
+        let given = endurance_min.iter().map(f64::to_string).collect::<Vec<_>>().join(",");
+        return Err(setting(
+            "--endurance",
+            given,
+            format!("1 to 1440 minutes, once or once for each of {count} aircraft"),
+        ));
+    }
+    if !(0.0..=0.9).contains(reserve) {
+        return Err(setting("--reserve", reserve, "0 to 0.9"));
+    }
+    if !(5.0..=10_000.0).contains(highest_m) {
+        return Err(setting("--highest", highest_m, "5 to 10000 m"));
+    }
+    let heights = crossings(count, manner.height_m, *highest_m)?;
+    let one = |(k, (id, _)): (usize, &(String, String))| Craft {
+        id: id.clone(),
+        home: homes[k],
+        battery_s: 60.0 * endurance_min[k % endurance_min.len()] * (1.0 - reserve),
+        crossing_m: heights[k],
+    };
+    Ok(request.aircraft.iter().enumerate().map(one).collect())
+}
+
+/// The mission file's text; it has been read back.
+fn mission(request: &Request, origin: Geodetic, shares: &[Share]) -> Result<String, SurveyError> {
+    let mut regions = Vec::with_capacity(shares.len());
+    for (share, (id, _)) in shares.iter().zip(&request.aircraft) {
+        let corners = ring(&share.ground);
+        if corners.len() > MAX_CORNERS {
+            let why = format!(
+                "leaves {id} a region of {} corners; a mission holds {MAX_CORNERS}, so draw it simpler",
+                corners.len()
+            );
+            return Err(in_file(&request.area, FleetError::Area(why)));
+        }
+        regions.push(corners.iter().map(|p| p.to_array().map(|v| (v * 1e3).round() / 1e3)).collect());
+    }
+    let text = Draft {
+        name: request.name.clone(),
+        origin,
+        picture: request.camera.picture,
+        fov_deg: request.camera.fov_deg,
+        area: DraftArea::Regions(regions),
+        aircraft: request.aircraft.clone(),
+        preset: None,
+    }
+    .text();
+    Mission::parse(&text, Path::new("."))?;
+    Ok(text)
+}
+
+/// Heights of the ground around the area.
+struct Terrain {
+    heights: Heights,
+    crs: Crs,
+}
+
+impl Terrain {
+    fn open(path: &Path, frame: &EnuFrame, ground: &Ground, homes: &[DVec2]) -> Result<Self, SurveyError> {
+        let bad = |why: String| SurveyError::File(FormatError::invalid(path, why));
+        let mut map = HeightMap::open(path)?;
+        let Some(code) = map.epsg() else {
+            return Err(bad(
+                "names no projected reference system by its EPSG code; gdalwarp -t_srs EPSG:… gives it one".into(),
+            ));
+        };
+        let crs = Crs::projected(code, frame.origin()).map_err(|e| bad(e.to_string()))?;
+        let places = ground.bounds().into_iter().chain(homes.iter().copied());
+        let (low, high) = places.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(l, h), p| (l.min(p), h.max(p)));
+        let (low, high) = (low - AROUND_M, high + AROUND_M);
+        let corners = [low, DVec2::new(low.x, high.y), high, DVec2::new(high.x, low.y)];
+        let mut bounds = [DVec2::INFINITY, DVec2::NEG_INFINITY];
+        for corner in corners {
+            let at = crs.to_map(corner.extend(0.0)).map_err(|e| bad(e.to_string()))?.truncate();
+            bounds = [bounds[0].min(at), bounds[1].max(at)];
+        }
+        let heights = map.part(bounds, MOST_PIXELS)?.ok_or_else(|| bad("holds nothing of the area".into()))?;
+        Ok(Self { heights, crs })
+    }
+
+    fn height(&self, p: DVec2) -> Option<f64> {
+        let at = self.crs.to_map(DVec3::new(p.x, p.y, 0.0)).ok()?;
+        self.heights.height(at.truncate())
+    }
+}
+
+fn table(out: &mut dyn std::io::Write, request: &Request, planned: &Planned) -> std::io::Result<()> {
+    writeln!(
+        out,
+        "aircraft,plan,pictures,minutes,km,gsd_cm,forward_overlap,side_overlap,height_m,speed_m_s,region_ha"
+    )?;
+    for row in &planned.rows {
+        let plan = row.plan.file_name().unwrap_or_default().to_string_lossy();
+        writeln!(
+            out,
+            "{},{plan},{},{:.2},{:.3},{:.2},{:.3},{:.3},{:.1},{:.2},{:.3}",
+            row.aircraft,
+            row.pictures,
+            row.minutes,
+            row.km,
+            request.pictures.gsd_m * 100.0,
+            request.pictures.forward_overlap,
+            row.side_overlap,
+            planned.height_m,
+            planned.speed_m_s,
+            row.hectares
+        )?;
+    }
+    Ok(())
+}

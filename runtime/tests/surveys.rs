@@ -1,0 +1,268 @@
+//! `dgtr survey` on three areas: dealt to fleets, written, read back and flown by the simulated aircraft, without its pictures.
+#![cfg(feature = "lab")]
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
+
+use std::path::Path;
+
+use config::coverage::CoverageSettings;
+use config::mission::Mission;
+use flight::coverage::route;
+use geometry::geodesy::{EnuFrame, Geodetic};
+use geometry::polygon;
+use glam::{DVec2, DVec3};
+use models::camera::{Intrinsics, Pose, View};
+use models::formats::flight_plan;
+use runtime::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Request};
+use serde::Deserialize;
+use sim::aircraft::Imperfections;
+use sim::autopilot::AutopilotSettings;
+use sim::reference::{Lens, flown_views};
+use sim::survey::SurveySettings;
+use sim::world::WorldSettings;
+use sim::{SessionSettings, SimSettings};
+use survey::coverage::{CoverageMap, CoverageRegion, State};
+
+const PLACE: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
+const CAMERA: Camera = Camera { picture: [4000, 3000], fov_deg: 60.0 };
+const GSD_M: f64 = 0.025;
+
+/// Longitude and latitude of places around [`PLACE`].
+fn degrees(places: &[DVec2]) -> Vec<[f64; 2]> {
+    let frame = EnuFrame::new(PLACE);
+    let at = |p: &DVec2| frame.to_geodetic(DVec3::new(p.x, p.y, 0.0));
+    places.iter().map(at).map(|g| [g.lon_deg, g.lat_deg]).collect()
+}
+
+fn corners(list: &[[f64; 2]]) -> Vec<DVec2> {
+    list.iter().map(|c| DVec2::from(*c)).collect()
+}
+
+/// A convex field of 20 ha as GeoJSON.
+fn field() -> String {
+    let mut ring = degrees(&corners(&[[0.0, 0.0], [440.0, -40.0], [590.0, 190.0], [400.0, 430.0], [60.0, 350.0]]));
+    ring.push(ring[0]);
+    format!(
+        r#"{{"type":"Feature","properties":{{"name":"field"}},"geometry":{{"type":"Polygon","coordinates":[{ring:?}]}}}}"#
+    )
+}
+
+/// An L with a hole as KML.
+fn yard() -> String {
+    let ring = |list: &[[f64; 2]]| {
+        let all: Vec<String> = degrees(&corners(list)).iter().map(|[lon, lat]| format!("{lon},{lat},0")).collect();
+        format!("<LinearRing><coordinates>{}</coordinates></LinearRing>", all.join(" "))
+    };
+    let outside = ring(&[[0.0, 0.0], [640.0, 0.0], [640.0, 220.0], [240.0, 220.0], [240.0, 560.0], [0.0, 560.0]]);
+    let hole = ring(&[[80.0, 80.0], [160.0, 80.0], [160.0, 140.0], [80.0, 140.0]]);
+    format!(
+        "<kml xmlns='http://www.opengis.net/kml/2.2'><Placemark><name>yard</name><Polygon><outerBoundaryIs>{outside}</outerBoundaryIs>\
+         <innerBoundaryIs>{hole}</innerBoundaryIs></Polygon></Placemark></kml>"
+    )
+}
+
+/// Three kilometres of a river that bends, as the fence of a plan.
+fn river() -> String {
+    let middle = |k: f64| DVec2::new(k * 2700.0, 420.0 * (k * 5.0).sin());
+    let bank = |k: i32, side: f64| {
+        let (a, b) = (middle(f64::from(k) / 40.0), middle((f64::from(k) + 0.5) / 40.0));
+        a + (b - a).normalize().perp() * side
+    };
+    let banks: Vec<DVec2> = (0..=40).map(|k| bank(k, -60.0)).chain((0..=40).rev().map(|k| bank(k, 60.0))).collect();
+    let ring: Vec<[f64; 2]> = degrees(&banks).into_iter().map(|[lon, lat]| [lat, lon]).collect();
+    format!(
+        r#"{{"fileType":"Plan","geoFence":{{"circles":[],"polygons":[{{"inclusion":true,"polygon":{ring:?},"version":1}}],"version":2}}}}"#
+    )
+}
+
+fn request(area: &Path, count: usize) -> Request {
+    Request {
+        area: area.to_owned(),
+        name: "survey".into(),
+        aircraft: (1..=count).map(|k| (format!("a{k}"), "udpin:127.0.0.1:14550".into())).collect(),
+        camera: CAMERA,
+        pictures: Pictures { gsd_m: GSD_M, forward_overlap: 0.75, side_overlap: 0.65, interval_s: 1.0 },
+        flying: Flying {
+            speed_m_s: 8.0,
+            fastest_m_s: 15.0,
+            wind_m_s: 5.0,
+            endurance_min: vec![25.0],
+            reserve: 0.25,
+            take_off: Vec::new(),
+            highest_m: 150.0,
+        },
+        home_m: PLACE.alt_m,
+        terrain: None,
+    }
+}
+
+/// What QGroundControl asks for when it opens a plan (`PlanMasterController`, `MissionController`, `SimpleMissionItem`).
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+#[allow(dead_code, reason = "that it is there is what counts")]
+struct PlanFile {
+    file_type: String,
+    ground_station: String,
+    version: u32,
+    geo_fence: serde_json::Value,
+    rally_points: serde_json::Value,
+    mission: PlanMission,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+#[allow(dead_code, reason = "that it is there is what counts")]
+struct PlanMission {
+    version: u32,
+    firmware_type: u32,
+    vehicle_type: u32,
+    global_plan_altitude_mode: u32,
+    cruise_speed: f64,
+    hover_speed: f64,
+    planned_home_position: [f64; 3],
+    items: Vec<PlanItem>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(non_snake_case, dead_code, reason = "names of QGroundControl")]
+struct PlanItem {
+    #[serde(rename = "type")]
+    kind: String,
+    command: u32,
+    frame: u32,
+    params: [Option<f64>; 7],
+    autoContinue: bool,
+    doJumpId: usize,
+    AMSLAltAboveTerrain: Option<f64>,
+    Altitude: Option<f64>,
+    AltitudeMode: Option<u32>,
+}
+
+/// The plan by other types than ours: its items are numbered, begin with a take-off and end with a landing where it took off.
+fn opened(path: &Path) {
+    let file: PlanFile =
+        serde_json::from_slice(&std::fs::read(path).expect("a plan")).expect("QGroundControl's members");
+    let items = &file.mission.items;
+    assert!(items.iter().enumerate().all(|(k, item)| item.doJumpId == k + 1 && item.kind == "SimpleItem"));
+    assert_eq!((items[0].command, items[items.len() - 1].command), (22, 21), "{}", path.display());
+    let home = file.mission.planned_home_position;
+    let landing = items[items.len() - 1].params;
+    assert!((0..2).all(|k| landing[4 + k].is_some_and(|v| (v - home[k]).abs() < 1e-6)) && landing[6] == Some(0.0));
+}
+
+/// The true views of a plan's flight, in wind and with the errors of a simulated aircraft.
+fn flown(plan: &Path, mission: &Mission, seed: u64) -> Vec<View> {
+    let plan = flight_plan::read(plan).expect("a plan");
+    let c = &mission.camera;
+    let lens =
+        Lens { width: c.width, height: c.height, fx: c.fx.into(), fy: c.fy.into(), cx: c.cx.into(), cy: c.cy.into() };
+    let settings = SimSettings {
+        world_seed: 1,
+        seed,
+        world: WorldSettings::default(),
+        origin: mission.origin,
+        lens,
+        region: Vec::new(),
+        survey: SurveySettings::default(),
+        route: Some(route(&plan, mission.origin, -90.0)),
+        imperfections: Imperfections::default(),
+        autopilot: AutopilotSettings::default(),
+        session: SessionSettings::default(),
+        prefix: String::new(),
+    };
+    let flight = settings.flight().expect("a flight");
+    let intrinsics = Intrinsics { width: c.width, height: c.height, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy };
+    let views = flown_views(&flight, &lens);
+    views.into_iter().map(|v| View { intrinsics, pose: Pose { rotation: v.rotation, center: v.position } }).collect()
+}
+
+/// Share of the area that is covered by the rules and at the asked ground sampling distance: no more than a twentieth coarser, as
+/// ground between two lines is seen from the side.
+fn covered(regions: &[Vec<DVec2>], views: &[View]) -> f64 {
+    let (mut good, mut all) = (0.0, 0.0);
+    for region in regions {
+        let region = CoverageRegion::new(region.clone()).expect("a region");
+        let mut map = CoverageMap::new(&region, 0.0, CoverageSettings { cell_m: 3.0, ..CoverageSettings::default() })
+            .expect("a map");
+        views.iter().for_each(|view| map.add(view));
+        let grid = *map.grid();
+        for (column, row) in (0..grid.rows).flat_map(|row| (0..grid.columns).map(move |column| (column, row))) {
+            let Some(cell) = map.cell(column, row) else { continue };
+            all += grid.cell_m2();
+            if cell.state == State::Covered && cell.gsd_m.is_some_and(|gsd| gsd <= 1.05 * GSD_M) {
+                good += grid.cell_m2();
+            }
+        }
+    }
+    good / all
+}
+
+/// Everything that a survey promises of a folder.
+fn kept(name: &str, out: &Path, planned: &Planned, hectares: f64) {
+    let mission = Mission::read(&out.join(MISSION)).expect("a mission");
+    let regions: Vec<Vec<DVec2>> =
+        mission.aircraft.iter().map(|a| mission.region(a).into_iter().map(DVec2::from).collect()).collect();
+    // Once: the areas add up, and no place has two owners.
+    let sum: f64 = regions.iter().map(|r| polygon::signed_area(r)).sum::<f64>() / 1e4;
+    assert!((sum / hectares - 1.0).abs() < 1e-3, "{name}: {sum} of {hectares} ha");
+    assert!((planned.hectares / hectares - 1.0).abs() < 1e-3, "{name}: {} ha", planned.hectares);
+    let every = regions.iter().flatten();
+    let (low, high) = every.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(l, h), p| (l.min(*p), h.max(*p)));
+    let (mut owned, mut twice) = (0, 0);
+    for k in 0..4000u32 {
+        let share = DVec2::new(f64::from(k) / 4000.0, f64::from(k.reverse_bits()) / f64::from(u32::MAX));
+        let owners = regions.iter().filter(|r| polygon::contains(r, low + (high - low) * share)).count();
+        owned += usize::from(owners > 0);
+        twice += usize::from(owners > 1);
+    }
+    assert!(owned > 100 && twice * 1000 <= owned, "{name}: {twice} of {owned} places have two owners");
+    let minutes: Vec<f64> = mission
+        .aircraft
+        .iter()
+        .map(|a| planned.rows.iter().filter(|r| r.aircraft == a.id).map(|r| r.minutes).sum())
+        .collect();
+    let (least, most) = minutes.iter().fold((f64::MAX, 0.0f64), |(l, m), v| (l.min(*v), m.max(*v)));
+    assert!(least > 0.9 * most, "{name}: {minutes:.1?} min");
+    let mut views = Vec::new();
+    for (k, row) in planned.rows.iter().enumerate() {
+        assert!(row.minutes < 25.0 * 0.75 + 1e-6 && row.side_overlap > 0.65 - 1e-6, "{name}: {row:?}");
+        opened(&row.plan);
+        let taken = flown(&row.plan, &mission, k as u64);
+        // At a line's end a centimetre decides over a picture.
+        let off = taken.len().abs_diff(row.pictures);
+        assert!(30 * off <= row.pictures, "{name}: {} pictures, not {row:?}", taken.len());
+        views.extend(taken);
+    }
+    let share = covered(&regions, &views);
+    println!(
+        "{name}: {minutes:.1?} min, {} sorties, {} pictures, covered {:.2} %",
+        planned.rows.len(),
+        views.len(),
+        100.0 * share
+    );
+    assert!(share >= 0.99, "{name}: {:.2} % covered", 100.0 * share);
+    let table = std::fs::read_to_string(out.join("survey.csv")).expect("a table");
+    assert_eq!(table.lines().count(), 1 + planned.rows.len());
+    let figure = std::fs::read_to_string(out.join("survey.svg")).expect("a figure");
+    let svg = survey::xml::parse(&figure).expect("SVG");
+    let drawn = |name: &str| svg.descendants().filter(|n| n.is_element() && n.tag_name().name() == name).count();
+    assert_eq!((drawn("circle"), drawn("text")), (mission.aircraft.len(), mission.aircraft.len() + 1));
+}
+
+#[test]
+fn three_areas_flown_by_one_three_and_eight_are_covered_once_and_at_the_asked_distance() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (name, text, hectares) in
+        [("field.geojson", field(), 19.955), ("yard.kml", yard(), 21.76), ("river.plan", river(), 0.0)]
+    {
+        let area = folder.path().join(name);
+        std::fs::write(&area, text).expect("written");
+        for count in [1, 3, 8] {
+            let out = folder.path().join(format!("{name}-{count}"));
+            let planned =
+                survey_job::run(&request(&area, count), &out).unwrap_or_else(|e| panic!("{name}, {count}: {e}"));
+            let hectares = if hectares > 0.0 { hectares } else { planned.hectares };
+            kept(&format!("{name}, {count} aircraft"), &out, &planned, hectares);
+        }
+    }
+}
