@@ -48,7 +48,7 @@ pub(super) const EXAMPLES: &Examples = &[
         "survey",
         &[
             "dgtr survey field.geojson --aircraft 3 --picture 4056x3040 --fov-deg 62 --gsd 2 --out survey",
-            "dgtr survey river.kml --aircraft 2 --picture 4056x3040 --fov-deg 62 --gsd 3 --endurance 25,18 --terrain dsm.tif --out survey",
+            "dgtr survey river.kml --picture 4056x3040 --fov-deg 62 --gsd 3 --terrain dsm.tif --out survey",
         ],
     ),
     ("plan", &["dgtr plan --mission mission.toml", "dgtr plan --budget-mib 300 --json"]),
