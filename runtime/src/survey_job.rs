@@ -21,6 +21,11 @@ use measure::heights::{HeightMap, Heights, MOST_PIXELS};
 use models::formats::FormatError;
 use survey::ortho::crs::Crs;
 
+mod after;
+mod regions;
+
+pub use after::Rest;
+
 /// Names in the folder.
 pub const MISSION: &str = "mission.toml";
 const FIGURE: &str = "survey.svg";
@@ -112,11 +117,20 @@ pub struct Flying {
     pub highest_m: f64,
 }
 
+/// What is flown.
+#[derive(Clone, Debug)]
+pub enum Source {
+    /// An area in a file.
+    File(PathBuf),
+    /// What a mission's aircraft left.
+    Rest(Box<Rest>),
+}
+
 /// What is asked for.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// The area's file.
-    pub area: PathBuf,
+    /// What is flown.
+    pub source: Source,
     /// Name of the mission.
     pub name: String,
     /// Ids and links of the aircraft.
@@ -180,9 +194,17 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
     }
     let count = request.aircraft.len();
     let (base_m, manner) = manner(&request.camera, &request.pictures, &request.flying)?;
-    let (area, middle) = area(&request.area)?;
-    let frame = EnuFrame::new(Geodetic { alt_m: request.home_m, ..middle });
-    let ground = placed(&request.area, &area, &frame)?;
+    let (place, area) = match &request.source {
+        Source::File(path) => area(path).map(|(area, middle)| (middle, Some((path, area))))?,
+        Source::Rest(rest) => (rest.origin(), None),
+    };
+    let ground_in = |frame: &EnuFrame| match (&area, &request.source) {
+        (Some((path, area)), _) => placed(path, area, frame),
+        (None, Source::Rest(rest)) => Ok(rest.left.clone()),
+        (None, Source::File(_)) => Ok(Ground::default()),
+    };
+    let frame = EnuFrame::new(place);
+    let ground = ground_in(&frame)?;
     let homes = homes(&request.flying, &frame, &ground, count)?;
     let terrain = request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &ground, &homes)).transpose()?;
     let height = |p: DVec2| terrain.as_ref().and_then(|t| t.height(p));
@@ -194,14 +216,20 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         })?,
         _ => request.home_m,
     };
-    // Heights are kept around the ground of the take-off place.
-    let origin = Geodetic { alt_m: (home_m * 100.0).round() / 100.0, ..middle };
-    // Frames of another height have other metres, by a ten-thousandth for each 640 m.
+    // The frame of an area lies as high as its take-off place; others have other metres, by a ten-thousandth for each 640 m.
+    let origin = match &request.source {
+        Source::File(_) => Geodetic { alt_m: (home_m * 100.0).round() / 100.0, ..place },
+        Source::Rest(_) => place,
+    };
     let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
-    let ground = placed(&request.area, &area, &frame)?;
+    let ground = ground_in(&frame)?;
     let craft = craft(request, &homes, &manner)?;
-    let shares = deal(&ground, &craft, &manner).map_err(|e| in_file(&request.area, e))?;
-    let text = mission(request, origin, &shares)?;
+    let shares = deal(&ground, &craft, &manner).map_err(|e| request.in_source(e))?;
+    let text = match &request.source {
+        Source::File(_) => mission(request, origin, &shares)?,
+        Source::Rest(rest) => rest.mission(&shares)?,
+    };
+    Mission::parse(&text, Path::new("."))?;
     let terrain: Option<&dyn Fn(DVec2) -> Option<f64>> = if terrain.is_some() { Some(&height) } else { None };
     let flights = Flights { frame, manner: &manner, base_m, terrain, home_m: origin.alt_m };
     let disk = Disk::default();
@@ -248,6 +276,16 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
 
 fn failed(path: &Path) -> impl FnOnce(DiskError) -> SurveyError {
     move |e| FormatError::disk(path, e).into()
+}
+
+impl Request {
+    /// With the file that an error is about.
+    fn in_source(&self, e: FleetError) -> SurveyError {
+        match &self.source {
+            Source::File(path) => in_file(path, e),
+            Source::Rest(_) => e.into(),
+        }
+    }
 }
 
 fn in_file(path: &Path, source: FleetError) -> SurveyError {
@@ -410,21 +448,11 @@ fn craft(request: &Request, homes: &[DVec2], manner: &Manner) -> Result<Vec<Craf
     Ok(request.aircraft.iter().enumerate().map(one).collect())
 }
 
-/// The mission file's text; it has been read back.
+/// The mission file's text.
 fn mission(request: &Request, origin: Geodetic, shares: &[Share]) -> Result<String, SurveyError> {
-    let mut regions = Vec::with_capacity(shares.len());
-    for (share, (id, _)) in shares.iter().zip(&request.aircraft) {
-        let corners = ring(&share.ground);
-        if corners.len() > MAX_CORNERS {
-            let why = format!(
-                "leaves {id} a region of {} corners; a mission holds {MAX_CORNERS}, so draw it simpler",
-                corners.len()
-            );
-            return Err(in_file(&request.area, FleetError::Area(why)));
-        }
-        regions.push(corners.iter().map(|p| p.to_array().map(|v| (v * 1e3).round() / 1e3)).collect());
-    }
-    let text = Draft {
+    let regions = shares.iter().zip(&request.aircraft).map(|(share, (id, _))| region(&share.ground, id));
+    let regions = regions.collect::<Result<Vec<_>, FleetError>>().map_err(|e| request.in_source(e))?;
+    let draft = Draft {
         name: request.name.clone(),
         origin,
         picture: request.camera.picture,
@@ -432,10 +460,20 @@ fn mission(request: &Request, origin: Geodetic, shares: &[Share]) -> Result<Stri
         area: DraftArea::Regions(regions),
         aircraft: request.aircraft.clone(),
         preset: None,
+    };
+    Ok(draft.text())
+}
+
+/// Corners of a region as a mission holds them, to the millimetre.
+fn region(ground: &Ground, id: &str) -> Result<Vec<[f64; 2]>, FleetError> {
+    let corners = ring(ground);
+    if corners.len() > MAX_CORNERS {
+        let count = corners.len();
+        return Err(FleetError::Area(format!(
+            "leaves {id} a region of {count} corners; a mission holds {MAX_CORNERS}, so draw it simpler"
+        )));
     }
-    .text();
-    Mission::parse(&text, Path::new("."))?;
-    Ok(text)
+    Ok(corners.iter().map(|p| p.to_array().map(|v| (v * 1e3).round() / 1e3)).collect())
 }
 
 /// Heights of the ground around the area.

@@ -11,8 +11,10 @@ use geometry::geodesy::{EnuFrame, Geodetic};
 use geometry::polygon;
 use glam::{DVec2, DVec3};
 use models::camera::{Intrinsics, Pose, View};
+use models::cloud::GaussianCloud;
 use models::formats::flight_plan;
-use runtime::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Request};
+use models::formats::model::{self, ModelHeader};
+use runtime::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Request, Rest, Source};
 use serde::Deserialize;
 use sim::aircraft::Imperfections;
 use sim::autopilot::AutopilotSettings;
@@ -76,7 +78,7 @@ fn river() -> String {
 
 fn request(area: &Path, count: usize) -> Request {
     Request {
-        area: area.to_owned(),
+        source: Source::File(area.to_owned()),
         name: "survey".into(),
         aircraft: (1..=count).map(|k| (format!("a{k}"), "udpin:127.0.0.1:14550".into())).collect(),
         camera: CAMERA,
@@ -264,5 +266,101 @@ fn three_areas_flown_by_one_three_and_eight_are_covered_once_and_at_the_asked_di
             let hectares = if hectares > 0.0 { hectares } else { planned.hectares };
             kept(&format!("{name}, {count} aircraft"), &out, &planned, hectares);
         }
+    }
+}
+
+/// A model on the ground as far as its coverage counts: a Gaussian, and the views.
+fn delivered(ground: &Path, mission: &Mission, id: &str, views: &[View], finished: bool) {
+    let header = ModelHeader {
+        mission: mission.name.clone(),
+        aircraft: id.into(),
+        origin: Some(mission.origin),
+        views: views.iter().enumerate().map(|(k, view)| (format!("{id}{k}.jpg"), *view)).collect(),
+        finished,
+        ..ModelHeader::default()
+    };
+    let mut cloud = GaussianCloud::with_capacity(0, 1);
+    cloud.push([0.0; 3], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 0.5, &[0.0; 3]);
+    let folder = ground.join("received").join(id);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    model::write(&folder.join("model.dgtr"), &header, &cloud).expect("written");
+}
+
+#[test]
+fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (area, out, ground) = (folder.path().join("field"), folder.path().join("out"), folder.path().join("ground"));
+    std::fs::write(&area, field()).expect("written");
+    let asked = request(&area, 3);
+    let planned = survey_job::run(&asked, &out).expect("planned");
+    let file = out.join(MISSION);
+    let mission = Mission::read(&file).expect("a mission");
+    let mut all = Vec::new();
+    for (k, row) in planned.rows.iter().enumerate() {
+        let mut views = flown(&row.plan, &mission, k as u64);
+        if row.aircraft == "a2" {
+            views.truncate(views.len() / 2);
+        }
+        delivered(&ground, &mission, &row.aircraft, &views, row.aircraft != "a2");
+        all.extend(views);
+    }
+    let regions = |mission: &Mission| -> Vec<Vec<DVec2>> {
+        mission.aircraft.iter().map(|a| mission.region(a).into_iter().map(DVec2::from).collect()).collect()
+    };
+    let before = covered(&regions(&mission), &all);
+    assert!((0.75..0.95).contains(&before), "{before}");
+    let rest = Rest::of(&file, &ground, &[]).expect("something is left");
+    assert_eq!(rest.lost, ["a2"]);
+    let again = folder.path().join("again");
+    let (aircraft, camera, origin) = (rest.aircraft(), rest.camera(), rest.origin());
+    assert!((camera.fov_deg - CAMERA.fov_deg).abs() < 1e-3 && camera.picture == CAMERA.picture);
+    let source = Source::Rest(Box::new(rest));
+    let more =
+        survey_job::run(&Request { source, aircraft, camera, home_m: origin.alt_m, ..asked }, &again).expect("dealt");
+    assert!(more.rows.iter().all(|row| row.aircraft != "a2") && more.hectares < 0.5 * planned.hectares, "{more:?}");
+    let now = Mission::read(&again.join(MISSION)).expect("a mission");
+    for (k, row) in more.rows.iter().enumerate() {
+        opened(&row.plan);
+        all.extend(flown(&row.plan, &now, 10 + k as u64));
+    }
+    let after = covered(&regions(&now), &all);
+    println!("covered {:.1} %, and {:.2} % in the end", 100.0 * before, 100.0 * after);
+    assert!(after >= 0.98, "{after}");
+    // The regions follow: together they are what they were.
+    let hectares = |mission: &Mission| regions(mission).iter().map(|r| polygon::signed_area(r)).sum::<f64>() / 1e4;
+    assert!((hectares(&now) / hectares(&mission) - 1.0).abs() < 1e-3, "{} {}", hectares(&now), hectares(&mission));
+    let lost = |mission: &Mission| polygon::signed_area(&regions(mission)[1]);
+    assert!(lost(&now) < 0.8 * lost(&mission), "who failed keeps what is covered");
+    // Nothing is dealt twice, and nobody is not a fleet.
+    for (without, word) in [
+        (vec!["a1", "a2", "a3"], "no aircraft is left"),
+        (vec!["b"], "no aircraft 'b'"),
+        (vec!["a1"], "nothing is left"),
+    ] {
+        let without: Vec<String> = without.into_iter().map(str::to_owned).collect();
+        let refused = Rest::of(&file, &ground, &without).expect_err(word).to_string();
+        assert!(refused.contains(word), "{refused}");
+    }
+    assert!(Rest::of(&file, folder.path(), &[]).expect_err("no ground").to_string().contains("--out of dgtr serve"));
+}
+
+/// Plans of other programs: a survey of QGroundControl with and without a speed, pictures by distance, Mission Planner's waypoints.
+#[test]
+fn plans_that_other_programs_write_are_flown() {
+    for (name, waypoints, pictures) in
+        [("survey.plan", 2, 2), ("survey_noHoverSpeed.plan", 2, 2), ("trigdist.plan", 4, 10), ("mp.waypoints", 1, 0)]
+    {
+        let Some(path) = needs::shared(&format!("field/mavlink/inputs/{name}")) else { continue };
+        let plan = flight_plan::read(&path).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!((plan.waypoints.len(), plan.speed_m_s), (waypoints, 5.0), "{name}");
+        let text = format!(
+            "name = \"m\"\norigin = {{ lat_deg = {:?}, lon_deg = {:?}, alt_m = {:?} }}\n\
+             camera = {{ width = 400, height = 300, fx = 346.0, fy = 346.0, cx = 200.0, cy = 150.0 }}\n\
+             [[aircraft]]\nid = \"a\"\nlink = \"tcpin:1\"\ncamera = {{ folder = \"c\" }}\n\
+             region_enu = [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]\n",
+            plan.home.lat_deg, plan.home.lon_deg, plan.home.alt_m
+        );
+        let mission = Mission::parse(&text, Path::new("/m")).expect("a mission");
+        assert_eq!(flown(&path, &mission, 1).len(), pictures, "{name}");
     }
 }

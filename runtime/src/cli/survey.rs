@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::CliError;
 use crate::cli::init::{field_of_view, numbers, size};
 use crate::cli::output::outln;
-use crate::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Request};
+use crate::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Request, Rest, Source};
 
 /// Deals an area to a fleet in regions that take equally long to fly, and writes the mission, a plan for each flight, a figure and a
 /// table.
@@ -16,19 +16,22 @@ use crate::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Reques
 )]
 pub struct Args {
     /// The area: a polygon, with holes or without, as GeoJSON, KML, or the fence of a QGroundControl plan.
-    area: PathBuf,
+    #[arg(required_unless_present = "after")]
+    area: Option<PathBuf>,
     /// Folder for mission.toml, the plans, survey.svg and survey.csv.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Number of aircraft.
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, conflicts_with = "after")]
     aircraft: usize,
     /// Short name of the mission.
-    #[arg(long, default_value = "survey")]
+    #[arg(long, default_value = "survey", conflicts_with = "after")]
     name: String,
     /// Link from each companion computer to its autopilot.
-    #[arg(long, value_name = "ADDRESS", default_value = "serial:/dev/ttyAMA0:921600")]
+    #[arg(long, value_name = "ADDRESS", default_value = "serial:/dev/ttyAMA0:921600", conflicts_with = "after")]
     link: String,
+    #[command(flatten, next_help_heading = "When an aircraft failed")]
+    rest: RestArgs,
     #[command(flatten, next_help_heading = "Camera")]
     camera: CameraArgs,
     #[command(flatten, next_help_heading = "Pictures")]
@@ -38,15 +41,29 @@ pub struct Args {
 }
 
 #[derive(Debug, clap::Args)]
+struct RestArgs {
+    /// Folder of dgtr serve: what its models do not cover is dealt to the aircraft that are left.
+    #[arg(long, value_name = "DIR", requires = "mission", conflicts_with = "area")]
+    after: Option<PathBuf>,
+    /// Mission file that was flown; the one that is written has its regions changed.
+    #[arg(long, value_name = "FILE", requires = "after")]
+    mission: Option<PathBuf>,
+    /// An aircraft that does not fly any more, once for each [default: those whose final model did not arrive].
+    #[arg(long, value_name = "ID", requires = "after")]
+    without: Vec<String>,
+}
+
+#[derive(Debug, clap::Args)]
 struct CameraArgs {
     /// Width and height of the camera's pictures, pixels.
-    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
-    picture: [u32; 2],
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size, required_unless_present = "after", conflicts_with = "after")]
+    picture: Option<[u32; 2]>,
     /// The camera's horizontal field of view, degrees.
-    #[arg(long, value_name = "DEG", value_parser = field_of_view, required_unless_present = "focal_mm", conflicts_with = "focal_mm")]
+    #[arg(long, value_name = "DEG", value_parser = field_of_view, required_unless_present_any = ["focal_mm", "after"],
+        conflicts_with_all = ["focal_mm", "after"])]
     fov_deg: Option<f64>,
     /// Focal length, millimetres, with --sensor-mm.
-    #[arg(long, value_name = "MM", requires = "sensor_mm")]
+    #[arg(long, value_name = "MM", requires = "sensor_mm", conflicts_with = "after")]
     focal_mm: Option<f64>,
     /// Width of the sensor, millimetres.
     #[arg(long, value_name = "MM", requires = "focal_mm")]
@@ -90,7 +107,7 @@ struct FlightArgs {
     #[arg(long, value_name = "LAT,LON", allow_hyphen_values = true, value_parser = numbers::<2>)]
     take_off: Vec<[f64; 2]>,
     /// Height of the take-off places as the autopilot reports it, metres.
-    #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true, conflicts_with = "terrain")]
+    #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true, conflicts_with_all = ["terrain", "after"])]
     home_height: f64,
     /// Height above ground that nobody exceeds, metres.
     #[arg(long, value_name = "M", default_value_t = 120.0)]
@@ -100,47 +117,74 @@ struct FlightArgs {
     terrain: Option<PathBuf>,
 }
 
-/// Runs `dgtr survey`.
-///
-/// # Errors
-/// Whatever ends the command; its kind is the exit code.
-pub fn run(args: Args) -> Result<(), CliError> {
-    let CameraArgs { picture, fov_deg, focal_mm, sensor_mm, interval } = args.camera;
-    let fov_deg = match (fov_deg, focal_mm, sensor_mm) {
+/// The camera that the options describe.
+fn camera(args: &CameraArgs) -> Result<Camera, CliError> {
+    let fov_deg = match (args.fov_deg, args.focal_mm, args.sensor_mm) {
         (Some(fov), ..) => fov,
         (_, Some(focal), Some(sensor)) if focal > 0.0 && sensor > 0.0 => {
             2.0 * (sensor / (2.0 * focal)).atan().to_degrees()
         }
         _ => return Err(CliError::input("survey: --focal-mm and --sensor-mm must be lengths above zero")),
     };
-    if args.aircraft > fleet::deal::MOST_CRAFT {
-        return Err(CliError::input(format!("--aircraft {}: must be 1 to {}", args.aircraft, fleet::deal::MOST_CRAFT)));
+    let picture = args.picture.ok_or_else(|| CliError::input("survey: give --picture WIDTHxHEIGHT"))?;
+    Ok(Camera { picture, fov_deg })
+}
+
+fn request(args: &Args) -> Result<Request, CliError> {
+    let most = fleet::deal::MOST_CRAFT;
+    if args.aircraft > most {
+        return Err(CliError::input(format!("--aircraft {}: must be 1 to {most}", args.aircraft)));
     }
-    let flight = args.flight;
-    let request = Request {
-        area: args.area,
-        name: args.name,
-        aircraft: (1..=args.aircraft).map(|k| (format!("a{k}"), args.link.clone())).collect(),
-        camera: Camera { picture, fov_deg },
+    let RestArgs { after, mission, without } = &args.rest;
+    let (source, name, aircraft, camera, home_m) = match (after, mission, &args.area) {
+        (Some(ground), Some(mission), _) => {
+            let rest = Rest::of(mission, ground, without)?;
+            let (name, aircraft, camera) = (rest.name().to_owned(), rest.aircraft(), rest.camera());
+            let home_m = rest.origin().alt_m;
+            (Source::Rest(Box::new(rest)), name, aircraft, camera, home_m)
+        }
+        (_, _, Some(area)) => {
+            let aircraft = (1..=args.aircraft).map(|k| (format!("a{k}"), args.link.clone())).collect();
+            (Source::File(area.clone()), args.name.clone(), aircraft, camera(&args.camera)?, args.flight.home_height)
+        }
+        _ => return Err(CliError::input("survey: give an area, or --after and --mission")),
+    };
+    let flight = &args.flight;
+    Ok(Request {
+        source,
+        name,
+        aircraft,
+        camera,
         pictures: Pictures {
             gsd_m: args.pictures.gsd / 100.0,
             forward_overlap: args.pictures.forward_overlap,
             side_overlap: args.pictures.side_overlap,
-            interval_s: interval,
+            interval_s: args.camera.interval,
         },
         flying: Flying {
             speed_m_s: flight.speed,
             fastest_m_s: flight.fastest,
             wind_m_s: flight.wind,
-            endurance_min: flight.endurance,
+            endurance_min: flight.endurance.clone(),
             reserve: flight.reserve,
-            take_off: flight.take_off,
+            take_off: flight.take_off.clone(),
             highest_m: flight.highest,
         },
-        home_m: flight.home_height,
-        terrain: flight.terrain,
-    };
+        home_m,
+        terrain: flight.terrain.clone(),
+    })
+}
+
+/// Runs `dgtr survey`.
+///
+/// # Errors
+/// Whatever ends the command; its kind is the exit code.
+pub fn run(args: Args) -> Result<(), CliError> {
+    let request = request(&args)?;
     let planned = survey_job::run(&request, &args.out)?;
+    if let Source::Rest(rest) = &request.source {
+        outln!("what {} left is dealt to the others", rest.lost.join(", "));
+    }
     print(&request, &planned);
     let mission = args.out.join(MISSION);
     outln!("next: load each plan into its aircraft; dgtr doctor --mission {}", mission.display());

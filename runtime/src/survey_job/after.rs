@@ -1,0 +1,161 @@
+//! What is left when an aircraft fails: the ground that nobody covered, dealt to the others.
+
+use std::path::Path;
+
+use config::mission::Mission;
+use fleet::deal::Share;
+use fleet::ground::{Ground, Ring};
+use geometry::geodesy::Geodetic;
+use geometry::polygon;
+use glam::DVec2;
+use models::camera::View;
+use models::formats::{FormatError, model};
+use survey::coverage::gaps::{self, Gap};
+use survey::coverage::{CoverageMap, CoverageRegion};
+
+use super::regions::with_regions;
+use super::{Camera, SurveyError, region};
+
+/// Where `dgtr serve` keeps what it receives, below its folder.
+const RECEIVED: &str = "received";
+/// Less ground than this is no region, square metres.
+const LEAST_M2: f64 = 100.0;
+
+/// A mission, what is left of it, and who flies that.
+#[derive(Clone, Debug)]
+pub struct Rest {
+    text: String,
+    mission: Mission,
+    /// Ground that is not covered, in metres around the mission's origin.
+    pub left: Ground,
+    /// Aircraft that do not fly it.
+    pub lost: Vec<String>,
+}
+
+impl Rest {
+    /// What is left of the mission in `file` by the models in the folder of its ground station. `lost` do not fly any more; where
+    /// none is named, those whose final model did not arrive.
+    ///
+    /// # Errors
+    /// Files that cannot be read, nobody left to fly, or nothing left to be flown.
+    pub fn of(file: &Path, ground: &Path, lost: &[String]) -> Result<Self, SurveyError> {
+        let mission = Mission::read(file)?;
+        for id in lost {
+            mission.aircraft(Some(id))?;
+        }
+        let text = std::fs::read_to_string(file).map_err(|e| FormatError::io(file, "reading", e))?;
+        let received = ground.join(RECEIVED);
+        if !received.is_dir() {
+            let why = "holds no models of a mission; give the folder that was --out of dgtr serve";
+            return Err(FormatError::invalid(ground, why).into());
+        }
+        let (mut views, mut open): (Vec<View>, Vec<String>) = (Vec::new(), Vec::new());
+        for aircraft in &mission.aircraft {
+            let path = received.join(&aircraft.id).join("model.dgtr");
+            if !path.is_file() {
+                open.push(aircraft.id.clone());
+                continue;
+            }
+            let (header, _) = model::read_header(&path)?;
+            if header.mission != mission.name || header.aircraft != aircraft.id {
+                let why = format!("is of aircraft {:?} of mission {:?}", header.aircraft, header.mission);
+                return Err(FormatError::invalid(&path, why).into());
+            }
+            if !header.finished {
+                open.push(aircraft.id.clone());
+            }
+            views.extend(header.views.iter().map(|(_, view)| *view));
+        }
+        let lost = if lost.is_empty() { open } else { lost.to_vec() };
+        let asked = |what: &str| Err(SurveyError::Request(format!("{}: {what}", ground.display())));
+        if lost.is_empty() {
+            return asked(
+                "the final models of all aircraft are here; name those that do not fly any more with --without",
+            );
+        }
+        if lost.len() == mission.aircraft.len() {
+            return asked("no aircraft is left to fly; name those that do not with --without");
+        }
+        let left = lost.iter().try_fold(Ground::default(), |all, id| -> Result<Ground, SurveyError> {
+            Ok(all.with(&uncovered(&mission, id, &views)?))
+        })?;
+        if left.area_m2() < LEAST_M2 {
+            return asked(&format!("nothing is left to be flown of {}", lost.join(", ")));
+        }
+        Ok(Self { text, mission, left, lost })
+    }
+
+    /// Ids and links of those that fly it.
+    pub fn aircraft(&self) -> Vec<(String, String)> {
+        let others = self.mission.aircraft.iter().filter(|a| !self.lost.contains(&a.id));
+        others.map(|a| (a.id.clone(), a.link.clone())).collect()
+    }
+
+    /// The mission's name.
+    pub fn name(&self) -> &str {
+        &self.mission.name
+    }
+
+    /// The mission's origin.
+    pub fn origin(&self) -> Geodetic {
+        self.mission.origin
+    }
+
+    /// The mission's camera.
+    pub fn camera(&self) -> Camera {
+        let c = &self.mission.camera;
+        let fov_deg = 2.0 * (f64::from(c.width) / (2.0 * f64::from(c.fx))).atan().to_degrees();
+        Camera { picture: [c.width, c.height], fov_deg }
+    }
+
+    /// The mission with the regions as they are now: who fails keeps what is covered, and the others get their shares.
+    ///
+    /// # Errors
+    /// A region with too many corners.
+    pub(super) fn mission(&self, shares: &[Share]) -> Result<String, SurveyError> {
+        let mut changes = Vec::new();
+        let mut dealt = shares.iter();
+        for aircraft in &self.mission.aircraft {
+            let before = ground(&self.mission, &aircraft.id)?;
+            let now = match (self.lost.contains(&aircraft.id), dealt.as_slice().first()) {
+                (false, Some(share)) => {
+                    dealt.next();
+                    before.with(&share.ground)
+                }
+                _ => before.without(&self.left),
+            };
+            let corners = (now.area_m2() >= LEAST_M2).then(|| region(&now, &aircraft.id)).transpose()?;
+            changes.push((aircraft.id.clone(), corners));
+        }
+        Ok(with_regions(&self.text, &changes)?)
+    }
+}
+
+fn ground(mission: &Mission, id: &str) -> Result<Ground, SurveyError> {
+    let corners: Ring = mission.region(mission.aircraft(Some(id))?).into_iter().map(DVec2::from).collect();
+    Ok(Ground::of(vec![corners]))
+}
+
+/// What of an aircraft's region the views do not cover: around each gap its convex hull, as squares would leave hundreds of corners.
+fn uncovered(mission: &Mission, id: &str, views: &[View]) -> Result<Ground, SurveyError> {
+    let ground = ground(mission, id)?;
+    let corners = mission.region(mission.aircraft(Some(id))?).into_iter().map(DVec2::from).collect();
+    let rules = mission.coverage;
+    let region = CoverageRegion::new(corners);
+    // Where the aircraft took off lies the origin, unless the mission says how high the ground is.
+    let map = region.and_then(|region| CoverageMap::new(&region, rules.ground_m.map_or(0.0, f64::from), rules));
+    let mut map = map.map_err(|e| SurveyError::Request(format!("region of {id}: {e}")))?;
+    views.iter().for_each(|view| map.add(view));
+    let found = gaps::find(&map);
+    Ok(found.iter().fold(Ground::default(), |all, gap| all.with(&around(&map, gap))).common(&ground))
+}
+
+fn around(map: &CoverageMap, gap: &Gap) -> Ground {
+    let grid = map.grid();
+    let corners = gap.squares.iter().flat_map(|square| {
+        let (column, row) = (*square as usize % grid.columns, *square as usize / grid.columns);
+        let (middle, half) = (grid.middle(column, row), 0.5 * grid.side_m);
+        [[-half, -half], [half, -half], [half, half], [-half, half]].map(|c| middle + DVec2::from(c))
+    });
+    Ground::of(vec![polygon::hull(corners.collect())])
+}

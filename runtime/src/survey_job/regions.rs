@@ -1,0 +1,115 @@
+//! New regions in the text of a mission file; everything else, comments included, stays as its author wrote it.
+
+use std::ops::Range;
+
+use config::mission::MissionError;
+use config::settings::{SettingError, parse};
+use serde::Deserialize;
+use toml::{Spanned, Value};
+
+/// Where the aircraft of a file and their regions stand.
+#[derive(Deserialize)]
+struct File {
+    aircraft: Vec<Entry>,
+}
+
+#[derive(Deserialize)]
+struct Entry {
+    id: Spanned<String>,
+    #[serde(default)]
+    region_enu: Option<Spanned<Value>>,
+    #[serde(default)]
+    region_wgs84: Option<Spanned<Value>>,
+}
+
+/// What an aircraft's table begins with.
+const TABLE: &str = "[[aircraft]]";
+
+/// `text` with other regions, metres east and north of the origin, for the aircraft that `regions` names; `None` takes an aircraft out.
+///
+/// # Errors
+/// The text is no mission, names no such aircraft, or does not have it as a table of its own.
+pub fn with_regions(text: &str, regions: &[(String, Option<Vec<[f64; 2]>>)]) -> Result<String, MissionError> {
+    let file: File = parse(text)?;
+    let known = || file.aircraft.iter().map(|a| a.id.as_ref().as_str()).collect::<Vec<_>>().join(", ");
+    let mut edits: Vec<(Range<usize>, String)> = Vec::new();
+    for (id, region) in regions {
+        let entry = file.aircraft.iter().find(|a| a.id.as_ref() == id);
+        let entry = entry.ok_or_else(|| MissionError::NoSuchAircraft { id: id.clone(), known: known() })?;
+        let not_a_table = || SettingError::new("aircraft", id, "a table of its own, under a line [[aircraft]]");
+        match region {
+            Some(corners) => {
+                let (key, value) = match (&entry.region_enu, &entry.region_wgs84) {
+                    (Some(value), _) => ("region_enu", value),
+                    (None, Some(value)) => ("region_wgs84", value),
+                    (None, None) => return Err(not_a_table().into()),
+                };
+                let start = text[..value.span().start].rfind(key).ok_or_else(not_a_table)?;
+                edits.push((start..value.span().end, format!("region_enu = {corners:?}")));
+            }
+            None => {
+                let start = text[..entry.id.span().start].rfind(TABLE).ok_or_else(not_a_table)?;
+                let body = &text[start + TABLE.len()..];
+                let next = |line: &str| line.starts_with('[') && !line.starts_with("[aircraft.");
+                let end = body.match_indices('\n').map(|(at, _)| at + 1).find(|at| next(&body[*at..]));
+                edits.push((start..end.map_or(text.len(), |end| start + TABLE.len() + end), String::new()));
+            }
+        }
+    }
+    edits.sort_by_key(|edit| edit.0.start);
+    let mut changed = text.to_owned();
+    for (range, new) in edits.into_iter().rev() {
+        changed.replace_range(range, &new);
+    }
+    Ok(changed)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use config::mission::Mission;
+
+    use super::*;
+
+    const TEXT: &str = r#"
+name = "park" # ours
+origin = { lat_deg = 28.0, lon_deg = -82.0, alt_m = 0.0 }
+camera = { width = 640, height = 480, fx = 385.0, fy = 385.0, cx = 320.0, cy = 240.0 }
+[[aircraft]]
+id = "a1"
+link = "udpin:127.0.0.1:14550"
+camera = { folder = "a1" }
+region_enu = [[0.0, 0.0],
+  [10.0, 0.0], [10.0, 10.0]] # the field
+[[aircraft]]
+id = "a2"
+region_wgs84 = [[28.0, -82.0], [28.001, -82.0], [28.001, -82.001]]
+link = "udpin:127.0.0.1:14551"
+camera = { folder = "a2" }
+[[aircraft]]
+id = "a3"
+link = "udpin:127.0.0.1:14552"
+camera = { folder = "a3" }
+region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
+[upload]
+folder = "upload"
+"#;
+
+    #[test]
+    fn regions_change_and_everything_else_stays() {
+        let region = vec![[1.0, 2.0], [30.5, 2.0], [1.0, 40.0]];
+        let changes = [("a1".into(), Some(region.clone())), ("a2".into(), Some(region.clone())), ("a3".into(), None)];
+        let text = with_regions(TEXT, &changes).expect("changed");
+        let mission = Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{e}\n{text}"));
+        assert_eq!(mission.aircraft.iter().map(|a| a.id.as_str()).collect::<Vec<_>>(), ["a1", "a2"]);
+        assert!(mission.aircraft.iter().all(|a| mission.region(a) == region));
+        assert!(
+            text.contains("# ours") && text.contains("# the field") && text.contains("folder = \"upload\""),
+            "{text}"
+        );
+        let unknown = with_regions(TEXT, &[("b".into(), None)]).expect_err("unknown").to_string();
+        assert!(unknown.contains("no aircraft 'b' in the mission; it has a1, a2, a3"), "{unknown}");
+        assert!(with_regions("name = 3", &[]).is_err());
+    }
+}
