@@ -84,8 +84,8 @@ fn apply(problem: &mut Problem, step: &Step, points: &[DVec3]) {
 /// the equations cannot be solved.
 pub(crate) fn shared_sigma(problem: &mut Problem, loss: Loss) -> [f64; SHARED] {
     let free = problem.free;
-    problem.free =
-        std::array::from_fn(|k| problem.shared_weight[k].is_finite() && (k <= FOCAL || problem.shared_weight[k] > 0.0));
+    // What is known exactly is no unknown: nothing might tell it, and the equations could not be solved.
+    problem.free = problem.shared_weight.map(|w| w.is_finite() && w > 0.0);
     let mut equations = Reduced::new(problem);
     equations.fill(problem, loss, 0.0);
     problem.free = free;

@@ -2,6 +2,7 @@
 //! shared parameters where the pictures can tell them, and the points and depth ranges that come out.
 
 use super::adjust::{Limits, adjust, shared_sigma};
+use super::keyframe::KeyFrame;
 use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::part::Part;
@@ -106,8 +107,11 @@ impl Refiner {
     }
 
     fn note_velocities(&mut self) {
-        let path: Vec<_> = self.frames.iter().map(|f| (f.told.time_ns, f.prior.center)).collect();
-        self.frames.iter_mut().zip(velocities(&path)).for_each(|(frame, v)| frame.velocity = v);
+        // Where nothing was told of the place, it tells nothing of the way either.
+        let told = |f: &&mut KeyFrame| f.sigma.position_m.iter().all(|s| s.is_finite());
+        let mut frames: Vec<&mut KeyFrame> = self.frames.iter_mut().filter(told).collect();
+        let path: Vec<_> = frames.iter().map(|f| (f.told.time_ns, f.prior.center)).collect();
+        frames.iter_mut().zip(velocities(&path)).for_each(|(frame, v)| frame.velocity = v);
     }
 
     /// The adjustment's problem at the present poses: chosen tracks that triangulate to below `max_px`.
