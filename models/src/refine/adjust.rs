@@ -4,6 +4,7 @@ use super::problem::{ASPECT, FOCAL, Loss, PRINCIPAL, Problem, RADIAL, SHARED};
 use super::reduced::Step;
 use super::schur::{FrameVec, Reduced, SharedVec, point_steps};
 use super::so3;
+use super::solving::INDEPENDENT;
 use glam::{DVec2, DVec3};
 use std::time::Instant;
 
@@ -28,6 +29,17 @@ const STILL: f64 = 1e-4;
 
 /// Moves poses, points and free shared parameters downhill; never leaves them worse than they were.
 pub(crate) fn adjust(problem: &mut Problem, limits: Limits) -> Outcome {
+    let as_given = problem.shared_weight;
+    // Few sightings of a picture say something of their own of the lens: what is known of it counts as if there were no more.
+    let per_frame = problem.observations.len() as f64 / problem.poses.len().max(1) as f64;
+    let by = (per_frame / INDEPENDENT).sqrt().max(1.0);
+    problem.shared_weight[FOCAL..].iter_mut().for_each(|w| *w *= by);
+    let outcome = descend(problem, limits);
+    problem.shared_weight = as_given;
+    outcome
+}
+
+fn descend(problem: &mut Problem, limits: Limits) -> Outcome {
     let mut equations = Reduced::new(problem);
     let mut cost = problem.cost(limits.loss);
     let mut lambda = 1e-4;
