@@ -11,9 +11,8 @@ use models::align::similarity::{Similarity, umeyama};
 #[path = "support/cards.rs"]
 mod cards;
 
-/// Cards of the ordinary run. Obliques that all face one way (1, 5, 9 …) are no part of it: of some of these focal length and shape drift
-/// together, and nothing says so yet.
-const USUAL: [u64; 6] = [2, 3, 4, 6, 7, 10];
+/// Cards of the ordinary run: each way of flying, each kind of positions, lenses far from what is stated.
+const USUAL: [u64; 6] = [1, 2, 7, 10, 68, 95];
 
 /// What one card came to.
 #[derive(Debug, Default)]

@@ -209,4 +209,35 @@ mod tests {
             close(equations.shared_gradient[k], wanted, format!("shared {k}"));
         }
     }
+
+    #[test]
+    fn the_lens_is_told_where_nothing_could_tell_what_is_known_exactly() {
+        let mut problem = scene();
+        problem.priors.iter_mut().for_each(|p| p.velocity = DVec3::ZERO);
+        problem.shared_weight[..FOCAL].fill(0.0);
+        let sigma = shared_sigma(&mut problem, LOSS);
+        assert!(sigma[FOCAL..].iter().all(|s| s.is_finite() && *s > 0.0), "{sigma:?}");
+    }
+
+    #[test]
+    fn sightings_that_repeat_each_other_do_not_outweigh_what_is_known_of_the_lens() {
+        let focal = |times: usize| {
+            let mut problem = scene();
+            // Nothing but the focal length and the points moves.
+            problem.priors.iter_mut().zip(&problem.poses).for_each(|(prior, pose)| {
+                (prior.pose, prior.velocity) = (*pose, DVec3::ZERO);
+                (prior.position_weight, prior.rotation_weight) = (DVec3::splat(1e7), DVec3::splat(1e7));
+            });
+            problem.shared.mount = glam::DQuat::IDENTITY;
+            problem.free = std::array::from_fn(|k| k == FOCAL);
+            let seen = problem.observations.clone();
+            problem.observations = seen.chunks(3).flat_map(|of| of.repeat(times)).collect();
+            problem.starts = (0..=12).map(|i| 3 * (i * times) as u32).collect();
+            let deadline = Instant::now() + std::time::Duration::from_secs(60);
+            adjust(&mut problem, Limits { loss: Loss::Cauchy(1e6), max_steps: 60, deadline });
+            problem.shared.lens.log_focal
+        };
+        let (once, often) = (focal(1), focal(40));
+        assert!(once.abs() > 1e-3 && (once - often).abs() < 0.02 * once.abs(), "{once} {often}");
+    }
 }
