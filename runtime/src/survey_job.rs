@@ -179,6 +179,12 @@ pub struct Planned {
     pub hectares: f64,
     /// Where aircraft take off when nobody said it.
     pub take_off: Option<Geodetic>,
+    /// Lines reach so far beyond the area, and into its holes, metres.
+    pub beyond_m: f64,
+    /// Holes of the area.
+    pub holes: usize,
+    /// Ways to, from and between lines that lead over one.
+    pub over_holes: usize,
 }
 
 /// Plans `request` and writes it into `out`.
@@ -264,6 +270,13 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         height_m: manner.height_m,
         speed_m_s: manner.pace.speed_m_s,
         hectares: ground.area_m2() / 1e4,
+        beyond_m: manner.beyond_m,
+        holes: ground.parts.iter().map(|part| part.len() - 1).sum(),
+        over_holes: craft
+            .iter()
+            .zip(&shares)
+            .flat_map(|(craft, share)| share.sorties.iter().map(|s| s.over_holes(&ground, craft.home)))
+            .sum(),
         take_off: (request.flying.take_off.is_empty()).then(|| frame.to_geodetic(homes[0].extend(0.0))),
     };
     let path = out.join(TABLE);

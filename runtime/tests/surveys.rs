@@ -2,10 +2,11 @@
 #![cfg(feature = "lab")]
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use config::coverage::CoverageSettings;
 use config::mission::Mission;
+use disk::Disk;
 use flight::coverage::route;
 use geometry::geodesy::{EnuFrame, Geodetic};
 use geometry::polygon;
@@ -23,6 +24,9 @@ use sim::survey::SurveySettings;
 use sim::world::WorldSettings;
 use sim::{SessionSettings, SimSettings};
 use survey::coverage::{CoverageMap, CoverageRegion, State};
+use survey::ortho::crs::Crs;
+use survey::ortho::files::MapFiles;
+use survey::ortho::grid::Grid;
 
 const PLACE: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
 const CAMERA: Camera = Camera { picture: [4000, 3000], fov_deg: 60.0 };
@@ -218,6 +222,8 @@ fn kept(name: &str, out: &Path, planned: &Planned, hectares: f64) {
         twice += usize::from(owners > 1);
     }
     assert!(owned > 100 && twice * 1000 <= owned, "{name}: {twice} of {owned} places have two owners");
+    // The yard's hole is said to be there, and some ways lead over it.
+    assert_eq!(planned.holes, usize::from(name.starts_with("yard")), "{name}");
     let minutes: Vec<f64> = mission
         .aircraft
         .iter()
@@ -363,4 +369,50 @@ fn plans_that_other_programs_write_are_flown() {
         let mission = Mission::parse(&text, Path::new("/m")).expect("a mission");
         assert_eq!(flown(&path, &mission, 1).len(), pictures, "{name}");
     }
+}
+
+/// A hillside of one in ten that goes up to the north, as a GeoTIFF in the place's UTM zone.
+fn hillside(folder: &Path) -> PathBuf {
+    let crs = Crs::utm(PLACE).expect("a zone");
+    let [low, high] = [-300.0, 1200.0].map(|m| crs.to_map(DVec3::new(m, m, 0.0)).expect("a place").truncate());
+    let zero = crs.to_map(DVec3::ZERO).expect("a place").y;
+    let grid = Grid::new(crs, [low, high], 10.0).expect("a grid");
+    let mut files = MapFiles::begin(folder, &grid).expect("a map");
+    for block in files.blocks().to_vec() {
+        let pixels = || (0..block.height).flat_map(|y| (0..block.width).map(move |x| (x, y)));
+        let north =
+            |(x, y): (u32, u32)| grid.place(DVec2::new(f64::from(block.x + x) + 0.5, f64::from(block.y + y) + 0.5)).y;
+        let heights: Vec<f32> = pixels().map(|p| (500.0 + 0.1 * (north(p) - zero)) as f32).collect();
+        let mut rgba: Vec<u8> = pixels().flat_map(|_| [120, 130, 140, 255]).collect();
+        files.write(block, &mut rgba, &heights).expect("written");
+    }
+    files.finish(&Disk::default(), None).expect("a map");
+    folder.join("dsm.tif")
+}
+
+#[test]
+fn lines_over_a_hillside_keep_their_height_above_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (area, out) = (folder.path().join("field"), folder.path().join("out"));
+    std::fs::write(&area, field()).expect("written");
+    let terrain = hillside(&folder.path().join("map"));
+    let planned =
+        survey_job::run(&Request { terrain: Some(terrain.clone()), ..request(&area, 2) }, &out).expect("planned");
+    let frame = EnuFrame::new(PLACE);
+    let mission = Mission::read(&out.join(MISSION)).expect("a mission");
+    let mut heights = Vec::new();
+    for row in &planned.rows {
+        let plan = flight_plan::read(&row.plan).expect("a plan");
+        let ground = |at: Geodetic| 500.0 + 0.1 * frame.to_enu(at).y;
+        assert!((plan.home.alt_m - ground(plan.home)).abs() < 1.5, "{:?}", plan.home);
+        let lines = plan.waypoints.iter().filter(|w| w.every_m.is_some());
+        heights.extend(lines.map(|w| w.position.alt_m - ground(w.position)));
+    }
+    assert!(heights.len() > 10 && heights.iter().all(|m| (m - planned.height_m).abs() < 5.0), "{heights:.1?}");
+    assert!((mission.origin.alt_m - 500.0).abs() < 50.0, "{:?}", mission.origin);
+    // Where the map ends there is no plan.
+    let far = Request { terrain: Some(terrain), ..request(&area, 1) };
+    let far = Request { flying: Flying { take_off: vec![[47.42, 8.5]], ..far.flying.clone() }, ..far };
+    let refused = survey_job::run(&far, &folder.path().join("far")).expect_err("beyond the map").to_string();
+    assert!(refused.starts_with("--terrain holds no height"), "{refused}");
 }

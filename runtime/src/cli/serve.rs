@@ -16,12 +16,15 @@ use job::interrupt::Interrupt;
 use job::run_json::RunReport;
 use job::service::Supervisor;
 use job::session::{Owner, Session};
-use pages::report::{REPORT, ReportData, Timing, bytes};
+use pages::report::{Craft, REPORT, ReportData, Timing, bytes};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};
 use super::ending::within_bounds;
 use super::http::HttpArgs;
+
+/// An aircraft that covered less of its region than this did not do what it was to do, percent.
+const COVERED: u32 = 75;
 
 /// Arguments of `dgtr serve`.
 #[derive(Debug, clap::Args)]
@@ -139,6 +142,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         run.stage("map", from);
     }
     let seen = board.watch().freeze();
+    data.warnings.extend(left_short(&args.out, &args.mission, &seen.aircraft, &reception.missing));
     (data.aircraft, data.ground) = (seen.aircraft, seen.ground);
     if !reception.missing.is_empty() {
         run.outcome = "interrupted".into();
@@ -152,6 +156,21 @@ pub fn run(args: Args) -> Result<(), CliError> {
             shown_instead(&reception)
         ))),
     }
+}
+
+/// Aircraft that left ground of their region uncovered, or sent no final model: what a battery, a link or an early landing did to them.
+fn left_short(out: &Path, mission: &Path, aircraft: &[Craft], missing: &[String]) -> Option<String> {
+    let short =
+        |craft: &&Craft| missing.contains(&craft.name) || craft.covered.is_some_and(|percent| percent < COVERED);
+    let of = |craft: &Craft| format!("{} ({} % of its region covered)", craft.name, craft.covered.unwrap_or(0));
+    let short: Vec<String> = aircraft.iter().filter(short).map(of).collect();
+    let (out, mission) = (out.display(), mission.display());
+    (!short.is_empty() && short.len() < aircraft.len()).then(|| {
+        format!(
+            "Ground is left by {}. `dgtr survey --after {out} --mission {mission}` deals what is left of aircraft that failed to the others.",
+            short.join(", ")
+        )
+    })
 }
 
 /// What is known when nothing arrived that counts: written down all the same, with what was refused.
@@ -215,5 +234,26 @@ fn add_reception(data: &mut ReportData, reception: &Reception) {
         if n > 0 {
             data.skipped.push((what.into(), n));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_left_ground_is_named_with_the_command_that_deals_it_to_the_others() {
+        let craft = |name: &str, covered| Craft { covered, ..Craft::new(name, "final model is here") };
+        let said = |aircraft: &[Craft], missing: &[&str]| {
+            let missing: Vec<String> = missing.iter().map(|id| (*id).to_owned()).collect();
+            left_short(Path::new("ground"), Path::new("m.toml"), aircraft, &missing)
+        };
+        let fleet = [craft("a1", Some(99)), craft("a2", Some(48)), craft("a3", Some(97)), craft("a4", None)];
+        let line = said(&fleet, &["a4"]).unwrap_or_default();
+        assert!(line.contains("a2 (48 % of its region covered), a4 (0 % of its region covered)"), "{line}");
+        assert!(line.contains("`dgtr survey --after ground --mission m.toml`"), "{line}");
+        // Nothing is dealt where all is well, or nobody is left.
+        assert_eq!(said(&fleet[..1], &[]), None);
+        assert_eq!(said(&fleet[1..2], &["a2"]), None);
     }
 }

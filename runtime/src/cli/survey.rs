@@ -12,7 +12,8 @@ use crate::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Reques
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Plans are for QGroundControl, ArduPilot and PX4. Flight times count turns, climbing and landing, in a wind from any \
-                  side. Aircraft cross others' ground at heights of their own. Check each plan against the place's rules and obstacles."
+                  side. Aircraft cross others' ground at heights of their own. Holes are not photographed, but may be flown over. Check each \
+                  plan against fences, rules and obstacles."
 )]
 pub struct Args {
     /// The area: a polygon, with holes or without, as GeoJSON, KML, or the fence of a QGroundControl plan.
@@ -209,6 +210,14 @@ fn print(request: &Request, planned: &Planned) {
     }
     if let Some(at) = planned.take_off {
         outln!("take-off and landing at {:.6},{:.6}, the area's corner nearest to its middle", at.lat_deg, at.lon_deg);
+    }
+    outln!("lines reach {:.0} m beyond the area", planned.beyond_m);
+    if planned.holes > 0 {
+        tracing::warn!(
+            "holes of the area are left out of the pictures, and not avoided: lines reach into them, and {} ways between lines lead over \
+             them",
+            planned.over_holes
+        );
     }
     outln!("{:<20} {:>9} {:>8} {:>7} {:>6} {:>10}", "plan", "pictures", "min", "km", "side", "region ha");
     for row in &planned.rows {
