@@ -10,7 +10,7 @@
 //! | Parrot `drone-parrot:` | – | `RelativeAltitude`… as DJI | `CameraYaw/Pitch/RollDegree`, −90° = nadir; else `DroneYaw/Pitch/RollDegree` (10°) | – |
 //! | Skydio `drone-skydio:` | `Latitude`, `Longitude` | `AbsoluteAltitude`, `RelativeAltitude` | `CameraOrientationNEDYaw/Pitch/Roll`, −90° = nadir | `CalibratedFocalLength` |
 //! | Pix4D `Camera:` (senseFly, Sequoia, MicaSense, Autel, Yuneec, Sentera) | ±`GPSXYAccuracy` | ±`GPSZAccuracy` | `Yaw/Pitch/Roll`, 0° = nadir with the heading at the top of the picture; a pitch below −45° (Autel) is taken as −90° = nadir; senseFly's roll has the other sign | `PerspectiveFocalLength` (mm), `PerspectiveDistortion` r1 r2 r3 t1 t2, `PrincipalPoint` (mm) |
-//! | `geo.txt` (OpenDroneMap), Mission Planner's and our own CSV | as stated, with its accuracies | as stated | yaw, pitch, roll: 0° = nadir in `geo.txt` | – |
+//! | `geo.txt` (OpenDroneMap), Pix4D's list, tables with named columns | as stated, with its accuracies | as stated | yaw, pitch, roll: 0° = nadir in `geo.txt` | – |
 //! | `gcp_list.txt` | surveyed points marked in pictures: they hold the poses, and give a card without GPS its place, north and scale | as stated | – | – |
 //! | flight log | at the exposure, 1.5 m | as logged | the airframe's (10°), the gimbal's where logged (3°) | – |
 
@@ -20,13 +20,13 @@ use geometry::geodesy::{EnuFrame, Geodetic};
 
 mod container;
 pub mod control;
-pub mod dataflash;
 mod error;
 mod exif;
 pub mod exposures;
 pub mod geotags;
 mod groups;
 mod lens;
+pub mod log;
 mod maker_note;
 mod notes;
 mod priors;
@@ -41,6 +41,7 @@ mod xmp;
 
 pub use error::CardError;
 pub use exposures::Exposure;
+pub use log::{FlightLog, Series, Source};
 pub use notes::name_list;
 pub use priors::CardPicture;
 pub use record::{Attitude, AttitudeSource, Fix, Record, nadir_rotation};
@@ -68,15 +69,15 @@ pub struct Card {
 /// What a card is read with besides its own files.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CardOptions {
-    /// A file of positions (`geo.txt`, Mission Planner's or our own CSV); files of these names on the card are found
+    /// A file of positions (`geo.txt`, Pix4D's list, a table with named columns); files of these names on the card are found
     /// without it.
     pub geotags: Option<PathBuf>,
     /// A file of surveyed points (`gcp_list.txt`); one of this name on the card is found without it.
     pub control: Option<PathBuf>,
     /// A file of the same form, of points that the result is measured against.
     pub check: Option<PathBuf>,
-    /// Exposures out of a flight log, in order.
-    pub exposures: Vec<Exposure>,
+    /// A flight log, whose exposures the pictures are matched to.
+    pub log: Option<log::FlightLog>,
     /// The band or lens whose pictures are taken, where a camera has several.
     pub band: Option<String>,
 }
@@ -117,8 +118,8 @@ impl Card {
             let (line, is_whole) = geotags::apply(file, &tags, &mut records)?;
             if is_whole { &mut read } else { &mut lines }.push(line);
         }
-        if !options.exposures.is_empty() {
-            lines.push(exposures::apply(&options.exposures, &mut records));
+        if let Some(log) = &options.log {
+            lines.push(log::apply(log, &mut records)?);
         }
         record::in_order(&mut records);
         sources::standing_still(&mut records, &mut lines, &mut notes);

@@ -44,6 +44,52 @@ pub(crate) fn number(cell: &str) -> Option<f64> {
     parsed.ok().filter(|v| v.is_finite())
 }
 
+/// Which way a coordinate counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Axis {
+    /// Longitude or easting.
+    East,
+    /// Latitude or northing.
+    North,
+}
+
+/// A coordinate as a number, or as degrees, minutes and seconds with or without the letter of its hemisphere (`46 deg 50' 33.36" N`).
+pub(crate) fn angle(cell: &str, axis: Axis) -> Option<f64> {
+    if let Some(plain) = number(cell) {
+        return Some(plain);
+    }
+    let halves = match axis {
+        Axis::East => ['E', 'W'],
+        Axis::North => ['N', 'S'],
+    };
+    let upper = cell.trim().to_uppercase();
+    let half = halves.into_iter().find(|h| upper.starts_with(*h) || upper.ends_with(*h));
+    let bare = half.map_or(upper.as_str(), |h| upper.trim_matches(h)).replace("DEG", " ");
+    let parts: Vec<&str> =
+        bare.split(|c: char| c.is_whitespace() || "°'\"′″’”:".contains(c)).filter(|p| !p.is_empty()).collect();
+    if parts.is_empty() || parts.len() > 3 || (half.is_none() && parts.len() == 1) {
+        return None;
+    }
+    let mut value = 0.0;
+    for (part, share) in parts.iter().zip([1.0, 60.0, 3600.0]) {
+        let part = number(part).filter(|v| share == 1.0 || (0.0..60.0).contains(v))?;
+        value += part.abs() / share;
+    }
+    let is_negative = half == Some(halves[1]) || parts.first().is_some_and(|p| p.starts_with('-'));
+    Some(if is_negative { -value } else { value })
+}
+
+/// A height as a number, with or without its unit and scale (`198.3 m Above Sea Level`).
+pub(crate) fn height(cell: &str) -> Option<f64> {
+    let lower = cell.trim().to_lowercase();
+    let (value, rest) = lower.split_once(|c: char| c.is_whitespace() || c == 'm').unwrap_or((&lower, ""));
+    match rest.trim().trim_start_matches('m').trim() {
+        "" | "above sea level" => number(value),
+        "below sea level" => number(value).map(|v| -v.abs()),
+        _ => None,
+    }
+}
+
 /// The cells of a line: between semicolons, tabs, commas or blanks, whichever it has first in this order. A comma between two digits
 /// of a line that blanks cut into three cells or more is a decimal one.
 pub(crate) fn cells(line: &str) -> Vec<&str> {
@@ -76,10 +122,14 @@ fn unquoted(line: &str, separates: impl Fn(char) -> bool) -> impl Iterator<Item 
     })
 }
 
+/// Whether a cell ends as names of pictures do.
+pub(crate) fn is_picture(cell: &str) -> bool {
+    PICTURES.iter().any(|e| cell.to_lowercase().ends_with(e))
+}
+
 /// A picture's name at the beginning of `cells`, and how many of them it takes: blanks may have cut it up.
 pub(crate) fn picture_name(cells: &[&str]) -> Option<(String, usize)> {
-    let ends = |cell: &&str| PICTURES.iter().any(|e| cell.to_lowercase().ends_with(e));
-    let taken = cells.iter().take(8).position(ends).map_or(1, |last| last + 1);
+    let taken = cells.iter().take(8).position(|cell| is_picture(cell)).map_or(1, |last| last + 1);
     let name = cells.get(..taken)?.join(" ");
     (!name.is_empty()).then_some((name, taken))
 }
@@ -103,6 +153,11 @@ impl Reference {
             .trim()
             .trim_matches(['"', ';', ','])
             .trim();
+        // Metashape writes what it is before it: `CoordinateSystem: GEOGCS[…`.
+        let line = match line.split_once(':') {
+            Some((before, after)) if before.chars().all(char::is_alphabetic) && before.len() > 5 => after.trim(),
+            _ => line,
+        };
         let upper = line.to_uppercase();
         let of = |source: Result<Proj, String>| {
             let geographic = geographic().ok_or_else(|| "WGS 84 is not known".to_owned());
@@ -125,9 +180,12 @@ impl Reference {
             return of(Proj::from_proj_string(&text).map_err(|e| format!("{line:?} cannot be read ({e})")));
         }
         if is_wkt(&upper) {
-            return match wkt_code(&upper) {
-                Some(code) => by_code(code),
-                None => Some(Err("is WKT without an EPSG code of its own; write EPSG:CODE".to_owned())),
+            // Without a code, a name of its own may be one that is known.
+            let name = line.split('"').nth(1).filter(|name| !is_wkt(&name.to_uppercase()));
+            return match (wkt_code(&upper), name.and_then(Self::named)) {
+                (Some(code), _) => by_code(code),
+                (None, Some(Ok(known))) => Some(Ok(known)),
+                (None, _) => Some(Err("is WKT without an EPSG code of its own; write EPSG:CODE".to_owned())),
             };
         }
         let plain: String = upper.chars().map(|c| if "/()_".contains(c) { ' ' } else { c }).collect();
@@ -262,7 +320,7 @@ pub(crate) fn definition(code: u16) -> Result<Proj, &'static str> {
 mod tests {
     use super::*;
 
-    const DEGREES: [&str; 11] = [
+    const DEGREES: [&str; 13] = [
         "WGS84",
         "wgs 84",
         "WGS84 longlat",
@@ -274,8 +332,10 @@ mod tests {
         "+proj=longlat +datum=WGS84 +no_defs +type=crs",
         "#CoordinateSystem: WGS 84 (EPSG::4326)",
         "\u{feff}EPSG:4326",
+        r#"# CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",AUTHORITY["EPSG","6326"]],AUTHORITY["EPSG","4326"]]"#,
+        r#"GEOGCS["WGS 84",DATUM["World Geodetic System 1984"]]"#,
     ];
-    const UTM: [&str; 12] = [
+    const UTM: [&str; 13] = [
         "WGS84 UTM 15N",
         "WGS84 UTM 15 N",
         "WGS 84 / UTM zone 15N",
@@ -287,6 +347,7 @@ mod tests {
         "http://www.opengis.net/def/crs/EPSG/0/32615",
         "+proj=utm +zone=15 +datum=WGS84 +units=m +no_defs",
         "+init=epsg:32615",
+        r#"PROJCS["WGS 84 / UTM zone 15N",GEOGCS["WGS 84",AUTHORITY["EPSG","4326"]]]"#,
         r#"COMPD_CS["a + b",PROJCS["WGS 84 / UTM zone 15N",GEOGCS["WGS 84",AUTHORITY["EPSG","4326"]],AUTHORITY["EPSG","32615"]],VERT_CS["b",AUTHORITY["EPSG","5703"]]]"#,
     ];
 
@@ -334,6 +395,26 @@ mod tests {
         );
         assert_eq!(picture_name(&["DJI", "0018.JPG", "gcp1"]), Some(("DJI 0018.JPG".to_owned(), 2)));
         assert_eq!(picture_name(&["DJI_0018", "gcp1"]), Some(("DJI_0018".to_owned(), 1)));
+    }
+
+    #[test]
+    fn angles_and_heights_are_read_with_their_units() {
+        for (cell, axis, expected) in [
+            ("46 deg 50' 33.36\" N", Axis::North, 46.8426),
+            ("91 deg 59' 40.20\"\" W", Axis::East, -91.9945),
+            ("S 33\u{b0}30\u{2032}", Axis::North, -33.5),
+            ("-33 30 0", Axis::North, -33.5),
+            ("7.5 E", Axis::East, 7.5),
+            ("7,5\u{b0}", Axis::East, 7.5),
+        ] {
+            assert!(angle(cell, axis).is_some_and(|v| (v - expected).abs() < 1e-9), "{cell}: {:?}", angle(cell, axis));
+        }
+        for cell in ["7.5 N", "7 60 0 E", "7 1 1 1 E", "x", "E", "7 -1 0"] {
+            assert_eq!(angle(cell, Axis::East), None, "{cell}");
+        }
+        let heights = ["198.3", "198,3 m", "198.3m", "198.3 m Above Sea Level", "2 m Below Sea Level", "3 ft", "high"]
+            .map(height);
+        assert_eq!(heights, [Some(198.3), Some(198.3), Some(198.3), Some(198.3), Some(-2.0), None, None]);
     }
 
     #[test]

@@ -8,7 +8,9 @@ use glam::DVec3;
 use image::{Rgb, RgbImage};
 use models::formats::reconstruction::Focal;
 use survey::card::write::{DJI, PIX4D, Tags};
-use survey::card::{AttitudeSource, Card, CardError, CardOptions, CardPicture, Exposure, Fix};
+use survey::card::{
+    AttitudeSource, Card, CardError, CardOptions, CardPicture, Exposure, Fix, FlightLog, Series, Source,
+};
 use survey::dataset::{Dataset, PoseSource};
 
 use needs::shared;
@@ -289,7 +291,8 @@ fn geotags_and_a_flight_log_give_positions_to_a_dumb_camera() {
             Exposure { time_s, fix: Fix { position: at(i), sigma_m: [1.5, 2.0] }, attitude: None }
         })
         .collect();
-    let options = CardOptions { exposures: log, ..CardOptions::default() };
+    let series = vec![Series { exposures: log, ..Series::default() }];
+    let options = CardOptions { log: Some(FlightLog { series, ..FlightLog::default() }), ..CardOptions::default() };
     let card = Card::open(&[dir.path().to_owned()], &options).unwrap();
     assert_note(&card, &["flight log", "8 of 8 pictures matched to 8 exposures"]);
     let second = picture(&card, "0001.JPG").prior;
@@ -368,4 +371,110 @@ fn phantoms_maker_notes_have_the_gimbals_angles() {
 #[test]
 fn attitudes_are_worth_what_they_come_from() {
     assert!(AttitudeSource::Gimbal < AttitudeSource::Airframe && AttitudeSource::Heading < AttitudeSource::Course);
+}
+
+/// Pictures of a camera without GPS and of whole seconds, `steps` apart.
+fn dumb_camera(steps: &[f64]) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    survey(dir.path(), steps.len() as u32, |i| {
+        let s: f64 = steps[..=i as usize].iter().sum();
+        Tags { position: None, time_ns: Some(START_NS + s as u64 * 1_000_000_000), ..tags(i) }
+    });
+    dir
+}
+
+/// The exposures of `steps`, `late_s` on another clock, `east_m` beside the card's line.
+fn flown(source: Source, steps: &[f64], late_s: f64, east_m: f64) -> Series {
+    let frame = EnuFrame::new(HOME);
+    let mut time_s = 512.3 + late_s;
+    let exposures = steps.iter().enumerate().map(|(i, step)| {
+        time_s += step;
+        let position = frame.to_geodetic(DVec3::new(10.0 * i as f64 + east_m, 3.0, 40.0));
+        Exposure { time_s, fix: Fix { position, sigma_m: [1.5, 2.0] }, attitude: None }
+    });
+    Series { source, exposures: exposures.collect() }
+}
+
+fn of(system: u8, camera: u8) -> Source {
+    Source { system: Some(system), component: Some(1), camera: Some(camera) }
+}
+
+fn matched(card: &Path, series: &[Series], system: Option<u8>, camera: Option<u8>) -> Result<Card, String> {
+    let log = FlightLog { path: "fleet.tlog".into(), series: series.to_vec(), system, camera };
+    let options = CardOptions { log: Some(log), ..CardOptions::default() };
+    Card::open(&[card.to_owned()], &options).map_err(|e| e.to_string())
+}
+
+/// Metres between the third picture of a card and where it was taken.
+fn off_m(card: &Card) -> f64 {
+    let place = EnuFrame::new(card.origin.unwrap()).to_geodetic(picture(card, "0002.JPG").prior.pose.center);
+    (EnuFrame::new(HOME).to_enu(place).truncate() - glam::DVec2::new(20.0, 3.0)).length()
+}
+
+const UNEVEN: [f64; 14] = [2.0, 3.0, 2.0, 7.0, 2.0, 4.0, 2.0, 2.0, 9.0, 3.0, 2.0, 5.0, 2.0, 3.0];
+const OTHER: [f64; 14] = [3.0, 2.0, 8.0, 2.0, 5.0, 2.0, 4.0, 3.0, 2.0, 2.0, 6.0, 2.0, 4.0, 2.0];
+
+#[test]
+fn of_a_fleets_log_the_aircraft_whose_rhythm_the_pictures_have_is_taken_and_the_others_named() {
+    let dir = dumb_camera(&UNEVEN);
+    let fleet = [
+        flown(of(1, 0), &OTHER, -8.0, 300.0),
+        flown(of(2, 0), &UNEVEN, 4.0, 0.0),
+        flown(of(3, 0), &OTHER, 3.0, -300.0),
+    ];
+    let card = matched(dir.path(), &fleet, None, None).unwrap();
+    assert_note(&card, &["flight log: 14 of 14", "system 2", "not system", "system 1", "system 3"]);
+    assert!(off_m(&card) < 0.01, "{}", off_m(&card));
+}
+
+#[test]
+fn aircraft_of_one_rhythm_are_refused_with_the_candidates_until_one_is_named() {
+    let dir = dumb_camera(&UNEVEN);
+    let fleet = [flown(of(1, 0), &UNEVEN, -3.0, 300.0), flown(of(2, 0), &UNEVEN, 4.0, 0.0)];
+    let error = matched(dir.path(), &fleet, None, None).unwrap_err();
+    assert!(error.contains("fleet.tlog") && error.contains("--system N") && !error.contains('\n'), "{error}");
+    assert!(error.contains("system 1") && error.contains("system 2"), "{error}");
+    assert!(off_m(&matched(dir.path(), &fleet, Some(2), None).unwrap()) < 0.01);
+    let error = matched(dir.path(), &fleet, Some(7), None).unwrap_err();
+    assert!(error.contains("it holds system 1") && error.contains("system 2"), "{error}");
+}
+
+#[test]
+fn places_that_the_pictures_state_tell_aircraft_of_one_rhythm_apart() {
+    let dir = tempfile::tempdir().unwrap();
+    let frame = EnuFrame::new(HOME);
+    survey(dir.path(), 8, |i| Tags {
+        position: Some(frame.to_geodetic(DVec3::new(10.0 * f64::from(i) + 2.0, 5.0, 40.0))),
+        ..tags(i)
+    });
+    let steps = [2.0; 8];
+    let fleet = [flown(of(1, 0), &steps, 0.0, 300.0), flown(of(2, 0), &steps, 0.0, 0.0)];
+    assert!(off_m(&matched(dir.path(), &fleet, None, None).unwrap()) < 0.01);
+    let error = matched(dir.path(), &fleet[..1], None, None).unwrap_err();
+    assert!(error.contains("give the log of this flight") && !error.contains('\n'), "{error}");
+}
+
+#[test]
+fn of_two_cameras_of_one_aircraft_the_one_that_the_pictures_fit_is_taken() {
+    let dir = dumb_camera(&UNEVEN);
+    let interval = flown(of(1, 1), &[0.7; 90], -5.0, 0.0);
+    let card = matched(dir.path(), &[interval, flown(of(1, 0), &UNEVEN, 0.0, 0.0)], None, None).unwrap();
+    assert_note(&card, &["14 of 14 pictures matched to 14 exposures", "camera 0"]);
+    assert!(off_m(&card) < 0.01);
+    // Fired together they say the same.
+    let pair = [flown(of(1, 0), &UNEVEN, 0.0, 0.0), flown(of(1, 1), &UNEVEN, 0.001, 0.0)];
+    assert!(off_m(&matched(dir.path(), &pair, None, None).unwrap()) < 0.01);
+    // Apart, nobody can tell.
+    let apart = [flown(of(1, 0), &UNEVEN, 0.0, 0.0), flown(of(1, 1), &UNEVEN, 1.0, 5.0)];
+    let error = matched(dir.path(), &apart, None, None).unwrap_err();
+    assert!(error.contains("--camera N"), "{error}");
+    assert!(off_m(&matched(dir.path(), &apart, None, Some(0)).unwrap()) < 0.01);
+}
+
+#[test]
+fn where_the_count_may_begin_at_another_exposure_places_are_as_uncertain_as_the_way_between_two() {
+    let dir = dumb_camera(&[2.0; 8]);
+    let card = matched(dir.path(), &[flown(Source::default(), &[2.0; 11], 0.0, 0.0)], None, None).unwrap();
+    assert_note(&card, &["another offset fits as well"]);
+    assert!(card.pictures.iter().all(|p| p.prior.sigma.position_m[0] >= 10.0));
 }

@@ -4,8 +4,9 @@
 
 use std::path::{Path, PathBuf};
 
+use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DVec3;
-use survey::card::{Card, CardError, CardOptions, control};
+use survey::card::{Card, CardError, CardOptions, Series, control, geotags, log};
 
 fn field(name: &str) -> Option<PathBuf> {
     needs::shared(&format!("field/cards/{name}"))
@@ -162,4 +163,66 @@ fn a_film_or_phone_pictures_alone_are_named_with_the_way_to_use_them() {
     std::fs::write(dir.path().join("IMG_1.HEIC"), b"ftyp").unwrap();
     let error = survey::dataset::Dataset::open(dir.path()).unwrap_err().to_string();
     assert!(error.contains("ffmpeg") && error.contains("magick") && !error.contains('\n'), "{error}");
+}
+
+/// A case among the logs and tables of the field; `None` (or a failing test) where they are not there.
+fn logged(name: &str) -> Option<std::path::PathBuf> {
+    needs::shared(&format!("field/mavlink/{name}"))
+}
+
+/// Where each picture of the card was taken: name, latitude, longitude, altitude.
+fn truth() -> Option<Vec<(String, Geodetic)>> {
+    let text = std::fs::read_to_string(logged("truth.json")?).unwrap();
+    let rows: Vec<serde_json::Value> = serde_json::from_str(&text).unwrap();
+    let place = |row: &serde_json::Value| {
+        let of = |name: &str| row[name].as_f64().unwrap();
+        Geodetic { lat_deg: of("lat"), lon_deg: of("lon"), alt_m: of("alt") }
+    };
+    Some(rows.iter().map(|row| (row["name"].as_str().unwrap().to_lowercase(), place(row))).collect())
+}
+
+fn apart_m(a: Geodetic, b: Geodetic) -> f64 {
+    EnuFrame::new(a).to_enu(b).length()
+}
+
+#[test]
+fn tables_of_positions_in_the_forms_of_other_programs_place_every_picture() {
+    let (Some(folder), Some(truth)) = (logged("inputs/geo"), truth()) else { return };
+    let mut read = 0;
+    for entry in std::fs::read_dir(&folder).unwrap().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        match geotags::read(&entry.path()) {
+            Ok(found) => {
+                assert_eq!(found.tags.len(), truth.len(), "{name}");
+                for ((picture, tag), (of, place)) in found.tags.iter().zip(&truth) {
+                    assert!(
+                        picture.ends_with(of) && apart_m(tag.fix.position, *place) < 0.05,
+                        "{name}: {picture} {tag:?}"
+                    );
+                }
+                read += 1;
+            }
+            // It names no pictures.
+            Err(e) => assert!(name == "suas.txt" && e.to_string().contains("no picture"), "{name}: {e}"),
+        }
+    }
+    assert_eq!(read, 8);
+}
+
+#[test]
+fn ardupilot_logs_of_every_kind_hold_the_exposures_of_the_card() {
+    let Some(truth) = truth() else { return };
+    for name in ["cam_ok.BIN", "cam_ok_named.log", "cam_text.log", "cam_ac32.BIN"] {
+        let Some(path) = logged(&format!("inputs/{name}")) else { return };
+        let series = log::read(&path).unwrap().unwrap();
+        let [Series { exposures, .. }] = series.as_slice() else { panic!("{name}: {} cameras", series.len()) };
+        assert_eq!(exposures.len(), truth.len(), "{name}");
+        for (e, (picture, place)) in exposures.iter().zip(&truth) {
+            assert!(apart_m(e.fix.position, *place) < 0.05, "{name}: {picture} {e:?}");
+        }
+    }
+    let Some(two) = logged("inputs/cam_two.BIN") else { return };
+    let counts: Vec<_> =
+        log::read(&two).unwrap().unwrap().iter().map(|s| (s.source.camera, s.exposures.len())).collect();
+    assert!(counts.len() == 2 && counts[0] == (Some(0), 18), "{counts:?}");
 }

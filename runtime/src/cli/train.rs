@@ -165,12 +165,18 @@ struct RecipeArgs {
 /// What a card of pictures is read with.
 #[derive(Debug, clap::Args)]
 struct CardArgs {
-    /// Positions of a card's pictures: OpenDroneMap's geo.txt, Mission Planner's list, geotags.csv of `dgtr fly`, a film's .SRT.
+    /// Positions of a card's pictures: OpenDroneMap's geo.txt, a table whose columns are named or Pix4D's, a film's .SRT.
     #[arg(long, value_name = "FILE")]
     geotags: Option<PathBuf>,
-    /// The flight's log beside a card, MAVLink (.tlog) or ArduPilot (.BIN), matched by order and time.
+    /// The flight's log beside a card, MAVLink (.tlog), ArduPilot (.BIN) or PX4 (.ulg), matched by order and time.
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
+    /// MAVLink system whose exposures in --log are meant [default: the one that the pictures fit].
+    #[arg(long, value_name = "N", requires = "log")]
+    system: Option<u8>,
+    /// Number of the camera whose exposures in --log are meant [default: the one that the pictures fit].
+    #[arg(long, value_name = "N", requires = "log")]
+    camera: Option<u8>,
     /// Surveyed points marked in a card's pictures; a gcp_list.txt beside them is found without this.
     #[arg(long, value_name = "FILE")]
     gcp: Option<PathBuf>,
@@ -188,7 +194,7 @@ impl CardArgs {
             geotags: self.geotags,
             control: self.gcp,
             check: self.check,
-            exposures: self.log.as_deref().map(log::exposures).transpose()?.unwrap_or_default(),
+            log: self.log.as_deref().map(|path| log::read(path, self.system, self.camera)).transpose()?,
             band: self.band,
         })
     }

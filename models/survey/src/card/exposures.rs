@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use super::record::{Attitude, Fix, Record};
+use super::record::{Attitude, Fix};
 
 /// An exposure that a log reports.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -25,8 +25,9 @@ pub struct Matching {
     pub offset_s: Option<f64>,
     /// Root mean square of what is left, seconds.
     pub rms_s: f64,
-    /// Another offset explains as many pictures nearly as well: evenly spaced exposures can be counted from either end.
-    pub ambiguous: bool,
+    /// What another offset would give that explains as many pictures nearly as well (evenly spaced exposures can be counted from either
+    /// end); empty where there is none.
+    pub rival: Vec<Option<usize>>,
 }
 
 /// Offsets that are tried in full.
@@ -85,7 +86,7 @@ pub fn match_exposures(pictures: &[Option<(f64, f64)>], exposures: &[f64]) -> Ma
         exposure: best.0.clone(),
         offset_s: Some(best.3),
         rms_s: best.2,
-        ambiguous: tried[1..].iter().find(rival).is_some(),
+        rival: tried[1..].iter().find(rival).map(|t| t.0.clone()).unwrap_or_default(),
     }
 }
 
@@ -111,31 +112,6 @@ fn pair(timed: &[(usize, f64)], exposures: &[f64], offset: f64, tolerance: f64) 
         }
     }
     pairs
-}
-
-/// Gives the pictures the positions and attitudes of their exposures; one line about it.
-pub(super) fn apply(exposures: &[Exposure], records: &mut [Record]) -> String {
-    super::record::in_order(records);
-    let times: Vec<Option<(f64, f64)>> =
-        records.iter().map(|r| r.time_ns.map(|(t, resolution)| (t as f64 * 1e-9, resolution as f64 * 1e-9))).collect();
-    let log: Vec<f64> = exposures.iter().map(|e| e.time_s).collect();
-    let matching = match_exposures(&times, &log);
-    let mut used = 0;
-    for (r, j) in records.iter_mut().zip(&matching.exposure) {
-        let Some(e) = j.map(|j| exposures[j]) else { continue };
-        used += 1;
-        r.fix = Some(e.fix);
-        r.relative_alt_m = None;
-        r.attitude = e.attitude.or(r.attitude);
-    }
-    let how = match matching.offset_s {
-        Some(offset) => {
-            format!("the camera's clock is {offset:+.2} s off the log's, {:.2} s rms remain", matching.rms_s)
-        }
-        None => "counted, because the pictures have no times".to_owned(),
-    };
-    let doubt = if matching.ambiguous { "; another offset fits as well, check the first picture" } else { "" };
-    format!("flight log: {used} of {} pictures matched to {} exposures ({how}{doubt})", records.len(), exposures.len())
 }
 
 #[cfg(test)]
@@ -164,7 +140,7 @@ mod tests {
             assert_eq!(*found, (*i != usize::MAX).then_some(*i));
         }
         assert!((matching.offset_s.unwrap_or(0.0) - offset + 0.5).abs() < 0.2, "{:?}", matching.offset_s);
-        assert!(!matching.ambiguous);
+        assert!(matching.rival.is_empty());
     }
 
     #[test]
@@ -172,7 +148,7 @@ mod tests {
         let log: Vec<f64> = (0..30).map(|i| 2.0 * f64::from(i)).collect();
         let pictures: Vec<_> = (0..20).map(|i| Some((1000.0 + 2.0 * f64::from(i), 0.001))).collect();
         let matching = match_exposures(&pictures, &log);
-        assert!(matching.ambiguous && matching.exposure.iter().all(Option::is_some));
+        assert!(!matching.rival.is_empty() && matching.exposure.iter().all(Option::is_some));
     }
 
     #[test]

@@ -1,5 +1,6 @@
-//! Files of positions: OpenDroneMap's `geo.txt`, Mission Planner's geotag list, our own `geotags.csv`, anything else whose first line
-//! names its columns.
+//! Files of positions: OpenDroneMap's `geo.txt`, Mission Planner's geotag list, our own `geotags.csv`, Pix4D's list without names of
+//! columns, and any table whose first line names its columns (exiftool's, Metashape's, a spreadsheet's), in any order and in a few
+//! languages.
 
 use std::path::Path;
 
@@ -9,7 +10,7 @@ use glam::{DQuat, DVec3};
 use super::record::{
     Attitude, AttitudeSource, FROM_HORIZON_DEG, Fix, GPS_SIGMA_M, Record, UNKNOWN_HEIGHT_SIGMA_M, nadir_rotation,
 };
-use crate::coordinates::{self, Reference, cells, number, picture_name};
+use crate::coordinates::{self, Axis, Reference, cells, is_picture, number, picture_name};
 use crate::names::PictureNames;
 use models::formats::FormatError;
 use models::formats::telemetry::dji_rotation;
@@ -29,20 +30,29 @@ pub struct Geotag {
     pub attitude: Option<Attitude>,
 }
 
-/// Reads a file of positions: tags by what it calls the pictures, in lower case.
+/// What a file says.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Geotags {
+    /// Tags by what the file calls the pictures, in lower case.
+    pub tags: Vec<(String, Geotag)>,
+    /// How it was understood, where that is not certain.
+    pub doubt: Option<&'static str>,
+}
+
+/// Reads a file of positions.
 ///
 /// # Errors
-/// The file cannot be read, names no columns that are understood, or a line is no number where one must be.
-pub fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
+/// The file cannot be read, lacks what a position needs, or a line is no number where one must be.
+pub fn read(path: &Path) -> Result<Geotags, FormatError> {
     let text = coordinates::text(path, LIMIT)?;
     let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()).peekable();
-    if lines.peek().is_none() {
+    let Some((_, first)) = lines.peek().copied() else {
         return Err(FormatError::invalid(path, "is empty"));
-    }
+    };
     // Metashape names the reference system in a comment before the columns.
     let (mut reference, mut columns) = (None, None);
     while let Some((number, line)) = lines.peek().copied() {
-        if let Some(named) = Columns::named(line) {
+        if let Ok(named) = Columns::named(line) {
             columns = Some(named);
             lines.next();
             break;
@@ -56,44 +66,103 @@ pub fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
         lines.next();
     }
     let is_table = columns.is_some();
-    let columns = match (columns, &reference) {
-        (Some(columns), _) => columns,
-        (None, Some(_)) => Columns::of_geo_txt(),
-        (None, None) => {
-            let what = "its first line is neither a projection (EPSG:4326, WGS84 UTM 32N) nor names columns for picture, latitude, longitude and altitude";
+    let unnamed = lines.peek().and_then(|(_, line)| Columns::of_pix4d(line));
+    let mut doubt = None;
+    let columns = match (columns, &reference, unnamed) {
+        (Some(columns), ..) => columns,
+        (None, Some(_), _) => Columns::of_geo_txt(),
+        (None, None, Some(columns)) => {
+            doubt = Some("its columns have no names; read as Pix4D writes them: latitude, longitude, altitude");
+            columns
+        }
+        (None, None, None) => {
+            let lacks = Columns::named(first).err().unwrap_or_default();
+            let what = format!(
+                "its first line is neither a projection (EPSG:4326, WGS84 UTM 32N) nor names columns for picture, latitude, longitude and altitude ({lacks})"
+            );
             return Err(FormatError::invalid(path, what));
         }
     };
+    if let Some(what) = columns.contradicts(reference.as_ref()) {
+        return Err(FormatError::invalid(path, what));
+    }
+    let mut rows = Rows { columns, reference, zone: None, is_table };
     let mut tags = Vec::new();
     for (at, line) in lines.filter(|(_, l)| !l.trim_start().starts_with('#')) {
+        let row = rows.read(line).map_err(|what| FormatError::invalid(path, format!("line {}: {what}", at + 1)))?;
+        tags.extend(row);
+    }
+    Ok(Geotags { tags, doubt })
+}
+
+/// What lines of a file are read by.
+struct Rows {
+    columns: Columns,
+    reference: Option<Reference>,
+    /// The zone of the last line, where a column names it.
+    zone: Option<(String, Reference)>,
+    is_table: bool,
+}
+
+impl Rows {
+    /// A picture's name and tag; `None` where the line has no position of it.
+    fn read(&mut self, line: &str) -> Result<Option<(String, Geotag)>, String> {
         let mut cells = cells(line);
-        let named = if is_table { None } else { picture_name(&cells) };
+        let columns = &self.columns;
+        let named = if self.is_table && cells.len() <= columns.count { None } else { picture_name(&cells) };
         if let Some((_, taken)) = &named {
             // Blanks in a picture's name are none between columns.
             cells.drain(1..*taken);
         }
-        let bad = |what: &str| FormatError::invalid(path, format!("line {}: {what}", at + 1));
+        if cells.len() > columns.count && cells[columns.count..].iter().any(|c| !c.is_empty()) {
+            return Err(format!(
+                "has {} cells where {} are named; write decimal points, or semicolons between cells",
+                cells.len(),
+                columns.count
+            ));
+        }
         let cell = |i: Option<usize>| i.and_then(|i| cells.get(i)).map(|c| c.trim()).filter(|c| !c.is_empty());
-        let value = |i: Option<usize>| -> Result<Option<f64>, FormatError> {
+        let read = |i: Option<usize>, of: &dyn Fn(&str) -> Option<f64>| -> Result<Option<f64>, String> {
             let Some(c) = cell(i) else { return Ok(None) };
-            number(c).map(Some).ok_or_else(|| bad(&format!("{c:?} is not a number")))
+            of(c).map(Some).ok_or_else(|| format!("{c:?} is not a number"))
         };
+        let value = |i: Option<usize>| read(i, &number);
         let name = named.map(|n| n.0).or_else(|| cell(Some(columns.name)).map(str::to_owned));
-        let Some(name) = name else { return Err(bad("names no picture")) };
-        let (Some(x), Some(y)) = (value(Some(columns.x))?, value(Some(columns.y))?) else {
-            return Err(bad("has no position"));
+        let Some(name) = name else { return Err("names no picture".to_owned()) };
+        let angle = |i: usize, half: Option<usize>, axis: Axis| {
+            let of = read(Some(i), &|c| coordinates::angle(c, axis));
+            // exiftool writes the hemisphere into a column of its own.
+            let is_negative = cell(half).is_some_and(|h| h.starts_with(['S', 's', 'W', 'w']));
+            of.map(|v| v.map(|v| if is_negative { -v.abs() } else { v }))
         };
-        let alt_m = value(columns.alt)?;
-        let position = match &reference {
+        let (x, y) = (angle(columns.x, columns.half[0], Axis::East)?, angle(columns.y, columns.half[1], Axis::North)?);
+        let (x, y) = match (x, y) {
+            (Some(x), Some(y)) => (x, y),
+            // exiftool lists pictures without GPS, too.
+            (None, None) if self.is_table => return Ok(None),
+            _ => return Err("has no position".to_owned()),
+        };
+        if (x, y) == (0.0, 0.0) {
+            return Ok(None);
+        }
+        let alt_m = read(columns.alt, &coordinates::height)?;
+        if let Some(zone) = cell(columns.zone).filter(|zone| self.zone.as_ref().is_none_or(|z| z.0 != *zone)) {
+            match Reference::named(&format!("UTM {zone}")) {
+                Some(Ok(reference)) => self.zone = Some((zone.to_owned(), reference)),
+                _ => return Err(format!("{zone:?} is no UTM zone (15N)")),
+            }
+        }
+        let zone = self.zone.as_ref().filter(|_| columns.zone.is_some()).map(|z| &z.1);
+        let position = match zone.or(self.reference.as_ref()) {
             Some(reference) => reference.geodetic(DVec3::new(x, y, alt_m.unwrap_or_default())),
             None => Some(Geodetic { lat_deg: y, lon_deg: x, alt_m: alt_m.unwrap_or_default() }),
         };
         let Some(position) = position.filter(Geodetic::is_valid) else {
-            return Err(bad(&format!(
-                "{y}, {x} is not a position on the earth; a table in metres needs a line EPSG:CODE before it"
-            )));
+            return Err(format!(
+                "{y}, {x} is not a position on the earth; a table in metres needs a line EPSG:CODE before it, or a column for the UTM zone"
+            ));
         };
-        let three = |of: [Option<usize>; 3]| -> Result<Option<[f64; 3]>, FormatError> {
+        let three = |of: [Option<usize>; 3]| -> Result<Option<[f64; 3]>, String> {
             Ok(match (value(of[0])?, value(of[1])?, value(of[2])?) {
                 (Some(a), Some(b), Some(c)) => Some([a, b, c]),
                 _ => None,
@@ -106,7 +175,7 @@ pub fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
             (Some([x, y, z]), Some(w)) => {
                 let q = DQuat::from_xyzw(x, y, z, w);
                 if !(0.9..1.1).contains(&q.length()) {
-                    return Err(bad("qw qx qy qz is not a rotation"));
+                    return Err("qw qx qy qz is not a rotation".to_owned());
                 }
                 Some(Attitude { rotation: q.normalize(), source: AttitudeSource::Gimbal })
             }
@@ -115,14 +184,13 @@ pub fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
                 true => Attitude { rotation: dji_rotation(y, p, r), source: AttitudeSource::Gimbal },
                 false => Attitude {
                     rotation: nadir_rotation(y, p, r),
-                    source: if is_table { AttitudeSource::Airframe } else { AttitudeSource::Gimbal },
+                    source: if self.is_table { AttitudeSource::Airframe } else { AttitudeSource::Gimbal },
                 },
             }),
         };
         let fix = Fix { position, sigma_m: [horizontal, vertical] };
-        tags.push((name.to_lowercase(), Geotag { fix, has_height: alt_m.is_some(), attitude }));
+        Ok(Some((name.to_lowercase(), Geotag { fix, has_height: alt_m.is_some(), attitude })))
     }
-    Ok(tags)
 }
 
 /// Gives the pictures their tags, which count more than what the pictures say; one line about it, and whether every picture has one.
@@ -131,7 +199,7 @@ pub fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
 /// The file's positions are nowhere near those of the pictures themselves.
 pub(super) fn apply(
     file: &Path,
-    tags: &[(String, Geotag)],
+    Geotags { tags, doubt }: &Geotags,
     records: &mut [Record],
 ) -> Result<(String, bool), FormatError> {
     let paths: Vec<String> = records.iter().map(|r| r.path.to_string_lossy().to_lowercase()).collect();
@@ -162,29 +230,47 @@ pub(super) fn apply(
         }
     }
     let line = format!(
-        "{}: positions of {} of {} pictures ({} lines)",
+        "{}: positions of {} of {} pictures ({} lines){}",
         file.display(),
         pairs.len(),
         records.len(),
-        tags.len()
+        tags.len(),
+        doubt.map_or(String::new(), |doubt| format!("; {doubt}"))
     );
-    Ok((line, pairs.len() == records.len()))
+    Ok((line, pairs.len() == records.len() && doubt.is_none()))
 }
 
 /// As [`apply`] for a film's subtitles; `None` where no picture is a frame of the film.
-pub(super) fn apply_to_some(file: &Path, tags: &[(String, Geotag)], records: &mut [Record]) -> Option<String> {
+pub(super) fn apply_to_some(file: &Path, tags: &Geotags, records: &mut [Record]) -> Option<String> {
     let names: Vec<String> = records.iter().map(|r| r.name.to_lowercase()).collect();
     let names = PictureNames::of(names.iter().map(String::as_str));
-    let is_any = tags.iter().any(|(name, _)| names.find(name).is_some());
+    let is_any = tags.tags.iter().any(|(name, _)| names.find(name).is_some());
     is_any.then(|| apply(file, tags, records).map_or_else(|e| e.to_string(), |(line, _)| line))
+}
+
+/// What the two coordinates are by their columns' names.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Unit {
+    /// x and y: degrees, unless a reference system says otherwise.
+    #[default]
+    Unsaid,
+    /// Longitude and latitude.
+    Degrees,
+    /// Easting and northing.
+    Metres,
 }
 
 /// Where what stands.
 #[derive(Debug, Default)]
 struct Columns {
+    count: usize,
     name: usize,
     x: usize,
     y: usize,
+    unit: Unit,
+    /// Hemispheres of x and y, where columns of their own name them.
+    half: [Option<usize>; 2],
+    zone: Option<usize>,
     alt: Option<usize>,
     /// Yaw, pitch, roll.
     angles: [Option<usize>; 3],
@@ -193,42 +279,171 @@ struct Columns {
     sigma: [Option<usize>; 2],
 }
 
+/// What people call the columns, each list with what is preferred first.
+const PICTURE: &[&str] = &[
+    "sourcefile",
+    "filename",
+    "picture",
+    "image",
+    "imagename",
+    "img",
+    "photo",
+    "file",
+    "label",
+    "name",
+    "source",
+    "bild",
+    "bildname",
+    "foto",
+    "datei",
+    "dateiname",
+    "imagen",
+    "immagine",
+    "fichier",
+    "archivo",
+    "photoid",
+    "imageid",
+];
+const LONGITUDE: &[&str] = &[
+    "longitude",
+    "lon",
+    "lng",
+    "long",
+    "gpslongitude",
+    "gpslon",
+    "gpslng",
+    "longitud",
+    "longitudine",
+    "länge",
+    "laenge",
+    "längengrad",
+    "laengengrad",
+];
+const LATITUDE: &[&str] =
+    &["latitude", "lat", "gpslatitude", "gpslat", "latitud", "latitudine", "breite", "breitengrad"];
+const EASTING: &[&str] = &["easting", "east", "eastings", "utmeasting", "ostwert", "rechtswert", "ost", "este"];
+const NORTHING: &[&str] = &["northing", "north", "northings", "utmnorthing", "nordwert", "hochwert", "nord", "norte"];
+const ALTITUDE: &[&str] = &[
+    "altitude",
+    "alt",
+    "gpsaltitude",
+    "gpsalt",
+    "height",
+    "elevation",
+    "elev",
+    "höhe",
+    "hoehe",
+    "altitud",
+    "altura",
+    "quota",
+    "altezza",
+    "absolutealtitude",
+    "z",
+];
+/// Words beside those that make something else of a column.
+const OTHERWISE: &[&str] =
+    &["ref", "accuracy", "sigma", "std", "error", "relative", "rel", "agl", "width", "size", "type", "date", "time"];
+
 impl Columns {
     /// `name x y [z] [yaw pitch roll] [horizontal vertical accuracy]`.
     fn of_geo_txt() -> Self {
         Self {
+            count: usize::MAX,
             name: 0,
             x: 1,
             y: 2,
             alt: Some(3),
             angles: [Some(4), Some(5), Some(6)],
-            q: [None; 4],
             sigma: [Some(7), Some(8)],
+            ..Self::default()
         }
     }
 
-    fn named(line: &str) -> Option<Self> {
-        let names: Vec<String> = cells(line).iter().map(|n| n.trim_start_matches('#').trim().to_lowercase()).collect();
-        let starting = |of: &[&str]| of.iter().find_map(|o| names.iter().position(|n| n.starts_with(o)));
-        let exactly = |of: &str| names.iter().position(|n| n == of);
-        let holding = |of: &str| names.iter().position(|n| n.contains(of) && !n.contains("accuracy"));
+    /// `name,latitude,longitude[,altitude[,omega,phi,kappa][,horizontal,vertical accuracy]]`, by a first line of this form.
+    fn of_pix4d(line: &str) -> Option<Self> {
+        let cells = cells(line);
+        let is_cut = line.contains([',', ';', '\t']) && cells.first().is_some_and(|name| is_picture(name));
+        let numbers = cells.iter().skip(1).all(|cell| number(cell).is_some());
+        // No other columns than these: what else there is would be guessed.
+        let sigma = match cells.len() {
+            3 | 4 | 7 => [None; 2],
+            6 => [Some(4), Some(5)],
+            9 => [Some(7), Some(8)],
+            _ => return None,
+        };
+        let alt = (cells.len() > 3).then_some(3);
+        let all = Self { count: cells.len(), y: 1, x: 2, unit: Unit::Degrees, alt, sigma, ..Self::default() };
+        (is_cut && numbers).then_some(all)
+    }
+
+    /// By what the line names, or what it lacks.
+    fn named(line: &str) -> Result<Self, String> {
+        let words = |name: &&str| -> Vec<String> {
+            let word = |w: &str| w.to_lowercase();
+            name.split(|c: char| !c.is_alphanumeric()).filter(|w| !w.is_empty()).map(word).collect()
+        };
+        let names: Vec<Vec<String>> = cells(line).iter().map(words).collect();
+        let plain = |name: &Vec<String>| !name.iter().any(|w| OTHERWISE.contains(&w.as_str()));
+        let column = |of: &[&str]| {
+            of.iter().find_map(|o| names.iter().position(|name| plain(name) && name.iter().any(|w| w == o)))
+        };
+        let exactly = |of: &str| names.iter().position(|name| name.join("_") == of || name.concat() == of);
         let accuracy = |axis: &[&str]| {
-            let sigma =
-                |n: &String| (n.contains("accuracy") || n.contains("sigma")) && axis.iter().any(|a| n.contains(a));
+            let sigma = |name: &Vec<String>| {
+                let of = name.iter().any(|w| w == "accuracy" || w == "sigma");
+                of && name.iter().any(|w| axis.iter().any(|a| w.starts_with(a)))
+            };
             names.iter().position(sigma)
         };
-        // Metashape writes "X/Longitude", RealityCapture x and y.
-        let x = starting(&["lon", "lng", "east"]).or_else(|| holding("longitude")).or_else(|| exactly("x"));
-        let y = starting(&["lat", "north"]).or_else(|| holding("latitude")).or_else(|| exactly("y"));
-        Some(Self {
-            name: starting(&["picture", "image", "name", "file", "photo", "label", "source"])?,
-            y: y?,
-            x: x?,
-            alt: starting(&["alt", "height", "elev"]).or_else(|| holding("altitude")).or_else(|| exactly("z")),
-            angles: [starting(&["yaw", "heading"]), starting(&["pitch"]), starting(&["roll"])],
+        let angle =
+            |of: &[&str]| names.iter().position(|name| plain(name) && name.iter().any(|w| of.iter().any(|o| w == o)));
+        let (name, degrees, metres) =
+            (column(PICTURE), [column(LONGITUDE), column(LATITUDE)], [column(EASTING), column(NORTHING)]);
+        let (at, unit) = match (degrees, metres) {
+            ([Some(x), Some(y)], _) => ([Some(x), Some(y)], Unit::Degrees),
+            (_, [Some(x), Some(y)]) => ([Some(x), Some(y)], Unit::Metres),
+            ([None, None], [None, None]) => ([exactly("x"), exactly("y")], Unit::Unsaid),
+            (degrees, metres) => ([degrees[0].or(metres[0]), degrees[1].or(metres[1])], Unit::Unsaid),
+        };
+        let lacks = |what: &[(&str, Option<usize>)]| {
+            let names = what.iter().filter(|w| w.1.is_none()).map(|w| w.0);
+            format!("it names no {}", names.collect::<Vec<_>>().join(", no "))
+        };
+        let (Some(name), [Some(x), Some(y)]) = (name, at) else {
+            return Err(lacks(&[("picture", name), ("longitude", at[0]), ("latitude", at[1])]));
+        };
+        if x == y || x == name || y == name {
+            return Err("it names two in one cell".to_owned());
+        }
+        Ok(Self {
+            count: names.len(),
+            name,
+            x,
+            y,
+            unit,
+            half: ["gpslongituderef", "gpslatituderef"].map(exactly),
+            zone: column(&["zone", "utmzone"]),
+            alt: column(ALTITUDE),
+            angles: [
+                angle(&["yaw", "heading", "gimbalyawdegree"]),
+                angle(&["pitch", "gimbalpitchdegree"]),
+                angle(&["roll", "gimbalrolldegree"]),
+            ],
             q: ["qw", "qx", "qy", "qz"].map(exactly),
             sigma: [accuracy(&["hor", "xy"]).or(exactly("sigma_m")), accuracy(&["ver", "z"])],
         })
+    }
+
+    /// What the names of the columns and a reference system do not say together.
+    fn contradicts(&self, reference: Option<&Reference>) -> Option<&'static str> {
+        match (self.unit, reference.map(Reference::is_in_degrees)) {
+            (Unit::Metres, None) if self.zone.is_none() => Some(
+                "has easting and northing, but names no zone: write a line EPSG:CODE (or UTM 32N) before it, or add a column zone",
+            ),
+            (Unit::Metres, Some(true)) => Some("has easting and northing, but its reference system is in degrees"),
+            (Unit::Degrees, Some(false)) => Some("has longitude and latitude, but its reference system is in metres"),
+            _ => None,
+        }
     }
 }
 
@@ -238,6 +453,10 @@ mod tests {
     use super::*;
 
     fn read_text(text: &str) -> Result<Vec<(String, Geotag)>, FormatError> {
+        read_whole(text).map(|found| found.tags)
+    }
+
+    fn read_whole(text: &str) -> Result<Geotags, FormatError> {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("geo.txt");
         std::fs::write(&path, text).unwrap();
@@ -303,9 +522,68 @@ mod tests {
             ("EPSG:4326\na.jpg x 95 3\n", "\"x\" is not a number"),
             ("name,lat,lon\na.jpg,1\n", "line 2: has no position"),
             ("name,lat,lon,qw,qx,qy,qz\na.jpg,1,2,0,0,0,0\n", "not a rotation"),
+            ("imageIndex: 1 Date:2020/2/1 lat/lon: 46.8,-91.9\n", "it names no picture"),
+            ("name,lat,alt\na.jpg,1,2\n", "it names no longitude"),
+            ("name,easting,northing\na.jpg,12.5,40.25\n", "names no zone"),
+            ("EPSG:4326\nname,easting,northing\na.jpg,12.5,40.25\n", "in degrees"),
+            ("EPSG:32615\nname,lon,lat\na.jpg,-91.9,46.8\n", "in metres"),
+            ("name,east,north,zone\na.jpg,576700,5188100,77\n", "\"77\" is no UTM zone"),
+            ("name,lat,lon,alt\na.jpg,46,84,-91,99,198\n", "has 6 cells where 4 are named"),
+            ("a.jpg,46.8,-91.9,198,1\n", "names columns"),
+            ("name,lat,lon\na.jpg,46 deg 61' 0\" N,7\n", "is not a number"),
+            ("name,lat,lon\na.jpg,46 deg 1' 0\" E,7\n", "is not a number"),
         ] {
             let error = read_text(text).unwrap_err().to_string();
             assert!(error.contains(expected) && !error.contains('\n'), "{text:?}: {error}");
+        }
+    }
+
+    #[test]
+    fn tables_as_programs_and_spreadsheets_write_them_say_the_same_in_any_order_of_columns() {
+        let position = Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 198.3 };
+        for text in [
+            "SourceFile,ImageWidth,FileSize,LongExposureNoiseReduction,GPSLatitudeRef,DateTimeOriginal,GPSLatitude,GPSLongitude,GPSAltitude\nDCIM/DJI_1.JPG,4000,3 MB,Off,North,2016:06:23 16:31:59,46.8426,-91.9945,198.3\n",
+            "SourceFile,GPSAltitude,GPSLatitude,GPSLongitude\nDCIM/DJI_1.JPG,198.3 m Above Sea Level,\"46 deg 50' 33.36\"\" N\",\"91 deg 59' 40.20\"\" W\"\n",
+            "SourceFile,GPSLongitude,GPSLongitudeRef,GPSLatitude,GPSAltitude\nDCIM/DJI_1.JPG,91.9945,West,46.8426,198.3\nDCIM/DJI_2.JPG,,,,\n",
+            "Bild;Breite;Laenge;Hoehe\r\nDJI_1.JPG;46,8426;-91,9945;198,3\r\n",
+            "H\u{f6}he;L\u{e4}nge;Breite;Dateiname\n198,3;-91,9945;46,8426;DJI_1.JPG\n",
+            "# CoordinateSystem: GEOGCS[\"WGS 84\",DATUM[\"World Geodetic System 1984\",SPHEROID[\"WGS 84\",6378137,298.257223563,AUTHORITY[\"EPSG\",\"7030\"]],AUTHORITY[\"EPSG\",\"6326\"]],UNIT[\"degree\",0.01745,AUTHORITY[\"EPSG\",\"9102\"]],AUTHORITY[\"EPSG\",\"4326\"]]\n#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll\nDJI_1.JPG,-91.9945,46.8426,198.3,46.00,0,0\n",
+            "# CoordinateSystem: GEOGCS[\"WGS 84\",DATUM[\"World Geodetic System 1984\"]]\n#Label,X/Longitude,Y/Latitude,Z/Altitude\nDJI_1,-91.9945,46.8426,198.3\n",
+            "DJI_1.JPG,46.8426,-91.9945,198.3,5.0,10.0\n",
+            "DJI_1.JPG;46,8426;-91,9945;198,3\n",
+            "alt [m];lat [deg];lon [deg];photo\n198.3;46.8426;-91.9945;DJI_1.JPG\n",
+        ] {
+            let tags = read_text(text).unwrap_or_else(|e| panic!("{text}: {e}"));
+            let near = |p: Geodetic| {
+                (p.lat_deg - position.lat_deg).abs() < 1e-9
+                    && (p.lon_deg - position.lon_deg).abs() < 1e-9
+                    && p.alt_m == position.alt_m
+            };
+            assert!(tags.len() == 1 && tags[0].0.contains("dji_1") && near(tags[0].1.fix.position), "{text}: {tags:?}");
+        }
+    }
+
+    #[test]
+    fn a_list_without_names_is_read_as_pix4ds_with_its_accuracies_and_says_so() {
+        let found = read_whole("DJI_1.JPG,46.8426,-91.9945,198.3,5.0,10.0\n").unwrap();
+        assert_eq!(found.tags[0].1.fix.sigma_m, [5.0, 10.0]);
+        assert!(found.doubt.is_some_and(|d| d.contains("latitude, longitude, altitude")));
+        assert!(read_whole("EPSG:4326\nDJI_1.JPG -91.9945 46.8426\n").unwrap().doubt.is_none());
+    }
+
+    #[test]
+    fn easting_and_northing_are_placed_by_a_line_or_a_column_that_states_the_zone() {
+        for text in [
+            "EPSG:32615\nname,easting,northing,alt\na.jpg,576689.183,5188174.180,158.5\n",
+            "# CoordinateSystem: WGS 84 / UTM zone 15N\n#Label,X/Easting,Y/Northing,Z/Altitude\na.jpg,576689.183,5188174.180,158.5\n",
+            "Bild;Rechtswert;Hochwert;H\u{f6}he;Zone\na.jpg;576689,183;5188174,180;158,5;15N\n",
+            "name,UTM Zone,Northing,Easting\na.jpg,15T,5188174.180,576689.183\n",
+        ] {
+            let p = read_text(text).unwrap_or_else(|e| panic!("{text}: {e}"))[0].1.fix.position;
+            assert!(
+                (p.lat_deg - 46.842_690_67).abs() < 1e-7 && (p.lon_deg + 91.994_216_22).abs() < 1e-7,
+                "{text}: {p:?}"
+            );
         }
     }
 }

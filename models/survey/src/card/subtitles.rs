@@ -5,7 +5,7 @@ use std::path::Path;
 
 use geometry::geodesy::Geodetic;
 
-use super::geotags::Geotag;
+use super::geotags::{Geotag, Geotags};
 use super::record::{Attitude, AttitudeSource, Fix, GPS_SIGMA_M, UNKNOWN_HEIGHT_SIGMA_M};
 use crate::coordinates::text;
 use models::formats::FormatError;
@@ -18,7 +18,7 @@ const LIMIT: u64 = 64 << 20;
 ///
 /// # Errors
 /// The file cannot be read, or no position stands in it.
-pub(super) fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
+pub(super) fn read(path: &Path) -> Result<Geotags, FormatError> {
     let text = text(path, LIMIT)?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
     let (mut tags, mut next) = (Vec::new(), 0u64);
@@ -36,7 +36,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<(String, Geotag)>, FormatError> {
     }
     match tags.is_empty() {
         true => Err(FormatError::invalid(path, "holds subtitles without positions")),
-        false => Ok(tags),
+        false => Ok(Geotags { tags, doubt: None }),
     }
 }
 
@@ -104,7 +104,7 @@ mod tests {
             + &block(4, "00:00:02,016", &new(0.0).replace("-91.99", "0.0"))
             + &block(5, "00:00:02,033", &new(46.83));
         std::fs::write(&path, film).unwrap();
-        let tags = read(&path).unwrap();
+        let tags = read(&path).unwrap().tags;
         let names: Vec<(&str, f64)> = tags.iter().map(|(n, t)| (n.as_str(), t.fix.position.lat_deg)).collect();
         assert_eq!(
             names,
@@ -113,7 +113,7 @@ mod tests {
         assert_eq!((tags[0].1.fix.position.alt_m, tags[0].1.has_height), (198.3, true));
         assert!((tags[0].1.attitude.unwrap().rotation * glam::DVec3::Z).z < -0.999);
         std::fs::write(&path, block(1, "00:00:00,000", "HOME(-91,46) GPS(-91.5,46.5,19) BAROMETER:40.1")).unwrap();
-        assert_eq!(read(&path).unwrap()[0].1.fix.position.lon_deg, -91.5);
+        assert_eq!(read(&path).unwrap().tags[0].1.fix.position.lon_deg, -91.5);
         std::fs::write(&path, block(1, "00:00:00,000", "hello")).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("without positions"));
     }

@@ -7,8 +7,10 @@ use geometry::geodesy::Geodetic;
 use image::{ImageFormat, Rgb, RgbImage};
 use models::picture;
 use survey::card::exposures::match_exposures;
+use survey::card::log;
+use survey::card::log::dataflash;
 use survey::card::write::{PIX4D, Tags};
-use survey::card::{Card, CardOptions, control, dataflash, geotags};
+use survey::card::{Card, CardOptions, control, geotags};
 
 use crate::driver::{Read, Reader, Shell, Verdict, line, survive};
 
@@ -174,15 +176,18 @@ fn files_of_positions() {
         "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt\nIMG_1.JPG 46.8426 -91.9945 198.3 90 0 0 0\n";
     let degrees = "EPSG:4326\nIMG_1.JPG -91.9945 46.8426 198.3 90 0 0 0.8 1.5\n";
     let utm = "WGS84 UTM 15N\nIMG_1.JPG 576700.5 5188000 198.3\n# a note\nIMG_2.JPG 576710 5188000 198.3\n";
+    let exiftool = "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\nDCIM/IMG_1.JPG,\"46 deg 50' 33.39\"\" N\",\"91 deg 59' 40.42\"\" W\",198.3 m Above Sea Level\n";
+    let german = "Bild;Rechtswert;Hochwert;H\u{f6}he;Zone\nIMG_1.JPG;576700,5;5188000;198,3;15N\nIMG_2.JPG;576710;5188000;198,3;15N\n";
+    let pix4d = "IMG_1.JPG,46.8426,-91.9945,198.3,5.0,10.0\nIMG_2.JPG,46.8427,-91.9945,198.3,5.0,10.0\n";
     survive(&Reader {
         name: "geotags",
-        seeds: [ours, planner, degrees, utm].map(|s| s.as_bytes().to_vec()).into(),
+        seeds: [ours, planner, degrees, utm, exiftool, german, pix4d].map(|s| s.as_bytes().to_vec()).into(),
         text: true,
         shell: None,
         memory: (64 << 10, 64),
         read: Read::File("geo.txt", &|path| {
-            line(geotags::read(path), |tags: Vec<(String, geotags::Geotag)>| {
-                tags.iter().all(|(_, t)| {
+            line(geotags::read(path), |found: geotags::Geotags| {
+                found.tags.iter().all(|(_, t)| {
                     let turned = t.attitude.is_none_or(|a| (a.rotation.length() - 1.0).abs() < 1e-6);
                     t.fix.position.is_valid() && t.fix.sigma_m.iter().all(|s| *s > 0.0) && turned
                 })
@@ -248,7 +253,8 @@ fn dataflash_logs() {
         shell: None,
         memory: (160 << 10, 64),
         read: Read::File("1.BIN", &|path| {
-            line(dataflash::read(path), |found| {
+            line(dataflash::read(path), |series| {
+                let found: Vec<_> = series.into_iter().flat_map(|s| s.exposures).collect();
                 let times: Vec<f64> = found.iter().map(|e| e.time_s).collect();
                 let matched = match_exposures(&pictures, &times);
                 let known = |i: &usize| *i < times.len();
@@ -256,4 +262,66 @@ fn dataflash_logs() {
             })
         }),
     });
+}
+
+#[test]
+fn dataflash_logs_as_text() {
+    let head = "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nFMT, 43, 45, CAM, QBIHLLeccC, TimeUS,I,GPSTime,GPSWeek,Lat,Lng,Alt,R,P,Y\n";
+    let line =
+        |i: u32| format!("CAM, {}, 0, {}, 1902, 46.8426{i}, -91.9945, 198.31, 1, -2, 90\n", 1_000_000 * i, 1000 * i);
+    let text: String = std::iter::once(head.to_owned()).chain((0..5).map(line)).collect();
+    survive(&Reader {
+        name: "dataflash-text",
+        seeds: vec![text.into_bytes()],
+        text: true,
+        shell: None,
+        memory: (160 << 10, 64),
+        read: Read::File("1.log", &logged),
+    });
+}
+
+/// A PX4 log of captures, with a position and an attitude between.
+fn ulog() -> Vec<u8> {
+    let message = |kind: u8, content: &[u8]| [&(content.len() as u16).to_le_bytes()[..], &[kind], content].concat();
+    let mut log = [&[0x55, 0x4C, 0x6F, 0x67, 0x01, 0x12, 0x35, 1][..], &7u64.to_le_bytes()].concat();
+    log.extend(message(b'B', &[0; 40]));
+    let formats = [
+        "camera_capture:uint64_t timestamp;double lat;double lon;float alt;float[4] q;int8_t result;",
+        "vehicle_global_position:uint64_t timestamp;double lat;double lon;float alt;",
+        "vehicle_attitude:uint64_t timestamp;float[4] q;",
+    ];
+    formats.iter().for_each(|f| log.extend(message(b'F', f.as_bytes())));
+    let names = ["camera_capture", "vehicle_global_position", "vehicle_attitude"];
+    for (id, name) in (0u8..).zip(names) {
+        log.extend(message(b'A', &[&[0, id, 0][..], name.as_bytes()].concat()));
+    }
+    let q: Vec<u8> = [0.7f32, 0.0, 0.0, 0.7].iter().flat_map(|v| v.to_le_bytes()).collect();
+    for i in 0..4u64 {
+        let (time, lat) = ((1_000_000 * (i + 1)).to_le_bytes(), (46.0 + 1e-4 * i as f64).to_le_bytes());
+        let place = [&time[..], &lat, &7f64.to_le_bytes(), &400f32.to_le_bytes()].concat();
+        log.extend(message(b'D', &[&[1, 0][..], &place].concat()));
+        log.extend(message(b'D', &[&[2, 0][..], &time, &q].concat()));
+        log.extend(message(b'S', &[0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12]));
+        log.extend(message(b'D', &[&[0, 0][..], &place, &q, &[1]].concat()));
+    }
+    log
+}
+
+#[test]
+fn px4_logs() {
+    survive(&Reader {
+        name: "ulog",
+        seeds: vec![ulog()],
+        text: false,
+        shell: None,
+        memory: (256 << 10, 64),
+        read: Read::File("1.ulg", &logged),
+    });
+}
+
+fn logged(path: &Path) -> Verdict {
+    line(log::read(path), |series| {
+        let mut exposures = series.iter().flatten().flat_map(|s| &s.exposures);
+        exposures.all(|e| e.fix.position.is_valid() && e.time_s.is_finite())
+    })
 }

@@ -1,0 +1,572 @@
+//! Exposures out of a PX4 log (`.ulg`, ULog 1): `camera_capture` (an exposure with its place), else `camera_trigger` (a command or a pulse
+//! of the hot-shoe), placed between what `vehicle_global_position`, else the receiver, and `vehicle_attitude` say. The format's
+//! description: <https://docs.px4.io/main/en/dev_log/ulog_file_format>. The crates that read it panic on cut messages or end at the
+//! first damaged one; a log of a power cut has both.
+
+use std::collections::{BTreeMap, HashMap};
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use geometry::geodesy::Geodetic;
+use glam::DQuat;
+use models::formats::FormatError;
+
+use super::{MAX_EXPOSURES, SIGMA_M, Series, Source, camera_attitude};
+use crate::card::exposures::Exposure;
+use crate::card::record::Fix;
+
+/// What a log begins with; its version and the start's time stamp follow.
+pub(super) const MAGIC: [u8; 7] = [0x55, 0x4C, 0x6F, 0x67, 0x01, 0x12, 0x35];
+const HEADER: u64 = 16;
+/// A message of this content stands between others, so that a reader finds the next one after damage.
+const SYNC: [u8; 11] = [8, 0, b'S', 0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12];
+/// All kinds of messages.
+const KINDS: &[u8] = b"BFIMPQARDLCSO";
+/// Bytes of descriptions of messages, all together.
+const MAX_DESCRIBED: usize = 4 << 20;
+/// Types within types.
+const DEEPEST: usize = 8;
+/// Places and attitudes between which exposures are placed: ten a second for five hours.
+const MAX_SAMPLES: usize = 200_000;
+const SAMPLE_US: u64 = 100_000;
+/// A place farther from a sample than this is not told by it, microseconds.
+const NEAR_US: u64 = 1_000_000;
+/// A hundred years since the autopilot's start.
+const MAX_TIME_US: u64 = 100 * 366 * 86_400 * 1_000_000;
+
+/// Type, elements (0 where it is no array) and name of a field.
+type Field = (String, usize, String);
+
+/// Where a message's fields stand.
+struct Topic {
+    kind: Kind,
+    instance: u8,
+    /// Offset and type by name.
+    fields: HashMap<String, (usize, String)>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Capture,
+    Trigger,
+    Place,
+    Receiver,
+    Attitude,
+}
+
+impl Kind {
+    fn named(topic: &str) -> Option<Self> {
+        Some(match topic {
+            "camera_capture" => Self::Capture,
+            "camera_trigger" => Self::Trigger,
+            "vehicle_global_position" => Self::Place,
+            "vehicle_gps_position" => Self::Receiver,
+            "vehicle_attitude" => Self::Attitude,
+            _ => return None,
+        })
+    }
+}
+
+impl Topic {
+    /// An element of a field as a number, by any of its names.
+    fn number(&self, data: &[u8], names: &[&str], element: usize) -> Option<f64> {
+        let (at, kind) = names.iter().find_map(|name| self.fields.get(*name))?;
+        let size = size_of_simple(kind)?;
+        let b = data.get(at + element * size..at + (element + 1) * size)?;
+        let value = match kind.as_str() {
+            "int8_t" => f64::from(b[0] as i8),
+            "uint8_t" | "bool" | "char" => f64::from(b[0]),
+            "int16_t" => f64::from(i16::from_le_bytes(b.try_into().ok()?)),
+            "uint16_t" => f64::from(u16::from_le_bytes(b.try_into().ok()?)),
+            "int32_t" => f64::from(i32::from_le_bytes(b.try_into().ok()?)),
+            "uint32_t" => f64::from(u32::from_le_bytes(b.try_into().ok()?)),
+            "int64_t" => i64::from_le_bytes(b.try_into().ok()?) as f64,
+            "uint64_t" => u64::from_le_bytes(b.try_into().ok()?) as f64,
+            "float" => f64::from(f32::from_le_bytes(b.try_into().ok()?)),
+            "double" => f64::from_le_bytes(b.try_into().ok()?),
+            _ => return None,
+        };
+        value.is_finite().then_some(value)
+    }
+
+    fn quaternion(&self, data: &[u8]) -> Option<DQuat> {
+        let q = |i| self.number(data, &["q"], i);
+        Some(DQuat::from_xyzw(q(1)?, q(2)?, q(3)?, q(0)?)).filter(|q| (0.9..1.1).contains(&q.length()))
+    }
+}
+
+fn size_of_simple(kind: &str) -> Option<usize> {
+    Some(match kind {
+        "int8_t" | "uint8_t" | "bool" | "char" => 1,
+        "int16_t" | "uint16_t" => 2,
+        "int32_t" | "uint32_t" | "float" => 4,
+        "int64_t" | "uint64_t" | "double" => 8,
+        _ => return None,
+    })
+}
+
+/// Samples by time, microseconds since the start.
+struct Track<T> {
+    samples: Vec<(u64, T)>,
+}
+
+impl<T> Default for Track<T> {
+    fn default() -> Self {
+        Self { samples: Vec::new() }
+    }
+}
+
+impl<T: Copy> Track<T> {
+    fn add(&mut self, time_us: u64, value: T) {
+        let due = self.samples.last().is_none_or(|last| time_us >= last.0 + SAMPLE_US);
+        if due && self.samples.len() < MAX_SAMPLES {
+            self.samples.push((time_us, value));
+        }
+    }
+
+    /// The samples on both sides of `time_us` and the share of the second one; `None` where either is far.
+    fn around(&self, time_us: u64) -> Option<(T, T, f64)> {
+        let after = self.samples.partition_point(|s| s.0 < time_us);
+        let (a, b) = (self.samples.get(after.saturating_sub(1))?, self.samples.get(after).or(self.samples.last())?);
+        if time_us.abs_diff(a.0) > NEAR_US || time_us.abs_diff(b.0) > NEAR_US {
+            return None;
+        }
+        let share = if b.0 > a.0 { time_us.saturating_sub(a.0) as f64 / (b.0 - a.0) as f64 } else { 0.0 };
+        Some((a.1, b.1, share.min(1.0)))
+    }
+}
+
+/// What a log says of one exposure.
+struct Event {
+    time_us: u64,
+    fix: Option<Geodetic>,
+    camera: Option<DQuat>,
+    is_pulse: bool,
+}
+
+/// What a log holds.
+#[derive(Default)]
+struct Found {
+    captures: BTreeMap<u8, Vec<Event>>,
+    triggers: BTreeMap<u8, Vec<Event>>,
+    count: usize,
+    places: Track<Geodetic>,
+    receiver: Track<Geodetic>,
+    attitudes: Track<DQuat>,
+}
+
+impl Found {
+    fn take(&mut self, topic: &Topic, data: &[u8]) -> Option<()> {
+        let of = |names: &[&str]| topic.number(data, names, 0);
+        let time_us = of(&["timestamp"]).filter(|t| (0.0..MAX_TIME_US as f64).contains(t))? as u64;
+        // Degrees, else ten millionths of them; metres, else thousandths.
+        let degrees = |names: &[&str]| {
+            let value = of(names)?;
+            Some(if value.abs() > 360.0 { value * 1e-7 } else { value })
+        };
+        let place = || {
+            let alt_m = of(&["altitude_msl_m"]).or_else(|| {
+                let (_, kind) = topic.fields.get("alt")?;
+                Some(of(&["alt"])? * if kind == "int32_t" { 1e-3 } else { 1.0 })
+            });
+            let lat_deg = degrees(&["latitude_deg", "lat"])?;
+            let position = Geodetic { lat_deg, lon_deg: degrees(&["longitude_deg", "lon"])?, alt_m: alt_m? };
+            (position.is_valid() && (position.lat_deg, position.lon_deg) != (0.0, 0.0)).then_some(position)
+        };
+        match topic.kind {
+            Kind::Place => self.places.add(time_us, place()?),
+            Kind::Receiver => self.receiver.add(time_us, place()?),
+            Kind::Attitude => self.attitudes.add(time_us, topic.quaternion(data)?),
+            Kind::Capture | Kind::Trigger => {
+                // 0: the camera says that it took none.
+                let failed = topic.kind == Kind::Capture && of(&["result"]) == Some(0.0);
+                if failed || self.count >= MAX_EXPOSURES {
+                    return None;
+                }
+                self.count += 1;
+                let list = if topic.kind == Kind::Capture { &mut self.captures } else { &mut self.triggers };
+                let camera = topic.quaternion(data);
+                let is_pulse = of(&["feedback"]) == Some(1.0);
+                list.entry(topic.instance).or_default().push(Event { time_us, fix: place(), camera, is_pulse });
+            }
+        }
+        Some(())
+    }
+
+    fn placed(&self, event: &Event) -> Option<Exposure> {
+        let between = |track: &Track<Geodetic>| {
+            let (a, b, share) = track.around(event.time_us)?;
+            let mix = |a: f64, b: f64| a + (b - a) * share;
+            Some(Geodetic {
+                lat_deg: mix(a.lat_deg, b.lat_deg),
+                lon_deg: mix(a.lon_deg, b.lon_deg),
+                alt_m: mix(a.alt_m, b.alt_m),
+            })
+        };
+        let position = event.fix.or_else(|| between(&self.places)).or_else(|| between(&self.receiver))?;
+        let own = event.camera.and_then(camera_attitude);
+        let attitude = own.or_else(|| {
+            let (a, b, share) = self.attitudes.around(event.time_us)?;
+            camera_attitude(a.slerp(b, share))
+        });
+        Some(Exposure { time_s: event.time_us as f64 * 1e-6, fix: Fix { position, sigma_m: SIGMA_M }, attitude })
+    }
+
+    fn series(mut self, path: &Path) -> Result<Vec<Series>, FormatError> {
+        let triggers: usize = self.triggers.values().map(Vec::len).sum();
+        let mut lists = std::mem::take(&mut self.captures);
+        if lists.is_empty() {
+            lists = std::mem::take(&mut self.triggers);
+            for list in lists.values_mut() {
+                // A pulse of the hot-shoe is the exposure, the command is not.
+                if list.iter().any(|e| e.is_pulse) {
+                    list.retain(|e| e.is_pulse);
+                }
+            }
+        }
+        let of = |(camera, list): (u8, Vec<Event>)| {
+            let mut exposures: Vec<Exposure> = list.iter().filter_map(|e| self.placed(e)).collect();
+            exposures.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+            Series { source: Source { camera: Some(camera), ..Source::default() }, exposures }
+        };
+        let mut series: Vec<Series> = lists.into_iter().map(of).filter(|s| !s.exposures.is_empty()).collect();
+        if let [only] = series.as_mut_slice() {
+            only.source = Source::default();
+        }
+        let what = match (series.is_empty(), triggers) {
+            (false, _) => return Ok(series),
+            (true, 0) => {
+                "holds no exposures (topics camera_capture or camera_trigger); was the camera triggered by the autopilot, and does SDLOG_PROFILE log it?"
+            }
+            (true, _) => {
+                "holds exposures without a place: neither camera_capture nor vehicle_global_position or vehicle_gps_position gives one"
+            }
+        };
+        Err(FormatError::invalid(path, what))
+    }
+}
+
+/// Messages of a file, one after the other, past damage and to where appended ones begin.
+struct Messages<'p, R> {
+    path: &'p Path,
+    reader: R,
+    at: u64,
+    /// Where data begin that were appended after a crash.
+    appended: Vec<u64>,
+    message: Vec<u8>,
+}
+
+impl<R: Read + Seek> Messages<'_, R> {
+    /// Fills `message` with `len` bytes, or fewer at the end of the file.
+    fn fill(&mut self, len: usize) -> Result<bool, FormatError> {
+        self.message.clear();
+        let read = self.reader.by_ref().take(len as u64).read_to_end(&mut self.message);
+        let read = read.map_err(|e| FormatError::io(self.path, "reading", e))?;
+        self.at += read as u64;
+        Ok(read == len)
+    }
+
+    /// The kind of the next message, whose content is then in `message`.
+    fn next(&mut self) -> Result<Option<u8>, FormatError> {
+        loop {
+            if !self.fill(3)? {
+                return Ok(None);
+            }
+            let (size, kind) = (usize::from(u16::from_le_bytes([self.message[0], self.message[1]])), self.message[2]);
+            let (start, end) = (self.at - 3, self.at + size as u64);
+            // What was written when the power failed is cut off where the appended data begin.
+            if let Some(cut) = self.appended.iter().position(|to| start < *to && *to < end) {
+                self.at = self.appended.swap_remove(cut);
+                self.reader.seek(SeekFrom::Start(self.at)).map_err(|e| FormatError::io(self.path, "reading", e))?;
+                continue;
+            }
+            match () {
+                () if KINDS.contains(&kind) => return Ok(self.fill(size)?.then_some(kind)),
+                () => {
+                    if !self.after_sync()? {
+                        return Ok(None);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Passes over everything up to the end of the next mark.
+    fn after_sync(&mut self) -> Result<bool, FormatError> {
+        let mut last = [0u8; SYNC.len()];
+        while last != SYNC {
+            if !self.fill(1)? {
+                return Ok(false);
+            }
+            last.rotate_left(1);
+            last[SYNC.len() - 1] = self.message[0];
+        }
+        Ok(true)
+    }
+}
+
+/// Reads the exposures of the log at `path`.
+///
+/// # Errors
+/// The file cannot be read, is no such log, describes more messages than any log, or holds no exposures that it places.
+pub fn read(path: &Path) -> Result<Vec<Series>, FormatError> {
+    let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
+    let reader = BufReader::with_capacity(1 << 16, file);
+    let mut messages = Messages { path, reader, at: 0, appended: Vec::new(), message: Vec::with_capacity(1 << 16) };
+    if !messages.fill(HEADER as usize)? || !messages.message.starts_with(&MAGIC) {
+        return Err(FormatError::invalid(path, "not a PX4 log (.ulg)"));
+    }
+    let (mut formats, mut described) = (HashMap::<String, Vec<Field>>::new(), 0);
+    let (mut topics, mut found) = (HashMap::<u16, Topic>::new(), Found::default());
+    while let Some(kind) = messages.next()? {
+        let data = messages.message.as_slice();
+        match kind {
+            b'B' => {
+                let offsets = data.get(16..40).unwrap_or_default().chunks_exact(8);
+                let offsets = offsets.filter_map(|b| Some(u64::from_le_bytes(b.try_into().ok()?)));
+                messages.appended = offsets.filter(|at| *at > HEADER).collect();
+            }
+            b'F' => {
+                described += data.len();
+                if described > MAX_DESCRIBED {
+                    return Err(FormatError::invalid(path, "describes more messages than any PX4 log does"));
+                }
+                formats.extend(format(data));
+            }
+            b'A' => {
+                let (Some(instance), Some(id), Some(name)) = (data.first(), data.get(1..3), data.get(3..)) else {
+                    continue;
+                };
+                let id = u16::from_le_bytes([id[0], id[1]]);
+                let name = String::from_utf8_lossy(name);
+                if let Some(kind) = Kind::named(name.trim_end_matches('\0')) {
+                    let fields = fields(&formats, &name).unwrap_or_default();
+                    topics.insert(id, Topic { kind, instance: *instance, fields });
+                }
+            }
+            b'D' => {
+                let Some((id, data)) = data.split_first_chunk::<2>() else { continue };
+                if let Some(topic) = topics.get(&u16::from_le_bytes(*id)) {
+                    found.take(topic, data);
+                }
+            }
+            _ => {}
+        }
+    }
+    found.series(path)
+}
+
+/// `name:type field;type[3] field;…`.
+fn format(message: &[u8]) -> Option<(String, Vec<Field>)> {
+    let text = std::str::from_utf8(message).ok()?;
+    let (name, fields) = text.split_once(':')?;
+    let field = |text: &str| {
+        let (kind, name) = text.trim().split_once(' ')?;
+        let (kind, elements) = match kind.split_once('[') {
+            Some((kind, n)) => (kind, n.strip_suffix(']')?.parse().ok().filter(|n| (1..=65_535).contains(n))?),
+            None => (kind, 0),
+        };
+        Some((kind.to_owned(), elements, name.to_owned()))
+    };
+    let fields: Option<Vec<Field>> = fields.split(';').filter(|f| !f.trim().is_empty()).map(field).collect();
+    Some((name.to_owned(), fields?))
+}
+
+/// Offset and type of the fields of `name`.
+fn fields(formats: &HashMap<String, Vec<Field>>, name: &str) -> Option<HashMap<String, (usize, String)>> {
+    let (mut at, mut fields) = (0usize, HashMap::new());
+    for (kind, elements, field) in formats.get(name)? {
+        fields.insert(field.clone(), (at, kind.clone()));
+        at = at.checked_add(size_of(formats, kind, DEEPEST)?.checked_mul((*elements).max(1))?)?;
+        if at > usize::from(u16::MAX) {
+            return None;
+        }
+    }
+    Some(fields)
+}
+
+fn size_of(formats: &HashMap<String, Vec<Field>>, kind: &str, deep: usize) -> Option<usize> {
+    if let Some(size) = size_of_simple(kind) {
+        return Some(size);
+    }
+    let mut size = 0usize;
+    for (kind, elements, _) in formats.get(kind).filter(|_| deep > 0)? {
+        size = size.checked_add(size_of(formats, kind, deep - 1)?.checked_mul((*elements).max(1))?)?;
+        if size > usize::from(u16::MAX) {
+            return None;
+        }
+    }
+    // A type of nothing could be nested without end.
+    (size > 0).then_some(size)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a test may
+mod tests {
+    use super::*;
+    use crate::card::record::{AttitudeSource, nadir_rotation};
+    use glam::DVec3;
+
+    fn message(kind: u8, content: &[u8]) -> Vec<u8> {
+        [&(content.len() as u16).to_le_bytes()[..], &[kind], content].concat()
+    }
+
+    fn topic(id: u16, instance: u8, name: &str) -> Vec<u8> {
+        message(b'A', &[&[instance][..], &id.to_le_bytes(), name.as_bytes()].concat())
+    }
+
+    fn data(id: u16, parts: &[&[u8]]) -> Vec<u8> {
+        message(b'D', &[&id.to_le_bytes()[..], &parts.concat()].concat())
+    }
+
+    /// Flag bits that promise nothing, and what PX4 1.14 says of its topics, a type within a type included.
+    fn head() -> Vec<u8> {
+        let mut log = [&MAGIC[..], &[1], &7u64.to_le_bytes()].concat();
+        log.extend(message(b'B', &[0; 40]));
+        for format in [
+            "camera_capture:uint64_t timestamp;uint64_t timestamp_utc;double lat;double lon;uint32_t seq;float alt;float ground_distance;float[4] q;int8_t result;uint8_t[3] _padding0;",
+            "camera_trigger:uint64_t timestamp;uint64_t timestamp_utc;uint32_t seq;bool feedback;uint8_t[3] _padding0;",
+            "covariance:float[6] values;",
+            "vehicle_global_position:uint64_t timestamp;covariance[2] c;double lat;double lon;float alt;",
+            "vehicle_gps_position:uint64_t timestamp;int32_t lat;int32_t lon;int32_t alt;",
+            "vehicle_attitude:uint64_t timestamp;float[4] q;",
+        ] {
+            log.extend(message(b'F', format.as_bytes()));
+        }
+        log.extend(message(b'I', b"\x10char[3] sys_namePX4"));
+        for (id, name) in [
+            (0, "camera_capture"),
+            (1, "camera_trigger"),
+            (2, "vehicle_global_position"),
+            (3, "vehicle_attitude"),
+            (4, "vehicle_gps_position"),
+        ] {
+            log.extend(topic(id, 0, name));
+        }
+        log
+    }
+
+    fn time(s: f64) -> [u8; 8] {
+        ((s * 1e6) as u64).to_le_bytes()
+    }
+
+    fn q(yaw_deg: f64, pitch_deg: f64) -> Vec<u8> {
+        let q = DQuat::from_rotation_z(yaw_deg.to_radians()) * DQuat::from_rotation_y(pitch_deg.to_radians());
+        [q.w, q.x, q.y, q.z].iter().flat_map(|v| (*v as f32).to_le_bytes()).collect()
+    }
+
+    fn capture(s: f64, lat: f64, q: &[u8], result: i8) -> Vec<u8> {
+        let (lat, lon) = (lat.to_le_bytes(), (-91.9945f64).to_le_bytes());
+        let (seq, alt, ground) = (1u32.to_le_bytes(), 198.5f32.to_le_bytes(), f32::NAN.to_le_bytes());
+        data(0, &[&time(s), &[0; 8], &lat, &lon, &seq, &alt, &ground, q, &result.to_le_bytes(), &[0; 3]])
+    }
+
+    /// A second of flight to the north at 1e-5 degrees a second, at 10 Hz.
+    fn flown(s: u32, log: &mut Vec<u8>) {
+        for tenth in 0..10 {
+            let t = f64::from(s) + f64::from(tenth) * 0.1;
+            let (lat, lon, alt) = ((46.0 + 1e-5 * t).to_le_bytes(), 7f64.to_le_bytes(), 400f32.to_le_bytes());
+            log.extend(data(2, &[&time(t), &[0; 48], &lat, &lon, &alt]));
+            log.extend(data(3, &[&time(t), &q(90.0, 2.0)]));
+        }
+    }
+
+    fn read_bytes(log: &[u8]) -> Result<Vec<Series>, FormatError> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("flight.log");
+        std::fs::write(&path, log).unwrap();
+        super::super::read(&path).map(Option::unwrap)
+    }
+
+    #[test]
+    fn captures_of_a_px4_log_have_place_time_and_the_airframes_or_the_gimbals_attitude() {
+        let mut log = head();
+        log.extend(capture(10.0, 46.8426, &q(90.0, 3.0), 1));
+        log.extend(capture(12.5, 46.8427, &q(45.0, -90.0), -1));
+        log.extend(capture(14.0, 46.8428, &q(45.0, 0.0), 0));
+        log.extend(capture(15.0, 46.8429, &q(0.0, 0.0), 1));
+        let series = read_bytes(&log).unwrap();
+        let [Series { exposures, .. }] = series.as_slice() else { panic!("{series:?}") };
+        let times: Vec<f64> = exposures.iter().map(|e| e.time_s).collect();
+        assert_eq!(times, [10.0, 12.5, 15.0], "the camera says that it took no third one");
+        assert_eq!(exposures[0].fix.position, Geodetic { lat_deg: 46.8426, lon_deg: -91.9945, alt_m: 198.5 });
+        for (e, source, forward_at_most) in [(0, AttitudeSource::Airframe, -0.99), (1, AttitudeSource::Gimbal, -0.9999)]
+        {
+            let attitude = exposures[e].attitude.unwrap();
+            let forward = attitude.rotation * DVec3::Z;
+            assert!(attitude.source == source && forward.z < forward_at_most, "{e}: {attitude:?} {forward}");
+        }
+        assert!(exposures[2].attitude.is_none(), "the identity says nothing");
+    }
+
+    #[test]
+    fn triggers_are_placed_between_positions_and_pulses_of_the_hot_shoe_count_more_than_commands() {
+        let of = |pulses: bool| {
+            let mut log = head();
+            for s in 5..9 {
+                flown(s, &mut log);
+                let trigger = |t: f64, pulse: bool| data(1, &[&time(t), &[0; 8], &[0; 4], &[pulse.into()], &[0; 3]]);
+                log.extend(trigger(f64::from(s) + 0.25, false));
+                if pulses {
+                    log.extend(trigger(f64::from(s) + 0.35, true));
+                }
+            }
+            read_bytes(&log).unwrap().remove(0).exposures
+        };
+        for (pulses, after) in [(false, 0.25), (true, 0.35)] {
+            let exposures = of(pulses);
+            assert_eq!(exposures.len(), 4, "{pulses}");
+            for (s, e) in (5..9).zip(&exposures) {
+                let t = f64::from(s) + after;
+                assert!(
+                    (e.time_s - t).abs() < 1e-6 && (e.fix.position.lat_deg - 46.0 - 1e-5 * t).abs() < 1e-8,
+                    "{e:?}"
+                );
+                let turned = e.attitude.unwrap().rotation.angle_between(nadir_rotation(90.0, 2.0, 0.0));
+                assert!(turned < 1e-3, "{turned}");
+            }
+        }
+    }
+
+    #[test]
+    fn without_an_estimate_the_receiver_places_triggers_and_without_either_the_log_says_what_it_lacks() {
+        let trigger = |t: f64| data(1, &[&time(t), &[0; 8], &[0; 4], &[0], &[0; 3]]);
+        let mut log = [head(), trigger(5.2), trigger(5.4)].concat();
+        let error = read_bytes(&log).unwrap_err().to_string();
+        assert!(error.contains("without a place") && !error.contains('\n'), "{error}");
+        for (t, lat) in [(5.0, 460_000_000i32), (6.0, 460_001_000)] {
+            log.extend(data(
+                4,
+                &[&time(t), &lat.to_le_bytes(), &70_000_000i32.to_le_bytes(), &400_500i32.to_le_bytes()],
+            ));
+        }
+        let found = read_bytes(&log).unwrap().remove(0).exposures;
+        assert_eq!((found.len(), found[0].fix.position.alt_m), (2, 400.5));
+        assert!((found[0].fix.position.lat_deg - 46.000_02).abs() < 1e-9, "{found:?}");
+        let error = read_bytes(&head()).unwrap_err().to_string();
+        assert!(error.contains("camera_capture") && !error.contains('\n'), "{error}");
+    }
+
+    #[test]
+    fn damage_costs_what_it_hit_and_data_appended_after_a_crash_are_read() {
+        let north = q(0.0, 3.0);
+        let captures = |from: i32| -> Vec<u8> {
+            (from..from + 3).flat_map(|s| capture(f64::from(s), 46.0 + 1e-4 * f64::from(s), &north, 1)).collect()
+        };
+        let holed = [head(), captures(1), vec![0xFF; 100], SYNC.to_vec(), captures(11)].concat();
+        assert_eq!(read_bytes(&holed).unwrap()[0].exposures.len(), 6);
+        let mut appended = [head(), captures(1)].concat();
+        let whole = appended.len();
+        appended.extend(&capture(9.0, 46.0, &north, 1)[..20]);
+        let at = appended.len() as u64;
+        appended.extend(captures(11));
+        let flags = (HEADER as usize + 3)..(HEADER as usize + 43);
+        appended[flags][16..24].copy_from_slice(&at.to_le_bytes());
+        assert_eq!(read_bytes(&appended).unwrap()[0].exposures.len(), 6, "{whole} {at}");
+        for len in 0..whole {
+            if len >= MAGIC.len() {
+                assert!(read_bytes(&appended[..len]).map_or(true, |s| s[0].exposures.len() <= 3), "{len}");
+            }
+        }
+    }
+}
