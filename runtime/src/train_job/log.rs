@@ -6,7 +6,7 @@ use std::path::Path;
 
 use geometry::geodesy::Geodetic;
 use glam::DQuat;
-use hal::mavlink::dialect::{CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA};
+use hal::mavlink::dialect::{CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, MavBool};
 use hal::mavlink::{Frame, Framer};
 use models::formats::FormatError;
 use survey::card::log::{MAX_EXPOSURES, SIGMA_M};
@@ -166,7 +166,7 @@ fn report(frame: &Frame<'_>) -> Option<(u8, Told, Report)> {
     }
     let f = frame.message::<CAMERA_IMAGE_CAPTURED_DATA>()?;
     // 0: the camera says that it took none; −1: nobody knows.
-    if f.capture_result == 0 {
+    if f.capture_result == MavBool::MAV_BOOL_FALSE {
         return None;
     }
     let position = place([f.lat, f.lon], f64::from(f.alt) * 1e-3)?;
@@ -295,7 +295,7 @@ mod tests {
     #[test]
     fn captured_pictures_of_px4_are_exposures_unless_the_camera_says_that_it_took_none() {
         let mut log = Written::default();
-        for (i, capture_result) in [1, -1, 0, 1].into_iter().enumerate() {
+        for (i, capture_result) in [1u8, 255, 0, 1].into_iter().enumerate() {
             let message = CAMERA_IMAGE_CAPTURED_DATA {
                 time_boot_ms: 1000 + 3000 * i as u32,
                 lat: 468_426_000 + i as i32,
@@ -303,7 +303,7 @@ mod tests {
                 alt: 198_500,
                 q: [0.0, 1.0, 0.0, 0.0],
                 image_index: i as i32,
-                capture_result,
+                capture_result: MavBool::from_bits_retain(capture_result),
                 ..CAMERA_IMAGE_CAPTURED_DATA::default()
             };
             log.add(f64::from(i as u32), (1, 100), &message);
