@@ -7,6 +7,8 @@
 
 mod alignment;
 #[cfg(feature = "std")]
+mod doubled;
+#[cfg(feature = "std")]
 pub mod landing;
 #[cfg(feature = "std")]
 pub mod reconcile;

@@ -4,7 +4,6 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use config::keys::to_hex;
@@ -17,35 +16,10 @@ use hal::vehicle::{Event, Vehicle, VehicleSettings};
 
 const KEY: [u8; 32] = [0x5A; 32];
 
-/// One test installs, the others wait for it.
-static SETUP: Mutex<()> = Mutex::new(());
+mod python;
 
 fn python() -> Option<PathBuf> {
-    let _guard = SETUP.lock().unwrap_or_else(PoisonError::into_inner);
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("pymavlink");
-    let python = folder.join("bin/python");
-    let works = || {
-        let quiet = Command::new(&python).args(["-c", "import pymavlink, serial"]).stderr(Stdio::null()).status();
-        quiet.is_ok_and(|s| s.success())
-    };
-    let run = |program: &Path, arguments: &[&str]| {
-        let status = Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status();
-        status.is_ok_and(|s| s.success())
-    };
-    let target = folder.to_string_lossy().into_owned();
-    if works()
-        || (run(Path::new("python3"), &["-m", "venv", &target])
-            && run(&python, &["-m", "pip", "install", "--quiet", "pymavlink==2.4.49", "pyserial==3.5"])
-            && works())
-    {
-        Some(python)
-    } else {
-        needs::missing(
-            needs::Need::PythonPackages,
-            "pymavlink cannot be installed here (needs python3 with venv, and a package index)",
-        );
-        None
-    }
+    python::with("pymavlink", &["pymavlink==2.4.49", "pyserial==3.5"], "pymavlink, serial")
 }
 
 /// What happened on our side.

@@ -4,6 +4,7 @@
 use super::alignment::{Band, Chain, Model, Rows, Slot, chance, confidence, interval, stride};
 use std::collections::HashSet;
 
+use super::doubled;
 use super::reconcile::Pairing;
 use super::{FIRST_JITTER_NS2, LEAST_CONFIDENCE, MatcherSettings, rarity};
 use crate::traits::PictureClues;
@@ -102,7 +103,7 @@ pub fn settle(
         known.iter().enumerate().map(|(k, pair)| (pair.1, Ok(k))).chain(waiting).collect();
     in_order(&mut all);
     let clues: Vec<PictureClues> = all.iter().map(|a| a.0).collect();
-    let answers = align(exposures, &clues, settings);
+    let answers = align_shutters(exposures, &clues, settings);
     let (mut taken, mut revised) = (HashSet::new(), Vec::new());
     for (answer, (_, place)) in answers.iter().zip(&all) {
         let Ok(k) = *place else { continue };
@@ -121,6 +122,21 @@ pub fn settle(
         }
     }
     (pairs, revised)
+}
+
+/// As [`align`], with the shutter's announcements alone where each picture is announced twice.
+fn align_shutters(exposures: &[Trigger], pictures: &[PictureClues], settings: MatcherSettings) -> Vec<Answer> {
+    let Some(shutters) = doubled::shutters(exposures, pictures.len()) else {
+        return align(exposures, pictures, settings);
+    };
+    // The counter counts both: what is left out is no gap.
+    let numbered = (0..).zip(&shutters).map(|(sequence, k)| Trigger { sequence, ..exposures[*k] });
+    let mut answers = align(&numbered.collect::<Vec<_>>(), pictures, settings);
+    for answer in &mut answers {
+        answer.exposure = answer.exposure.map(|k| shutters[k]);
+        answer.other = answer.other.map(|k| shutters[k]);
+    }
+    answers
 }
 
 /// Sorts pictures as they were taken: as they came, but by their numbers where one came late.

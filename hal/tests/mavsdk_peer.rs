@@ -1,0 +1,188 @@
+//! MAVSDK, whose camera client ground stations' programs are built on, beside a vehicle whose camera is ours: what it lists, sets, takes
+//! and is told. The set-up installs it into a virtual environment below `target/`; without Python or a network it is skipped.
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
+
+use std::net::{SocketAddr, UdpSocket};
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use config::link::LinkSettings;
+use config::mission::{CameraSettings, CameraSource, MountAttitude, MountSettings};
+use geometry::geodesy::Geodetic;
+use hal::link::LinkAddress;
+use hal::mavlink::dialect::{
+    ATTITUDE_DATA, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavState, MavType, SYSTEM_TIME_DATA,
+};
+use hal::mavlink::{Encoder, MessageData};
+use hal::vehicle::{Event, Vehicle, VehicleSettings};
+
+mod python;
+
+const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 };
+
+/// An autopilot at 10 Hz that hands everything on between the vehicle's port and the client's, as routers on board do.
+struct Router {
+    vehicle: UdpSocket,
+    client: UdpSocket,
+    client_at: SocketAddr,
+}
+
+impl Router {
+    fn run(&self, over: &AtomicBool) {
+        let mut vehicle_at = None;
+        let mut encoder = Encoder::new(1, 1);
+        let (started, mut next) = (Instant::now(), Instant::now());
+        let mut bytes = [0; 2048];
+        while !over.load(Ordering::Relaxed) {
+            while let Ok((n, from)) = self.vehicle.recv_from(&mut bytes) {
+                vehicle_at = Some(from);
+                let _ = self.client.send_to(&bytes[..n], self.client_at);
+            }
+            while let Ok((n, _)) = self.client.recv_from(&mut bytes) {
+                vehicle_at.map(|at| self.vehicle.send_to(&bytes[..n], at));
+            }
+            if Instant::now() >= next {
+                next += Duration::from_millis(100);
+                let boot_ms = 60_000 + started.elapsed().as_millis() as u32;
+                let tell = |frame: &[u8]| {
+                    let _ = self.client.send_to(frame, self.client_at);
+                    vehicle_at.map(|at| self.vehicle.send_to(frame, at));
+                };
+                tell(encoded(
+                    &mut encoder,
+                    &HEARTBEAT_DATA {
+                        mavtype: MavType::MAV_TYPE_QUADROTOR,
+                        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+                        system_status: MavState::MAV_STATE_STANDBY,
+                        mavlink_version: 3,
+                        ..HEARTBEAT_DATA::default()
+                    },
+                ));
+                tell(encoded(
+                    &mut encoder,
+                    &SYSTEM_TIME_DATA {
+                        time_unix_usec: 1_780_000_000_000_000 + u64::from(boot_ms) * 1000,
+                        time_boot_ms: boot_ms,
+                    },
+                ));
+                tell(encoded(&mut encoder, &ATTITUDE_DATA { time_boot_ms: boot_ms, ..ATTITUDE_DATA::default() }));
+                tell(encoded(
+                    &mut encoder,
+                    &GLOBAL_POSITION_INT_DATA {
+                        time_boot_ms: boot_ms,
+                        lat: (ORIGIN.lat_deg * 1e7) as i32,
+                        lon: (ORIGIN.lon_deg * 1e7) as i32,
+                        alt: (ORIGIN.alt_m * 1e3) as i32 + 40_000,
+                        relative_alt: 40_000,
+                        ..GLOBAL_POSITION_INT_DATA::default()
+                    },
+                ));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+fn encoded<'e, D: MessageData>(encoder: &'e mut Encoder, message: &D) -> &'e [u8] {
+    encoder.encode(message, None)
+}
+
+fn socket() -> UdpSocket {
+    let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+    socket.set_nonblocking(true).expect("a socket");
+    socket
+}
+
+#[test]
+fn mavsdks_camera_client_lists_sets_and_takes_and_is_told_of_each_picture() {
+    let Some(python) = python::with("mavsdk", &["mavsdk==4.1.0"], "mavsdk.mavsdk") else { return };
+    let folder = tempfile::tempdir().expect("a folder");
+    let router = Router {
+        vehicle: socket(),
+        client: socket(),
+        // Free a moment ago, and the client's now.
+        client_at: socket().local_addr().expect("an address"),
+    };
+    let settings = VehicleSettings {
+        address: LinkAddress::UdpOut(router.vehicle.local_addr().expect("an address").to_string()),
+        patient: false,
+        system_id: 1,
+        link: LinkSettings::default(),
+        failsafe: config::failsafe::FailsafeSettings::default(),
+        camera: Some(CameraSource::Folder(folder.path().into())),
+        pictures_since: None,
+        lens: CameraSettings {
+            width: 32,
+            height: 24,
+            fx: 25.0,
+            fy: 25.0,
+            cx: 16.0,
+            cy: 12.0,
+            distortion: [0.0; 4],
+            exposure_delay_ms: 0.0,
+            index: None,
+        },
+        mount: MountSettings {
+            attitude: MountAttitude::Fixed,
+            rotation_deg: [0.0, -90.0, 0.0],
+            ..MountSettings::default()
+        },
+        origin: ORIGIN,
+    };
+    let mut vehicle = Vehicle::open(&settings).expect("a link");
+    let mut picture = std::io::Cursor::new(Vec::new());
+    image::RgbImage::new(32, 24).write_to(&mut picture, image::ImageFormat::Jpeg).expect("encoded");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/mavsdk_client.py");
+    let over = AtomicBool::new(false);
+    let (output, asked, posed) = std::thread::scope(|scope| {
+        scope.spawn(|| router.run(&over));
+        let mut client = Command::new(python)
+            .arg(script)
+            .arg(router.client_at.port().to_string())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("python starts");
+        let (mut taken, mut asked, mut posed, mut events) = (0, Vec::new(), 0, Vec::new());
+        while client.try_wait().expect("a child").is_none() {
+            match vehicle.poll(Duration::from_millis(50)).expect("a link") {
+                Some(Event::Trigger(_)) => {
+                    taken += 1;
+                    std::fs::write(folder.path().join(format!("IMG_{taken:04}.jpg")), picture.get_ref())
+                        .expect("written");
+                }
+                Some(Event::Asked { parameter, value }) => {
+                    asked.push(value);
+                    vehicle.answer(parameter, Some(value));
+                }
+                Some(Event::Posed(_)) => posed += 1,
+                Some(Event::Pose(_)) | None => {}
+                Some(other) => events.push(format!("{other:?}")),
+            }
+        }
+        over.store(true, Ordering::Relaxed);
+        println!("{taken} taken, {posed} posed, {events:?}, {:?}", vehicle.counters());
+        (client.wait_with_output().expect("its output"), asked, posed)
+    });
+    let said = String::from_utf8_lossy(&output.stdout);
+    // The client writes its own log there, too.
+    let report = said.lines().rev().find(|line| line.starts_with('{')).unwrap_or_else(|| panic!("{said}"));
+    let report: serde_json::Value = serde_json::from_str(report).expect("its report");
+    assert!(output.status.success() && report["failed"].is_null(), "{report}");
+    assert_eq!(report["camera"], serde_json::json!([100, 32, 24]), "{report}");
+    assert!(report["settings"].as_array().is_some_and(|s| s.len() >= 3), "{report}");
+    assert!(report["options"].to_string().contains("KF_DISTANCE"), "{report}");
+    assert_eq!(
+        (asked.as_slice(), report["set"].as_str().and_then(|v| v.parse().ok())),
+        (&[5.5][..], Some(5.5)),
+        "{report}"
+    );
+    // Each of them once, with the exposure's own time, counted from 0.
+    let captured = report["captured"].as_array().expect("a list");
+    let indices: Vec<i64> = captured.iter().filter_map(|c| c[0].as_i64()).collect();
+    assert_eq!(indices, (0..indices.len() as i64).collect::<Vec<_>>(), "{report}");
+    assert!(indices.len() >= 4 && posed >= indices.len(), "{posed}: {report}");
+    assert!(captured.iter().all(|c| c[1] == true && c[2] == true), "{report}");
+    assert!(report["photos"].as_array().is_some_and(|p| p.len() >= 4), "{report}");
+}
