@@ -53,7 +53,10 @@ mod upright;
 pub use bootstrap::BootstrapReport;
 pub use control::ControlPoint;
 pub use positions::PositionsReport;
-pub use report::{AddReport, ControlResidual, NearReport, RefineReport, RefinedPoint, SharedEstimate};
+pub use report::{
+    AddReport, ControlResidual, LENS_PARAMETERS, LensPrecision, NearReport, PosePrecision, RefineReport, RefinedPoint,
+    SharedEstimate,
+};
 pub use untied::Untied;
 
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
@@ -371,8 +374,9 @@ impl Refiner {
 
     /// Tells of every tied key frame how well its place is known. No longer takes those for tied that do not agree with the largest part of
     /// the scene, or whose place is known to a tenth of the distance to what they show or worse. Call it after a [`Refiner::solve`].
-    pub fn judge(&mut self) {
-        certainty::judge(self);
+    /// Returns how well the lens is known: `None` of more pictures than the equations are inverted of, or where they tell nothing.
+    pub fn judge(&mut self) -> Option<LensPrecision> {
+        certainty::judge(self)
     }
 
     /// Takes their places from key frames that do not agree with the scene, so that the next [`Refiner::solve`] is not bent by them; false
@@ -385,10 +389,9 @@ impl Refiner {
         any
     }
 
-    /// Standard deviation of the key frame's place as [`Refiner::judge`] left it, in the scene's units: within the scene where nothing says
-    /// where that is.
-    pub fn certainty(&self, name: &str) -> Option<f64> {
-        self.by_name.get(name).and_then(|i| self.frames[*i as usize].known.certainty)
+    /// How well the key frame's pose is known, as [`Refiner::judge`] left it.
+    pub fn precision(&self, name: &str) -> Option<PosePrecision> {
+        self.by_name.get(name).and_then(|i| self.frames[*i as usize].known.precision)
     }
 
     /// The key frames that are not part of the scene: those that nothing ties, and those that no chain of verified pairs joins to its

@@ -39,7 +39,7 @@ fn outcome(seed: u64) -> Outcome {
     out.reprojection_px = report.reprojection_rms_px;
     for (k, i) in tied.iter().enumerate() {
         let Some(by) = &by else { continue };
-        let sigma = refiner.certainty(&cards::name(*i)).unwrap_or(0.0) * by.scale;
+        let sigma = refiner.precision(&cards::name(*i)).map_or(0.0, |p| p.distance()) * by.scale;
         let off = by.apply(found[k]).distance(truth[k]);
         if off > 3.0 * sigma + 0.5 {
             out.lies.push((cards::name(*i), off, sigma));

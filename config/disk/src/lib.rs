@@ -17,6 +17,7 @@ mod lock;
 mod operations;
 pub mod plan;
 pub mod regular;
+pub mod table;
 
 pub use lock::FolderLock;
 pub use operations::{Operations, Output, System};

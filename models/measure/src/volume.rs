@@ -141,11 +141,9 @@ pub fn write_table(out: &mut dyn Write, volumes: &[Volume]) -> io::Result<()> {
         "name,area_m2,unseen_m2,cut_m3,cut_sigma_m3,fill_m3,fill_sigma_m3,net_m3,net_sigma_m3,highest_m,lowest_m"
     )?;
     for v in volumes {
-        // A name that a spreadsheet would take for a formula is none.
-        let name = v.name.replace('"', "\"\"");
-        let name = if name.starts_with(['=', '+', '-', '@']) { format!("'{name}") } else { name };
+        let name = disk::table::field(&v.name);
         let numbers = [v.cut_m3, v.fill_m3, v.net_m3].map(|m| format!("{:.3},{:.3}", m.value, m.sigma)).join(",");
-        writeln!(out, "\"{name}\",{:.3},{:.3},{numbers},{:.3},{:.3}", v.area_m2, v.unseen_m2, v.highest_m, v.lowest_m)?;
+        writeln!(out, "{name},{:.3},{:.3},{numbers},{:.3},{:.3}", v.area_m2, v.unseen_m2, v.highest_m, v.lowest_m)?;
     }
     Ok(())
 }

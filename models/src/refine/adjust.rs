@@ -1,10 +1,9 @@
 //! Levenberg–Marquardt on the reduced equations, and the question which shared parameters the pictures can tell.
 
-use super::problem::{ASPECT, FOCAL, Loss, PRINCIPAL, Problem, RADIAL, SHARED};
+use super::problem::{ASPECT, FOCAL, INDEPENDENT, Loss, PRINCIPAL, Problem, RADIAL, SHARED};
 use super::reduced::Step;
 use super::schur::{FrameVec, Reduced, SharedVec, point_steps};
 use super::so3;
-use super::solving::INDEPENDENT;
 use glam::{DVec2, DVec3};
 use std::time::Instant;
 

@@ -8,11 +8,12 @@ use glam::DVec3;
 use nalgebra::DMatrix;
 
 use super::adjust::{Limits, adjust};
+use super::calibration::LENS;
 use super::keyframe::belongs;
 use super::linking::median;
-use super::problem::{Loss, Problem};
+use super::problem::{FOCAL, INDEPENDENT, Loss, Problem, SHARED};
+use super::report::{LENS_PARAMETERS, LensPrecision, PosePrecision};
 use super::schur::Reduced;
-use super::solving::INDEPENDENT;
 use super::tracks::Tracks;
 use super::{Refiner, agreement};
 use crate::align::similarity::{Similarity, umeyama};
@@ -26,61 +27,91 @@ const LOOSE: f64 = 0.1;
 /// No place is known better than to this share of that distance: key points are of single precision.
 const LEAST: f64 = 1e-6;
 
-/// Standard deviation of a place, in the scene's units.
+/// Standard deviations of a place along each axis, in the scene's units, and of the angles.
 #[derive(Clone, Copy, Debug, Default)]
 struct Doubt {
     /// Once what moves, turns and scales all places alike is taken out.
-    within: f64,
-    on_earth: f64,
+    within: DVec3,
+    on_earth: DVec3,
+    /// About the camera's axes, radians; of the scene as it lies.
+    angles: DVec3,
 }
 
 /// Tells of every tied key frame how well its place is known, and no longer takes those for tied whose place is known to a tenth of the
 /// distance to what they show or worse. Call it after the last [`Refiner::solve`].
-pub(super) fn judge(refiner: &mut Refiner) {
+pub(super) fn judge(refiner: &mut Refiner) -> Option<LensPrecision> {
     let tracks = Tracks::build(&mut refiner.union, &refiner.frames, refiner.settings.max_observations);
     agreement::agree(refiner, &tracks);
     let most = refiner.settings.max_tracks.max(refiner.settings.tracks_per_keyframe * refiner.frames.len());
     let chosen = tracks.select(refiner.frames.len(), most);
-    let (formal, halves) = (by_equations(refiner, &tracks, &chosen), by_halves(refiner, &tracks, &chosen));
+    let ((formal, lens), halves) = (by_equations(refiner, &tracks, &chosen), by_halves(refiner, &tracks, &chosen));
     let floats = refiner.standing.floating && !refiner.standing.fixed;
+    let told_angles = !floats && !formal.is_empty();
     for (i, frame) in refiner.frames.iter_mut().enumerate() {
-        frame.known.certainty = None;
+        frame.known.precision = None;
         let Some((near, far)) = frame.known.depths.filter(|_| frame.tied && !frame.known.apart) else { continue };
         let depth = f64::from(near * far).sqrt();
-        let sigma = |of: fn(&Doubt) -> f64| of(&formal[i]).hypot(of(&halves[i])).max(LEAST * depth);
+        let formal = formal.get(i).copied().unwrap_or_default();
+        let least = DVec3::splat(LEAST * depth / 3f64.sqrt());
+        let sigma = |of: fn(&Doubt) -> DVec3| {
+            let (a, b) = (of(&formal), of(&halves[i]));
+            (a * a + b * b + least * least).map(f64::sqrt)
+        };
         let within = sigma(|d| d.within);
-        frame.known.certainty = Some(if floats { within } else { sigma(|d| d.on_earth) });
+        let rotation_deg = told_angles.then(|| formal.angles.map(f64::to_degrees).to_array());
+        let position = if floats { within } else { sigma(|d| d.on_earth) }.to_array();
+        frame.known.precision = Some(PosePrecision { position, rotation_deg });
         // Positions that are good to metres are no fault of a scene that is seen from as near.
-        frame.known.loose = within.is_nan() || within > LOOSE * depth;
+        frame.known.loose = within.is_nan() || within.length() > LOOSE * depth;
     }
+    lens
 }
 
-/// By the equations; 0 where there are too many of them.
-fn by_equations(refiner: &Refiner, tracks: &Tracks, chosen: &[u32]) -> Vec<Doubt> {
+/// By the equations, and of the lens; nothing where there are too many of them.
+fn by_equations(refiner: &Refiner, tracks: &Tracks, chosen: &[u32]) -> (Vec<Doubt>, Option<LensPrecision>) {
     let n = refiner.frames.len();
     if n > MOST {
-        return vec![Doubt::default(); n];
+        return (Vec::new(), None);
     }
     let mut problem = refiner.problem(tracks, chosen, refiner.settings.outlier_px);
     // Whatever is not known exactly is open, be it estimated or not.
     problem.free = problem.shared_weight.map(|w| w > 0.0);
     let per_frame = problem.observations.len() as f64 / n.max(1) as f64;
-    problem.pixel_sigma = noise(refiner, &problem) * (per_frame / INDEPENDENT).sqrt().max(1.0);
+    let (noise, dependence) = (noise(refiner, &problem), (per_frame / INDEPENDENT).sqrt().max(1.0));
+    problem.pixel_sigma = noise * dependence;
     let mut equations = Reduced::new(&problem);
     equations.fill(&problem, Loss::Cauchy(2.0), 0.0);
-    let mut doubt = vec![Doubt { within: f64::INFINITY, on_earth: f64::INFINITY }; n];
-    let Some(all) = equations.inverse() else { return doubt };
+    let unknown = DVec3::INFINITY;
+    let mut doubt = vec![Doubt { within: unknown, on_earth: unknown, angles: unknown }; n];
+    let Some(all) = equations.inverse() else { return (doubt, None) };
     let tied: Vec<usize> = (0..n).filter(|i| belongs(&refiner.frames[*i])).collect();
     let at = |k: usize| 6 * tied[k / 3] + 3 + k % 3;
     let mut places = DMatrix::from_fn(3 * tied.len(), 3 * tied.len(), |r, c| all[(at(r), at(c))]);
-    let sigma = |places: &DMatrix<f64>, k: usize| {
-        (0..3).map(|axis| places[(3 * k + axis, 3 * k + axis)]).sum::<f64>().max(0.0).sqrt()
+    let sigma = |of: &DMatrix<f64>, first: usize| {
+        DVec3::from_array(std::array::from_fn(|axis| of[(first + axis, first + axis)].max(0.0).sqrt()))
     };
-    tied.iter().enumerate().for_each(|(k, i)| doubt[*i].on_earth = sigma(&places, k));
+    for (k, i) in tied.iter().enumerate() {
+        (doubt[*i].on_earth, doubt[*i].angles) = (sigma(&places, 3 * k), sigma(&all, 6 * i));
+    }
     let centers: Vec<DVec3> = tied.iter().map(|i| refiner.frames[*i].pose.center).collect();
     without_similarities(&mut places, &centers);
-    tied.iter().enumerate().for_each(|(k, i)| doubt[*i].within = sigma(&places, k));
-    doubt
+    tied.iter().enumerate().for_each(|(k, i)| doubt[*i].within = sigma(&places, 3 * k));
+    let lens = of_lens(&all, 6 * n + FOCAL, &problem.free);
+    (doubt, Some(LensPrecision { sighting_sigma_px: noise, dependence, ..lens }))
+}
+
+/// What the covariance of all, in which the lens begins at row `first`, says of the lens.
+fn of_lens(all: &DMatrix<f64>, first: usize, free: &[bool; SHARED]) -> LensPrecision {
+    let open = |k: usize| free[FOCAL + k];
+    let sigma: [f64; LENS] =
+        std::array::from_fn(|k| if open(k) { all[(first + k, first + k)].max(0.0).sqrt() } else { 0.0 });
+    let correlation = |r: usize, c: usize| match (r == c, sigma[r] * sigma[c] > 0.0) {
+        (true, _) => 1.0,
+        (_, true) => (all[(first + r, first + c)] / (sigma[r] * sigma[c])).clamp(-1.0, 1.0),
+        _ => 0.0,
+    };
+    let correlation = std::array::from_fn(|r| std::array::from_fn(|c| correlation(r, c)));
+    LensPrecision { parameters: LENS_PARAMETERS, sigma, correlation, sighting_sigma_px: 0.0, dependence: 1.0 }
 }
 
 /// What is left of the sightings, robustly, and no less than the key points' own noise; pixels.
@@ -111,8 +142,12 @@ fn by_halves(refiner: &Refiner, tracks: &Tracks, chosen: &[u32]) -> Vec<Doubt> {
     let pick = |of: &[DVec3]| tied.iter().map(|i| of[*i]).collect::<Vec<_>>();
     let by = umeyama(&pick(&other), &pick(&one), None).unwrap_or(Similarity::IDENTITY);
     // Each half has twice the variance of the whole, their difference four times.
-    let doubt =
-        |(a, b): (&DVec3, &DVec3)| Doubt { within: a.distance(by.apply(*b)) / 2.0, on_earth: a.distance(*b) / 2.0 };
+    let half = |off: DVec3| off.abs() / 2.0;
+    let doubt = |(a, b): (&DVec3, &DVec3)| Doubt {
+        within: half(*a - by.apply(*b)),
+        on_earth: half(*a - *b),
+        angles: DVec3::ZERO,
+    };
     one.iter().zip(&other).map(doubt).collect()
 }
 
@@ -162,5 +197,17 @@ mod tests {
         let sigma = |i: usize| (0..3).map(|k| covariance[(3 * i + k, 3 * i + k)]).sum::<f64>().sqrt();
         assert!((0..9).filter(|i| *i != 4).all(|i| sigma(i) < 0.12), "{:?}", (0..9).map(sigma).collect::<Vec<_>>());
         assert!(sigma(4) > 0.25 && sigma(4) < 0.35, "{}", sigma(4));
+    }
+
+    #[test]
+    fn what_is_said_of_the_lens_is_its_part_of_the_covariance_and_nothing_of_what_was_given_as_exact() {
+        let factor = DMatrix::from_fn(SHARED + 6, SHARED + 6, |r, c| ((r * 5 + c * 3) % 7) as f64 - 3.0);
+        let all = &factor * factor.transpose();
+        let free = std::array::from_fn(|k| k != FOCAL + 2);
+        let lens = of_lens(&all, 6 + FOCAL, &free);
+        assert_eq!((lens.sigma[2], lens.correlation[2][0], lens.correlation[2][2]), (0.0, 0.0, 1.0));
+        assert!((lens.sigma[0] - all[(6 + FOCAL, 6 + FOCAL)].sqrt()).abs() < 1e-12);
+        let wanted = all[(6 + FOCAL, 7 + FOCAL)] / (lens.sigma[0] * lens.sigma[1]);
+        assert!((lens.correlation[0][1] - wanted).abs() < 1e-12 && lens.correlation[0][1] == lens.correlation[1][0]);
     }
 }

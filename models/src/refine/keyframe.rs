@@ -2,6 +2,7 @@
 
 use super::calibration::Calibration;
 use super::grey::Grey;
+use super::report::PosePrecision;
 use crate::camera::{Intrinsics, Pose, PoseSigma};
 use crate::frame_file::{AsBytes, FrameFile, Kept};
 pub(crate) use crate::onnx::features::DESCRIPTOR;
@@ -55,8 +56,8 @@ pub(crate) struct Told {
 pub(crate) struct Known {
     /// Depth below which 1 % and above which 1 % of them lie, metres.
     pub depths: Option<(f32, f32)>,
-    /// Standard deviation of its place, once all have been judged.
-    pub certainty: Option<f64>,
+    /// How well its pose is known, once all have been judged.
+    pub precision: Option<PosePrecision>,
     /// Its place is known too badly to be one.
     pub loose: bool,
     /// It does not agree with the largest part of the scene.

@@ -8,7 +8,7 @@ use super::discovery::discover;
 use super::keyframe::KeyFrame;
 use super::linking::{Pair, epipolar_lines, median, rays};
 use super::matching::{Guide, Match, MatchLimits, likeliest_first, match_frames};
-use super::solving::INDEPENDENT;
+use super::problem::INDEPENDENT;
 use super::tracks::Union;
 use super::twoview::{RayPair, TwoView, TwoViewLimits, adapted, verify};
 use super::{AddReport, RefineError, Refiner};

@@ -75,7 +75,7 @@ pub(super) fn places_off(refiner: &Refiner) -> Vec<(String, f64)> {
         let away = f.pose.center - f.told.pose.center;
         let per = DVec3::from_array(f.told.sigma.position_m.map(f64::from)) * WRONG.0;
         // What cannot be known of the place itself is no fault of the position.
-        let room = WRONG.0 * f.known.certainty.unwrap_or(0.0);
+        let room = WRONG.0 * f.known.precision.map_or(0.0, |p| p.distance());
         let excess = (away.abs() - DVec3::splat(room)).max(DVec3::ZERO) / per;
         (excess.length() > 1.0).then(|| (f.name.clone(), away.length()))
     };

@@ -19,6 +19,11 @@ pub(crate) const PRINCIPAL: usize = FOCAL + 2;
 /// Index of the first radial term.
 pub(crate) const RADIAL: usize = FOCAL + 4;
 
+/// Sightings of one picture that count as independent when the lens is asked for. What no such lens holds (a rolling shutter,
+/// leaves in the wind, relief under a patch) shifts whole regions of a picture together: on brighton_beach (480 sightings per
+/// picture) a free focal length went 13 % off with a formal sigma of 1.3 %.
+pub(crate) const INDEPENDENT: f64 = 8.0;
+
 /// What all key frames have in common and telemetry does not know.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Shared {

@@ -1,6 +1,9 @@
 //! What the refiner did and what came of it, for logs and `run.json`.
 
+use glam::DVec3;
 use serde::Serialize;
+
+use super::calibration::LENS;
 
 /// One key frame's arrival.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -193,4 +196,40 @@ pub struct ControlResidual {
     pub off_m: [f64; 3],
     /// Root mean square distance of its marks, pixels.
     pub error_px: f64,
+}
+
+/// How well a picture's pose is known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct PosePrecision {
+    /// Standard deviations east, north and up, in the scene's units: within the scene where nothing says where that is.
+    pub position: [f64; 3],
+    /// Standard deviations about the camera's axes (right, down, forward), degrees; `None` where nothing says how the scene lies, or
+    /// its pictures are too many for the whole inverse.
+    pub rotation_deg: Option<[f64; 3]>,
+}
+
+impl PosePrecision {
+    /// Standard deviation of the place, all axes together.
+    pub fn distance(&self) -> f64 {
+        DVec3::from_array(self.position).length()
+    }
+}
+
+/// Parameters of a lens, in the order of [`LensPrecision`].
+pub const LENS_PARAMETERS: [&str; LENS] = ["focal", "aspect", "principal_x", "principal_y", "k1", "k2"];
+
+/// How well the lens that all pictures share is known: focal length and aspect relative, principal point in focal lengths, radial terms
+/// as OpenCV's. What was given as exact has no standard deviation and no correlation.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LensPrecision {
+    /// What each row stands for.
+    pub parameters: [&'static str; LENS],
+    /// Standard deviation of each.
+    pub sigma: [f64; LENS],
+    /// Correlations of all with all.
+    pub correlation: [[f64; LENS]; LENS],
+    /// Standard deviation of a key point along an axis, from what is left of the sightings, pixels.
+    pub sighting_sigma_px: f64,
+    /// By how much it is multiplied, for sightings of one picture that err alike.
+    pub dependence: f64,
 }

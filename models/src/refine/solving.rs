@@ -7,7 +7,7 @@ use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::part::Part;
 use super::placing::Placed;
-use super::problem::{ASPECT, FOCAL, Loss, Observation, PRINCIPAL, PosePrior, Problem, RADIAL, SHARED};
+use super::problem::{ASPECT, FOCAL, INDEPENDENT, Loss, Observation, PRINCIPAL, PosePrior, Problem, RADIAL, SHARED};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
 use super::triangulate::Triangulated;
@@ -22,10 +22,6 @@ pub(super) const COARSE_PX: f64 = 60.0;
 pub(super) const FINE_PX: f64 = 12.0;
 /// Sightings that tie a frame to the map; with fewer, its pose is mostly telemetry's.
 pub(super) const TIED: usize = 12;
-/// Sightings of one picture that count as independent when the lens is asked for. What no such lens holds (a rolling shutter,
-/// leaves in the wind, relief under a patch) shifts whole regions of a picture together: on brighton_beach (480 sightings per
-/// picture) a free focal length went 13 % off with a formal sigma of 1.3 %.
-pub(super) const INDEPENDENT: f64 = 8.0;
 /// Share of the usual doubt that a focal length may leave where pictures alone tell it: on brighton_beach without positions it left 0.043
 /// and was 8 % off.
 const PICTURES_SURE: f64 = 0.6;

@@ -6,7 +6,9 @@ use std::ops::ControlFlow;
 
 use config::refine::RefineSettings;
 use models::camera::View;
-use models::refine::{ControlPoint, PositionsReport, RefineError, RefineReport, Refiner, Untied};
+use models::refine::{
+    ControlPoint, LensPrecision, PosePrecision, PositionsReport, RefineError, RefineReport, Refiner, Untied,
+};
 
 use crate::dataset::{CardNotes, Dataset, PoseSource, Settled};
 
@@ -85,8 +87,10 @@ pub struct Settlement {
     pub untied: Vec<(String, Untied)>,
     /// Those that could not be decoded, or not be taken.
     pub skipped: Vec<String>,
-    /// Standard deviation of the place of each picture of the scene, in its units.
-    pub sigma: HashMap<String, f64>,
+    /// How well the pose of each picture of the scene is known, in its units.
+    pub precision: HashMap<String, PosePrecision>,
+    /// How well the lens is known.
+    pub lens: Option<LensPrecision>,
     /// The last adjustment.
     pub solved: RefineReport,
     /// Pictures whose stated positions the others contradict, of those that could be compared; nothing where none were asked.
@@ -120,7 +124,7 @@ impl Settlement {
             }
             // Only a picture without a distortion of its own may have been given one.
             let distortion = if frame.distortion.is_none() { refiner.distortion() } else { frame.distortion };
-            found.sigma.extend(refiner.certainty(name).map(|s| (name.clone(), s)));
+            found.precision.extend(refiner.precision(name).map(|p| (name.clone(), p)));
             found.settled.insert(name.clone(), Settled { view: View { intrinsics, pose }, distortion });
         }
         found
@@ -252,12 +256,12 @@ fn attempt<E: From<RefineError>>(
     let has_attitudes = notes.has_attitudes && !notes.floats && !positions_refused;
     let look = |refiner: &mut Refiner| -> Result<Settlement, E> {
         let mut solved = refiner.solve()?;
-        refiner.judge();
+        let mut lens = refiner.judge();
         if refiner.leave_out_apart() {
             solved = refiner.solve()?;
-            refiner.judge();
+            lens = refiner.judge();
         }
-        Ok(Settlement::of(set, refiner, solved, has_attitudes))
+        Ok(Settlement { lens, ..Settlement::of(set, refiner, solved, has_attitudes) })
     };
     let mut found = look(&mut refiner)?;
     for _ in 0..start.looks_again() {

@@ -21,6 +21,7 @@ use survey::settling::{self, Needs, Settlement};
 use crate::error::JobError;
 
 mod control;
+mod precision;
 
 /// Poses of a card, in the folder of the model.
 pub(super) const FILE: &str = "transforms.json";
@@ -84,7 +85,9 @@ pub(super) fn settle(
             set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
         }
         Some(settings) => match refined(set, &notes, settings, out, go_on, &mut card.remarks)? {
-            Some((settled, place)) => {
+            Some((settled, place, known)) => {
+                std::fs::create_dir_all(out).map_err(JobError::io(out))?;
+                known.write(set, &settled, out)?;
                 set.origin = match place {
                     Place::Stated => set.origin,
                     Place::Surveyed(origin) => set.origin.or(Some(origin)),
@@ -211,12 +214,14 @@ fn announce_settled(found: &Settlement) {
 }
 
 /// A scene without a scale is given one: half of the pictures lie less than 1 from the one taken before.
-fn scale_to_baselines(set: &Dataset, settled: &mut HashMap<String, Settled>) {
+fn scale_to_baselines(set: &Dataset, found: &mut Settlement) {
+    let settled = &mut found.settled;
     let centers: Vec<_> = set.frames.iter().filter_map(|f| Some(settled.get(&f.name)?.view.pose.center)).collect();
     let mut baselines: Vec<f64> = centers.windows(2).map(|w| w[0].distance(w[1])).filter(|d| *d > 0.0).collect();
     baselines.sort_by(f64::total_cmp);
     if let Some(&usual) = baselines.get(baselines.len() / 2) {
         settled.values_mut().for_each(|s| s.view.pose.center /= usual);
+        found.precision.values_mut().for_each(|p| p.position = p.position.map(|s| s / usual));
     }
 }
 
@@ -231,7 +236,7 @@ enum Place {
 }
 
 /// What the pictures settle on.
-type Agreed = (HashMap<String, Settled>, Place);
+type Agreed = (HashMap<String, Settled>, Place, precision::Known);
 
 /// The poses that the pictures agree on. `None` when asked to stop.
 fn refined(
@@ -289,7 +294,7 @@ fn refined(
         (false, false) => Place::Stated,
     };
     if matches!(place, Place::None) {
-        scale_to_baselines(set, &mut found.settled);
+        scale_to_baselines(set, &mut found);
     }
     if found.settled.len() < 2 {
         let what = match notes.floats {
@@ -303,5 +308,9 @@ fn refined(
         return Err(JobError::Request(format!("{}: {what}", set.root.display())));
     }
     remarks.push(("refine", serde_json::to_value(&found.solved)?));
-    Ok(Some((found.settled, place)))
+    let in_metres = !matches!(place, Place::None);
+    let believed = in_metres && !found.positions_refused && !notes.floats;
+    let known = precision::Known::of(&found, in_metres, believed);
+    remarks.push(("pose_sigma", known.usual()));
+    Ok(Some((found.settled, place, known)))
 }

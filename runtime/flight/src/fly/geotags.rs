@@ -1,7 +1,6 @@
 //! `geotags.csv`: where every matched picture was taken, as the HAL measured it, before any refinement. One line per
 //! picture, written at once; a line that a power cut tore is taken off at the next start. Surveyors feed such files to other tools.
 
-use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::path::Path;
@@ -65,7 +64,7 @@ impl Geotags {
         let written = writeln!(
             self.line,
             "{},{},{:.9},{:.9},{:.3},{:.3},{:.3},{:.3},{:.6},{:.6},{:.6},{:.6},{:.3},{:.3},{:.2},{},{:.3}",
-            field(&name.file_name().unwrap_or(name.as_os_str()).to_string_lossy()),
+            disk::table::field(&name.file_name().unwrap_or(name.as_os_str()).to_string_lossy()),
             frame.sequence,
             at.lat_deg,
             at.lon_deg,
@@ -103,29 +102,5 @@ impl Drop for Geotags {
         {
             tracing::warn!("{FILE}: {e}; its last lines may be lost");
         }
-    }
-}
-
-/// A name as one field of one line (RFC 4180). A line end in it would begin a line of its own, and a spreadsheet computes
-/// what begins with one of `=+-@`: such names get a quotation mark before them.
-fn field(name: &str) -> Cow<'_, str> {
-    let formula = name.starts_with(['=', '+', '-', '@']);
-    if !formula && !name.contains(|c: char| c.is_control() || matches!(c, ',' | '"')) {
-        return Cow::Borrowed(name);
-    }
-    let printable = name.replace(|c: char| c.is_control(), "_").replace('"', "\"\"");
-    Cow::Owned(format!("\"{}{printable}\"", if formula { "'" } else { "" }))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_name_is_one_field_of_one_line_and_no_formula() {
-        assert_eq!(field("DJI_0001.JPG"), "DJI_0001.JPG");
-        assert_eq!(field("a,b\n0,1\u{85}.jpg"), "\"a,b_0,1_.jpg\"");
-        assert_eq!(field("a\"b.jpg"), "\"a\"\"b.jpg\"");
-        assert_eq!(field("=HYPERLINK(1).jpg"), "\"'=HYPERLINK(1).jpg\"");
     }
 }
