@@ -53,7 +53,7 @@ pub struct Args {
     /// Write the survey's pictures here as a camera's card, with EXIF and XMP, instead of flying.
     #[arg(long, value_name = "DIR", help_heading = INSTEAD)]
     card: Option<PathBuf>,
-    /// Fly this plan (QGroundControl's `.plan`, as `dgtr fly` writes it) instead of a survey.
+    /// Fly this plan instead: QGroundControl's `.plan` of waypoints, surveys and corridor scans, or a list of waypoints ("QGC WPL 110").
     #[arg(long, value_name = "FILE", help_heading = INSTEAD, conflicts_with_all = ["height", "forward_overlap", "side_overlap", "cross"])]
     plan: Option<PathBuf>,
     #[command(flatten, next_help_heading = "Flight")]
