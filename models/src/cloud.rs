@@ -8,9 +8,11 @@
 use serde::{Deserialize, Serialize};
 
 pub(crate) use coarser::coarser;
+pub use plausible::Plausible;
 pub use turn::ShTurn;
 
 mod coarser;
+mod plausible;
 mod turn;
 
 /// Number of SH coefficients per colour channel for a degree 0…3.

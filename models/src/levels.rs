@@ -133,7 +133,7 @@ pub fn write_and_see(
     model.each(&mut |cloud| {
         let mut lowered;
         let cloud = if degree == cloud.sh_degree {
-            cloud
+            &*cloud
         } else {
             lowered = cloud.clone();
             lowered.lower_sh_degree(degree);

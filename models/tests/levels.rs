@@ -30,7 +30,7 @@ fn chunks_of(cloud: &GaussianCloud, folder: &Path) -> Chunks {
 
 fn pieces(chunks: &Chunks) -> (GaussianCloud, usize, u64) {
     let (mut all, mut pieces) = (GaussianCloud::with_capacity(chunks.sh_degree, 0), 0);
-    let each = &mut |cloud: &GaussianCloud| {
+    let each = &mut |cloud: &mut GaussianCloud| {
         all.extend(cloud);
         pieces += 1;
         Ok::<(), FormatError>(())

@@ -318,7 +318,7 @@ impl Trainer {
     /// Those of [`Trainer::snapshot`], and those of `take`.
     pub fn each_piece<E: From<TrainError>>(
         &mut self,
-        take: &mut dyn FnMut(&GaussianCloud) -> Result<(), E>,
+        take: &mut dyn FnMut(&mut GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
         self.model.each_piece(&mut self.device, take)
     }

@@ -101,7 +101,7 @@ fn what_comes_out_in_pieces_is_the_snapshot() {
         t.load(&places(140)).unwrap();
         (0..3).for_each(|_| _ = t.step().unwrap());
         let (mut all, mut pieces) = (GaussianCloud::with_capacity(3, 0), 0);
-        let mut add = |piece: &GaussianCloud| {
+        let mut add = |piece: &mut GaussianCloud| {
             all.extend(piece);
             pieces += 1;
             Ok::<(), TrainError>(())
@@ -160,7 +160,7 @@ fn memory_does_not_grow_with_the_scene_on_the_way_in_or_out() {
         let (report, way_in) = peak_of(|| t.load_pieces(&|take| ground(side, take)).unwrap());
         assert_eq!(report.loaded, side * side);
         let mut seen = 0;
-        let mut count = |piece: &GaussianCloud| {
+        let mut count = |piece: &mut GaussianCloud| {
             seen += piece.len();
             Ok::<(), TrainError>(())
         };

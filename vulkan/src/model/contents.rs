@@ -91,18 +91,18 @@ impl Model {
     pub fn each_piece<E: From<TrainError>>(
         &mut self,
         device: &mut Device,
-        take: &mut dyn FnMut(&GaussianCloud) -> Result<(), E>,
+        take: &mut dyn FnMut(&mut GaussianCloud) -> Result<(), E>,
     ) -> Result<(), E> {
         let mut piece = GaussianCloud::with_capacity(device.plan().sh_degree, PIECE.min(self.total()));
         self.each_record::<E>(device, |plan, record| {
             push_record(&mut piece, plan, record);
             if piece.len() == PIECE {
-                take(&piece)?;
+                take(&mut piece)?;
                 clear(&mut piece, plan.sh_degree);
             }
             Ok(())
         })?;
-        if piece.is_empty() { Ok(()) } else { take(&piece) }
+        if piece.is_empty() { Ok(()) } else { take(&mut piece) }
     }
 
     /// Gives the record of every Gaussian to `take`, up to date.

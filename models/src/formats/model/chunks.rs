@@ -39,8 +39,8 @@ pub fn piece_bytes(sh_degree: u8) -> u64 {
     ROWS as u64 * exact_bytes(sh_degree) + COLUMNS_BUFFERED
 }
 
-/// What is done with a piece.
-pub type Each<'a, E> = &'a mut dyn FnMut(&GaussianCloud) -> Result<(), E>;
+/// What is done with a piece, which is nobody else's.
+pub type Each<'a, E> = &'a mut dyn FnMut(&mut GaussianCloud) -> Result<(), E>;
 
 impl Chunks {
     /// Opens a model; the file is read once, to verify it.
@@ -66,7 +66,7 @@ impl Chunks {
         let mut dropped = 0;
         let mut valid = |mut cloud: GaussianCloud| {
             dropped += cloud.drop_invalid() as u64;
-            each(&cloud)
+            each(&mut cloud)
         };
         let mut opened = open(&self.path)?;
         let header = read_header_of(&self.path, &mut opened)?;
@@ -104,7 +104,7 @@ impl Chunks {
         let sh = 3 * sh_coefficients(self.sh_degree);
         let mut start = FIXED + header as u64;
         let mut column = |floats: usize| {
-            let mut file = File::open(&self.path)?;
+            let mut file = disk::regular::open(&self.path)?;
             file.seek(SeekFrom::Start(start))?;
             start += 4 * (floats * self.count) as u64;
             std::io::Result::Ok(BufReader::with_capacity(1 << 16, file))

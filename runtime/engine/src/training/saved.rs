@@ -4,13 +4,12 @@ use std::path::Path;
 
 use disk::Disk;
 use job::run_json::RunReport;
-use models::cloud::GaussianCloud;
+use models::cloud::{GaussianCloud, Plausible};
 use models::formats::model::{self, Chunks, ModelHeader};
-use vulkan::trainer::TrainError;
 
 use super::Training;
 use crate::error::EngineError;
-use crate::pieces::{load, save};
+use crate::pieces::{self, load, save, told};
 
 /// The model that an earlier run left.
 pub(crate) enum Earlier {
@@ -39,7 +38,10 @@ impl Training {
     pub(crate) fn earlier(&self, disk: &Disk, path: &Path) -> Result<Option<Earlier>, EngineError> {
         Ok(match self.in_pieces {
             true => model::open_checkpoint(disk, path)?.map(Earlier::Pieces),
-            false => model::read_checkpoint(disk, path)?.map(|(header, cloud)| Earlier::Whole(header, cloud)),
+            false => model::read_checkpoint(disk, path)?.map(|(header, mut cloud)| {
+                told(Plausible::of(&cloud.means).mend(&mut cloud));
+                Earlier::Whole(header, cloud)
+            }),
         })
     }
 
@@ -74,6 +76,7 @@ impl Training {
         if self.has_model() && !self.is_average() {
             self.trainer.snapshot(&mut self.cloud)?;
         }
+        told(Plausible::of(&self.cloud.means).mend(&mut self.cloud));
         model::write_checkpoint(disk, path, header, &self.cloud)?;
         Ok(self.cloud.len())
     }
@@ -83,12 +86,6 @@ impl Training {
         if !self.in_pieces {
             return Ok(self.cloud.means.clone());
         }
-        let (every, mut at, mut means) = (self.trainer.gaussians().div_ceil(most).max(1), 0, Vec::new());
-        self.trainer.each_piece::<TrainError>(&mut |piece| {
-            means.extend(piece.means.iter().skip((every - at % every) % every).step_by(every));
-            at += piece.len();
-            Ok(())
-        })?;
-        Ok(means)
+        Ok(pieces::means(&mut self.trainer, most)?)
     }
 }
