@@ -1,5 +1,6 @@
 #!/bin/bash
-# Five aircraft, a ground and an attacker over bad links, everybody killed at random, for so many seconds (600 without a number):
+# Five aircraft, a ground and an attacker over bad links and with full disks, everybody killed at random, for so many seconds (600 without a
+# number):
 #   tests/chaos.sh [SECONDS [SEED]]
 # Every honest final model arrives once, byte for byte, nothing of the attacker counts, and what the ground holds of memory, files,
 # descriptors and threads is bounded.

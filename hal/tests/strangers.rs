@@ -15,14 +15,16 @@ use hal::camera::Picture;
 use hal::counters::{HalCounters, LinkCounters};
 use hal::error::HalError;
 use hal::link::{LinkAddress, TlogLink};
-use hal::mavlink::dialect::{
-    CAMERA_FEEDBACK_DATA, EXTENDED_SYS_STATE_DATA, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot,
-    SYS_STATUS_DATA,
-};
-use hal::mavlink::{Encoder, Framer, MessageData};
+use hal::mavlink::Framer;
+use hal::mavlink::dialect::CAMERA_FEEDBACK_DATA;
 use hal::time::ManualClock;
 use hal::traits::{Camera, Flow, Link, PictureClues, Received};
 use hal::vehicle::{Vehicle, VehicleSettings};
+
+#[path = "../../tests/strangers.rs"]
+mod strangers;
+
+use strangers::Stranger;
 
 /// When, from whom, what.
 type Datagram = (u64, SocketAddr, Vec<u8>);
@@ -102,81 +104,6 @@ fn recorded() -> (Vec<Datagram>, VecDeque<u64>) {
     (datagrams, pictures)
 }
 
-/// Numbers of splitmix64.
-struct Dice(u64);
-
-impl Dice {
-    fn roll(&mut self, sides: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) % sides.max(1) as u64) as usize
-    }
-
-    /// A frame in the autopilot's name that would end the flight, or spoil it.
-    fn frame(&mut self, at_ns: u64) -> Vec<u8> {
-        let mut encoder = Encoder::new(1, 1);
-        // Any sequence number.
-        for _ in 0..self.roll(256) {
-            encoder.encode(&EXTENDED_SYS_STATE_DATA::default(), None);
-        }
-        let mut encode = |kind: usize, n: usize| match kind {
-            0 => encoded(&mut encoder, &SYS_STATUS_DATA { battery_remaining: 3, load: n as u16, ..Default::default() }),
-            1 => {
-                let time_boot_ms = (at_ns / 1_000_000) as u32;
-                encoded(&mut encoder, &GLOBAL_POSITION_INT_DATA { time_boot_ms, lat: n as i32, ..Default::default() })
-            }
-            2 => {
-                let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
-                encoded(&mut encoder, &HEARTBEAT_DATA { autopilot, custom_mode: n as u32, ..Default::default() })
-            }
-            _ => encoded(&mut encoder, &CAMERA_FEEDBACK_DATA { img_idx: n as u16, ..Default::default() }),
-        };
-        let kind = self.roll(4);
-        let mut n = self.roll(1 << 16);
-        // Often one whose last byte begins a frame, too.
-        let wanted = self.roll(2) == 0;
-        let mut frame = encode(kind, n);
-        for _ in 0..if wanted { 2000 } else { 0 } {
-            if matches!(frame.last(), Some(0xFD | 0xFE)) {
-                break;
-            }
-            n += 1;
-            frame = encode(kind, n);
-        }
-        frame
-    }
-
-    /// What a stranger sends at `at_ns`. Whole frames in the autopilot's name come once it has proven itself: before, without
-    /// signatures, nobody can tell who is who.
-    fn datagram(&mut self, at_ns: u64, flight: &[Datagram]) -> Vec<u8> {
-        let cut = |mut frame: Vec<u8>, dice: &mut Self| {
-            let most = if dice.roll(2) == 0 { 1 } else { frame.len() - 1 };
-            frame.truncate(frame.len() - 1 - dice.roll(most));
-            frame
-        };
-        match self.roll(6) {
-            0 => (0..1 + self.roll(300)).map(|_| self.roll(256) as u8).collect(),
-            1 => {
-                let frame = self.frame(at_ns);
-                cut(frame, self)
-            }
-            2 => {
-                let overheard = flight[self.roll(flight.len())].2.clone();
-                cut(overheard, self)
-            }
-            3 => [0xFD, 0xFE, 0xFD, 255][..1 + self.roll(4)].to_vec(),
-            _ if at_ns < 4_000_000_000 => vec![0xFD; 1 + self.roll(40)],
-            4 => self.frame(at_ns),
-            _ => flight[self.roll(flight.len())].2.clone(),
-        }
-    }
-}
-
-fn encoded<D: MessageData>(encoder: &mut Encoder, message: &D) -> Vec<u8> {
-    encoder.encode(message, None).to_vec()
-}
-
 fn settings() -> VehicleSettings {
     let lens = CameraSettings {
         width: 640,
@@ -247,14 +174,15 @@ fn whatever_strangers_send_a_flight_over_udp_is_the_flight_without_them() {
     let alone = fly(&flight, &pictures);
     let posed = alone.iter().filter(|told| told.starts_with("Posed")).count();
     assert!(posed >= 10, "{posed} pictures posed of a flight that has 15");
+    let overheard: Vec<Vec<u8>> = flight.iter().map(|(_, _, bytes)| bytes.clone()).collect();
     let streams = std::env::var("DGTR_STREAMS").ok().and_then(|n| n.parse().ok()).unwrap_or(3000);
     for seed in 0..streams {
-        let mut dice = Dice(seed);
+        let mut dice = Stranger(seed);
         let mut all = Vec::with_capacity(2 * flight.len());
         let often = 1 + dice.roll(12);
         for datagram in &flight {
             while dice.roll(12) < often {
-                let bytes = dice.datagram(datagram.0, &flight);
+                let bytes = dice.datagram(datagram.0, &overheard);
                 all.push((datagram.0, address(40_000 + dice.roll(3) as u16), bytes));
                 if dice.roll(2) == 0 {
                     break;

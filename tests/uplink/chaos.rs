@@ -1,5 +1,5 @@
 //! Five aircraft, one ground and a rogue over bad links, in the manner of Jepsen: every node is a process, which is killed
-//! and started again at random; links are slow, late, lossy, cut and reset. When the chaos is over, every honest final
+//! and started again at random; links are slow, late, lossy, cut and reset; disks are full for a while. When the chaos is over, every honest final
 //! model is at the ground, byte for byte, and nothing else is. Meanwhile the rogue offers what it has no right to, answers falsely or
 //! never, shows finals of another session, and holds connections that say nothing or anything.
 //!
@@ -17,6 +17,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use config::upload::UploadSettings;
+use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use zenoh::Wait;
 
 use super::admission::Admission;
@@ -89,17 +90,25 @@ fn fly(dir: &Path, aircraft: usize, port: u16) {
     let (model, landed) = (dir.join(format!("{id}.dgtr")), dir.join(format!("{id}.landed")));
     let mut n = 0;
     while !landed.exists() {
-        write_whole(&model, &checkpoint_of(aircraft, n)).expect("write");
-        o.offer(&model);
-        n += 1;
+        // A checkpoint that finds no room is left out.
+        if write_whole(&model, &checkpoint_of(aircraft, n)).is_ok() {
+            o.offer(&model);
+            n += 1;
+        }
         wait_until(Instant::now() + CHECKPOINT);
     }
-    write_whole(&model, &final_of(aircraft)).expect("write");
+    write_when_there_is_room(&model, &final_of(aircraft));
     o.offer_final(&model);
     while !o.wait_delivered(Duration::from_secs(3600), || true) {}
-    write_whole(&dir.join(format!("{id}.delivered")), b"").expect("write");
+    write_when_there_is_room(&dir.join(format!("{id}.delivered")), b"");
     // Until it is killed, it answers.
     std::thread::sleep(Duration::from_secs(3600));
+}
+
+fn write_when_there_is_room(path: &Path, bytes: &[u8]) {
+    while write_whole(path, bytes).is_err() {
+        std::thread::sleep(Duration::from_millis(100));
+    }
 }
 
 /// As `dgtr serve` does, and writes down what it counted and which final models it completed.
@@ -126,7 +135,7 @@ fn serve(dir: &Path, port: u16) {
         for id in now.iter().filter(|id| !finals.contains(id)) {
             let log = dir.join(format!("{id}.final.{}", std::process::id()));
             let n = std::fs::read(&log).map_or(0, |b| b.len());
-            write_whole(&log, &vec![b'.'; n + 1]).expect("write");
+            write_when_there_is_room(&log, &vec![b'.'; n + 1]);
         }
         finals = now;
         let done = r.all_finished() && r.all_told();
@@ -135,7 +144,8 @@ fn serve(dir: &Path, port: u16) {
         let (counters, refused) = (&r.counters, &r.refusals);
         let said =
             serde_json::json!({ "done": done, "counters": counters, "refused": refused, "most": most, "now": now });
-        write_whole(&counted, said.to_string().as_bytes()).expect("write");
+        // What finds no room is said in the next round.
+        let _ = write_whole(&counted, said.to_string().as_bytes());
     }
 }
 
@@ -213,7 +223,9 @@ struct Node {
 
 impl Node {
     fn start(&mut self, dir: &Path) {
-        let mut command = Command::new(std::env::current_exe().expect("this program"));
+        // What goes beyond a limit on files fails, as on a full disk, and does not end the process.
+        let mut command = Command::new("sh");
+        command.args(["-c", "trap '' XFSZ; exec \"$@\"", "sh"]).arg(std::env::current_exe().expect("this program"));
         command.args(["--exact", "chaos::node", "--ignored", "--nocapture"]);
         command.env("DGTR_CHAOS_ROLE", self.role).env("DGTR_CHAOS_DIR", dir);
         command.env("DGTR_CHAOS_PORT", self.port.to_string());
@@ -221,6 +233,15 @@ impl Node {
         let log = std::fs::File::options().create(true).append(true).open(path).expect("log");
         let (out, err) = (Stdio::from(log.try_clone().expect("log")), Stdio::from(log));
         self.child = Some(command.stdin(Stdio::null()).stdout(out).stderr(err).spawn().expect("process"));
+    }
+
+    /// From now on its files may not grow; or they may again.
+    fn fill_disk(&self, is_full: bool) {
+        let pid = self.child.as_ref().and_then(|child| Pid::from_raw(i32::try_from(child.id()).ok()?));
+        let pid = Some(pid.expect("a process"));
+        let limit = Rlimit { current: is_full.then_some(0), maximum: None };
+        // Whoever is gone already needs no room.
+        let _ = prlimit(pid, Resource::Fsize, limit);
     }
 
     /// SIGKILL.
@@ -310,11 +331,12 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
     nodes.iter_mut().for_each(|n| n.start(dir.path()));
 
     let mut dice = Dice(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
-    let (mut kills, mut cuts, mut resets) = (0, 0, 0);
+    let (mut kills, mut cuts, mut resets, mut full_disks) = (0, 0, 0, 0);
     let begun = Instant::now();
     let [landing, last_third, until] =
         [length * 500, length * 667, length * 1000].map(|ms| begun + Duration::from_millis(ms));
     let mut mend_at = vec![None::<Instant>; proxies.len()];
+    let mut room_at = vec![None::<Instant>; nodes.len()];
     let (ground, mut is_landed, mut early) = (AIRCRAFT.len(), false, None);
     while Instant::now() < until {
         if Instant::now() >= landing && !is_landed {
@@ -332,7 +354,13 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
                 *at = None;
             }
         }
-        let (what, who) = (dice.roll(4), dice.roll(5) as usize);
+        for (node, at) in nodes.iter().zip(&mut room_at) {
+            if at.is_some_and(|at| Instant::now() >= at) {
+                node.fill_disk(false);
+                *at = None;
+            }
+        }
+        let (what, who) = (dice.roll(5), dice.roll(5) as usize);
         match what {
             0 => {
                 // Everybody, the rogue included.
@@ -352,10 +380,18 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
                 proxies[who].reset();
                 resets += 1;
             }
+            3 => {
+                // The ground's as well.
+                let node = dice.roll(nodes.len() as u64) as usize;
+                nodes[node].fill_disk(true);
+                room_at[node] = Some(Instant::now() + Duration::from_millis(500 + dice.roll(4000)));
+                full_disks += 1;
+            }
             _ => {}
         }
     }
     proxies.iter().for_each(|p| p.cut(false));
+    nodes.iter().for_each(|node| node.fill_disk(false));
     let until = Instant::now() + CALM;
     let told = |id: &str| dir.path().join(format!("{id}.delivered")).exists();
     while !(counted(dir.path()).2 && AIRCRAFT.iter().all(|id| told(id))) && Instant::now() < until {
@@ -376,7 +412,7 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
     nodes.iter_mut().for_each(Node::kill);
     let (counters, refused, done) = counted(dir.path());
     println!(
-        "{length} s of chaos, seed {seed}: {kills} kills, {cuts} cuts, {resets} resets\n{counters:?}\n{refused:#?}"
+        "{length} s of chaos, seed {seed}: {kills} kills, {cuts} cuts, {resets} resets, {full_disks} full disks\n{counters:?}\n{refused:#?}"
     );
     let most = most_held(dir.path());
     println!("at most {} descriptors, {} threads, {} MiB", most[0], most[1], most[2]);
