@@ -4,7 +4,6 @@
 //!
 //! Everything is checked once, on reading: what [`Mission::read`] returns needs no further validation.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -170,7 +169,7 @@ impl Mission {
     pub fn read(path: &Path) -> Result<Self, MissionError> {
         let at = |source| MissionError::Unreadable { path: path.into(), source };
         let mut text = String::new();
-        let file = File::open(path).map_err(at)?;
+        let file = disk::regular::open(path).map_err(at)?;
         file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text).map_err(at)?;
         if text.len() as u64 > MAX_FILE_BYTES {
             let bytes = std::fs::metadata(path).map_or(0, |m| m.len()).max(MAX_FILE_BYTES + 1);

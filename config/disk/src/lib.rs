@@ -187,7 +187,7 @@ impl Disk {
     /// # Errors
     /// The system's.
     pub fn append_lines(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        match File::open(path) {
+        match regular::open(path) {
             Ok(mut file) => {
                 let whole = whole_lines(&file)?;
                 if whole < file.metadata()?.len() {

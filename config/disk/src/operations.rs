@@ -5,6 +5,8 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::Path;
 
+use crate::regular;
+
 /// What a file system is asked to do. Reading is done directly: it changes nothing.
 pub trait Operations: fmt::Debug + Send + Sync {
     /// Makes one folder, whose parent is there.
@@ -80,7 +82,7 @@ impl Operations for System {
     }
 
     fn append(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        Ok(Box::new(File::options().append(true).create(true).open(path)?))
+        Ok(Box::new(regular::append(path)?))
     }
 
     fn link(&self, from: &Path, to: &Path) -> io::Result<()> {

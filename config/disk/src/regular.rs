@@ -13,8 +13,20 @@ use rustix::fs::OFlags;
 /// # Errors
 /// The system's; `InvalidInput` for what is no regular file.
 pub fn open(path: &Path) -> io::Result<File> {
+    opened(path, OpenOptions::new().read(true))
+}
+
+/// Opens the file at `path`, which is made where there is none, to write behind its end.
+///
+/// # Errors
+/// As [`open`].
+pub(crate) fn append(path: &Path) -> io::Result<File> {
+    opened(path, OpenOptions::new().append(true).create(true))
+}
+
+fn opened(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
-    let file = OpenOptions::new().read(true).custom_flags(flags.bits().cast_signed()).open(path)?;
+    let file = options.custom_flags(flags.bits().cast_signed()).open(path)?;
     if file.metadata()?.is_file() {
         Ok(file)
     } else {

@@ -8,6 +8,7 @@ mod tlog;
 #[cfg(test)]
 mod tests;
 
+use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
@@ -20,6 +21,9 @@ use crate::autopilot::{Autopilot, AutopilotSettings};
 use crate::photographer::Photographer;
 use crate::session::{self, SessionReport, SessionSettings};
 use hal::link::LinkAddress;
+
+/// A photograph has no more; what lies behind is not sent.
+const MOST_BYTES: u64 = 1 << 30;
 
 /// How a playlist is played.
 #[derive(Clone, Debug, PartialEq)]
@@ -71,7 +75,9 @@ pub fn play(
             let paths: Vec<_> = playlist.items.iter().map(|item| item.picture.clone()).collect();
             let read = move |index: usize| {
                 let path: &std::path::PathBuf = &paths[index];
-                std::fs::read(path).map_err(|source| SimError::Folder { path: path.clone(), source })
+                let mut bytes = Vec::new();
+                let read = disk::regular::open(path).and_then(|file| file.take(MOST_BYTES).read_to_end(&mut bytes));
+                read.map(|_| bytes).map_err(|source| SimError::Folder { path: path.clone(), source })
             };
             let nothing_more = |_: &AtomicBool| Ok(());
             Some(Photographer::new(folder, flight.exposures.clone(), settings.autopilot.seed, read, nothing_more)?)

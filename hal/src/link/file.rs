@@ -35,7 +35,7 @@ impl TlogLink {
     /// # Errors
     /// [`HalError::Open`] when it cannot be read.
     pub fn open(path: &Path) -> Result<Self, HalError> {
-        match File::open(path) {
+        match disk::regular::open(path) {
             Ok(file) => Ok(Self {
                 reader: BufReader::with_capacity(BUFFER, file),
                 path: path.into(),

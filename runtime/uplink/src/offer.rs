@@ -274,7 +274,7 @@ impl OfferedModel {
         order: Order,
         finished: bool,
     ) -> std::io::Result<Self> {
-        let mut file = File::open(path)?;
+        let mut file = disk::regular::open(path)?;
         let size = file.metadata()?.len();
         if size == 0 || size > settings.max_model_bytes() {
             return Err(std::io::Error::other(format!(

@@ -6,7 +6,6 @@
 //! have the promised hashes.
 
 use std::collections::HashMap;
-use std::fs::File;
 use std::io::{Read, Write};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
@@ -123,7 +122,7 @@ impl Store {
     }
 
     fn hash_of_model(&self) -> Option<Hash> {
-        let mut file = File::open(self.model_path()).ok()?;
+        let mut file = disk::regular::open(&self.model_path()).ok()?;
         let mut hasher = blake3::Hasher::new();
         let mut buffer = vec![0; 1 << 20];
         loop {
@@ -156,7 +155,7 @@ impl Store {
         let right = |bytes: &Vec<u8>| bytes.len() as u64 == length && blake3::hash(bytes).as_bytes() == hash;
         let held = self.held.get(hash).filter(|(_, held)| *held == length).and_then(|(start, _)| {
             let mut bytes = vec![0; length as usize];
-            File::open(self.model_path()).ok()?.read_exact_at(&mut bytes, *start).ok()?;
+            disk::regular::open(&self.model_path()).ok()?.read_exact_at(&mut bytes, *start).ok()?;
             Some(bytes)
         });
         held.filter(right).or_else(|| read_bounded(&self.chunk_path(hash), length).ok().filter(right))

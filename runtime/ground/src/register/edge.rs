@@ -5,7 +5,7 @@
 
 use std::collections::{HashMap, HashSet};
 use std::fs::File;
-use std::io::Read;
+use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use disk::Disk;
@@ -97,8 +97,11 @@ impl Edges {
             return Some(*known);
         }
         let path = self.path(key);
-        let file = File::open(&path).ok()?;
-        match read(file, key) {
+        let opened = match disk::regular::open(&path) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return None,
+            opened => opened.map_err(|_| "cannot be opened"),
+        };
+        match opened.and_then(|file| read(file, key)) {
             Ok(found) => {
                 self.known.insert(*key, found);
                 Some(found)

@@ -1,6 +1,5 @@
 //! A folder that all workers reach: a disk, NFS.
 
-use std::fs::File;
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -48,7 +47,7 @@ impl Folder {
 
     pub fn range(&self, name: &str, from: u64, bytes: u64) -> Result<Vec<u8>, StoreError> {
         let read = || {
-            let mut file = File::open(self.path.join(name))?;
+            let mut file = disk::regular::open(&self.path.join(name))?;
             file.seek(SeekFrom::Start(from))?;
             let mut buffer = Vec::new();
             file.take(bytes).read_to_end(&mut buffer)?;

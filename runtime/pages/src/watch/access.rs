@@ -81,7 +81,10 @@ pub(super) fn judge(asked: &Asked, token: Option<&Token>) -> Verdict {
 /// Whether `HOST[:PORT]` is a name of this machine that no name server is asked for.
 fn is_this_machine(host: &str) -> bool {
     let name = match host.strip_prefix('[') {
-        Some(rest) => rest.split_once(']').map_or(rest, |r| r.0),
+        Some(rest) => {
+            let is_port = |p: &str| p.strip_prefix(':').is_some_and(|p| p.bytes().all(|b| b.is_ascii_digit()));
+            rest.split_once(']').filter(|(_, port)| port.is_empty() || is_port(port)).map_or("", |r| r.0)
+        }
         None => host.rsplit_once(':').map_or(host, |h| h.0),
     };
     name.eq_ignore_ascii_case("localhost") || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
@@ -113,8 +116,17 @@ mod tests {
         for name in ["localhost", "LOCALHOST:80", "127.0.0.1:8080", "127.8.9.1", "[::1]:8080", "[::1]"] {
             assert!(is_this_machine(name), "{name}");
         }
-        for name in ["", "evil.example", "localhost.evil.example:80", "127.0.0.1.evil.example", "10.0.0.2:80", "[::2]"]
-        {
+        for name in [
+            "",
+            "evil.example",
+            "localhost.evil.example:80",
+            "127.0.0.1.evil.example",
+            "10.0.0.2:80",
+            "[::2]",
+            "[::1",
+            "[::1]evil.example",
+            "[::1]:80:80",
+        ] {
             assert!(!is_this_machine(name), "{name}");
         }
     }

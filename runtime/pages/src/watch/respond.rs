@@ -2,7 +2,6 @@
 //! from anywhere else.
 
 use std::fmt::Write as _;
-use std::fs::File;
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
 use std::sync::atomic::Ordering;
@@ -92,7 +91,7 @@ fn document(stream: &TcpStream, kind: &str, bytes: &[u8]) -> io::Result<()> {
 
 /// A file piece by piece; it may be replaced meanwhile.
 fn file(stream: &TcpStream, kind: &str, path: &std::path::Path) -> io::Result<()> {
-    let Ok(mut file) = File::open(path) else { return status(stream, "404 Not Found", "") };
+    let Ok(mut file) = disk::regular::open(path) else { return status(stream, "404 Not Found", "") };
     let length = file.metadata()?.len();
     let mut sender = Sender::new(stream);
     sender.send(head("200 OK", kind, Some(length), "").as_bytes())?;
