@@ -141,7 +141,7 @@ mod tests {
         let mut row = String::new();
         known.row("=1,2.jpg", DVec3::new(10.0, 20.0, 53.0), Some(stated), &mut row);
         // Three metres up, of three stated and 0.3 of its own.
-        let wanted = "\"'=1,2.jpg\",10.0000,20.0000,53.0000,0.1000,0.2000,0.3000,,,,0.000,0.000,-3.000,0.99";
+        let wanted = "\"'=1,2.jpg\",10.0000,20.0000,53.0000,0.1000,0.2000,0.3000,,,,0.000,0.000,-3.000,1.00";
         assert_eq!(row.trim_end(), wanted);
         row.clear();
         known.row("b.jpg", DVec3::ZERO, None, &mut row);
