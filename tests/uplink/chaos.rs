@@ -37,8 +37,8 @@ const DELAYS: [u64; 5] = [50, 100, 200, 400, 1000];
 const CHECKPOINT: Duration = Duration::from_secs(2);
 /// After that everything must be in within so long.
 const CALM: Duration = Duration::from_secs(120);
-/// By so many threads the pools of zenoh and of tokio may differ between two moments.
-const THREADS: u64 = 8;
+/// By so many threads and descriptors a ground may differ between two moments: the pools of zenoh and of tokio, files that it writes.
+const A_FEW: u64 = 24;
 
 /// Every one of a flight differs.
 fn checkpoint_of(aircraft: usize, n: u64) -> Vec<u8> {
@@ -403,7 +403,7 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
     let until = Instant::now() + CALM;
     let late = loop {
         let late = held_by(dir.path(), &nodes[ground]).expect("the ground has said what it holds");
-        if (late[0] <= early[0] && late[1] <= early[1] + THREADS) || Instant::now() >= until {
+        if (late[0] <= early[0] + A_FEW && late[1] <= early[1] + A_FEW) || Instant::now() >= until {
             break late;
         }
         std::thread::sleep(Duration::from_millis(500));
@@ -419,7 +419,8 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
     // Of all grounds; an attack takes 150 connections at a time.
     assert!(most[0] < 1024 && most[1] < 256 && most[2] < 512, "{most:?}");
     println!("the last ground held {early:?} and {files_early} files, at the end {late:?} and {files_late} files");
-    assert!(late[0] <= early[0] && late[1] <= early[1] + THREADS && late[2] <= early[2] + 64, "{early:?} {late:?}");
+    let bound = [A_FEW, A_FEW, 64];
+    assert!((0..3).all(|k| late[k] <= early[k] + bound[k]), "{early:?} {late:?}");
     assert!(files_late <= files_early + 8 * AIRCRAFT.len(), "{files_early} files, then {files_late}");
     assert!(done, "not everything arrived");
     for (i, id) in AIRCRAFT.iter().enumerate() {
