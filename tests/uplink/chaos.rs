@@ -37,6 +37,8 @@ const DELAYS: [u64; 5] = [50, 100, 200, 400, 1000];
 const CHECKPOINT: Duration = Duration::from_secs(2);
 /// After that everything must be in within so long.
 const CALM: Duration = Duration::from_secs(120);
+/// Disks are full for a while in runs of so many seconds.
+const FULL_DISKS_FROM_S: u64 = 60;
 /// By so many threads and descriptors a ground may differ between two moments: the pools of zenoh and of tokio, files that it writes.
 const A_FEW: u64 = 24;
 
@@ -380,8 +382,8 @@ fn after_the_chaos_every_final_model_is_here_once_and_nothing_else() {
                 proxies[who].reset();
                 resets += 1;
             }
-            3 => {
-                // The ground's as well.
+            // The ground's as well; in a run long enough for everybody to come back after it.
+            3 if length >= FULL_DISKS_FROM_S => {
                 let node = dice.roll(nodes.len() as u64) as usize;
                 nodes[node].fill_disk(true);
                 room_at[node] = Some(Instant::now() + Duration::from_millis(500 + dice.roll(4000)));
