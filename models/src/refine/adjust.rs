@@ -29,7 +29,8 @@ const STILL: f64 = 1e-4;
 /// Moves poses, points and free shared parameters downhill; never leaves them worse than they were.
 pub(crate) fn adjust(problem: &mut Problem, limits: Limits) -> Outcome {
     let as_given = problem.shared_weight;
-    // Few sightings of a picture say something of their own of the lens: what is known of it counts as if there were no more.
+    // Sightings of one picture err alike: as many as are independent are held against the prior of the lens, which is weighted up by
+    // what the others would add.
     let per_frame = problem.observations.len() as f64 / problem.poses.len().max(1) as f64;
     let by = (per_frame / INDEPENDENT).sqrt().max(1.0);
     problem.shared_weight[FOCAL..].iter_mut().for_each(|w| *w *= by);
@@ -38,6 +39,7 @@ pub(crate) fn adjust(problem: &mut Problem, limits: Limits) -> Outcome {
     outcome
 }
 
+/// Steps downhill with the weights as they are.
 fn descend(problem: &mut Problem, limits: Limits) -> Outcome {
     let mut equations = Reduced::new(problem);
     let mut cost = problem.cost(limits.loss);

@@ -46,7 +46,7 @@ pub(super) fn judge(refiner: &mut Refiner) -> Option<LensPrecision> {
     let chosen = tracks.select(refiner.frames.len(), most);
     let ((formal, lens), halves) = (by_equations(refiner, &tracks, &chosen), by_halves(refiner, &tracks, &chosen));
     let floats = refiner.standing.floating && !refiner.standing.fixed;
-    let told_angles = !floats && !formal.is_empty();
+    let by_equations = !formal.is_empty();
     for (i, frame) in refiner.frames.iter_mut().enumerate() {
         frame.known.precision = None;
         let Some((near, far)) = frame.known.depths.filter(|_| frame.tied && !frame.known.apart) else { continue };
@@ -58,9 +58,9 @@ pub(super) fn judge(refiner: &mut Refiner) -> Option<LensPrecision> {
             (a * a + b * b + least * least).map(f64::sqrt)
         };
         let within = sigma(|d| d.within);
-        let rotation_deg = told_angles.then(|| formal.angles.map(f64::to_degrees).to_array());
+        let rotation_deg = (by_equations && !floats).then(|| formal.angles.map(f64::to_degrees).to_array());
         let position = if floats { within } else { sigma(|d| d.on_earth) }.to_array();
-        frame.known.precision = Some(PosePrecision { position, rotation_deg });
+        frame.known.precision = Some(PosePrecision { position, by_equations, rotation_deg });
         // Positions that are good to metres are no fault of a scene that is seen from as near.
         frame.known.loose = within.is_nan() || within.length() > LOOSE * depth;
     }

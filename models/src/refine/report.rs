@@ -203,8 +203,11 @@ pub struct ControlResidual {
 pub struct PosePrecision {
     /// Standard deviations east, north and up, in the scene's units: within the scene where nothing says where that is.
     pub position: [f64; 3],
+    /// The equations of the adjustment have been asked, not only its two halves: of too many pictures they are not, and `position` is
+    /// then no more than what the halves differ by.
+    pub by_equations: bool,
     /// Standard deviations about the camera's axes (right, down, forward), degrees; `None` where nothing says how the scene lies, or
-    /// its pictures are too many for the whole inverse.
+    /// the equations have not been asked.
     pub rotation_deg: Option<[f64; 3]>,
 }
 

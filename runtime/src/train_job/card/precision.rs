@@ -36,7 +36,10 @@ struct Stated {
 
 impl Known {
     pub(super) fn of(found: &Settlement, in_metres: bool, has_positions: bool) -> Self {
-        let (poses, lens, estimate) = (found.precision.clone(), found.lens.clone(), found.solved.shared.clone());
+        // What two halves of the points differ by is no standard deviation that a map could be defended with.
+        let poses =
+            found.precision.iter().filter(|(_, p)| p.by_equations).map(|(name, p)| (name.clone(), *p)).collect();
+        let (lens, estimate) = (found.lens.clone(), found.solved.shared.clone());
         Self { poses, lens, estimate, in_metres, has_positions }
     }
 
@@ -62,10 +65,10 @@ impl Known {
     pub(super) fn write(&self, set: &Dataset, settled: &HashMap<String, Settled>, out: &Path) -> Result<(), JobError> {
         let mut text = String::from(if self.in_metres {
             "name,east_m,north_m,up_m,sigma_east_m,sigma_north_m,sigma_up_m,sigma_right_deg,sigma_down_deg,sigma_forward_deg,\
-             stated_off_east_m,stated_off_north_m,stated_off_up_m,stated_off_sigmas\n"
+             stated_off_east_m,stated_off_north_m,stated_off_up_m,off_in_stated_sigmas\n"
         } else {
             "name,x,y,z,sigma_x,sigma_y,sigma_z,sigma_right_deg,sigma_down_deg,sigma_forward_deg,\
-             stated_off_x,stated_off_y,stated_off_z,stated_off_sigmas\n"
+             stated_off_x,stated_off_y,stated_off_z,off_in_stated_sigmas\n"
         });
         let mut frames: Vec<&DatasetFrame> = set.frames.iter().filter(|f| settled.contains_key(&f.name)).collect();
         frames.sort_by(|a, b| a.name.cmp(&b.name));
@@ -97,10 +100,7 @@ impl Known {
         match stated.filter(|s| s.sigma_m.iter().all(|s| s.is_finite())) {
             Some(stated) => {
                 let off = (stated.center - center).to_array();
-                let sigmas = [0, 1, 2].map(|axis| {
-                    let own = known.map_or(0.0, |k| k.position[axis]);
-                    off[axis].abs() / f64::from(stated.sigma_m[axis]).hypot(own)
-                });
+                let sigmas = [0, 1, 2].map(|axis| off[axis].abs() / f64::from(stated.sigma_m[axis]));
                 cells.extend(off.map(|o| number(Some(o), 3)));
                 cells.push(number(Some(sigmas.into_iter().fold(0.0, f64::max)), 2));
             }
@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     fn precision(east: f64) -> PosePrecision {
-        PosePrecision { position: [east, 0.2, 0.3], rotation_deg: None }
+        PosePrecision { position: [east, 0.2, 0.3], by_equations: true, rotation_deg: None }
     }
 
     #[test]
@@ -137,11 +137,11 @@ mod tests {
         let poses = [("=1,2.jpg".to_owned(), precision(0.1))].into();
         let known =
             Known { poses, lens: None, estimate: SharedEstimate::default(), in_metres: true, has_positions: true };
-        let stated = Stated { center: DVec3::new(10.0, 20.0, 50.0), sigma_m: [1.0, 1.0, 3.0] };
+        let stated = Stated { center: DVec3::new(10.0, 20.0, 50.0), sigma_m: [1.0, 1.0, 2.0] };
         let mut row = String::new();
         known.row("=1,2.jpg", DVec3::new(10.0, 20.0, 53.0), Some(stated), &mut row);
-        // Three metres up, of three stated and 0.3 of its own.
-        let wanted = "\"'=1,2.jpg\",10.0000,20.0000,53.0000,0.1000,0.2000,0.3000,,,,0.000,0.000,-3.000,1.00";
+        // Three metres down, where two are stated.
+        let wanted = "\"'=1,2.jpg\",10.0000,20.0000,53.0000,0.1000,0.2000,0.3000,,,,0.000,0.000,-3.000,1.50";
         assert_eq!(row.trim_end(), wanted);
         row.clear();
         known.row("b.jpg", DVec3::ZERO, None, &mut row);
