@@ -167,6 +167,14 @@ impl Mission {
     /// # Errors
     /// One line that names the file, the field and the remedy.
     pub fn read(path: &Path) -> Result<Self, MissionError> {
+        Ok(Self::read_with_text(path)?.0)
+    }
+
+    /// As [`Mission::read`], with the text that was read.
+    ///
+    /// # Errors
+    /// Those of [`Mission::read`].
+    pub fn read_with_text(path: &Path) -> Result<(Self, String), MissionError> {
         let at = |source| MissionError::Unreadable { path: path.into(), source };
         let mut text = String::new();
         let file = disk::regular::open(path).map_err(at)?;
@@ -176,7 +184,8 @@ impl Mission {
             return Err(MissionError::TooLarge { path: path.into(), bytes, limit: MAX_FILE_BYTES });
         }
         let folder = path.parent().unwrap_or(Path::new("."));
-        Self::parse(&text, folder).map_err(|e| e.in_file(path))
+        let mission = Self::parse(&text, folder).map_err(|e| e.in_file(path))?;
+        Ok((mission, text))
     }
 
     /// As [`Mission::read`], from text; relative paths are taken from `folder`.

@@ -8,33 +8,34 @@ use disk::{Disk, DiskError};
 use fleet::FleetError;
 use fleet::deal::{Share, deal};
 use fleet::figure;
-use fleet::flights::{Flights, crossings};
-use fleet::ground::{Ground, Ring};
+use fleet::flights::{Flights, Off, crossings};
+use fleet::ground::Ground;
 use fleet::pace::{Manner, Pace};
 use fleet::ring::ring;
 use fleet::sortie::Craft;
 use geometry::geodesy::{EnuFrame, Geodetic};
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use measure::MeasureError;
-use measure::areas::{self, Area};
-use measure::heights::{HeightMap, Heights, MOST_PIXELS};
 use models::formats::FormatError;
-use survey::ortho::crs::Crs;
 
 mod after;
+mod place;
 mod regions;
+mod terrain;
 
 pub use after::Rest;
+use place::{area, homes, moved, placed};
+use terrain::Terrain;
 
 /// Names in the folder.
 pub const MISSION: &str = "mission.toml";
 const FIGURE: &str = "survey.svg";
 const TABLE: &str = "survey.csv";
-/// Around the area as much terrain is read as this, metres: lines and ways reach beyond it.
-const AROUND_M: f64 = 500.0;
 /// Lines are longer than the ground by this many distances of pictures, at both ends, so that its border lies in as many pictures as
 /// its middle.
 const BEYOND: f64 = 1.5;
+/// Take-off places are no higher above the sea, and no lower below it, metres.
+const HIGHEST_HOME_M: f64 = 10_000.0;
 /// Least distance of lines and of pictures on a line, metres.
 const NEAREST_M: f64 = 0.5;
 
@@ -181,8 +182,10 @@ pub struct Planned {
     pub take_off: Option<Geodetic>,
     /// Lines reach so far beyond the area, and into its holes, metres.
     pub beyond_m: f64,
-    /// Holes of the area.
+    /// Rings that are cut out of the area.
     pub holes: usize,
+    /// Lines that reach into one.
+    pub lines_over_holes: usize,
     /// Ways to, from and between lines that lead over one.
     pub over_holes: usize,
 }
@@ -198,6 +201,10 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
             out.join(MISSION).display()
         )));
     }
+    if !(-HIGHEST_HOME_M..=HIGHEST_HOME_M).contains(&request.home_m) {
+        let wanted = format!("{:.0} to {HIGHEST_HOME_M:.0} m", -HIGHEST_HOME_M);
+        return Err(setting("--home-height", request.home_m, wanted));
+    }
     let count = request.aircraft.len();
     let (base_m, manner) = manner(&request.camera, &request.pictures, &request.flying)?;
     let (place, area) = match &request.source {
@@ -206,11 +213,11 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
     };
     let ground_in = |frame: &EnuFrame| match (&area, &request.source) {
         (Some((path, area)), _) => placed(path, area, frame),
-        (None, Source::Rest(rest)) => Ok(rest.left.clone()),
-        (None, Source::File(_)) => Ok(Ground::default()),
+        (None, Source::Rest(rest)) => Ok((rest.left.clone(), rest.holes.clone())),
+        (None, Source::File(_)) => Ok((Ground::default(), Vec::new())),
     };
     let frame = EnuFrame::new(place);
-    let ground = ground_in(&frame)?;
+    let (ground, _) = ground_in(&frame)?;
     let homes = homes(&request.flying, &frame, &ground, count)?;
     let terrain = request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &ground, &homes)).transpose()?;
     let height = |p: DVec2| terrain.as_ref().and_then(|t| t.height(p));
@@ -228,7 +235,7 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         Source::Rest(_) => place,
     };
     let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
-    let ground = ground_in(&frame)?;
+    let (ground, holes) = ground_in(&frame)?;
     let craft = craft(request, &homes, &manner)?;
     let shares = deal(&ground, &craft, &manner).map_err(|e| request.in_source(e))?;
     let text = match &request.source {
@@ -260,6 +267,14 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
             });
         }
     }
+    let mut names: Vec<&PathBuf> = plans.iter().map(|(path, _)| path).collect();
+    names.sort();
+    if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
+        return Err(SurveyError::Request(format!(
+            "{}: would hold the plans of two aircraft; give them ids that end in no number after a hyphen",
+            pair[0].display()
+        )));
+    }
     for (path, plan) in &plans {
         disk.replace(path, |to| plan.write(to)).map_err(failed(path))?;
     }
@@ -271,11 +286,12 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         speed_m_s: manner.pace.speed_m_s,
         hectares: ground.area_m2() / 1e4,
         beyond_m: manner.beyond_m,
-        holes: ground.parts.iter().map(|part| part.len() - 1).sum(),
+        holes: holes.len(),
+        lines_over_holes: shares.iter().flat_map(|share| &share.sorties).map(|s| s.lines_over(&holes)).sum(),
         over_holes: craft
             .iter()
             .zip(&shares)
-            .flat_map(|(craft, share)| share.sorties.iter().map(|s| s.over_holes(&ground, craft.home)))
+            .flat_map(|(craft, share)| share.sorties.iter().map(|s| s.ways_over(&holes, craft.home)))
             .sum(),
         take_off: (request.flying.take_off.is_empty()).then(|| frame.to_geodetic(homes[0].extend(0.0))),
     };
@@ -356,81 +372,9 @@ fn manner(camera: &Camera, pictures: &Pictures, flying: &Flying) -> Result<(f64,
             format!("{:.2} s or less, as pictures lie {base_m:.1} m apart", base_m / 0.5),
         ));
     }
-    let pace = Pace::new(flying.speed_m_s.min(most), flying.wind_m_s, flying.fastest_m_s)?;
+    let mut pace = Pace::new(flying.speed_m_s, flying.wind_m_s, flying.fastest_m_s)?;
+    pace.speed_m_s = pace.speed_m_s.min(most);
     Ok((base_m, Manner { spacing_m, beyond_m: BEYOND * base_m, height_m, pace }))
-}
-
-/// The area in degrees, and its middle.
-fn area(path: &Path) -> Result<(Area, Geodetic), SurveyError> {
-    let mut drawn = areas::read_degrees(path)?;
-    if drawn.others > 0 {
-        tracing::warn!("{}: {} features are no polygons and are left out", path.display(), drawn.others);
-    }
-    let (Some(area), 1) = (drawn.areas.first(), drawn.areas.len()) else {
-        let names: Vec<&str> = drawn.areas.iter().take(3).map(|a| a.name.as_str()).collect();
-        return Err(SurveyError::Request(format!(
-            "{}: holds {} polygons ({}, …), and one is surveyed at a time; save that one by itself",
-            path.display(),
-            drawn.areas.len(),
-            names.join(", ")
-        )));
-    };
-    let [low, high] = area.bounds();
-    let middle = low.midpoint(high);
-    // A hundredth of a millionth of a degree is a millimetre.
-    let [lon_deg, lat_deg] = [middle.x, middle.y].map(|v| (v * 1e7).round() / 1e7);
-    Ok((drawn.areas.swap_remove(0), Geodetic { lat_deg, lon_deg, alt_m: 0.0 }))
-}
-
-/// The area in metres.
-fn placed(path: &Path, area: &Area, frame: &EnuFrame) -> Result<Ground, SurveyError> {
-    let put = |corners: &Vec<DVec2>| -> Ring { corners.iter().map(|p| flat(frame, p.y, p.x)).collect() };
-    let holes: Vec<Ring> = area.holes.iter().map(put).collect();
-    Ground::new(put(&area.outside), &holes).map_err(|e| in_file(path, e))
-}
-
-fn flat(frame: &EnuFrame, lat_deg: f64, lon_deg: f64) -> DVec2 {
-    frame.to_enu(Geodetic { lat_deg, lon_deg, alt_m: frame.origin().alt_m }).truncate()
-}
-
-/// Places of one frame in another.
-fn moved(from: &EnuFrame, to: &EnuFrame, places: Vec<DVec2>) -> Vec<DVec2> {
-    let place = |p: DVec2| {
-        let at = from.to_geodetic(DVec3::new(p.x, p.y, 0.0));
-        flat(to, at.lat_deg, at.lon_deg)
-    };
-    places.into_iter().map(place).collect()
-}
-
-/// Where each aircraft takes off.
-fn homes(flying: &Flying, frame: &EnuFrame, ground: &Ground, count: usize) -> Result<Vec<DVec2>, SurveyError> {
-    let place = |[lat_deg, lon_deg]: &[f64; 2]| {
-        let valid = Geodetic { lat_deg: *lat_deg, lon_deg: *lon_deg, alt_m: 0.0 }.is_valid();
-        match valid.then(|| flat(frame, *lat_deg, *lon_deg)).filter(|p| p.length() < 50_000.0) {
-            Some(p) => Ok(p),
-            None => Err(setting(
-                "--take-off",
-                format!("{lat_deg},{lon_deg}"),
-                "latitude and longitude near the area, degrees",
-            )),
-        }
-    };
-    match flying.take_off.as_slice() {
-        [] => {
-            // The corner with the shortest way to all of the area.
-            let middle = ground.middle();
-            let corners = ground.parts.first().and_then(|part| part.first()).into_iter().flatten();
-            let nearest = corners.min_by(|a, b| a.distance(middle).total_cmp(&b.distance(middle)));
-            Ok(vec![nearest.copied().unwrap_or(middle); count])
-        }
-        [one] => Ok(vec![place(one)?; count]),
-        each if each.len() == count => each.iter().map(place).collect(),
-        each => Err(setting(
-            "--take-off",
-            format!("was given {} times", each.len()),
-            format!("given once, or once for each of {count} aircraft"),
-        )),
-    }
 }
 
 fn craft(request: &Request, homes: &[DVec2], manner: &Manner) -> Result<Vec<Craft>, SurveyError> {
@@ -451,7 +395,8 @@ fn craft(request: &Request, homes: &[DVec2], manner: &Manner) -> Result<Vec<Craf
     if !(5.0..=10_000.0).contains(highest_m) {
         return Err(setting("--highest", highest_m, "5 to 10000 m"));
     }
-    let heights = crossings(count, manner.height_m, *highest_m)?;
+    let off = if request.terrain.is_some() { Off::above_terrain(manner.height_m) } else { Off::default() };
+    let heights = crossings(count, manner.height_m, *highest_m, off)?;
     let one = |(k, (id, _)): (usize, &(String, String))| Craft {
         id: id.clone(),
         home: homes[k],
@@ -487,41 +432,6 @@ fn region(ground: &Ground, id: &str) -> Result<Vec<[f64; 2]>, FleetError> {
         )));
     }
     Ok(corners.iter().map(|p| p.to_array().map(|v| (v * 1e3).round() / 1e3)).collect())
-}
-
-/// Heights of the ground around the area.
-struct Terrain {
-    heights: Heights,
-    crs: Crs,
-}
-
-impl Terrain {
-    fn open(path: &Path, frame: &EnuFrame, ground: &Ground, homes: &[DVec2]) -> Result<Self, SurveyError> {
-        let bad = |why: String| SurveyError::File(FormatError::invalid(path, why));
-        let mut map = HeightMap::open(path)?;
-        let Some(code) = map.epsg() else {
-            return Err(bad(
-                "names no projected reference system by its EPSG code; gdalwarp -t_srs EPSG:… gives it one".into(),
-            ));
-        };
-        let crs = Crs::projected(code, frame.origin()).map_err(|e| bad(e.to_string()))?;
-        let places = ground.bounds().into_iter().chain(homes.iter().copied());
-        let (low, high) = places.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(l, h), p| (l.min(p), h.max(p)));
-        let (low, high) = (low - AROUND_M, high + AROUND_M);
-        let corners = [low, DVec2::new(low.x, high.y), high, DVec2::new(high.x, low.y)];
-        let mut bounds = [DVec2::INFINITY, DVec2::NEG_INFINITY];
-        for corner in corners {
-            let at = crs.to_map(corner.extend(0.0)).map_err(|e| bad(e.to_string()))?.truncate();
-            bounds = [bounds[0].min(at), bounds[1].max(at)];
-        }
-        let heights = map.part(bounds, MOST_PIXELS)?.ok_or_else(|| bad("holds nothing of the area".into()))?;
-        Ok(Self { heights, crs })
-    }
-
-    fn height(&self, p: DVec2) -> Option<f64> {
-        let at = self.crs.to_map(DVec3::new(p.x, p.y, 0.0)).ok()?;
-        self.heights.height(at.truncate())
-    }
 }
 
 fn table(out: &mut dyn std::io::Write, request: &Request, planned: &Planned) -> std::io::Result<()> {

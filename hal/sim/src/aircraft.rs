@@ -205,6 +205,11 @@ impl Leg {
         legs
     }
 
+    /// Pictures along it.
+    pub fn pictures(&self) -> usize {
+        self.shots.len()
+    }
+
     fn direction(&self) -> Option<DVec3> {
         let way = self.to - self.from;
         (way.length() > 1e-6).then(|| way.normalize())

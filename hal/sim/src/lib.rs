@@ -97,24 +97,41 @@ impl SimSettings {
         let named = |legs: &[Leg], manner| {
             aircraft::fly(self.origin, legs, manner, &self.imperfections, &self.prefix, self.seed)
         };
+        let whole = |flight: Flight, legs: &[Leg]| {
+            let (taken, planned) = (flight.exposures.len(), legs.iter().map(Leg::pictures).sum::<usize>());
+            match taken < planned {
+                true => Err(SimError::Settings {
+                    what: "flight",
+                    why: format!(
+                        "takes longer than an hour, {taken} of {planned} pictures; fly a part of it or faster"
+                    ),
+                }),
+                false => Ok(flight),
+            }
+        };
         if let Some(route) = &self.route {
             let manner = Manner { speed_ms: route.speed_ms, gimbal_pitch_deg: route.gimbal_pitch_deg };
             let near = |w: &survey::Waypoint| w.position.is_finite() && w.position.length() < FARTHEST;
             let flyable = route.speed_ms > 0.1 && route.speed_ms < 100.0 && route.waypoints.iter().all(near);
-            let flight = flyable.then(|| named(&Leg::of_route(route), manner)).flatten();
-            return flight.ok_or_else(|| SimError::Settings {
+            let legs = if flyable { Leg::of_route(route) } else { Vec::new() };
+            let flight = named(&legs, manner).ok_or_else(|| SimError::Settings {
                 what: "route",
                 why: "needs waypoints within 10 km of the mission's origin and a speed of 0.1..100 m/s".into(),
-            });
+            })?;
+            if let Some(low) = route.waypoints.iter().map(|w| w.position.z).find(|z| *z < 0.0) {
+                return wrong("route", format!("leads {:.0} m below the mission's origin, where its ground is", -low));
+            }
+            return whole(flight, &legs);
         }
         let region: Vec<DVec2> = self.region.iter().map(|c| DVec2::from(*c)).collect();
         let footprint = DVec2::new(f64::from(lens.width) / lens.fx, f64::from(lens.height) / lens.fy) * survey.height_m;
         let legs = Leg::of_lines(&lines(&region, footprint, survey), survey.height_m);
         let manner = Manner { speed_ms: survey.speed_ms, gimbal_pitch_deg: survey.gimbal_pitch_deg };
-        named(&legs, manner).ok_or_else(|| SimError::Settings {
+        let flight = named(&legs, manner).ok_or_else(|| SimError::Settings {
             what: "region",
             why: "needs at least three corners around an area".into(),
-        })
+        })?;
+        whole(flight, &legs)
     }
 }
 

@@ -10,7 +10,7 @@ use crate::FleetError;
 use crate::ground::Ground;
 use crate::lines::{Line, lines, path_s};
 use crate::pace::Manner;
-use crate::rows::{Lattice, Rows, held, rows};
+use crate::rows::{Lattice, MOST_ROWS, Rows, held, rows};
 use crate::sortie::{Craft, Sortie, sorties};
 
 /// Most aircraft that one area is dealt to.
@@ -55,8 +55,15 @@ pub fn deal(ground: &Ground, craft: &[Craft], manner: &Manner) -> Result<Vec<Sha
         return Err(FleetError::Setting { what: "--aircraft", value: craft.len().to_string(), wanted });
     }
     let mut best = Best::default();
+    let quickest = quickest(ground, manner);
+    if quickest.is_empty() {
+        return Err(FleetError::Area(format!(
+            "is too wide for lines {:.2} m apart, as {MOST_ROWS} are planned; survey it in parts, or ask for coarser pixels or less overlap",
+            manner.spacing_m
+        )));
+    }
     // Lines along each region's best direction; where their number jumps, along the strips; and strips of another direction.
-    for along in quickest(ground, manner) {
+    for along in quickest {
         let lattice = Lattice::over(ground, along, manner.spacing_m);
         let all = rows(ground, &lattice);
         let dealer = Dealer { ground, craft, manner, lattice, all };
@@ -99,8 +106,11 @@ impl Best {
 /// The directions of lines over all of `ground` that take the least time, the quickest first.
 fn quickest(ground: &Ground, manner: &Manner) -> Vec<DVec2> {
     let home = ground.middle();
-    let seconds = |along: DVec2| path_s(&laid(ground, along, home, manner).1, home, &manner.pace);
-    let mut timed: Vec<(f64, DVec2)> = directions(ground).into_iter().map(|d| (seconds(d), d)).collect();
+    let timed = directions(ground).into_iter().filter_map(|along| {
+        let (_, lines) = laid(ground, along, home, manner)?;
+        Some((path_s(&lines, home, &manner.pace), along))
+    });
+    let mut timed: Vec<(f64, DVec2)> = timed.collect();
     timed.sort_by(|a, b| a.0.total_cmp(&b.0));
     timed.into_iter().take(MOST_LATTICES).map(|t| t.1).collect()
 }
@@ -119,10 +129,14 @@ fn directions(ground: &Ground) -> Vec<DVec2> {
     found
 }
 
-fn laid(ground: &Ground, along: DVec2, home: DVec2, manner: &Manner) -> (Lattice, Vec<Line>) {
+/// Lines over all of `ground`; `None` where more would be needed than are planned.
+fn laid(ground: &Ground, along: DVec2, home: DVec2, manner: &Manner) -> Option<(Lattice, Vec<Line>)> {
     let lattice = Lattice::over(ground, along, manner.spacing_m);
+    if lattice.width > manner.spacing_m * (1.0 + 1e-6) {
+        return None;
+    }
     let lines = lines(&rows(ground, &lattice), &lattice, manner.beyond_m, home, &manner.pace);
-    (lattice, lines)
+    Some((lattice, lines))
 }
 
 struct Dealer<'a> {
@@ -178,9 +192,9 @@ impl Dealer<'_> {
         let beside = lines(rows, &self.lattice, manner.beyond_m, craft.home, &manner.pace);
         let mut tried = vec![(self.lattice.width, beside)];
         if free {
-            tried.extend(directions(&ground).into_iter().map(|along| {
-                let (lattice, lines) = laid(&ground, along, craft.home, manner);
-                (lattice.width, lines)
+            tried.extend(directions(&ground).into_iter().filter_map(|along| {
+                let (lattice, lines) = laid(&ground, along, craft.home, manner)?;
+                Some((lattice.width, lines))
             }));
         }
         let seconds = |lines: &Vec<Line>| path_s(lines, craft.home, &manner.pace);

@@ -13,31 +13,50 @@ use crate::sortie::{Craft, Sortie, crosses};
 const APART_M: f64 = 5.0;
 /// The lowest crossing above ground, metres.
 const LOWEST_M: f64 = 20.0;
-/// The ground is asked for its height this far apart, metres, and a line may be off by this share of its height above ground.
+/// The ground is asked for its height this far apart, metres.
 const STEP_M: f64 = 10.0;
+/// A line may be off its height above ground by this share of it, and a crossing by so many metres.
 const OFF: f64 = 0.05;
+const CROSSING_OFF_M: f64 = 1.0;
 
 /// Heights of the ground above the sea, metres, at places east and north.
 pub type Terrain<'a> = &'a dyn Fn(DVec2) -> Option<f64>;
 
-/// Crossing heights of `count` aircraft that photograph from `height_m`, none above `highest_m`; one alone has no need to cross.
+/// By how much an aircraft is higher or lower above the ground than planned, metres, as it follows terrain in straight pieces.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Off {
+    line_m: f64,
+    crossing_m: f64,
+}
+
+impl Off {
+    /// Of flights that follow terrain and photograph from `height_m`.
+    pub fn above_terrain(height_m: f64) -> Self {
+        Self { line_m: OFF * height_m, crossing_m: CROSSING_OFF_M }
+    }
+}
+
+/// Crossing heights of `count` aircraft that photograph from `height_m`, none above `highest_m`; one alone has no need to cross. They are
+/// so far apart that nobody is nearer than [`APART_M`] to another's crossing or lines where both are `off`.
 ///
 /// # Errors
 /// There is no room for so many.
-pub fn crossings(count: usize, height_m: f64, highest_m: f64) -> Result<Vec<f64>, FleetError> {
-    if height_m > highest_m {
+pub fn crossings(count: usize, height_m: f64, highest_m: f64, off: Off) -> Result<Vec<f64>, FleetError> {
+    let Off { line_m, crossing_m } = off;
+    if height_m + line_m.max(crossing_m) > highest_m {
         return Err(FleetError::Setting {
             what: "--gsd",
-            value: format!("is flown {height_m:.0} m above ground"),
+            value: format!("is flown {:.0} m above ground", height_m + line_m.max(crossing_m)),
             wanted: format!("at most {highest_m:.0} m (--highest); ask for finer pixels"),
         });
     }
     if count == 1 {
         return Ok(vec![height_m]);
     }
-    let steps = (1..=count).map(|k| APART_M * k as f64);
-    let above = steps.clone().map(|s| height_m + s).filter(|m| *m <= highest_m);
-    let below = steps.map(|s| height_m - s).filter(|m| *m >= LOWEST_M);
+    let (first, apart) = (APART_M + line_m + crossing_m, APART_M + 2.0 * crossing_m);
+    let steps = (0..count).map(|k| first + apart * k as f64);
+    let above = steps.clone().map(|s| height_m + s).filter(|m| *m + crossing_m <= highest_m);
+    let below = steps.map(|s| height_m - s).filter(|m| *m - crossing_m >= LOWEST_M);
     let found: Vec<f64> = above.chain(below).take(count).collect();
     match found.len() == count {
         true => Ok(found),
@@ -114,11 +133,13 @@ impl Flights<'_> {
         Waypoint { position: self.at(p, alt_m), yaw_deg: None, picture: false, every_m }
     }
 
-    /// Straight from place to place at the aircraft's own height above the highest ground between them.
+    /// Straight from place to place at the aircraft's own height above the ground: level above all of it, somebody would be too high
+    /// above valleys, or as high as another who crosses lower ground.
     fn cross(&self, waypoints: &mut Vec<Waypoint>, from: DVec2, to: DVec2, craft: &Craft) -> Result<(), FleetError> {
-        let highest = self.profile(from, to)?.into_iter().map(|p| p.1).fold(f64::MIN, f64::max);
-        for p in [from, to] {
-            waypoints.push(self.waypoint(p, highest + craft.crossing_m, None));
+        let profile = self.profile(from, to)?;
+        for k in simplified(&profile, CROSSING_OFF_M) {
+            let (share, ground) = profile[k];
+            waypoints.push(self.waypoint(from.lerp(to, share), ground + craft.crossing_m, None));
         }
         Ok(())
     }
@@ -228,22 +249,36 @@ mod tests {
         let far = Line { from: DVec2::ZERO, to: DVec2::new(500.0, 0.0) };
         let refused = flights.line(&mut Vec::new(), &far).expect_err("beyond the map").to_string();
         assert!(refused.starts_with("--terrain holds no height at 47.4"), "{refused}");
-        // What is crossed is crossed above its highest place.
+        // Ways across are at one height above the ground, too.
         let mut way = Vec::new();
         flights.cross(&mut way, DVec2::ZERO, DVec2::new(300.0, 0.0), &craft).expect("a way");
-        assert!(way.iter().all(|w| w.position.alt_m > 603.0), "{way:?}");
+        let places: Vec<(f64, f64)> = way.iter().map(|w| (frame.to_enu(w.position).x, w.position.alt_m)).collect();
+        assert!(places[0].0.abs() < 1e-6 && (places[places.len() - 1].0 - 300.0).abs() < 0.1, "{places:?}");
+        for pair in places.windows(2) {
+            for k in 0..=10 {
+                let share = f64::from(k) / 10.0;
+                let [x, z] = [pair[0].0 + share * (pair[1].0 - pair[0].0), pair[0].1 + share * (pair[1].1 - pair[0].1)];
+                let above = z - hill(DVec2::new(x, 0.0)).expect("ground");
+                assert!((above - 75.0).abs() < 1.5, "{above} m above ground at {x}");
+            }
+        }
     }
 
     #[test]
     fn nobody_crosses_at_the_height_of_another() {
-        let found = crossings(8, 60.0, 120.0).expect("room");
+        let level = |count, height_m, highest_m| crossings(count, height_m, highest_m, Off::default());
+        let found = level(8, 60.0, 120.0).expect("room");
         let mut sorted = found.clone();
         sorted.sort_by(f64::total_cmp);
         assert!(sorted.windows(2).all(|w| w[1] - w[0] >= APART_M) && sorted[0] > 60.0);
-        assert_eq!(crossings(1, 60.0, 120.0), Ok(vec![60.0]));
+        assert_eq!(level(1, 60.0, 120.0), Ok(vec![60.0]));
         // Below, where there is no room above.
-        assert_eq!(crossings(3, 110.0, 120.0), Ok(vec![115.0, 120.0, 105.0]));
-        assert!(crossings(40, 60.0, 120.0).expect_err("no").to_string().contains("--highest"));
-        assert!(crossings(1, 130.0, 120.0).expect_err("no").to_string().contains("--gsd is flown 130 m"));
+        assert_eq!(level(3, 110.0, 120.0), Ok(vec![115.0, 120.0, 105.0]));
+        assert!(level(40, 60.0, 120.0).expect_err("no").to_string().contains("--highest"));
+        assert!(level(1, 130.0, 120.0).expect_err("no").to_string().contains("--gsd is flown 130 m"));
+        // Over terrain lines may be 3 m off at 60 m, and crossings 1 m.
+        let off = Off::above_terrain(60.0);
+        assert_eq!(crossings(4, 60.0, 79.0, off), Ok(vec![69.0, 76.0, 51.0, 44.0]));
+        assert!(crossings(1, 60.0, 62.0, off).expect_err("no").to_string().contains("--gsd is flown 63 m"));
     }
 }

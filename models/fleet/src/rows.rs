@@ -4,8 +4,8 @@ use glam::DVec2;
 
 use crate::ground::{Ground, Ring};
 
-/// More strips than this are wider ones.
-const MOST_ROWS: f64 = 4000.0;
+/// More strips than this are wider ones, and are not planned.
+pub const MOST_ROWS: f64 = 4000.0;
 /// Gaps of a strip shorter than this are flown through, in widths of the strip: turning around takes longer.
 const GAP: f64 = 1.0;
 

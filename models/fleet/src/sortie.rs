@@ -4,7 +4,7 @@ use geometry::polygon;
 use glam::DVec2;
 
 use crate::FleetError;
-use crate::ground::{Ground, Ring};
+use crate::ground::Ring;
 use crate::lines::{Line, path_s};
 use crate::pace::Manner;
 
@@ -47,13 +47,17 @@ impl Sortie {
         metres + here.distance(home)
     }
 
-    /// Ways to the first line, from line to line and back that lead over a hole of `ground`.
-    pub fn over_holes(&self, ground: &Ground, home: DVec2) -> usize {
+    /// Lines that lead over a hole or reach into one.
+    pub fn lines_over(&self, holes: &[Ring]) -> usize {
+        self.lines.iter().filter(|line| holes.iter().any(|hole| crosses_ring((line.from, line.to), hole))).count()
+    }
+
+    /// Ways to the first line, from line to line and back that lead over a hole.
+    pub fn ways_over(&self, holes: &[Ring], home: DVec2) -> usize {
         let ends = self.lines.iter().map(|line| line.to);
         let begins = self.lines.iter().map(|line| line.from);
         let ways = std::iter::once(home).chain(ends).zip(begins.chain([home]));
-        let holes = || ground.parts.iter().flat_map(|part| part.iter().skip(1));
-        ways.filter(|way| holes().any(|hole| crosses_ring(*way, hole))).count()
+        ways.filter(|way| holes.iter().any(|hole| crosses_ring(*way, hole))).count()
     }
 }
 
@@ -62,7 +66,8 @@ fn crosses_ring((from, to): (DVec2, DVec2), ring: &Ring) -> bool {
     let side = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
     let apart = |a: DVec2, b: DVec2, p: DVec2, q: DVec2| side(a, b, p) * side(a, b, q) < 0.0;
     let mut sides = ring.iter().zip(ring.iter().cycle().skip(1));
-    polygon::contains(ring, from) || sides.any(|(a, b)| apart(from, to, *a, *b) && apart(*a, *b, from, to))
+    [from, to].into_iter().any(|end| polygon::contains(ring, end))
+        || sides.any(|(a, b)| apart(from, to, *a, *b) && apart(*a, *b, from, to))
 }
 
 /// The lines as flights that a battery lasts for. A line that is too long for one is flown in several.
@@ -128,15 +133,18 @@ mod tests {
 
     #[test]
     fn ways_over_a_hole_are_counted_and_those_beside_it_are_not() {
-        let outside = rectangle(0.0, 0.0, 100.0, 100.0);
-        let ground = Ground::new(outside, &[rectangle(40.0, 40.0, 20.0, 20.0)]).expect("ground");
+        let holes = [rectangle(40.0, 40.0, 20.0, 20.0)];
         let line = |from: [f64; 2], to: [f64; 2]| Line { from: from.into(), to: to.into() };
         let home = DVec2::new(-10.0, 50.0);
-        let over = |lines| Sortie { lines, seconds: 0.0 }.over_holes(&ground, home);
+        let over = |lines| Sortie { lines, seconds: 0.0 }.ways_over(&holes, home);
         // There over the hole and back beside it; and from line to line.
         assert_eq!(over(vec![line([90.0, 50.0], [90.0, 90.0])]), 1);
         assert_eq!(over(vec![line([10.0, 5.0], [90.0, 5.0])]), 0);
         assert_eq!(over(vec![line([5.0, 10.0], [30.0, 10.0]), line([70.0, 90.0], [5.0, 90.0])]), 1);
+        // A line over it, one that ends in it, and one beside it.
+        let lines =
+            vec![line([0.0, 50.0], [90.0, 50.0]), line([0.0, 45.0], [45.0, 45.0]), line([0.0, 5.0], [90.0, 5.0])];
+        assert_eq!(Sortie { lines, seconds: 0.0 }.lines_over(&holes), 2);
     }
 
     #[test]

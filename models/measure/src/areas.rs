@@ -318,13 +318,17 @@ fn from_kml(text: &str) -> Result<Drawn, String> {
         let polygons: Vec<_> = placemark.descendants().filter(|n| is_called(n, "Polygon")).collect();
         others += usize::from(polygons.is_empty());
         for (k, polygon) in polygons.iter().enumerate() {
-            let of = |kind: &'static str| polygon.children().filter(move |n| is_called(n, kind));
+            let of = |kind: &'static str| {
+                let boundaries = polygon.children().filter(move |n| is_called(n, kind));
+                boundaries.flat_map(|boundary| boundary.descendants().filter(|n| is_called(n, "coordinates")))
+            };
+            if of("outerBoundaryIs").count() != 1 {
+                return Err(format!("a polygon of {name:?} has {} outer boundaries", of("outerBoundaryIs").count()));
+            }
+            // Some programs write several rings into one innerBoundaryIs.
             let rings: Result<Vec<_>, String> = of("outerBoundaryIs")
                 .chain(of("innerBoundaryIs"))
-                .map(|boundary| {
-                    let corners = boundary.descendants().find(|n| is_called(n, "coordinates"));
-                    corners.and_then(|n| n.text()).unwrap_or_default().split_whitespace().map(kml_corner).collect()
-                })
+                .map(|corners| corners.text().unwrap_or_default().split_whitespace().map(kml_corner).collect())
                 .collect();
             let name = if polygons.len() > 1 { format!("{name} ({})", k + 1) } else { name.to_owned() };
             drawn.polygons.push((name, rings?));
@@ -421,6 +425,10 @@ mod tests {
             ),
             (nested.as_str(), "nested"),
             (
+                "<kml><Placemark><Polygon><innerBoundaryIs><coordinates>0,0 4,0 4,4</coordinates></innerBoundaryIs></Polygon></Placemark></kml>",
+                "0 outer boundaries",
+            ),
+            (
                 "<kml><Placemark><Polygon><outerBoundaryIs><coordinates>1 2</coordinates></outerBoundaryIs></Polygon></Placemark></kml>",
                 "no corner",
             ),
@@ -471,5 +479,20 @@ mod tests {
             [("7 (1)", 15.0), ("7 (2)", 0.5)]
         );
         assert_eq!(areas[0].bounds(), [DVec2::ZERO, DVec2::splat(4.0)]);
+    }
+
+    #[test]
+    fn all_rings_of_an_inner_boundary_are_holes() {
+        let ring = |x: u32| format!("<LinearRing><coordinates>{x},1 {},1 {x},2</coordinates></LinearRing>", x + 1);
+        let kml = format!(
+            "<kml><Placemark><Polygon><outerBoundaryIs><coordinates>0,0 9,0 9,9 0,9</coordinates></outerBoundaryIs><innerBoundaryIs>{}{}\
+             </innerBoundaryIs></Polygon></Placemark></kml>",
+            ring(1),
+            ring(5)
+        );
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("two.kml");
+        std::fs::write(&path, kml).unwrap();
+        assert_eq!(super::read_degrees(&path).unwrap().areas[0].holes.len(), 2);
     }
 }

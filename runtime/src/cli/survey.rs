@@ -214,8 +214,9 @@ fn print(request: &Request, planned: &Planned) {
     outln!("lines reach {:.0} m beyond the area", planned.beyond_m);
     if planned.holes > 0 {
         tracing::warn!(
-            "holes of the area are left out of the pictures, and not avoided: lines reach into them, and {} ways between lines lead over \
-             them",
+            "holes of the area are left out of the pictures, and not avoided: {} lines reach into them, and {} ways to, from and between \
+             lines lead over them",
+            planned.lines_over_holes,
             planned.over_holes
         );
     }

@@ -5,7 +5,7 @@ use std::path::Path;
 use config::mission::Mission;
 use fleet::deal::Share;
 use fleet::ground::{Ground, Ring};
-use geometry::geodesy::Geodetic;
+use geometry::geodesy::{EnuFrame, Geodetic};
 use geometry::polygon;
 use glam::DVec2;
 use models::camera::View;
@@ -20,6 +20,8 @@ use super::{Camera, SurveyError, region};
 const RECEIVED: &str = "received";
 /// Less ground than this is no region, square metres.
 const LEAST_M2: f64 = 100.0;
+/// Origins nearer to each other are one, metres.
+const SAME_M: f64 = 0.1;
 
 /// A mission, what is left of it, and who flies that.
 #[derive(Clone, Debug)]
@@ -28,6 +30,8 @@ pub struct Rest {
     mission: Mission,
     /// Ground that is not covered, in metres around the mission's origin.
     pub left: Ground,
+    /// What no aircraft's region holds, between the regions.
+    pub(super) holes: Vec<Ring>,
     /// Aircraft that do not fly it.
     pub lost: Vec<String>,
 }
@@ -39,11 +43,10 @@ impl Rest {
     /// # Errors
     /// Files that cannot be read, nobody left to fly, or nothing left to be flown.
     pub fn of(file: &Path, ground: &Path, lost: &[String]) -> Result<Self, SurveyError> {
-        let mission = Mission::read(file)?;
+        let (mission, text) = Mission::read_with_text(file)?;
         for id in lost {
             mission.aircraft(Some(id))?;
         }
-        let text = std::fs::read_to_string(file).map_err(|e| FormatError::io(file, "reading", e))?;
         let received = ground.join(RECEIVED);
         if !received.is_dir() {
             let why = "holds no models of a mission; give the folder that was --out of dgtr serve";
@@ -61,12 +64,20 @@ impl Rest {
                 let why = format!("is of aircraft {:?} of mission {:?}", header.aircraft, header.mission);
                 return Err(FormatError::invalid(&path, why).into());
             }
+            // Views of another frame would cover other ground.
+            let apart = header.origin.map_or(0.0, |own| EnuFrame::new(mission.origin).to_enu(own).length());
+            if apart > SAME_M {
+                let why = format!("has its origin {apart:.1} m from the mission's; give the mission that was flown");
+                return Err(FormatError::invalid(&path, why).into());
+            }
             if !header.finished {
                 open.push(aircraft.id.clone());
             }
             views.extend(header.views.iter().map(|(_, view)| *view));
         }
-        let lost = if lost.is_empty() { open } else { lost.to_vec() };
+        let mut lost = if lost.is_empty() { open } else { lost.to_vec() };
+        lost.sort();
+        lost.dedup();
         let asked = |what: &str| Err(SurveyError::Request(format!("{}: {what}", ground.display())));
         if lost.is_empty() {
             return asked(
@@ -82,7 +93,12 @@ impl Rest {
         if left.area_m2() < LEAST_M2 {
             return asked(&format!("nothing is left to be flown of {}", lost.join(", ")));
         }
-        Ok(Self { text, mission, left, lost })
+        let all = mission.aircraft.iter().try_fold(Ground::default(), |all, a| -> Result<Ground, SurveyError> {
+            Ok(all.with(&self::ground(&mission, &a.id)?))
+        })?;
+        let inner = all.parts.into_iter().flat_map(|part| part.into_iter().skip(1));
+        let holes = inner.filter(|ring| polygon::signed_area(ring).abs() >= LEAST_M2).collect();
+        Ok(Self { text, mission, left, holes, lost })
     }
 
     /// Ids and links of those that fly it.
@@ -127,7 +143,17 @@ impl Rest {
             let corners = (now.area_m2() >= LEAST_M2).then(|| region(&now, &aircraft.id)).transpose()?;
             changes.push((aircraft.id.clone(), corners));
         }
-        Ok(with_regions(&self.text, &changes)?)
+        let text = with_regions(&self.text, &changes)?;
+        // Text is changed where its author wrote it: what is read of it decides.
+        let now = Mission::parse(&text, Path::new("."))?;
+        let wanted = changes.iter().filter_map(|(id, corners)| Some((id, corners.as_ref()?)));
+        let read = now.aircraft.iter().map(|a| (&a.id, now.region(a)));
+        match wanted.map(|(id, corners)| (id, corners.clone())).eq(read) {
+            true => Ok(text),
+            false => Err(SurveyError::Request(
+                "the regions of the mission file cannot be exchanged; write each aircraft below a line [[aircraft]] of its own".into(),
+            )),
+        }
     }
 }
 

@@ -50,7 +50,7 @@ pub fn with_regions(text: &str, regions: &[(String, Option<Vec<[f64; 2]>>)]) -> 
             None => {
                 let start = text[..entry.id.span().start].rfind(TABLE).ok_or_else(not_a_table)?;
                 let body = &text[start + TABLE.len()..];
-                let next = |line: &str| line.starts_with('[') && !line.starts_with("[aircraft.");
+                let next = |line: &str| table(line).is_some_and(|name| !name.starts_with("aircraft."));
                 let end = body.match_indices('\n').map(|(at, _)| at + 1).find(|at| next(&body[*at..]));
                 edits.push((start..end.map_or(text.len(), |end| start + TABLE.len() + end), String::new()));
             }
@@ -64,6 +64,12 @@ pub fn with_regions(text: &str, regions: &[(String, Option<Vec<[f64; 2]>>)]) -> 
     Ok(changed)
 }
 
+/// What a line calls the table that it begins; corners of a region that stand alone on a line are no name.
+fn table(line: &str) -> Option<&str> {
+    let name = line.trim_start().strip_prefix('[')?.trim_start_matches('[').trim_start();
+    name.starts_with(|c: char| c.is_alphabetic() || c == '_').then_some(name)
+}
+
 #[cfg(test)]
 mod tests {
     use std::path::Path;
@@ -73,18 +79,18 @@ mod tests {
     use super::*;
 
     const TEXT: &str = r#"
+origin = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 430.0 }
 name = "park" # ours
-origin = { lat_deg = 28.0, lon_deg = -82.0, alt_m = 0.0 }
-camera = { width = 640, height = 480, fx = 385.0, fy = 385.0, cx = 320.0, cy = 240.0 }
+camera = { width = 4000, height = 3000, fx = 3464.0, fy = 3464.0, cx = 2000.0, cy = 1500.0 }
 [[aircraft]]
-id = "a1"
 link = "udpin:127.0.0.1:14550"
-camera = { folder = "a1" }
+id = "a1"
 region_enu = [[0.0, 0.0],
   [10.0, 0.0], [10.0, 10.0]] # the field
+camera = { folder = "a1" }
 [[aircraft]]
 id = "a2"
-region_wgs84 = [[28.0, -82.0], [28.001, -82.0], [28.001, -82.001]]
+region_wgs84 = [[47.0, 8.0], [47.001, 8.0], [47.001, 8.001]]
 link = "udpin:127.0.0.1:14551"
 camera = { folder = "a2" }
 [[aircraft]]
@@ -111,5 +117,14 @@ folder = "upload"
         let unknown = with_regions(TEXT, &[("b".into(), None)]).expect_err("unknown").to_string();
         assert!(unknown.contains("no aircraft 'b' in the mission; it has a1, a2, a3"), "{unknown}");
         assert!(with_regions("name = 3", &[]).is_err());
+        // Indented tables, and corners that begin a line.
+        let other: String = TEXT.lines().map(|line| format!("  {}\n", line.trim_start())).collect();
+        for text in [other.as_str(), &TEXT.replace("  [10.0", "[10.0")] {
+            let text =
+                with_regions(text, &[("a1".into(), None), ("a2".into(), Some(region.clone()))]).expect("changed");
+            let mission = Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{e}\n{text}"));
+            assert_eq!(mission.aircraft.iter().map(|a| a.id.as_str()).collect::<Vec<_>>(), ["a2", "a3"]);
+            assert!(mission.region(&mission.aircraft[0]) == region && text.contains("folder = \"upload\""), "{text}");
+        }
     }
 }

@@ -115,3 +115,16 @@ fn a_hundred_areas_by_seed_are_dealt_once_and_equally_or_refused() {
     println!("{dealt} dealt");
     assert!(dealt >= 80, "{dealt} of 100");
 }
+
+#[test]
+fn lines_are_never_further_apart_than_asked() {
+    let narrow = Manner { spacing_m: 0.5, beyond_m: 0.5, ..manner() };
+    let wide = Ground::new(rectangle(0.0, 0.0, 3000.0, 3000.0), &[]).expect("ground");
+    let refused = deal(&wide, &fleet(1, DVec2::ZERO), &narrow).expect_err("6000 lines").to_string();
+    assert!(refused.contains("too wide for lines 0.50 m apart"), "{refused}");
+    // Along its length a strip is narrow enough.
+    let long = Ground::new(rectangle(0.0, 0.0, 3000.0, 20.0), &[]).expect("ground");
+    let craft = [Craft { battery_s: 1e9, ..fleet(1, DVec2::ZERO)[0].clone() }];
+    let shares = deal(&long, &craft, &narrow).expect("40 lines");
+    assert!(shares[0].spacing_m <= 0.5 + 1e-9 && shares[0].sorties[0].lines.len() == 40, "{}", shares[0].spacing_m);
+}
