@@ -1,6 +1,6 @@
 """MAVSDK's client of a camera, as a ground station's program uses it: lists cameras, settings and their options, sets one, takes a
 photo and a series, lists what was taken. Prints what it saw as JSON; ends by itself after two minutes, whatever it waits for.
-  python mavsdk_client.py PORT"""
+  python mavsdk_client.py PORT    (where a router listens, which hands everything on)"""
 import json
 import signal
 import sys
@@ -31,7 +31,7 @@ def step(name, what, tries=60):
 
 
 client = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
-client.add_any_connection(f"udpin://127.0.0.1:{sys.argv[1]}")
+client.add_any_connection(f"udpout://127.0.0.1:{sys.argv[1]}")
 camera = cc.Camera(client.first_autopilot(30.0))
 camera.subscribe_capture_info(lambda info, _: seen["captured"].append([info.index, info.time_utc_us > 0, info.is_success]))
 found = step("list", lambda: camera.camera_list().cameras)

@@ -1,5 +1,6 @@
 //! pymavlink, an independent implementation, as the autopilot at the far end of a pseudo-terminal: both ways, unsigned and
-//! signed. The set-up installs it into a virtual environment below `target/`; without Python or a network it is skipped.
+//! signed. It is installed into a virtual environment below `target/`; where that fails, so do the tests, unless DGTR_SKIP names
+//! `python-packages`.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 use std::path::{Path, PathBuf};

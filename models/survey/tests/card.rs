@@ -472,9 +472,28 @@ fn of_two_cameras_of_one_aircraft_the_one_that_the_pictures_fit_is_taken() {
 }
 
 #[test]
-fn where_the_count_may_begin_at_another_exposure_places_are_as_uncertain_as_the_way_between_two() {
-    let dir = dumb_camera(&[2.0; 8]);
-    let card = matched(dir.path(), &[flown(Source::default(), &[2.0; 11], 0.0, 0.0)], None, None).unwrap();
-    assert_note(&card, &["another offset fits as well"]);
-    assert!(card.pictures.iter().all(|p| p.prior.sigma.position_m[0] >= 10.0));
+fn a_log_none_of_whose_exposures_is_matched_and_a_camera_that_it_does_not_hold_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    survey(dir.path(), 5, |i| Tags { position: None, time_ns: None, ..tags(i) });
+    let one = flown(Source { camera: Some(0), ..Source::default() }, &UNEVEN, 0.0, 0.0);
+    let error = matched(dir.path(), std::slice::from_ref(&one), None, None).unwrap_err();
+    assert!(error.contains("none of its exposures (14)") && !error.contains('\n'), "{error}");
+    let dir = dumb_camera(&UNEVEN);
+    let error = matched(dir.path(), std::slice::from_ref(&one), None, Some(2)).unwrap_err();
+    assert!(error.contains("it holds camera 0 (14)") && !error.contains('\n'), "{error}");
+    let card = matched(dir.path(), std::slice::from_ref(&one), None, Some(0)).unwrap();
+    assert_note(&card, &["14 of 14 pictures", "; camera 0"]);
+}
+
+#[test]
+fn where_the_count_may_begin_at_other_exposures_places_are_as_uncertain_as_the_way_to_the_farthest() {
+    let even = [2.0; 14];
+    let dir = dumb_camera(&even[..6]);
+    let card = matched(dir.path(), &[flown(of(1, 0), &even, 0.0, 0.0)], None, None).unwrap();
+    assert_note(&card, &["flight log", "other offsets that fit: 8"]);
+    // Nine beginnings, 10 m apart.
+    for p in &card.pictures {
+        assert!(p.prior.sigma.position_m[0] >= 40.0, "{}: {:?}", p.name, p.prior.sigma);
+    }
+    assert!(card.pictures[0].prior.sigma.position_m[0] <= 81.0);
 }

@@ -1,5 +1,5 @@
 //! Cards and tables as people have them, each with one fault: the right result, a line that names the fault, or a refusal. They lie in
-//! the reference data; where that is not there, this says so and passes.
+//! the reference data; where that is not there, the tests fail unless DGTR_SKIP names `cases`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a test may
 
 use std::path::{Path, PathBuf};

@@ -19,7 +19,7 @@ const MAX_CAMERAS: usize = 64;
 /// A time stamp stands before each frame of a log: microseconds since 1970, the first byte first.
 const STAMP: usize = 8;
 /// No link delays one message by so much more than another, microseconds.
-const JUMP_US: i64 = 60_000_000;
+const JUMP_US: f64 = 60e6;
 
 /// Exposures of a MAVLink log (`.tlog`), of an ArduPilot log (`.BIN`, or as text) or of a PX4 log (`.ulg`), told by their content.
 ///
@@ -68,16 +68,20 @@ impl Reports {
         is_new
     }
 
-    /// By the sender's clock; where that says nothing or jumps, by when the log received them.
+    /// By the sender's clock; where that says nothing or jumps, by when the log received them. What has no time then is left out.
     fn exposures(self) -> Vec<Exposure> {
-        let received = |r: &(Exposure, u64, Option<u64>)| r.2.map(|us| us as i64 - r.1 as i64);
-        let late: Option<Vec<i64>> = self.list.iter().map(received).collect();
-        let jumps =
-            late.is_some_and(|late| late.iter().max().zip(late.iter().min()).is_some_and(|(a, b)| a - b > JUMP_US));
-        let by_sender = !jumps && self.list.iter().all(|r| r.1 > 0) || self.list.iter().any(|r| r.2.is_none());
-        let time_us = |r: &(Exposure, u64, Option<u64>)| if by_sender { r.1 } else { r.2.unwrap_or(r.1) };
-        let mut exposures: Vec<Exposure> =
-            self.list.iter().map(|r| Exposure { time_s: time_us(r) as f64 * 1e-6, ..r.0 }).collect();
+        let late = self.list.iter().filter(|r| r.1 > 0).filter_map(|r| Some(r.2? as f64 - r.1 as f64));
+        let (first, last) =
+            late.fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), us| (least.min(us), most.max(us)));
+        let told = self.list.iter().filter(|r| r.1 > 0).count();
+        let received = self.list.iter().filter(|r| r.2.is_some()).count();
+        // A log of frames alone has no clock but the sender's, or only an order. A damaged stamp takes nothing from the rest.
+        let by_sender = received == 0 || (last - first <= JUMP_US && told >= received);
+        let time_us = |r: &(Exposure, u64, Option<u64>)| {
+            if by_sender { Some(r.1).filter(|us| *us > 0 || told == 0) } else { r.2 }
+        };
+        let timed = self.list.iter().filter_map(|r| Some(Exposure { time_s: time_us(r)? as f64 * 1e-6, ..r.0 }));
+        let mut exposures: Vec<Exposure> = timed.collect();
         exposures.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
         exposures
     }
@@ -113,8 +117,9 @@ fn of_mavlink(path: &Path) -> Result<Vec<Series>, JobError> {
             break;
         }
     }
-    let series: Vec<Series> =
+    let mut series: Vec<Series> =
         found.into_iter().map(|((source, _), reports)| Series { source, exposures: reports.exposures() }).collect();
+    series.retain(|s| !s.exposures.is_empty());
     let what = match (series.is_empty(), frames) {
         (false, _) => return Ok(series),
         (true, 0) => {
@@ -289,6 +294,28 @@ mod tests {
             let exposures = log.read().unwrap().remove(0).exposures;
             let steps: Vec<f64> = exposures.windows(2).map(|w| w[1].time_s - w[0].time_s).collect();
             assert!(steps.len() == 4 && steps.iter().all(|s| (s - 3.0).abs() < 1e-5), "{stamps:?}: {steps:?}");
+        }
+    }
+
+    #[test]
+    fn one_damaged_stamp_of_the_log_and_one_impossible_time_cost_that_exposure_alone() {
+        for time_usec in [0, 1 << 63, u64::MAX] {
+            let mut log = Written::default();
+            for i in 0..6u16 {
+                let s = f64::from(i) * 3.0;
+                let end = log.0.len();
+                let time_usec = if time_usec == 0 || i == 4 { time_usec } else { START_US + (s * 1e6) as u64 };
+                log.add(s, (1, 1), &CAMERA_FEEDBACK_DATA { time_usec, ..feedback(i, s, 0) });
+                if i == 2 {
+                    log.0[end..end + STAMP].fill(0xFF);
+                }
+            }
+            let exposures = log.read().unwrap().remove(0).exposures;
+            let lat = |e: &Exposure| (e.fix.position.lat_deg * 1e7).round() as i32 / 1000 - 468_426;
+            let order: Vec<i32> = exposures.iter().map(lat).collect();
+            assert_eq!(order, [0, 1, 3, 4, 5], "{time_usec}");
+            let steps: Vec<f64> = exposures.windows(2).map(|w| w[1].time_s - w[0].time_s).collect();
+            assert!(steps.iter().zip([3.0, 6.0, 3.0, 3.0]).all(|(a, b)| (a - b).abs() < 1e-5), "{steps:?}");
         }
     }
 

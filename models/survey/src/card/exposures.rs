@@ -25,9 +25,9 @@ pub struct Matching {
     pub offset_s: Option<f64>,
     /// Root mean square of what is left, seconds.
     pub rms_s: f64,
-    /// What another offset would give that explains as many pictures nearly as well (evenly spaced exposures can be counted from either
-    /// end); empty where there is none.
-    pub rival: Vec<Option<usize>>,
+    /// What each other offset would give that explains as many pictures nearly as well: evenly spaced exposures can be counted from
+    /// either end, or from anywhere between.
+    pub rivals: Vec<Vec<Option<usize>>>,
 }
 
 /// Offsets that are tried in full.
@@ -80,14 +80,14 @@ pub fn match_exposures(pictures: &[Option<(f64, f64)>], exposures: &[f64]) -> Ma
     let Some(best) = tried.first() else {
         return Matching { exposure: vec![None; pictures.len()], ..Matching::default() };
     };
-    let rival =
-        |t: &&(Vec<Option<usize>>, usize, f64, f64)| t.0 != best.0 && t.1 == best.1 && t.2 < 1.2 * best.2 + 0.02;
-    Matching {
-        exposure: best.0.clone(),
-        offset_s: Some(best.3),
-        rms_s: best.2,
-        rival: tried[1..].iter().find(rival).map(|t| t.0.clone()).unwrap_or_default(),
+    let mut rivals: Vec<Vec<Option<usize>>> = Vec::new();
+    for (exposure, pairs, rms_s, _) in &tried[1..] {
+        let fits_as_well = *pairs == best.1 && *rms_s < 1.2 * best.2 + 0.02;
+        if fits_as_well && *exposure != best.0 && !rivals.contains(exposure) {
+            rivals.push(exposure.clone());
+        }
     }
+    Matching { exposure: best.0.clone(), offset_s: Some(best.3), rms_s: best.2, rivals }
 }
 
 /// Pairs in order, each exposure once, within `tolerance` of the offset.
@@ -140,7 +140,7 @@ mod tests {
             assert_eq!(*found, (*i != usize::MAX).then_some(*i));
         }
         assert!((matching.offset_s.unwrap_or(0.0) - offset + 0.5).abs() < 0.2, "{:?}", matching.offset_s);
-        assert!(matching.rival.is_empty());
+        assert!(matching.rivals.is_empty());
     }
 
     #[test]
@@ -148,7 +148,15 @@ mod tests {
         let log: Vec<f64> = (0..30).map(|i| 2.0 * f64::from(i)).collect();
         let pictures: Vec<_> = (0..20).map(|i| Some((1000.0 + 2.0 * f64::from(i), 0.001))).collect();
         let matching = match_exposures(&pictures, &log);
-        assert!(!matching.rival.is_empty() && matching.exposure.iter().all(Option::is_some));
+        assert!(matching.exposure.iter().all(Option::is_some));
+        let mut first: Vec<_> =
+            matching.rivals.iter().chain([&matching.exposure]).map(|exposure| exposure[0]).collect();
+        first.sort();
+        assert_eq!(
+            first,
+            (0..11).map(Some).collect::<Vec<_>>(),
+            "the first picture is any of the first eleven exposures"
+        );
     }
 
     #[test]

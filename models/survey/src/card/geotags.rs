@@ -2,13 +2,15 @@
 //! columns, and any table whose first line names its columns (exiftool's, Metashape's, a spreadsheet's), in any order and in a few
 //! languages.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use geometry::geodesy::Geodetic;
 use glam::{DQuat, DVec3};
 
 use super::record::{
-    Attitude, AttitudeSource, FROM_HORIZON_DEG, Fix, GPS_SIGMA_M, Record, UNKNOWN_HEIGHT_SIGMA_M, nadir_rotation,
+    Attitude, AttitudeSource, FROM_HORIZON_DEG, Fix, GPS_SIGMA_M, Record, UNKNOWN_HEIGHT_SIGMA_M, believable,
+    nadir_rotation,
 };
 use crate::coordinates::{self, Axis, Reference, cells, is_picture, number, picture_name};
 use crate::names::PictureNames;
@@ -18,6 +20,8 @@ use models::picture::Orientation;
 
 /// A hundred thousand pictures at 600 bytes each.
 const LIMIT: u64 = 64 << 20;
+/// The international foot, metres; that of American surveyors differs by two millionths.
+const FOOT_M: f64 = 0.3048;
 
 /// What a file says of one picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,7 +40,7 @@ pub struct Geotags {
     /// Tags by what the file calls the pictures, in lower case.
     pub tags: Vec<(String, Geotag)>,
     /// How it was understood, where that is not certain.
-    pub doubt: Option<&'static str>,
+    pub doubt: Option<String>,
 }
 
 /// Reads a file of positions.
@@ -67,12 +71,13 @@ pub fn read(path: &Path) -> Result<Geotags, FormatError> {
     }
     let is_table = columns.is_some();
     let unnamed = lines.peek().and_then(|(_, line)| Columns::of_pix4d(line));
-    let mut doubt = None;
+    let mut doubts = Vec::new();
     let columns = match (columns, &reference, unnamed) {
         (Some(columns), ..) => columns,
         (None, Some(_), _) => Columns::of_geo_txt(),
         (None, None, Some(columns)) => {
-            doubt = Some("its columns have no names; read as Pix4D writes them: latitude, longitude, altitude");
+            doubts
+                .push("its columns have no names; read as Pix4D writes them: latitude, longitude, altitude".to_owned());
             columns
         }
         (None, None, None) => {
@@ -86,13 +91,48 @@ pub fn read(path: &Path) -> Result<Geotags, FormatError> {
     if let Some(what) = columns.contradicts(reference.as_ref()) {
         return Err(FormatError::invalid(path, what));
     }
-    let mut rows = Rows { columns, reference, zone: None, is_table };
+    if columns.unit == Unit::Unsaid && reference.is_none() && columns.zone.is_none() {
+        doubts.push("its x and y are read as longitude and latitude".to_owned());
+    }
+    let mut rows = Rows { columns, reference, zone: None, is_table, all_whole: true, doubt: None };
     let mut tags = Vec::new();
     for (at, line) in lines.filter(|(_, l)| !l.trim_start().starts_with('#')) {
         let row = rows.read(line).map_err(|what| FormatError::invalid(path, format!("line {}: {what}", at + 1)))?;
         tags.extend(row);
     }
-    Ok(Geotags { tags, doubt })
+    if is_table && rows.all_whole && !tags.is_empty() {
+        let what =
+            "its latitudes and longitudes are all whole degrees; write decimal points, or semicolons between cells";
+        return Err(FormatError::invalid(path, what));
+    }
+    doubts.extend(rows.doubt);
+    let (tags, contradicted) = once(tags);
+    if let Some(name) = contradicted.first() {
+        let n = contradicted.len();
+        doubts.push(format!(
+            "{n} named twice, at different places, and not used ({name}{})",
+            if n > 1 { ", …" } else { "" }
+        ));
+    }
+    Ok(Geotags { tags, doubt: (!doubts.is_empty()).then(|| doubts.join("; ")) })
+}
+
+/// Each picture once where its lines give it one place; and the names of those whose lines contradict each other.
+fn once(tags: Vec<(String, Geotag)>) -> (Vec<(String, Geotag)>, Vec<String>) {
+    let mut first: HashMap<String, usize> = HashMap::new();
+    let mut all: Vec<(String, Option<Geotag>)> = Vec::with_capacity(tags.len());
+    for (name, tag) in tags {
+        match first.get(&name) {
+            Some(&i) if all[i].1.is_some_and(|t| t.fix.position != tag.fix.position) => all[i].1 = None,
+            Some(_) => {}
+            None => {
+                first.insert(name.clone(), all.len());
+                all.push((name, Some(tag)));
+            }
+        }
+    }
+    let contradicted = all.iter().filter(|t| t.1.is_none()).map(|t| t.0.clone()).collect();
+    (all.into_iter().filter_map(|(name, tag)| Some((name, tag?))).collect(), contradicted)
 }
 
 /// What lines of a file are read by.
@@ -102,6 +142,10 @@ struct Rows {
     /// The zone of the last line, where a column names it.
     zone: Option<(String, Reference)>,
     is_table: bool,
+    /// Whether every position so far is one of whole degrees: decimal commas between commas become that.
+    all_whole: bool,
+    /// How a line was understood, where that is not certain.
+    doubt: Option<String>,
 }
 
 impl Rows {
@@ -131,9 +175,13 @@ impl Rows {
         let Some(name) = name else { return Err("names no picture".to_owned()) };
         let angle = |i: usize, half: Option<usize>, axis: Axis| {
             let of = read(Some(i), &|c| coordinates::angle(c, axis));
-            // exiftool writes the hemisphere into a column of its own.
-            let is_negative = cell(half).is_some_and(|h| h.starts_with(['S', 's', 'W', 'w']));
-            of.map(|v| v.map(|v| if is_negative { -v.abs() } else { v }))
+            // exiftool writes the hemisphere into a column of its own, others into the next one.
+            let beside =
+                || cell(Some(i + 1)).filter(|c| self.is_table && c.len() == 1 && is_negative(c, axis).is_some());
+            let Some(half) = cell(half).or_else(beside) else { return of };
+            let Some(v) = of? else { return Ok(None) };
+            let negative = is_negative(half, axis).ok_or_else(|| format!("{half:?} is no hemisphere"))?;
+            Ok(Some(if negative { -v.abs() } else { v }))
         };
         let (x, y) = (angle(columns.x, columns.half[0], Axis::East)?, angle(columns.y, columns.half[1], Axis::North)?);
         let (x, y) = match (x, y) {
@@ -145,15 +193,24 @@ impl Rows {
         if (x, y) == (0.0, 0.0) {
             return Ok(None);
         }
-        let alt_m = read(columns.alt, &coordinates::height)?;
+        let alt_m = read(columns.alt, &coordinates::height)?.map(|alt| alt * columns.alt_unit_m);
         if let Some(zone) = cell(columns.zone).filter(|zone| self.zone.as_ref().is_none_or(|z| z.0 != *zone)) {
             match Reference::named(&format!("UTM {zone}")) {
-                Some(Ok(reference)) => self.zone = Some((zone.to_owned(), reference)),
+                Some(Ok(reference)) => {
+                    if zone.ends_with(['S', 's']) {
+                        let what =
+                            format!("zone {zone} is read as south of the equator, not as band S of the military grid");
+                        self.doubt = Some(what);
+                    }
+                    self.zone = Some((zone.to_owned(), reference));
+                }
                 _ => return Err(format!("{zone:?} is no UTM zone (15N)")),
             }
         }
         let zone = self.zone.as_ref().filter(|_| columns.zone.is_some()).map(|z| &z.1);
-        let position = match zone.or(self.reference.as_ref()) {
+        let reference = zone.or(self.reference.as_ref());
+        self.all_whole &= x.fract() == 0.0 && y.fract() == 0.0 && reference.is_none_or(Reference::is_in_degrees);
+        let position = match reference {
             Some(reference) => reference.geodetic(DVec3::new(x, y, alt_m.unwrap_or_default())),
             None => Some(Geodetic { lat_deg: y, lon_deg: x, alt_m: alt_m.unwrap_or_default() }),
         };
@@ -168,8 +225,8 @@ impl Rows {
                 _ => None,
             })
         };
-        let horizontal = value(columns.sigma[0])?.filter(|s| *s > 0.0).unwrap_or(GPS_SIGMA_M);
-        let vertical = value(columns.sigma[1])?.filter(|s| *s > 0.0).unwrap_or(horizontal);
+        let horizontal = value(columns.sigma[0])?.filter(|s| *s > 0.0).map_or(GPS_SIGMA_M, believable);
+        let vertical = value(columns.sigma[1])?.filter(|s| *s > 0.0).map_or(horizontal, believable);
         let vertical = if alt_m.is_some() { vertical } else { UNKNOWN_HEIGHT_SIGMA_M };
         let attitude = match (three([columns.q[1], columns.q[2], columns.q[3]])?, value(columns.q[0])?) {
             (Some([x, y, z]), Some(w)) => {
@@ -235,7 +292,7 @@ pub(super) fn apply(
         pairs.len(),
         records.len(),
         tags.len(),
-        doubt.map_or(String::new(), |doubt| format!("; {doubt}"))
+        doubt.as_ref().map_or(String::new(), |doubt| format!("; {doubt}"))
     );
     Ok((line, pairs.len() == records.len() && doubt.is_none()))
 }
@@ -246,6 +303,15 @@ pub(super) fn apply_to_some(file: &Path, tags: &Geotags, records: &mut [Record])
     let names = PictureNames::of(names.iter().map(String::as_str));
     let is_any = tags.tags.iter().any(|(name, _)| names.find(name).is_some());
     is_any.then(|| apply(file, tags, records).map_or_else(|e| e.to_string(), |(line, _)| line))
+}
+
+/// Whether a hemisphere is the one that counts below zero; `None` where `cell` is none of this axis.
+fn is_negative(cell: &str, axis: Axis) -> Option<bool> {
+    match (axis, cell.chars().next()?.to_ascii_uppercase()) {
+        (Axis::East, 'E') | (Axis::North, 'N') => Some(false),
+        (Axis::East, 'W') | (Axis::North, 'S') => Some(true),
+        _ => None,
+    }
 }
 
 /// What the two coordinates are by their columns' names.
@@ -261,7 +327,7 @@ enum Unit {
 }
 
 /// Where what stands.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Columns {
     count: usize,
     name: usize,
@@ -272,6 +338,8 @@ struct Columns {
     half: [Option<usize>; 2],
     zone: Option<usize>,
     alt: Option<usize>,
+    /// What a height is in, metres.
+    alt_unit_m: f64,
     /// Yaw, pitch, roll.
     angles: [Option<usize>; 3],
     /// w, x, y, z.
@@ -341,8 +409,46 @@ const ALTITUDE: &[&str] = &[
     "z",
 ];
 /// Words beside those that make something else of a column.
-const OTHERWISE: &[&str] =
-    &["ref", "accuracy", "sigma", "std", "error", "relative", "rel", "agl", "width", "size", "type", "date", "time"];
+const OTHERWISE: &[&str] = &[
+    "ref",
+    "hemisphere",
+    "accuracy",
+    "sigma",
+    "std",
+    "error",
+    "relative",
+    "rel",
+    "agl",
+    "ground",
+    "terrain",
+    "takeoff",
+    "home",
+    "width",
+    "size",
+    "type",
+    "date",
+    "time",
+];
+const FEET: &[&str] = &["ft", "feet", "foot"];
+
+impl Default for Columns {
+    fn default() -> Self {
+        Self {
+            count: 0,
+            name: 0,
+            x: 0,
+            y: 0,
+            unit: Unit::Unsaid,
+            half: [None; 2],
+            zone: None,
+            alt: None,
+            alt_unit_m: 1.0,
+            angles: [None; 3],
+            q: [None; 4],
+            sigma: [None; 2],
+        }
+    }
+}
 
 impl Columns {
     /// `name x y [z] [yaw pitch roll] [horizontal vertical accuracy]`.
@@ -395,6 +501,16 @@ impl Columns {
             };
             names.iter().position(sigma)
         };
+        // GPSLatitudeRef, lat_ref, "N/S".
+        let half = |axis: &[&str], letters: &str| {
+            let of = |all: &str, end: &str| all.strip_suffix(end).is_some_and(|axis_name| axis.contains(&axis_name));
+            names
+                .iter()
+                .map(|name| name.concat())
+                .position(|all| all == letters || of(&all, "ref") || of(&all, "hemisphere"))
+        };
+        let alt = column(ALTITUDE);
+        let in_feet = alt.is_some_and(|i| names[i].iter().any(|w| FEET.contains(&w.as_str())));
         let angle =
             |of: &[&str]| names.iter().position(|name| plain(name) && name.iter().any(|w| of.iter().any(|o| w == o)));
         let (name, degrees, metres) =
@@ -421,9 +537,10 @@ impl Columns {
             x,
             y,
             unit,
-            half: ["gpslongituderef", "gpslatituderef"].map(exactly),
+            half: [half(LONGITUDE, "ew"), half(LATITUDE, "ns")],
             zone: column(&["zone", "utmzone"]),
-            alt: column(ALTITUDE),
+            alt,
+            alt_unit_m: if in_feet { FOOT_M } else { 1.0 },
             angles: [
                 angle(&["yaw", "heading", "gimbalyawdegree"]),
                 angle(&["pitch", "gimbalpitchdegree"]),
@@ -584,6 +701,72 @@ mod tests {
                 (p.lat_deg - 46.842_690_67).abs() < 1e-7 && (p.lon_deg + 91.994_216_22).abs() < 1e-7,
                 "{text}: {p:?}"
             );
+        }
+    }
+
+    #[test]
+    fn a_hemisphere_stands_in_a_column_of_any_such_name_or_in_the_next_one() {
+        for text in [
+            "name,lat,lat_ref,lon,lon_ref,alt\na.jpg,33.5,S,70.5,W,500.5\n",
+            "name,latitude,N/S,longitude,E/W\na.jpg,33.5,S,70.5,W\n",
+            "name,lat,,lon,\na.jpg,33.5,s,70.5,w\n",
+            "file;latitude;lat hemisphere;longitude;lon hemisphere\na.jpg;33,5;South;70,5;West\n",
+        ] {
+            let p = read_text(text).unwrap_or_else(|e| panic!("{text}: {e}"))[0].1.fix.position;
+            assert_eq!((p.lat_deg, p.lon_deg), (-33.5, -70.5), "{text}");
+        }
+        for text in
+            ["name,lat,latref,lon,lonref\na.jpg,33.5,W,70.5,W\n", "name,lat,lon,lonref\na.jpg,33.5,70.5,Ouest\n"]
+        {
+            let error = read_text(text).unwrap_err().to_string();
+            assert!(error.contains("is no hemisphere"), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn heights_in_feet_are_told_by_their_column_and_heights_above_the_ground_are_none() {
+        let alt = |column: &str| read_text(&format!("name,lat,lon,{column}\na.jpg,46.5,7.5,1000\n")).unwrap()[0].1;
+        for feet in ["altitude (ft)", "alt_feet", "altitude_above_seaLevel(feet)"] {
+            let found = alt(feet);
+            assert!((found.fix.position.alt_m - 304.8).abs() < 1e-9 && found.has_height, "{feet}: {found:?}");
+        }
+        for relative in ["altitude above ground", "height_above_takeoff(feet)"] {
+            assert!(!alt(relative).has_height, "{relative}");
+        }
+    }
+
+    #[test]
+    fn a_picture_that_is_named_twice_counts_once_where_both_lines_agree_and_not_at_all_where_they_do_not() {
+        let found = read_whole("EPSG:4326\na.jpg 7.5 46.5\nA.JPG 7.5 46.5\nb.jpg 7.5 46.5\nb.jpg 7.6 46.5\n").unwrap();
+        let names: Vec<&str> = found.tags.iter().map(|t| t.0.as_str()).collect();
+        assert_eq!(names, ["a.jpg"]);
+        assert!(found.doubt.as_ref().is_some_and(|d| d.contains("1 named twice") && d.contains("b.jpg")), "{found:?}");
+    }
+
+    #[test]
+    fn decimal_commas_between_commas_that_fill_the_named_cells_are_refused() {
+        for text in [
+            "name,lat,lon,alt,yaw,pitch,roll\na.jpg,46,8,7,5,198,3\n",
+            "name,lat,lon,alt,yaw\na.jpg,46,8,7,5\nb.jpg,46,9,7,5\n",
+        ] {
+            let error = read_text(text).unwrap_err().to_string();
+            assert!(error.contains("whole degrees") && !error.contains('\n'), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_certain_is_said() {
+        let doubt = |text: &str| read_whole(text).unwrap().doubt.unwrap_or_default();
+        assert!(doubt("name,x,y\na.jpg,12.5,40.25\n").contains("longitude and latitude"));
+        assert!(doubt("name,east,north,zone\na.jpg,384000,3768000,11S\n").contains("south of the equator"));
+        assert_eq!(doubt("name,east,north,zone\na.jpg,384000,3768000,11N\n"), "");
+    }
+
+    #[test]
+    fn accuracies_that_no_receiver_has_are_not_believed() {
+        for (stated, believed) in [("1e-300", 0.01), ("1e300", 1000.0), ("0", GPS_SIGMA_M)] {
+            let text = format!("EPSG:4326\na.jpg 7.5 46.5 400 0 0 0 {stated} {stated}\n");
+            assert_eq!(read_text(&text).unwrap()[0].1.fix.sigma_m, [believed; 2], "{stated}");
         }
     }
 }

@@ -14,6 +14,7 @@ use super::exposures::{Exposure, Matching, match_exposures};
 use super::record::{Attitude, AttitudeSource, Record, in_order, nadir_rotation};
 
 pub mod dataflash;
+mod number;
 pub mod ulog;
 
 /// Bytes at the beginning of a file by which its format is told.
@@ -99,6 +100,28 @@ pub fn read(path: &Path) -> Result<Option<Vec<Series>>, FormatError> {
         () if named("ulg") => Some(ulog::read(path)?),
         () => None,
     })
+}
+
+/// Exposures by time, which the log has in the order in which they were written.
+///
+/// # Errors
+/// The clock starts again among them: nothing tells how much later.
+fn by_time(path: &Path, mut exposures: Vec<Exposure>) -> Result<Vec<Exposure>, FormatError> {
+    // Two before and two after: one damaged time stamp is no start.
+    let starts = |w: &[Exposure]| w[0].time_s.min(w[1].time_s) > w[2].time_s.max(w[3].time_s);
+    if let Some(at) = exposures.windows(4).position(starts) {
+        let what = format!(
+            "its clock starts again after {} exposures: it holds more than one flight; give the log of one",
+            at + 2
+        );
+        return Err(FormatError::invalid(path, what));
+    }
+    exposures.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+    Ok(exposures)
+}
+
+fn too_many(path: &Path) -> FormatError {
+    FormatError::invalid(path, format!("reports more than {MAX_EXPOSURES} exposures"))
 }
 
 /// A camera's attitude by its quaternion, body (front, right, down) to north-east-down: that of an airframe below which the camera looks
@@ -222,7 +245,14 @@ pub(super) fn apply(log: &FlightLog, records: &mut [Record]) -> Result<String, F
         fits.into_iter().partition(|f| !near.is_finite() || f.away.is_some_and(|a| a <= FAR));
     // The first of equal ones: the order of the log.
     fitting.sort_by(|a, b| b.likelihood.total_cmp(&a.likelihood));
-    let Some(best) = fitting.first() else { return Err(refuse("fits no picture".to_owned())) };
+    let Some(best) = fitting.first().filter(|f| f.matched > 0) else {
+        let counts: Vec<String> = log.series.iter().map(|s| s.exposures.len().to_string()).collect();
+        return Err(refuse(format!(
+            "none of its exposures ({}) is matched to any of {} pictures: those without times are matched only where both are as many",
+            counts.join("; "),
+            records.len()
+        )));
+    };
     let rivals: Vec<&Fit<'_>> = fitting[1..]
         .iter()
         .filter(|f| f.matched > 0 && best.likelihood - f.likelihood < DECISIVE && !f.is_twin_of(best))
@@ -237,19 +267,21 @@ pub(super) fn apply(log: &FlightLog, records: &mut [Record]) -> Result<String, F
         )));
     }
     let others: Vec<String> = fitting[1..].iter().filter(|f| !f.is_twin_of(best)).chain(&far).map(Fit::named).collect();
-    Ok(give(best, &others, records))
+    Ok(give(best, &others, log.system.is_some() || log.camera.is_some(), records))
 }
 
-fn give(best: &Fit<'_>, others: &[String], records: &mut [Record]) -> String {
+fn give(best: &Fit<'_>, others: &[String], is_asked: bool, records: &mut [Record]) -> String {
     let (exposures, matching) = (&best.series.exposures, &best.matching);
     for (i, r) in records.iter_mut().enumerate() {
         let Some(e) = matching.exposure[i].map(|j| exposures[j]) else { continue };
         let mut fix = e.fix;
-        // Where the count may begin elsewhere, each place is as uncertain as what it would be then.
-        if let Some(other) = matching.rival.get(i).copied().flatten().map(|j| exposures[j].fix) {
-            let away = EnuFrame::new(fix.position).to_enu(other.position);
-            fix.sigma_m = [fix.sigma_m[0].hypot(away.truncate().length()), fix.sigma_m[1].hypot(away.z)];
+        // Where the count may begin elsewhere, each place is as uncertain as the farthest that it would be then.
+        let mut away = [0.0f64; 2];
+        for other in matching.rivals.iter().filter_map(|rival| Some(exposures[(*rival.get(i)?)?].fix)) {
+            let way = EnuFrame::new(fix.position).to_enu(other.position);
+            away = [away[0].max(way.truncate().length()), away[1].max(way.z.abs())];
         }
+        fix.sigma_m = [fix.sigma_m[0].hypot(away[0]), fix.sigma_m[1].hypot(away[1])];
         r.fix = Some(fix);
         r.relative_alt_m = None;
         r.attitude = e.attitude.or(r.attitude);
@@ -260,14 +292,14 @@ fn give(best: &Fit<'_>, others: &[String], records: &mut [Record]) -> String {
         }
         None => "counted, because the pictures have no times".to_owned(),
     };
-    let doubt = match matching.rival.is_empty() {
-        true => "",
-        false => {
-            "; another offset fits as well, so that places are as uncertain as the way between two exposures: check the first picture"
-        }
+    let doubt = match matching.rivals.len() {
+        0 => String::new(),
+        n => format!(
+            "; the count may begin elsewhere, too (other offsets that fit: {n}), so that each place is as uncertain as the way to the farthest: check the first picture"
+        ),
     };
     let whose = match (best.series.source, others) {
-        (source, []) if source == Source::default() => String::new(),
+        (source, []) if source.system.is_none() && !is_asked => String::new(),
         (source, []) => format!("; {source}"),
         (source, others) => format!("; {source}, not {}", others.join("; ")),
     };

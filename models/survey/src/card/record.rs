@@ -34,6 +34,8 @@ const WRAPS_M: f64 = 4_294_967.296;
 const LEAST_SIDE: u32 = 8;
 /// No receiver in an aircraft is better; what claims less does not count its lever arm.
 const BEST_M: f64 = 0.01;
+/// No receiver that says where it is is worse.
+const WORST_M: f64 = 1000.0;
 /// A pitch in the `Camera:` namespace below this is measured from the horizon, degrees: no mapping camera looks back.
 pub(super) const FROM_HORIZON_DEG: f64 = -45.0;
 
@@ -57,6 +59,11 @@ pub enum AttitudeSource {
     Heading,
     /// Which way the aircraft moved.
     Course,
+}
+
+/// A standard deviation as far as it can be believed, metres.
+pub(super) fn believable(sigma_m: f64) -> f64 {
+    sigma_m.clamp(BEST_M, WORST_M)
 }
 
 /// An attitude.
@@ -250,7 +257,7 @@ fn fix(exif: Option<&Fields>, xmp: &Xmp, mended: &mut Vec<String>) -> Option<Fix
     let vertical =
         dji("RtkStdHgt").or(by_flag.map(|f| f[1])).or(pix4d("GPSZAccuracy")).unwrap_or(horizontal.max(GPS_SIGMA_M));
     let vertical = if alt_m.is_some() { vertical } else { UNKNOWN_HEIGHT_SIGMA_M };
-    Some(Fix { position, sigma_m: [horizontal, vertical].map(|s| s.clamp(BEST_M, 1000.0)) })
+    Some(Fix { position, sigma_m: [horizontal, vertical].map(believable) })
 }
 
 /// The height that the first source states, unless it cannot be or is a zero beside one that the second states.

@@ -8,7 +8,8 @@ use std::path::Path;
 use geometry::geodesy::Geodetic;
 use models::formats::FormatError;
 
-use super::{MAX_EXPOSURES, SIGMA_M, Series, Source};
+use super::number::Number;
+use super::{MAX_EXPOSURES, SIGMA_M, Series, Source, by_time, too_many};
 use crate::card::exposures::Exposure;
 use crate::card::record::{Attitude, AttitudeSource, Fix, nadir_rotation};
 
@@ -139,8 +140,8 @@ struct Stamped {
 /// What a log holds, by camera.
 #[derive(Default)]
 struct Found {
-    feedback: BTreeMap<u8, Vec<Stamped>>,
-    triggers: BTreeMap<u8, Vec<Stamped>>,
+    feedback: BTreeMap<Option<u8>, Vec<Stamped>>,
+    triggers: BTreeMap<Option<u8>, Vec<Stamped>>,
     count: usize,
 }
 
@@ -152,31 +153,31 @@ impl Found {
             "TRIG" => &mut self.triggers,
             _ => return,
         };
-        if self.count < MAX_EXPOSURES
-            && let Some(stamped) = stamped(of)
-        {
-            let camera = of(&["I", "Instance"]).filter(|n| (0.0..256.0).contains(n)).unwrap_or(0.0) as u8;
+        let Some(stamped) = stamped(of) else { return };
+        self.count += 1;
+        if self.count <= MAX_EXPOSURES {
+            // Older ArduPilots number no cameras.
+            let camera = of(&["I", "Instance"]).filter(|n| (0.0..256.0).contains(n)).map(|n| n as u8);
             list.entry(camera).or_default().push(stamped);
-            self.count += 1;
         }
     }
 
     fn series(mut self, path: &Path) -> Result<Vec<Series>, FormatError> {
+        if self.count > MAX_EXPOSURES {
+            return Err(too_many(path));
+        }
         self.triggers.retain(|camera, _| !self.feedback.contains_key(camera));
-        let of = |(camera, list): (u8, Vec<Stamped>)| {
+        let of = |(camera, list): (Option<u8>, Vec<Stamped>)| {
             // ArduPilot before 3.3 logs no time since its start.
             let boot = list.iter().all(|s| s.since_boot_s.is_some());
             let time = |s: &Stamped| if boot { s.since_boot_s } else { s.gps_s };
             let timed = list.iter().filter_map(|s| Some(Exposure { time_s: time(s)?, ..s.exposure }));
-            let mut exposures: Vec<Exposure> = timed.collect();
-            exposures.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
-            Series { source: Source { camera: Some(camera), ..Source::default() }, exposures }
+            let exposures = by_time(path, timed.collect())?;
+            Ok(Series { source: Source { camera, ..Source::default() }, exposures })
         };
-        let mut series: Vec<Series> = self.feedback.into_iter().chain(self.triggers).map(of).collect();
+        let all = self.feedback.into_iter().chain(self.triggers);
+        let mut series = all.map(of).collect::<Result<Vec<Series>, FormatError>>()?;
         series.retain(|s| !s.exposures.is_empty());
-        if let [only] = series.as_mut_slice() {
-            only.source = Source::default();
-        }
         match series.is_empty() {
             false => Ok(series),
             true => Err(FormatError::invalid(
@@ -200,15 +201,36 @@ fn described(message: &[u8]) -> Option<(u8, Format)> {
     (at + 3 <= length).then(|| (id, Format { length, name: text(&message[2..6]), fields }))
 }
 
+/// How a letter stores its numbers, and what they are divided by.
+fn number(letter: u8) -> Option<(Number, f64)> {
+    Some(match letter {
+        b'b' => (Number::I8, 1.0),
+        b'B' | b'M' => (Number::U8, 1.0),
+        b'h' => (Number::I16, 1.0),
+        b'H' => (Number::U16, 1.0),
+        b'c' => (Number::I16, 100.0),
+        b'C' => (Number::U16, 100.0),
+        b'i' => (Number::I32, 1.0),
+        b'I' => (Number::U32, 1.0),
+        b'e' => (Number::I32, 100.0),
+        b'E' => (Number::U32, 100.0),
+        b'L' => (Number::I32, 1e7),
+        b'f' => (Number::F32, 1.0),
+        b'd' => (Number::F64, 1.0),
+        b'q' => (Number::I64, 1.0),
+        b'Q' => (Number::U64, 1.0),
+        _ => return None,
+    })
+}
+
 fn size(letter: u8) -> Option<usize> {
     Some(match letter {
-        b'b' | b'B' | b'M' => 1,
-        b'h' | b'H' | b'c' | b'C' | b'g' => 2,
-        b'i' | b'I' | b'e' | b'E' | b'L' | b'f' | b'n' => 4,
-        b'q' | b'Q' | b'd' => 8,
+        b'n' => 4,
         b'N' => 16,
         b'Z' | b'a' => 64,
-        _ => return None,
+        // A float of 16 bits.
+        b'g' => 2,
+        _ => number(letter)?.0.size(),
     })
 }
 
@@ -216,26 +238,8 @@ impl Format {
     /// A field as a number, by any of its names.
     fn number(&self, message: &[u8], names: &[&str]) -> Option<f64> {
         let (letter, at, _) = self.fields.iter().find(|f| names.contains(&f.2.as_str()))?;
-        let b = message.get(*at..at + size(*letter)?)?;
-        let value = match letter {
-            b'b' => f64::from(b[0] as i8),
-            b'B' | b'M' => f64::from(b[0]),
-            b'h' => f64::from(i16::from_le_bytes(b.try_into().ok()?)),
-            b'H' => f64::from(u16::from_le_bytes(b.try_into().ok()?)),
-            b'c' => f64::from(i16::from_le_bytes(b.try_into().ok()?)) / 100.0,
-            b'C' => f64::from(u16::from_le_bytes(b.try_into().ok()?)) / 100.0,
-            b'i' => f64::from(i32::from_le_bytes(b.try_into().ok()?)),
-            b'I' => f64::from(u32::from_le_bytes(b.try_into().ok()?)),
-            b'e' => f64::from(i32::from_le_bytes(b.try_into().ok()?)) / 100.0,
-            b'E' => f64::from(u32::from_le_bytes(b.try_into().ok()?)) / 100.0,
-            b'L' => f64::from(i32::from_le_bytes(b.try_into().ok()?)) / 1e7,
-            b'f' => f64::from(f32::from_le_bytes(b.try_into().ok()?)),
-            b'd' => f64::from_le_bytes(b.try_into().ok()?),
-            b'q' => i64::from_le_bytes(b.try_into().ok()?) as f64,
-            b'Q' => u64::from_le_bytes(b.try_into().ok()?) as f64,
-            _ => return None,
-        };
-        value.is_finite().then_some(value)
+        let (number, divisor) = number(*letter)?;
+        Some(number.read(message, *at)? / divisor)
     }
 }
 
@@ -452,5 +456,38 @@ mod tests {
         std::fs::write(&path, log).unwrap();
         let found: Vec<_> = read(&path).unwrap().iter().map(|s| (s.source.camera, s.exposures.len())).collect();
         assert_eq!(found, [(Some(0), 3), (Some(2), 5)]);
+    }
+
+    #[test]
+    fn a_camera_that_the_log_numbers_keeps_its_number_and_a_clock_that_starts_again_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("1.BIN");
+        std::fs::write(&path, log(5)).unwrap();
+        assert_eq!(read(&path).unwrap()[0].source.camera, Some(0));
+        std::fs::write(&path, [log(5), log(4)].concat()).unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        assert!(error.contains("starts again after 5 exposures") && !error.contains('\n'), "{error}");
+    }
+
+    #[test]
+    fn a_layout_that_is_described_anew_counts_from_there() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("1.BIN");
+        let mut bytes = Vec::new();
+        for (from, format, labels) in [(0, "QLLe", "TimeUS,Lat,Lng,Alt"), (3, "QeLL", "TimeUS,Alt,Lng,Lat")] {
+            bytes.extend(fmt(43, 23, "CAM", format, labels));
+            for i in from..from + 3 {
+                let ([lat, lng, alt], time) = (place(i), 7e6 + 3e6 * f64::from(i));
+                let values = if from == 0 { [time, lat, lng, alt] } else { [time, alt, lng, lat] };
+                bytes.extend(message(43, format, &values));
+            }
+        }
+        std::fs::write(&path, bytes).unwrap();
+        let exposures = read(&path).unwrap().remove(0).exposures;
+        assert_eq!(exposures.len(), 6);
+        for (i, e) in (0..).zip(&exposures) {
+            let ([lat, lng, alt], p) = (place(i), e.fix.position);
+            assert!((p.lat_deg - lat).abs() < 1e-7 && (p.lon_deg - lng).abs() < 1e-7 && p.alt_m == alt, "{i}: {p:?}");
+        }
     }
 }

@@ -11,7 +11,8 @@ use geometry::geodesy::Geodetic;
 use glam::DQuat;
 use models::formats::FormatError;
 
-use super::{MAX_EXPOSURES, SIGMA_M, Series, Source, camera_attitude};
+use super::number::Number;
+use super::{MAX_EXPOSURES, SIGMA_M, Series, Source, by_time, camera_attitude, too_many};
 use crate::card::exposures::Exposure;
 use crate::card::record::Fix;
 
@@ -26,6 +27,11 @@ const KINDS: &[u8] = b"BFIMPQARDLCSO";
 const MAX_DESCRIBED: usize = 4 << 20;
 /// Types within types.
 const DEEPEST: usize = 8;
+/// Subscriptions to the topics below, repeated ones included: more than any autopilot has cameras, receivers and estimators.
+const MAX_SUBSCRIBED: usize = 1024;
+/// The fields that are read.
+const FIELDS: [&str; 10] =
+    ["timestamp", "lat", "latitude_deg", "lon", "longitude_deg", "alt", "altitude_msl_m", "q", "result", "feedback"];
 /// Places and attitudes between which exposures are placed: ten a second for five hours.
 const MAX_SAMPLES: usize = 200_000;
 const SAMPLE_US: u64 = 100_000;
@@ -41,8 +47,8 @@ type Field = (String, usize, String);
 struct Topic {
     kind: Kind,
     instance: u8,
-    /// Offset and type by name.
-    fields: HashMap<String, (usize, String)>,
+    /// Where a field begins and what its elements are, of those that are read.
+    fields: HashMap<String, (usize, Number)>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -68,39 +74,30 @@ impl Kind {
 }
 
 impl Topic {
-    /// An element of a field as a number, by any of its names.
-    fn number(&self, data: &[u8], names: &[&str], element: usize) -> Option<f64> {
-        let (at, kind) = names.iter().find_map(|name| self.fields.get(*name))?;
-        let size = size_of_simple(kind)?;
-        let b = data.get(at + element * size..at + (element + 1) * size)?;
-        let value = match kind.as_str() {
-            "int8_t" => f64::from(b[0] as i8),
-            "uint8_t" | "bool" | "char" => f64::from(b[0]),
-            "int16_t" => f64::from(i16::from_le_bytes(b.try_into().ok()?)),
-            "uint16_t" => f64::from(u16::from_le_bytes(b.try_into().ok()?)),
-            "int32_t" => f64::from(i32::from_le_bytes(b.try_into().ok()?)),
-            "uint32_t" => f64::from(u32::from_le_bytes(b.try_into().ok()?)),
-            "int64_t" => i64::from_le_bytes(b.try_into().ok()?) as f64,
-            "uint64_t" => u64::from_le_bytes(b.try_into().ok()?) as f64,
-            "float" => f64::from(f32::from_le_bytes(b.try_into().ok()?)),
-            "double" => f64::from_le_bytes(b.try_into().ok()?),
-            _ => return None,
-        };
-        value.is_finite().then_some(value)
+    /// An element of a field as a number.
+    fn number(&self, data: &[u8], name: &str, element: usize) -> Option<f64> {
+        let (at, number) = *self.fields.get(name)?;
+        number.read(data, at + element * number.size())
     }
 
     fn quaternion(&self, data: &[u8]) -> Option<DQuat> {
-        let q = |i| self.number(data, &["q"], i);
+        let q = |i| self.number(data, "q", i);
         Some(DQuat::from_xyzw(q(1)?, q(2)?, q(3)?, q(0)?)).filter(|q| (0.9..1.1).contains(&q.length()))
     }
 }
 
-fn size_of_simple(kind: &str) -> Option<usize> {
+fn simple(kind: &str) -> Option<Number> {
     Some(match kind {
-        "int8_t" | "uint8_t" | "bool" | "char" => 1,
-        "int16_t" | "uint16_t" => 2,
-        "int32_t" | "uint32_t" | "float" => 4,
-        "int64_t" | "uint64_t" | "double" => 8,
+        "int8_t" => Number::I8,
+        "uint8_t" | "bool" | "char" => Number::U8,
+        "int16_t" => Number::I16,
+        "uint16_t" => Number::U16,
+        "int32_t" => Number::I32,
+        "uint32_t" => Number::U32,
+        "int64_t" => Number::I64,
+        "uint64_t" => Number::U64,
+        "float" => Number::F32,
+        "double" => Number::F64,
         _ => return None,
     })
 }
@@ -117,11 +114,16 @@ impl<T> Default for Track<T> {
 }
 
 impl<T: Copy> Track<T> {
+    /// A damaged time stamp far ahead keeps none of the later samples out.
     fn add(&mut self, time_us: u64, value: T) {
-        let due = self.samples.last().is_none_or(|last| time_us >= last.0 + SAMPLE_US);
+        let due = self.samples.last().is_none_or(|last| time_us.abs_diff(last.0) >= SAMPLE_US);
         if due && self.samples.len() < MAX_SAMPLES {
             self.samples.push((time_us, value));
         }
+    }
+
+    fn in_order(&mut self) {
+        self.samples.sort_by_key(|s| s.0);
     }
 
     /// The samples on both sides of `time_us` and the share of the second one; `None` where either is far.
@@ -157,20 +159,19 @@ struct Found {
 
 impl Found {
     fn take(&mut self, topic: &Topic, data: &[u8]) -> Option<()> {
-        let of = |names: &[&str]| topic.number(data, names, 0);
-        let time_us = of(&["timestamp"]).filter(|t| (0.0..MAX_TIME_US as f64).contains(t))? as u64;
-        // Degrees, else ten millionths of them; metres, else thousandths.
-        let degrees = |names: &[&str]| {
-            let value = of(names)?;
-            Some(if value.abs() > 360.0 { value * 1e-7 } else { value })
+        let of = |name: &str| topic.number(data, name, 0);
+        let time_us = of("timestamp").filter(|t| (0.0..MAX_TIME_US as f64).contains(t))? as u64;
+        // Degrees and metres; whole numbers are ten millionths of a degree and thousandths of a metre.
+        let scaled = |name: &str, whole: f64| {
+            let (_, number) = *topic.fields.get(name)?;
+            Some(of(name)? * if number == Number::I32 { whole } else { 1.0 })
         };
         let place = || {
-            let alt_m = of(&["altitude_msl_m"]).or_else(|| {
-                let (_, kind) = topic.fields.get("alt")?;
-                Some(of(&["alt"])? * if kind == "int32_t" { 1e-3 } else { 1.0 })
-            });
-            let lat_deg = degrees(&["latitude_deg", "lat"])?;
-            let position = Geodetic { lat_deg, lon_deg: degrees(&["longitude_deg", "lon"])?, alt_m: alt_m? };
+            let position = Geodetic {
+                lat_deg: scaled("latitude_deg", 1.0).or_else(|| scaled("lat", 1e-7))?,
+                lon_deg: scaled("longitude_deg", 1.0).or_else(|| scaled("lon", 1e-7))?,
+                alt_m: scaled("altitude_msl_m", 1.0).or_else(|| scaled("alt", 1e-3))?,
+            };
             (position.is_valid() && (position.lat_deg, position.lon_deg) != (0.0, 0.0)).then_some(position)
         };
         match topic.kind {
@@ -179,14 +180,17 @@ impl Found {
             Kind::Attitude => self.attitudes.add(time_us, topic.quaternion(data)?),
             Kind::Capture | Kind::Trigger => {
                 // 0: the camera says that it took none.
-                let failed = topic.kind == Kind::Capture && of(&["result"]) == Some(0.0);
-                if failed || self.count >= MAX_EXPOSURES {
+                let failed = topic.kind == Kind::Capture && of("result") == Some(0.0);
+                if failed {
                     return None;
                 }
                 self.count += 1;
+                if self.count > MAX_EXPOSURES {
+                    return None;
+                }
                 let list = if topic.kind == Kind::Capture { &mut self.captures } else { &mut self.triggers };
                 let camera = topic.quaternion(data);
-                let is_pulse = of(&["feedback"]) == Some(1.0);
+                let is_pulse = of("feedback") == Some(1.0);
                 list.entry(topic.instance).or_default().push(Event { time_us, fix: place(), camera, is_pulse });
             }
         }
@@ -213,6 +217,12 @@ impl Found {
     }
 
     fn series(mut self, path: &Path) -> Result<Vec<Series>, FormatError> {
+        if self.count > MAX_EXPOSURES {
+            return Err(too_many(path));
+        }
+        self.places.in_order();
+        self.receiver.in_order();
+        self.attitudes.in_order();
         let triggers: usize = self.triggers.values().map(Vec::len).sum();
         let mut lists = std::mem::take(&mut self.captures);
         if lists.is_empty() {
@@ -225,14 +235,14 @@ impl Found {
             }
         }
         let of = |(camera, list): (u8, Vec<Event>)| {
-            let mut exposures: Vec<Exposure> = list.iter().filter_map(|e| self.placed(e)).collect();
-            exposures.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
-            Series { source: Source { camera: Some(camera), ..Source::default() }, exposures }
+            let exposures = list.iter().filter_map(|e| self.placed(e)).collect();
+            Ok(Series {
+                source: Source { camera: Some(camera), ..Source::default() },
+                exposures: by_time(path, exposures)?,
+            })
         };
-        let mut series: Vec<Series> = lists.into_iter().map(of).filter(|s| !s.exposures.is_empty()).collect();
-        if let [only] = series.as_mut_slice() {
-            only.source = Source::default();
-        }
+        let mut series = lists.into_iter().map(of).collect::<Result<Vec<Series>, FormatError>>()?;
+        series.retain(|s| !s.exposures.is_empty());
         let what = match (series.is_empty(), triggers) {
             (false, _) => return Ok(series),
             (true, 0) => {
@@ -317,11 +327,18 @@ pub fn read(path: &Path) -> Result<Vec<Series>, FormatError> {
         return Err(FormatError::invalid(path, "not a PX4 log (.ulg)"));
     }
     let (mut formats, mut described) = (HashMap::<String, Vec<Field>>::new(), 0);
-    let (mut topics, mut found) = (HashMap::<u16, Topic>::new(), Found::default());
+    let (mut topics, mut subscribed, mut found) = (HashMap::<u16, Topic>::new(), 0, Found::default());
     while let Some(kind) = messages.next()? {
         let data = messages.message.as_slice();
         match kind {
             b'B' => {
+                // One bit is known: data are appended. What others mean a reader cannot guess (the format's description).
+                if data.get(8..16).is_some_and(|flags| flags[0] & !1 != 0 || flags[1..].iter().any(|f| *f != 0)) {
+                    return Err(FormatError::invalid(
+                        path,
+                        "is of a later edition of PX4's logs than this build knows",
+                    ));
+                }
                 let offsets = data.get(16..40).unwrap_or_default().chunks_exact(8);
                 let offsets = offsets.filter_map(|b| Some(u64::from_le_bytes(b.try_into().ok()?)));
                 messages.appended = offsets.filter(|at| *at > HEADER).collect();
@@ -339,10 +356,17 @@ pub fn read(path: &Path) -> Result<Vec<Series>, FormatError> {
                 };
                 let id = u16::from_le_bytes([id[0], id[1]]);
                 let name = String::from_utf8_lossy(name);
-                if let Some(kind) = Kind::named(name.trim_end_matches('\0')) {
-                    let fields = fields(&formats, &name).unwrap_or_default();
-                    topics.insert(id, Topic { kind, instance: *instance, fields });
+                let name = name.trim_end_matches('\0');
+                let Some(kind) = Kind::named(name) else {
+                    topics.remove(&id);
+                    continue;
+                };
+                subscribed += 1;
+                if subscribed > MAX_SUBSCRIBED {
+                    return Err(FormatError::invalid(path, "subscribes to more topics than any PX4 log does"));
                 }
+                let fields = fields(&formats, name).unwrap_or_default();
+                topics.insert(id, Topic { kind, instance: *instance, fields });
             }
             b'D' => {
                 let Some((id, data)) = data.split_first_chunk::<2>() else { continue };
@@ -372,11 +396,13 @@ fn format(message: &[u8]) -> Option<(String, Vec<Field>)> {
     Some((name.to_owned(), fields?))
 }
 
-/// Offset and type of the fields of `name`.
-fn fields(formats: &HashMap<String, Vec<Field>>, name: &str) -> Option<HashMap<String, (usize, String)>> {
+/// Where the fields of `name` begin and what their elements are, of those that are read.
+fn fields(formats: &HashMap<String, Vec<Field>>, name: &str) -> Option<HashMap<String, (usize, Number)>> {
     let (mut at, mut fields) = (0usize, HashMap::new());
     for (kind, elements, field) in formats.get(name)? {
-        fields.insert(field.clone(), (at, kind.clone()));
+        if let Some(number) = simple(kind).filter(|_| FIELDS.contains(&field.as_str())) {
+            fields.insert(field.clone(), (at, number));
+        }
         at = at.checked_add(size_of(formats, kind, DEEPEST)?.checked_mul((*elements).max(1))?)?;
         if at > usize::from(u16::MAX) {
             return None;
@@ -386,8 +412,8 @@ fn fields(formats: &HashMap<String, Vec<Field>>, name: &str) -> Option<HashMap<S
 }
 
 fn size_of(formats: &HashMap<String, Vec<Field>>, kind: &str, deep: usize) -> Option<usize> {
-    if let Some(size) = size_of_simple(kind) {
-        return Some(size);
+    if let Some(number) = simple(kind) {
+        return Some(number.size());
     }
     let mut size = 0usize;
     for (kind, elements, _) in formats.get(kind).filter(|_| deep > 0)? {
@@ -568,5 +594,53 @@ mod tests {
                 assert!(read_bytes(&appended[..len]).map_or(true, |s| s[0].exposures.len() <= 3), "{len}");
             }
         }
+    }
+
+    #[test]
+    fn a_type_says_the_unit_of_a_place_also_within_metres_of_the_equator() {
+        let mut log = [head(), data(1, &[&time(5.5), &[0; 8], &[0; 4], &[0], &[0; 3]])].concat();
+        for (t, lat) in [(5.0, 300i32), (6.0, 300)] {
+            log.extend(data(4, &[&time(t), &lat.to_le_bytes(), &200i32.to_le_bytes(), &400_500i32.to_le_bytes()]));
+        }
+        let position = read_bytes(&log).unwrap()[0].exposures[0].fix.position;
+        assert!((position.lat_deg - 3e-5).abs() < 1e-12 && (position.lon_deg - 2e-5).abs() < 1e-12, "{position:?}");
+    }
+
+    #[test]
+    fn a_damaged_time_stamp_among_the_places_costs_that_place_alone() {
+        let mut log = head();
+        let at = |t: f64, lat: f64| {
+            data(2, &[&time(t), &[0; 48], &lat.to_le_bytes(), &7f64.to_le_bytes(), &400f32.to_le_bytes()])
+        };
+        flown(5, &mut log);
+        log.extend(at(9e7, 12.0));
+        flown(6, &mut log);
+        flown(7, &mut log);
+        log.extend(data(1, &[&time(7.25), &[0; 8], &[0; 4], &[0], &[0; 3]]));
+        let found = read_bytes(&log).unwrap().remove(0).exposures;
+        assert!((found[0].fix.position.lat_deg - 46.0 - 7.25e-5).abs() < 1e-8, "{found:?}");
+    }
+
+    #[test]
+    fn a_clock_that_starts_again_unknown_flags_and_subscriptions_without_end_are_refused_in_one_line() {
+        let captures = |from: i32| -> Vec<u8> {
+            (from..from + 3).flat_map(|s| capture(f64::from(s), 46.0 + 1e-4 * f64::from(s), &q(0.0, 3.0), 1)).collect()
+        };
+        let twice = [head(), captures(11), captures(1)].concat();
+        let mut later = [head(), captures(1)].concat();
+        later[HEADER as usize + 3 + 8] = 2;
+        let many: Vec<u8> = (0..=MAX_SUBSCRIBED).flat_map(|_| topic(0, 0, "camera_capture")).collect();
+        let many = [head(), many, captures(1)].concat();
+        for (log, expected) in [(twice, "starts again after 3"), (later, "later edition"), (many, "subscribes")] {
+            let error = read_bytes(&log).unwrap_err().to_string();
+            assert!(error.contains(expected) && !error.contains('\n'), "{error}");
+        }
+    }
+
+    #[test]
+    fn an_identifier_that_is_given_to_another_topic_is_no_exposure_any_more() {
+        let one = capture(1.0, 46.0, &q(0.0, 3.0), 1);
+        let log = [head(), one, topic(0, 0, "sensor_combined"), capture(2.0, 46.1, &q(0.0, 3.0), 1)].concat();
+        assert_eq!(read_bytes(&log).unwrap()[0].exposures.len(), 1);
     }
 }
