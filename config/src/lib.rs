@@ -39,6 +39,8 @@ pub mod settings;
 #[cfg(feature = "std")]
 pub mod state;
 #[cfg(feature = "std")]
+pub mod survey;
+#[cfg(feature = "std")]
 pub mod training;
 #[cfg(feature = "std")]
 pub mod upload;

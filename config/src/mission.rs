@@ -19,6 +19,7 @@ use crate::map::MapSettings;
 use crate::preset::Preset;
 use crate::refine::RefineSettings;
 use crate::settings::{Limits, SettingError, record, table};
+use crate::survey::SurveySettings;
 use crate::training::TrainSettings;
 use crate::upload::UploadSettings;
 use geometry::geodesy::{EnuFrame, Geodetic};
@@ -100,6 +101,9 @@ record! {
         /// What goes wrong in the simulators; off by default.
         #[serde(default)]
         pub faults: FaultSettings = FaultSettings::default();
+        /// What the flights were planned by, as `dgtr survey` wrote it.
+        #[serde(default)]
+        pub survey: Option<SurveySettings> = None;
         /// Who flies, and where.
         pub aircraft: Vec<Aircraft>;
     } where Self::fits_together
@@ -284,6 +288,9 @@ impl Mission {
             for p in [&mut tls.authority, &mut tls.certificate, &mut tls.key] {
                 anchor(p);
             }
+        }
+        if let Some(terrain) = self.survey.as_mut().and_then(|survey| survey.terrain.as_mut()) {
+            anchor(terrain);
         }
         for aircraft in &mut self.aircraft {
             if let CameraSource::Folder(p) = &mut aircraft.camera {

@@ -4,15 +4,17 @@ use std::path::{Path, PathBuf};
 
 use config::error::{Error, ErrorKind};
 use config::mission::{Draft, DraftArea, MAX_CORNERS, Mission, MissionError};
+use config::survey::SurveySettings;
 use disk::{Disk, DiskError};
 use fleet::FleetError;
 use fleet::deal::{Share, deal};
 use fleet::figure;
 use fleet::flights::{Flights, Off, crossings};
-use fleet::ground::Ground;
+use fleet::ground::{Ground, Ring};
+use fleet::obstacles::Obstacles;
 use fleet::pace::{Manner, Pace};
 use fleet::ring::ring;
-use fleet::sortie::Craft;
+use fleet::sortie::{Craft, Sortie};
 use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DVec2;
 use measure::MeasureError;
@@ -116,6 +118,8 @@ pub struct Flying {
     pub take_off: Vec<[f64; 2]>,
     /// Metres above ground at most.
     pub highest_m: f64,
+    /// Metres that are kept from holes.
+    pub clearance_m: f64,
 }
 
 /// What is flown.
@@ -180,14 +184,12 @@ pub struct Planned {
     pub hectares: f64,
     /// Where aircraft take off when nobody said it.
     pub take_off: Option<Geodetic>,
-    /// Lines reach so far beyond the area, and into its holes, metres.
+    /// Lines reach so far beyond the area, metres.
     pub beyond_m: f64,
-    /// Rings that are cut out of the area.
+    /// Rings that are cut out of the area and flown round.
     pub holes: usize,
-    /// Lines that reach into one.
-    pub lines_over_holes: usize,
-    /// Ways to, from and between lines that lead over one.
-    pub over_holes: usize,
+    /// Ways to, from and between lines that lead round them.
+    pub detours: usize,
 }
 
 /// Plans `request` and writes it into `out`.
@@ -217,8 +219,9 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         (None, Source::File(_)) => Ok((Ground::default(), Vec::new())),
     };
     let frame = EnuFrame::new(place);
-    let (ground, _) = ground_in(&frame)?;
-    let homes = homes(&request.flying, &frame, &ground, count)?;
+    let (ground, holes) = ground_in(&frame)?;
+    let obstacles = obstacles(&holes, request.flying.clearance_m).map_err(|e| request.in_source(e))?;
+    let homes = homes(&request.flying, &frame, (&ground, &obstacles), count)?;
     let terrain = request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &ground, &homes)).transpose()?;
     let height = |p: DVec2| terrain.as_ref().and_then(|t| t.height(p));
     let home_m = match (&terrain, homes.first()) {
@@ -236,11 +239,13 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
     };
     let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
     let (ground, holes) = ground_in(&frame)?;
+    let obstacles = self::obstacles(&holes, request.flying.clearance_m).map_err(|e| request.in_source(e))?;
     let craft = craft(request, &homes, &manner)?;
-    let shares = deal(&ground, &craft, &manner).map_err(|e| request.in_source(e))?;
+    let shares = deal(&ground, &obstacles, &craft, &manner).map_err(|e| request.in_source(e))?;
+    let settings = settings(request, &frame, &homes, &holes);
     let text = match &request.source {
-        Source::File(_) => mission(request, origin, &shares)?,
-        Source::Rest(rest) => rest.mission(&shares)?,
+        Source::File(_) => mission(request, origin, &shares, settings)?,
+        Source::Rest(rest) => rest.mission(&shares, settings)?,
     };
     Mission::parse(&text, Path::new("."))?;
     let terrain: Option<&dyn Fn(DVec2) -> Option<f64>> = if terrain.is_some() { Some(&height) } else { None };
@@ -287,12 +292,7 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         hectares: ground.area_m2() / 1e4,
         beyond_m: manner.beyond_m,
         holes: holes.len(),
-        lines_over_holes: shares.iter().flat_map(|share| &share.sorties).map(|s| s.lines_over(&holes)).sum(),
-        over_holes: craft
-            .iter()
-            .zip(&shares)
-            .flat_map(|(craft, share)| share.sorties.iter().map(|s| s.ways_over(&holes, craft.home)))
-            .sum(),
+        detours: shares.iter().flat_map(|share| &share.sorties).map(Sortie::detours).sum(),
         take_off: (request.flying.take_off.is_empty()).then(|| frame.to_geodetic(homes[0].extend(0.0))),
     };
     let path = out.join(TABLE);
@@ -406,8 +406,57 @@ fn craft(request: &Request, homes: &[DVec2], manner: &Manner) -> Result<Vec<Craf
     Ok(request.aircraft.iter().enumerate().map(one).collect())
 }
 
+/// What is flown round.
+fn obstacles(holes: &[Ring], clearance_m: f64) -> Result<Obstacles, FleetError> {
+    match (1.0..=500.0).contains(&clearance_m) {
+        true => Obstacles::new(holes, clearance_m),
+        false => Err(FleetError::Setting {
+            what: "--clearance",
+            value: clearance_m.to_string(),
+            wanted: "1 to 500 m".into(),
+        }),
+    }
+}
+
+/// What is asked for, as the mission keeps it.
+fn settings(request: &Request, frame: &EnuFrame, homes: &[DVec2], holes: &[Ring]) -> SurveySettings {
+    let Request { pictures, flying, .. } = request;
+    let place = |home: &DVec2| {
+        let at = frame.to_geodetic(home.extend(0.0));
+        // A ten-millionth of a degree is a centimetre.
+        [at.lat_deg, at.lon_deg].map(|v| (v * 1e7).round() / 1e7)
+    };
+    let minutes = (0..homes.len()).map(|k| flying.endurance_min[k % flying.endurance_min.len()]);
+    SurveySettings {
+        gsd_cm: (pictures.gsd_m * 1e6).round() / 1e4,
+        forward_overlap: pictures.forward_overlap,
+        side_overlap: pictures.side_overlap,
+        interval_s: pictures.interval_s,
+        speed_m_s: flying.speed_m_s,
+        fastest_m_s: flying.fastest_m_s,
+        wind_m_s: flying.wind_m_s,
+        endurance_min: minutes.collect(),
+        reserve: flying.reserve,
+        take_off: homes.iter().map(place).collect(),
+        highest_m: flying.highest_m,
+        clearance_m: flying.clearance_m,
+        // Whoever reads the mission stands in another folder.
+        terrain: request.terrain.as_deref().map(|path| std::path::absolute(path).unwrap_or_else(|_| path.into())),
+        holes_enu: holes.iter().map(|ring| ring.iter().map(|p| millimetres(*p)).collect()).collect(),
+    }
+}
+
+fn millimetres(p: DVec2) -> [f64; 2] {
+    p.to_array().map(|v| (v * 1e3).round() / 1e3)
+}
+
 /// The mission file's text.
-fn mission(request: &Request, origin: Geodetic, shares: &[Share]) -> Result<String, SurveyError> {
+fn mission(
+    request: &Request,
+    origin: Geodetic,
+    shares: &[Share],
+    settings: SurveySettings,
+) -> Result<String, SurveyError> {
     let regions = shares.iter().zip(&request.aircraft).map(|(share, (id, _))| region(&share.ground, id));
     let regions = regions.collect::<Result<Vec<_>, FleetError>>().map_err(|e| request.in_source(e))?;
     let draft = Draft {
@@ -418,6 +467,7 @@ fn mission(request: &Request, origin: Geodetic, shares: &[Share]) -> Result<Stri
         area: DraftArea::Regions(regions),
         aircraft: request.aircraft.clone(),
         preset: None,
+        survey: Some(settings),
     };
     Ok(draft.text())
 }
@@ -431,7 +481,7 @@ fn region(ground: &Ground, id: &str) -> Result<Vec<[f64; 2]>, FleetError> {
             "leaves {id} a region of {count} corners; a mission holds {MAX_CORNERS}, so draw it simpler"
         )));
     }
-    Ok(corners.iter().map(|p| p.to_array().map(|v| (v * 1e3).round() / 1e3)).collect())
+    Ok(corners.into_iter().map(millimetres).collect())
 }
 
 fn table(out: &mut dyn std::io::Write, request: &Request, planned: &Planned) -> std::io::Result<()> {

@@ -2,15 +2,20 @@
 #![cfg(feature = "lab")]
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 use config::coverage::CoverageSettings;
-use config::mission::Mission;
+use config::ground::GroundSettings;
+use config::mission::{Aircraft, KeyframeSettings, Mission};
 use disk::Disk;
 use flight::coverage::route;
 use geometry::geodesy::{EnuFrame, Geodetic};
 use geometry::polygon;
 use glam::{DVec2, DVec3};
+use ground::jobs::aggregate;
+use ground::jobs::serve::admit::admit;
+use ground::member::Member;
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::flight_plan;
@@ -31,6 +36,9 @@ use survey::ortho::grid::Grid;
 const PLACE: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
 const CAMERA: Camera = Camera { picture: [4000, 3000], fov_deg: 60.0 };
 const GSD_M: f64 = 0.025;
+const CLEARANCE_M: f64 = 10.0;
+/// A hole of the yard.
+const HOLE: [[f64; 2]; 4] = [[80.0, 80.0], [160.0, 80.0], [160.0, 140.0], [80.0, 140.0]];
 
 /// Longitude and latitude of places around [`PLACE`].
 fn degrees(places: &[DVec2]) -> Vec<[f64; 2]> {
@@ -59,7 +67,7 @@ fn yard() -> String {
         format!("<LinearRing><coordinates>{}</coordinates></LinearRing>", all.join(" "))
     };
     let outside = ring(&[[0.0, 0.0], [640.0, 0.0], [640.0, 220.0], [240.0, 220.0], [240.0, 560.0], [0.0, 560.0]]);
-    let hole = ring(&[[80.0, 80.0], [160.0, 80.0], [160.0, 140.0], [80.0, 140.0]]);
+    let hole = ring(&HOLE);
     format!(
         "<kml xmlns='http://www.opengis.net/kml/2.2'><Placemark><name>yard</name><Polygon><outerBoundaryIs>{outside}</outerBoundaryIs>\
          <innerBoundaryIs>{hole}</innerBoundaryIs></Polygon></Placemark></kml>"
@@ -95,6 +103,7 @@ fn request(area: &Path, count: usize) -> Request {
             reserve: 0.25,
             take_off: Vec::new(),
             highest_m: 150.0,
+            clearance_m: CLEARANCE_M,
         },
         home_m: PLACE.alt_m,
         terrain: None,
@@ -154,6 +163,21 @@ fn opened(path: &Path) {
     let home = file.mission.planned_home_position;
     let landing = items[items.len() - 1].params;
     assert!((0..2).all(|k| landing[4 + k].is_some_and(|v| (v - home[k]).abs() < 1e-6)) && landing[6] == Some(0.0));
+}
+
+/// How near a plan leads to the yard's hole, from take-off to landing.
+fn from_hole_m(path: &Path) -> f64 {
+    let plan = flight_plan::read(path).expect("a plan");
+    let frame = EnuFrame::new(PLACE);
+    let ways = std::iter::once(plan.home).chain(plan.waypoints.iter().map(|w| w.position)).chain(plan.landing);
+    let ways: Vec<DVec2> = ways.map(|at| frame.to_enu(at).truncate()).collect();
+    let places = ways.windows(2).flat_map(|w| {
+        let steps = w[0].distance(w[1]).ceil().max(1.0);
+        (0..=steps as usize).map(move |k| w[0].lerp(w[1], k as f64 / steps))
+    });
+    // A rectangle along the axes.
+    let [low, high] = [HOLE[0], HOLE[2]].map(DVec2::from);
+    places.map(|p| (p - p.clamp(low, high)).length()).fold(f64::MAX, f64::min)
 }
 
 /// The true views of a plan's flight, in wind and with the errors of a simulated aircraft.
@@ -222,7 +246,6 @@ fn kept(name: &str, out: &Path, planned: &Planned, hectares: f64) {
         twice += usize::from(owners > 1);
     }
     assert!(owned > 100 && twice * 1000 <= owned, "{name}: {twice} of {owned} places have two owners");
-    // The yard's hole is said to be there, and some ways lead over it.
     assert_eq!(planned.holes, usize::from(name.starts_with("yard")), "{name}");
     let minutes: Vec<f64> = mission
         .aircraft
@@ -235,6 +258,10 @@ fn kept(name: &str, out: &Path, planned: &Planned, hectares: f64) {
     for (k, row) in planned.rows.iter().enumerate() {
         assert!(row.minutes < 25.0 * 0.75 + 1e-6 && row.side_overlap > 0.65 - 1e-6, "{name}: {row:?}");
         opened(&row.plan);
+        if planned.holes > 0 {
+            let off = from_hole_m(&row.plan);
+            assert!(off >= CLEARANCE_M - 0.02, "{name}: {off} m from the hole: {row:?}");
+        }
         let taken = flown(&row.plan, &mission, k as u64);
         // At a line's end a centimetre decides over a picture.
         let off = taken.len().abs_diff(row.pictures);
@@ -275,7 +302,15 @@ fn three_areas_flown_by_one_three_and_eight_are_covered_once_and_at_the_asked_di
     }
 }
 
-/// A model on the ground as far as its coverage counts: a Gaussian, and the views.
+/// Side of the squares in each of which a model has a Gaussian where it saw ground, metres.
+const SIDE_M: f64 = 4.0;
+
+fn square(p: DVec2) -> (i32, i32) {
+    let at = (p / SIDE_M).floor().as_ivec2();
+    (at.x, at.y)
+}
+
+/// A model on the ground as training would leave it, but for its looks: a Gaussian in each square that a view saw well, and the views.
 fn delivered(ground: &Path, mission: &Mission, id: &str, views: &[View], finished: bool) {
     let header = ModelHeader {
         mission: mission.name.clone(),
@@ -285,11 +320,61 @@ fn delivered(ground: &Path, mission: &Mission, id: &str, views: &[View], finishe
         finished,
         ..ModelHeader::default()
     };
-    let mut cloud = GaussianCloud::with_capacity(0, 1);
-    cloud.push([0.0; 3], [-2.0; 3], [1.0, 0.0, 0.0, 0.0], 0.5, &[0.0; 3]);
+    // Half of the shorter side of a picture.
+    let reach = 0.5 * GSD_M * f64::from(CAMERA.picture[1]);
+    let seen: BTreeSet<(i32, i32)> = views
+        .iter()
+        .flat_map(|view| {
+            let middle = view.pose.center.truncate();
+            let (low, high) = (square(middle - reach), square(middle + reach));
+            (low.0 + 1..high.0).flat_map(move |x| (low.1 + 1..high.1).map(move |y| (x, y)))
+        })
+        .collect();
+    let mut cloud = GaussianCloud::with_capacity(0, seen.len());
+    for (x, y) in seen {
+        let [x, y] = [x, y].map(|k| ((f64::from(k) + 0.5) * SIDE_M) as f32);
+        cloud.push([x, y, 0.0], [0.5; 3], [1.0, 0.0, 0.0, 0.0], 0.5, &[0.0; 3]);
+    }
     let folder = ground.join("received").join(id);
     std::fs::create_dir_all(&folder).expect("a folder");
     model::write(&folder.join("model.dgtr"), &header, &cloud).expect("written");
+}
+
+/// What the ground merges of the models in its folder: views that took part, and the share of all regions' squares that hold a Gaussian,
+/// and the share that hold several.
+fn merged(ground: &Path, mission: &Mission) -> (Vec<View>, f64, f64) {
+    let member = |a: &Aircraft| {
+        let path = ground.join("received").join(&a.id).join("model.dgtr");
+        Member::of(admit(mission, &a.id, &path).unwrap_or_else(|e| panic!("{}: {e}", a.id)))
+    };
+    let members = mission.aircraft.iter().map(member).collect();
+    // Nothing was rendered that could be distilled.
+    let settings = GroundSettings { epochs: 0, register: false, ..mission.ground.clone() };
+    let outcome = aggregate::run(members, &settings, Some(mission.origin), ground, &|| true).expect("merged");
+    let (header, cloud) = model::read(&outcome.path).expect("a model");
+    let mut count: HashMap<(i32, i32), usize> = HashMap::new();
+    for [x, y, _] in &cloud.means {
+        *count.entry(square(DVec2::new((*x).into(), (*y).into()))).or_default() += 1;
+    }
+    let (mut all, mut held, mut twice) = (0usize, 0usize, 0usize);
+    for region in mission.aircraft.iter().map(|a| mission.region(a).into_iter().map(DVec2::from).collect::<Vec<_>>()) {
+        let (low, high) = region.iter().fold((DVec2::MAX, DVec2::MIN), |(l, h), p| (l.min(*p), h.max(*p)));
+        let (from, to) = (square(low), square(high));
+        for at in (from.0..=to.0).flat_map(|x| (from.1..=to.1).map(move |y| (x, y))) {
+            let middle = (DVec2::new(at.0.into(), at.1.into()) + 0.5) * SIDE_M;
+            if polygon::contains(&region, middle) {
+                let here = count.get(&at).copied().unwrap_or(0);
+                (all, held, twice) = (all + 1, held + usize::from(here > 0), twice + usize::from(here > 1));
+            }
+        }
+    }
+    let share = |n: usize| n as f64 / all as f64;
+    (header.views.into_iter().map(|(_, view)| view).collect(), share(held), share(twice))
+}
+
+/// The aircraft keep all of their pictures.
+fn many() -> KeyframeSettings {
+    KeyframeSettings { max: 20_000, ..KeyframeSettings::default() }
 }
 
 #[test]
@@ -302,13 +387,17 @@ fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end
     let file = out.join(MISSION);
     let mission = Mission::read(&file).expect("a mission");
     let mut all = Vec::new();
+    let mut own: BTreeMap<String, Vec<View>> = BTreeMap::new();
     for (k, row) in planned.rows.iter().enumerate() {
         let mut views = flown(&row.plan, &mission, k as u64);
         if row.aircraft == "a2" {
             views.truncate(views.len() / 2);
         }
-        delivered(&ground, &mission, &row.aircraft, &views, row.aircraft != "a2");
+        own.entry(row.aircraft.clone()).or_default().extend(&views);
         all.extend(views);
+    }
+    for (id, views) in &own {
+        delivered(&ground, &mission, id, views, id != "a2");
     }
     let regions = |mission: &Mission| -> Vec<Vec<DVec2>> {
         mission.aircraft.iter().map(|a| mission.region(a).into_iter().map(DVec2::from).collect()).collect()
@@ -327,7 +416,9 @@ fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end
     let now = Mission::read(&again.join(MISSION)).expect("a mission");
     for (k, row) in more.rows.iter().enumerate() {
         opened(&row.plan);
-        all.extend(flown(&row.plan, &now, 10 + k as u64));
+        let views = flown(&row.plan, &now, 10 + k as u64);
+        own.entry(row.aircraft.clone()).or_default().extend(&views);
+        all.extend(views);
     }
     let after = covered(&regions(&now), &all);
     println!("covered {:.1} %, and {:.2} % in the end", 100.0 * before, 100.0 * after);
@@ -337,6 +428,18 @@ fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end
     assert!((hectares(&now) / hectares(&mission) - 1.0).abs() < 1e-3, "{} {}", hectares(&now), hectares(&mission));
     let lost = |mission: &Mission| polygon::signed_area(&regions(mission)[1]);
     assert!(lost(&now) < 0.8 * lost(&mission), "who failed keeps what is covered");
+    // The ground merges what all of them brought. The others went on with the key frames of their first flight; what one that failed
+    // brought counts where it covered ground.
+    let (_, incomplete, _) = merged(&ground, &Mission { keyframes: many(), ..mission.clone() });
+    assert!(incomplete < 0.95, "{incomplete}");
+    for (id, views) in own.iter().filter(|(id, _)| *id != "a2") {
+        delivered(&ground, &now, id, views, true);
+    }
+    let (views, complete, twice) = merged(&ground, &Mission { keyframes: many(), ..now.clone() });
+    println!("merged {} of {} views, {:.2} % of all regions", views.len(), all.len(), 100.0 * complete);
+    assert!(complete >= 0.98 && twice < 0.02, "{complete} hold something, {twice} several");
+    let share = covered(&regions(&now), &views);
+    assert!(share >= 0.98, "{share} of the merged model's ground is covered by its views");
     // Nothing is dealt twice, and nobody is not a fleet.
     for (without, word) in [
         (vec!["a1", "a2", "a3"], "no aircraft is left"),

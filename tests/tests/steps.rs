@@ -25,7 +25,8 @@ fn run(lines: &[String], words: &[&str], dir: &Path) {
     let wanted: Vec<&String> = lines.iter().filter(|line| words.iter().any(|word| line.starts_with(word))).collect();
     assert!(wanted.len() >= words.len(), "{words:?} are steps of the page: {lines:#?}");
     for line in wanted {
-        let line = line.replace("LAT,LON,ALT", "47.4,8.5,488").replace("dgtr init", "\"$DGTR\" init");
+        let line = line.replace("LAT,LON,ALT", "47.4,8.5,488");
+        let line = line.strip_prefix("dgtr ").map_or(line.clone(), |more| format!("\"$DGTR\" {more}"));
         let mut shell = Command::new("sh");
         shell.args(["-ec", &line]).current_dir(dir).env("DGTR", env!("CARGO_BIN_EXE_dgtr-under-test"));
         let output = shell.output().expect("sh");
@@ -65,10 +66,19 @@ fn a_signing_key_is_made_of_its_passphrase() {
 fn an_installed_companion_has_its_camera_folder_where_the_service_may_read_it() {
     let dir = tempfile::tempdir().expect("tempdir");
     let at = |folder: &str| dir.path().join(folder).to_str().expect("UTF-8").to_owned();
-    let unprivileged = page("INSTALL.md").replace("sudo ", "").replace("-o dgtr -g dgtr ", "");
+    let mut unprivileged = page("INSTALL.md");
+    for right in ["sudo -u dgtr ", "&& sudo chown -R dgtr: /etc/dgtr/keys", "sudo ", "-o dgtr -g dgtr "] {
+        assert!(unprivileged.contains(right), "{right:?} is in the page");
+        unprivileged = unprivileged.replace(right, "");
+    }
     let here = unprivileged.replace("/etc/dgtr", &at("etc")).replace("/var/lib/dgtr", &at("lib"));
-    let made = format!("mkdir -p {}", at("etc"));
-    run(&steps(&here), &[&made, "dgtr init", "install -d -m", "sed"], dir.path());
+    let here = here.replace("/etc/systemd/system", &at("units"));
+    let words = ["mkdir -p ", "dgtr init", "install -d -m", "sed", "dgtr keys", "dgtr plan"];
+    run(&steps(&here), &words, dir.path());
+    let bounds = std::fs::read_to_string(at("units/dgtr-fly.service.d/plan.conf")).expect("plan.conf");
+    assert!(bounds.starts_with("[Service]\n") && bounds.contains("MemoryMax="), "{bounds}");
+    let keys = std::fs::read_dir(at("etc/keys")).expect("keys").flatten().count();
+    assert!(keys > 0, "a private key");
     let folder = camera_folder(&mission(&dir.path().join("etc/mission.toml")));
     assert!(Path::new(&folder).is_dir() && folder.starts_with(&at("lib")), "{folder}");
 }

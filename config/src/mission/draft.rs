@@ -6,6 +6,7 @@ use super::reference::{comment, explain};
 use crate::plan::WORKING_SIDE;
 use crate::preset::Preset;
 use crate::settings::{Setting, Value};
+use crate::survey::SurveySettings;
 use geometry::geodesy::Geodetic;
 
 /// What a mission needs to know from its author.
@@ -25,6 +26,8 @@ pub struct Draft {
     pub aircraft: Vec<(String, String)>,
     /// Budgets, unless the defaults of `[memory]` do.
     pub preset: Option<Preset>,
+    /// What its flights were planned by.
+    pub survey: Option<SurveySettings>,
 }
 
 /// What the aircraft of a draft fly.
@@ -97,6 +100,9 @@ impl Draft {
                 _ => section(&mut out, &all, table, &[], true),
             }
         }
+        if let Some(survey) = &self.survey {
+            section(&mut out, &all, "survey", &survey.given(), true);
+        }
         for (i, (id, link)) in self.aircraft.iter().enumerate() {
             let region = self.area.region(i, self.aircraft.len());
             let given = [
@@ -155,6 +161,7 @@ mod tests {
             area: DraftArea::Box([200.0, 100.0]),
             aircraft: vec![("west".into(), "udpin:0.0.0.0:14550".into()), ("east".into(), "tcpin:0.0.0.0:1".into())],
             preset: Some(Preset::Tiny),
+            survey: None,
         }
     }
 

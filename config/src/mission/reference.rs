@@ -161,7 +161,7 @@ mod tests {
         same!(MemorySettings, Preset, NetworkSettings, UploadSettings, TlsSettings, GroundSettings, InitSettings);
         same!(RefineSettings, TrainSettings, LossSettings, RateSettings, AdamSettings, DensitySettings, Strategy);
         same!(ShSettings, ResolutionSettings, ViewSettings, StopSettings, RegulariseSettings, SkipSettings);
-        same!(FaultSettings, FailsafeSettings, CoverageSettings, HttpSettings, Aircraft);
+        same!(FaultSettings, FailsafeSettings, CoverageSettings, HttpSettings, SurveySettings, Aircraft);
     }
 
     /// All tables of the reference, as the structs that would be read from it.

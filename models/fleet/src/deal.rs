@@ -9,6 +9,7 @@ use glam::DVec2;
 use crate::FleetError;
 use crate::ground::Ground;
 use crate::lines::{Line, lines, path_s};
+use crate::obstacles::Obstacles;
 use crate::pace::Manner;
 use crate::rows::{Lattice, MOST_ROWS, Rows, held, rows};
 use crate::sortie::{Craft, Sortie, sorties};
@@ -45,11 +46,16 @@ impl Share {
     }
 }
 
-/// Deals `ground` to all of `craft`, in their order.
+/// Deals `ground` to all of `craft`, in their order; they fly round `obstacles`.
 ///
 /// # Errors
 /// Too many aircraft for the area, batteries that do not reach, or times that cannot be made equal.
-pub fn deal(ground: &Ground, craft: &[Craft], manner: &Manner) -> Result<Vec<Share>, FleetError> {
+pub fn deal(
+    ground: &Ground,
+    obstacles: &Obstacles,
+    craft: &[Craft],
+    manner: &Manner,
+) -> Result<Vec<Share>, FleetError> {
     if !(1..=MOST_CRAFT).contains(&craft.len()) {
         let wanted = format!("1 to {MOST_CRAFT}");
         return Err(FleetError::Setting { what: "--aircraft", value: craft.len().to_string(), wanted });
@@ -66,7 +72,7 @@ pub fn deal(ground: &Ground, craft: &[Craft], manner: &Manner) -> Result<Vec<Sha
     for along in quickest {
         let lattice = Lattice::over(ground, along, manner.spacing_m);
         let all = rows(ground, &lattice);
-        let dealer = Dealer { ground, craft, manner, lattice, all };
+        let dealer = Dealer { ground, obstacles, craft, manner, lattice, all };
         for free in [true, false] {
             dealer.equal(free, &mut best);
             if best.is_equal() {
@@ -141,6 +147,7 @@ fn laid(ground: &Ground, along: DVec2, home: DVec2, manner: &Manner) -> Option<(
 
 struct Dealer<'a> {
     ground: &'a Ground,
+    obstacles: &'a Obstacles,
     craft: &'a [Craft],
     manner: &'a Manner,
     lattice: Lattice,
@@ -200,10 +207,11 @@ impl Dealer<'_> {
         let seconds = |lines: &Vec<Line>| path_s(lines, craft.home, &manner.pace);
         let best = tried.into_iter().min_by(|a, b| seconds(&a.1).total_cmp(&seconds(&b.1)));
         let (spacing_m, lines) = best.unwrap_or_default();
+        let lines: Vec<Line> = lines.iter().flat_map(|line| self.obstacles.clear(line)).collect();
         if lines.is_empty() {
             return Err(FleetError::Deal(format!("the area is too small for {} aircraft", self.craft.len())));
         }
-        Ok(Share { ground, sorties: sorties(&lines, craft, manner)?, spacing_m })
+        Ok(Share { ground, sorties: sorties(&lines, craft, manner, self.obstacles)?, spacing_m })
     }
 
     /// Cuts strips into one part for each weight.

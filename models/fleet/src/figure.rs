@@ -43,10 +43,10 @@ impl Paper {
 /// # Errors
 /// Those of `out`.
 pub fn write(out: &mut dyn Write, craft: &[Craft], shares: &[Share]) -> io::Result<()> {
-    let homes = craft.iter().map(|c| c.home);
-    let lines = shares.iter().flat_map(|s| &s.sorties).flat_map(|s| &s.lines).flat_map(|l| [l.from, l.to]);
+    let flown = craft.iter().zip(shares);
+    let ways = flown.flat_map(|(craft, share)| share.sorties.iter().flat_map(|sortie| sortie.path(craft.home)));
     let corners = shares.iter().flat_map(|s| s.ground.bounds());
-    let all = homes.chain(lines).chain(corners).filter(|p| p.is_finite());
+    let all = ways.chain(corners).filter(|p| p.is_finite());
     let (low, high) = all.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(l, h), p| (l.min(p), h.max(p)));
     let size = (high - low).max(DVec2::ONE);
     let paper = Paper { low, high, scale: (WIDTH - 2.0 * MARGIN) / size.max_element() };
@@ -64,9 +64,7 @@ pub fn write(out: &mut dyn Write, craft: &[Craft], shares: &[Share]) -> io::Resu
             paper.ground(&share.ground)
         );
         for sortie in &share.sorties {
-            let way =
-                std::iter::once(craft.home).chain(sortie.lines.iter().flat_map(|l| [l.from, l.to])).chain([craft.home]);
-            let way: Vec<String> = way.map(|p| paper.at(p)).collect();
+            let way: Vec<String> = sortie.path(craft.home).into_iter().map(|p| paper.at(p)).collect();
             let _ = writeln!(
                 text,
                 "<path d=\"M{}\" fill=\"none\" stroke=\"{color}\" stroke-dasharray=\"2 4\"/>",

@@ -90,15 +90,22 @@ impl Flights<'_> {
         let home = self.at(craft.home, self.ground(craft.home)?);
         let mut waypoints = Vec::new();
         let mut here = craft.home;
-        for (k, line) in sortie.lines.iter().enumerate() {
-            let crossed = k == 0 || crosses(&sortie.lines[k - 1], line, self.manner);
-            if crossed {
-                self.cross(&mut waypoints, here, line.from, craft)?;
+        for (k, (line, way)) in sortie.lines.iter().zip(&sortie.ways).enumerate() {
+            let path: Vec<DVec2> = std::iter::once(here).chain(way.iter().copied()).chain([line.from]).collect();
+            match k == 0 || crosses(&path, self.manner) {
+                true => self.cross(&mut waypoints, &path, craft)?,
+                false => {
+                    for bend in way {
+                        waypoints.push(self.waypoint(*bend, self.ground(*bend)? + self.manner.height_m, None));
+                    }
+                }
             }
             self.line(&mut waypoints, line)?;
             here = line.to;
         }
-        self.cross(&mut waypoints, here, craft.home, craft)?;
+        let way = sortie.ways.last().into_iter().flatten().copied();
+        let path: Vec<DVec2> = std::iter::once(here).chain(way).chain([craft.home]).collect();
+        self.cross(&mut waypoints, &path, craft)?;
         Ok(FlightPlan {
             home,
             speed_m_s: self.manner.pace.speed_m_s,
@@ -133,13 +140,16 @@ impl Flights<'_> {
         Waypoint { position: self.at(p, alt_m), yaw_deg: None, picture: false, every_m }
     }
 
-    /// Straight from place to place at the aircraft's own height above the ground: level above all of it, somebody would be too high
-    /// above valleys, or as high as another who crosses lower ground.
-    fn cross(&self, waypoints: &mut Vec<Waypoint>, from: DVec2, to: DVec2, craft: &Craft) -> Result<(), FleetError> {
-        let profile = self.profile(from, to)?;
-        for k in simplified(&profile, CROSSING_OFF_M) {
-            let (share, ground) = profile[k];
-            waypoints.push(self.waypoint(from.lerp(to, share), ground + craft.crossing_m, None));
+    /// From place to place at the aircraft's own height above the ground: level above all of it, somebody would be too high above
+    /// valleys, or as high as another who crosses lower ground.
+    fn cross(&self, waypoints: &mut Vec<Waypoint>, path: &[DVec2], craft: &Craft) -> Result<(), FleetError> {
+        for (n, leg) in path.windows(2).enumerate() {
+            let profile = self.profile(leg[0], leg[1])?;
+            // Where a leg ends, the next begins.
+            for k in simplified(&profile, CROSSING_OFF_M).into_iter().skip(usize::from(n > 0)) {
+                let (share, ground) = profile[k];
+                waypoints.push(self.waypoint(leg[0].lerp(leg[1], share), ground + craft.crossing_m, None));
+            }
         }
         Ok(())
     }
@@ -189,6 +199,7 @@ fn simplified(profile: &[(f64, f64)], off: f64) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::obstacles::Obstacles;
     use crate::pace::Pace;
     use crate::sortie::sorties;
 
@@ -199,6 +210,29 @@ mod tests {
 
     fn craft() -> Craft {
         Craft { id: "west".into(), home: DVec2::new(-50.0, -50.0), battery_s: 1500.0, crossing_m: 75.0 }
+    }
+
+    #[test]
+    fn ways_round_a_hole_are_waypoints_at_the_height_that_the_way_has() {
+        let manner = manner();
+        let craft = Craft { home: DVec2::new(-50.0, 35.0), ..craft() };
+        let flights =
+            Flights { frame: EnuFrame::new(ORIGIN), manner: &manner, base_m: 12.0, terrain: None, home_m: 430.0 };
+        let hole: Vec<DVec2> = [[90.0, 34.0], [110.0, 34.0], [110.0, 36.0], [90.0, 36.0]].map(DVec2::from).to_vec();
+        let obstacles = Obstacles::new(&[hole], 5.0).expect("one");
+        let line = |a: [f64; 2], b: [f64; 2]| Line { from: a.into(), to: b.into() };
+        // From one side of it to the other, and home along it.
+        let lines = [line([0.0, 35.0], [80.0, 35.0]), line([120.0, 35.0], [200.0, 35.0])];
+        let sortie = &sorties(&lines, &craft, &manner, &obstacles).expect("one")[0];
+        assert_eq!(sortie.ways.iter().map(Vec::is_empty).collect::<Vec<_>>(), [true, false, false]);
+        let plan = flights.plan(&craft, sortie).expect("a plan");
+        let heights: Vec<f64> = plan.waypoints.iter().map(|w| w.position.alt_m - 430.0).collect();
+        let [between, back] = [1, 2].map(|k| sortie.ways[k].len());
+        let level = |height: f64, count: usize| vec![height; count];
+        assert_eq!(heights, [level(75.0, 2), level(60.0, 4 + between), level(75.0, 2 + back)].concat());
+        let frame = EnuFrame::new(ORIGIN);
+        let bend = frame.to_enu(plan.waypoints[4].position).truncate();
+        assert!(bend.distance(sortie.ways[1][0]) < 0.01, "{bend}");
     }
 
     const ORIGIN: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
@@ -213,7 +247,7 @@ mod tests {
         let (manner, craft) = (manner(), craft());
         let flights =
             Flights { frame: EnuFrame::new(ORIGIN), manner: &manner, base_m: 12.0, terrain: None, home_m: 430.0 };
-        let sortie = &sorties(&lines(), &craft, &manner).expect("one")[0];
+        let sortie = &sorties(&lines(), &craft, &manner, &Obstacles::default()).expect("one")[0];
         let plan = flights.plan(&craft, sortie).expect("a plan");
         let heights: Vec<f64> = plan.waypoints.iter().map(|w| w.position.alt_m - 430.0).collect();
         // There, two lines, across to the third, back.
@@ -251,7 +285,7 @@ mod tests {
         assert!(refused.starts_with("--terrain holds no height at 47.4"), "{refused}");
         // Ways across are at one height above the ground, too.
         let mut way = Vec::new();
-        flights.cross(&mut way, DVec2::ZERO, DVec2::new(300.0, 0.0), &craft).expect("a way");
+        flights.cross(&mut way, &[DVec2::ZERO, DVec2::new(300.0, 0.0)], &craft).expect("a way");
         let places: Vec<(f64, f64)> = way.iter().map(|w| (frame.to_enu(w.position).x, w.position.alt_m)).collect();
         assert!(places[0].0.abs() < 1e-6 && (places[places.len() - 1].0 - 300.0).abs() < 0.1, "{places:?}");
         for pair in places.windows(2) {

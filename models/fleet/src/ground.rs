@@ -105,6 +105,14 @@ impl Ground {
         Self::from_shapes(flat.overlay_as::<i64>(&Flat::new(), OverlayRule::Subject, FillRule::EvenOdd))
     }
 
+    /// What lies inside of any ring.
+    pub fn covered_by(mut rings: Vec<Ring>) -> Self {
+        // Rings of both directions would take each other away.
+        rings.iter_mut().filter(|ring| polygon::signed_area(ring) < 0.0).for_each(|ring| ring.reverse());
+        let flat = flat(&rings);
+        Self::from_shapes(flat.overlay_as::<i64>(&Flat::new(), OverlayRule::Subject, FillRule::NonZero))
+    }
+
     /// What lies in this and in `other`.
     pub fn common(&self, other: &Self) -> Self {
         self.overlaid(other, OverlayRule::Intersect)

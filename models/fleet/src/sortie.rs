@@ -1,11 +1,10 @@
 //! What one battery flies.
 
-use geometry::polygon;
 use glam::DVec2;
 
 use crate::FleetError;
-use crate::ground::Ring;
-use crate::lines::{Line, path_s};
+use crate::lines::Line;
+use crate::obstacles::Obstacles;
 use crate::pace::Manner;
 
 /// Lines further apart than this, in distances of neighbouring ones, are no neighbours.
@@ -31,68 +30,104 @@ pub struct Craft {
 pub struct Sortie {
     /// In flying order.
     pub lines: Vec<Line>,
+    /// Where the ways to each line bend, and that back home: round what is not flown over.
+    pub ways: Vec<Vec<DVec2>>,
     /// From take-off to landing.
     pub seconds: f64,
 }
 
 impl Sortie {
+    /// All corners from the take-off place and back.
+    pub fn path(&self, home: DVec2) -> Vec<DVec2> {
+        let ends = self.lines.iter().map(|line| vec![line.from, line.to]).chain([vec![home]]);
+        let flown = self.ways.iter().zip(ends).flat_map(|(way, end)| way.iter().copied().chain(end));
+        std::iter::once(home).chain(flown).collect()
+    }
+
     /// Metres flown from the take-off place and back.
     pub fn metres(&self, home: DVec2) -> f64 {
-        let mut here = home;
-        let mut metres = 0.0;
-        for line in &self.lines {
-            metres += here.distance(line.from) + line.length();
-            here = line.to;
-        }
-        metres + here.distance(home)
+        metres(&self.path(home))
     }
 
-    /// Lines that lead over a hole or reach into one.
-    pub fn lines_over(&self, holes: &[Ring]) -> usize {
-        self.lines.iter().filter(|line| holes.iter().any(|hole| crosses_ring((line.from, line.to), hole))).count()
-    }
-
-    /// Ways to the first line, from line to line and back that lead over a hole.
-    pub fn ways_over(&self, holes: &[Ring], home: DVec2) -> usize {
-        let ends = self.lines.iter().map(|line| line.to);
-        let begins = self.lines.iter().map(|line| line.from);
-        let ways = std::iter::once(home).chain(ends).zip(begins.chain([home]));
-        ways.filter(|way| holes.iter().any(|hole| crosses_ring(*way, hole))).count()
+    /// Ways that lead round something.
+    pub fn detours(&self) -> usize {
+        self.ways.iter().filter(|way| !way.is_empty()).count()
     }
 }
 
-/// Whether a straight way crosses a side of a ring or lies inside.
-fn crosses_ring((from, to): (DVec2, DVec2), ring: &Ring) -> bool {
-    let side = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
-    let apart = |a: DVec2, b: DVec2, p: DVec2, q: DVec2| side(a, b, p) * side(a, b, q) < 0.0;
-    let mut sides = ring.iter().zip(ring.iter().cycle().skip(1));
-    [from, to].into_iter().any(|end| polygon::contains(ring, end))
-        || sides.any(|(a, b)| apart(from, to, *a, *b) && apart(*a, *b, from, to))
+fn metres(path: &[DVec2]) -> f64 {
+    path.windows(2).map(|w| w[0].distance(w[1])).sum()
 }
 
-/// The lines as flights that a battery lasts for. A line that is too long for one is flown in several.
+/// A way between two places.
+struct Way {
+    bends: Vec<DVec2>,
+    seconds: f64,
+    far: bool,
+}
+
+/// Who flies, how, and round what.
+struct Flying<'a> {
+    craft: &'a Craft,
+    manner: &'a Manner,
+    obstacles: &'a Obstacles,
+}
+
+impl Flying<'_> {
+    fn way(&self, from: DVec2, to: DVec2) -> Result<Way, FleetError> {
+        let bends = self.obstacles.way(from, to).ok_or_else(|| {
+            FleetError::Reach(format!(
+                "{}: no way leads round the holes of the area to all of its lines with {} m of room; move --take-off, give less \
+                 --clearance, or draw the holes otherwise",
+                self.craft.id,
+                self.obstacles.clearance_m()
+            ))
+        })?;
+        let path: Vec<DVec2> = std::iter::once(from).chain(bends.iter().copied()).chain([to]).collect();
+        Ok(Way { seconds: self.manner.pace.path_s(&path), far: crosses(&path, self.manner), bends })
+    }
+
+    fn line_s(&self, line: &Line) -> f64 {
+        self.manner.pace.leg_s(line.length())
+    }
+}
+
+/// The lines as flights that a battery lasts for, round `obstacles`. A line that is too long for one is flown in several.
 ///
 /// # Errors
-/// The way there and back alone is too long.
-pub fn sorties(lines: &[Line], craft: &Craft, manner: &Manner) -> Result<Vec<Sortie>, FleetError> {
+/// The way there and back alone is too long, or there is none.
+pub fn sorties(
+    lines: &[Line],
+    craft: &Craft,
+    manner: &Manner,
+    obstacles: &Obstacles,
+) -> Result<Vec<Sortie>, FleetError> {
+    let flying = Flying { craft, manner, obstacles };
     let Manner { pace, height_m, .. } = manner;
-    let vertical = pace.vertical_s(craft.crossing_m, *height_m);
-    let change = pace.change_s(craft.crossing_m, *height_m);
-    let seconds = |lines: &[Line]| {
-        let crossed = lines.windows(2).filter(|w| crosses(&w[0], &w[1], manner)).count();
-        vertical + crossed as f64 * change + path_s(lines, craft.home, pace)
-    };
-    let fits = |lines: &[Line]| seconds(lines) <= craft.battery_s;
+    let vertical_s = pace.vertical_s(craft.crossing_m, *height_m);
+    let change_s = pace.change_s(craft.crossing_m, *height_m);
     let mut found = Vec::new();
     let mut rest: Vec<Line> = lines.iter().rev().copied().collect();
-    while let Some(next) = rest.pop() {
-        let mut flown = vec![next];
-        if !fits(&flown) {
-            let part = |share: f64| Line { from: next.from, to: next.from.lerp(next.to, share) };
+    while let Some(mut line) = rest.pop() {
+        let there = flying.way(craft.home, line.from)?;
+        let mut back = flying.way(line.to, craft.home)?;
+        // Up to the end of the last line.
+        let mut seconds = vertical_s + there.seconds + flying.line_s(&line);
+        if seconds + back.seconds > craft.battery_s {
+            let whole = line;
+            let mut fits = None;
             // As much as fits: seconds grow with the share but for the way home, hence from above.
-            let share = (1..64).rev().map(|k| f64::from(k) / 64.0).find(|share| fits(&[part(*share)]));
-            let Some(share) = share.filter(|_| found.len() < MOST_SORTIES) else {
-                let far = craft.home.distance(next.from).max(craft.home.distance(next.to));
+            for share in (1..64).rev().map(|k| f64::from(k) / 64.0) {
+                let part = Line { from: whole.from, to: whole.from.lerp(whole.to, share) };
+                let home = flying.way(part.to, craft.home)?;
+                let up_to = vertical_s + there.seconds + flying.line_s(&part);
+                if up_to + home.seconds <= craft.battery_s {
+                    fits = Some((part, home, up_to));
+                    break;
+                }
+            }
+            let Some(fits) = fits.filter(|_| found.len() < MOST_SORTIES) else {
+                let far = craft.home.distance(whole.from).max(craft.home.distance(whole.to));
                 return Err(FleetError::Reach(format!(
                     "{}: its lines begin {far:.0} m from the take-off place, and a battery lasts {:.1} min of flight; move --take-off \
                      nearer, raise --endurance or --speed, or give more aircraft",
@@ -100,25 +135,32 @@ pub fn sorties(lines: &[Line], craft: &Craft, manner: &Manner) -> Result<Vec<Sor
                     craft.battery_s / 60.0
                 )));
             };
-            flown = vec![part(share)];
-            rest.push(Line { from: flown[0].to, to: next.to });
+            (line, back, seconds) = fits;
+            rest.push(Line { from: line.to, to: whole.to });
         }
+        let (mut flown, mut ways) = (vec![line], vec![there.bends]);
         while let Some(more) = rest.pop() {
-            flown.push(more);
-            if !fits(&flown) {
-                flown.pop();
+            let between = flying.way(line.to, more.from)?;
+            let home = flying.way(more.to, craft.home)?;
+            let change_s = if between.far { change_s } else { 0.0 };
+            let longer = seconds + between.seconds + change_s + flying.line_s(&more);
+            if longer + home.seconds > craft.battery_s {
                 rest.push(more);
                 break;
             }
+            (line, back, seconds) = (more, home, longer);
+            flown.push(more);
+            ways.push(between.bends);
         }
-        found.push(Sortie { seconds: seconds(&flown), lines: flown });
+        ways.push(back.bends);
+        found.push(Sortie { lines: flown, ways, seconds: seconds + back.seconds });
     }
     Ok(found)
 }
 
 /// Whether the way from a line to the next is so long that it may lead over others' ground: it is flown at the crossing height.
-pub fn crosses(line: &Line, next: &Line, manner: &Manner) -> bool {
-    line.to.distance(next.from) > FAR * manner.spacing_m + 2.0 * manner.beyond_m
+pub fn crosses(way: &[DVec2], manner: &Manner) -> bool {
+    metres(way) > FAR * manner.spacing_m + 2.0 * manner.beyond_m
 }
 
 #[cfg(test)]
@@ -132,19 +174,30 @@ mod tests {
     }
 
     #[test]
-    fn ways_over_a_hole_are_counted_and_those_beside_it_are_not() {
-        let holes = [rectangle(40.0, 40.0, 20.0, 20.0)];
+    fn ways_round_a_hole_are_longer_and_counted_and_those_beside_it_are_straight() {
+        let pace = Pace::new(8.0, 0.0, 15.0).expect("a pace");
+        let manner = Manner { spacing_m: 20.0, beyond_m: 8.0, height_m: 40.0, pace };
+        let obstacles = Obstacles::new(&[rectangle(40.0, 40.0, 20.0, 20.0)], 5.0).expect("one");
         let line = |from: [f64; 2], to: [f64; 2]| Line { from: from.into(), to: to.into() };
-        let home = DVec2::new(-10.0, 50.0);
-        let over = |lines| Sortie { lines, seconds: 0.0 }.ways_over(&holes, home);
-        // There over the hole and back beside it; and from line to line.
-        assert_eq!(over(vec![line([90.0, 50.0], [90.0, 90.0])]), 1);
-        assert_eq!(over(vec![line([10.0, 5.0], [90.0, 5.0])]), 0);
-        assert_eq!(over(vec![line([5.0, 10.0], [30.0, 10.0]), line([70.0, 90.0], [5.0, 90.0])]), 1);
-        // A line over it, one that ends in it, and one beside it.
-        let lines =
-            vec![line([0.0, 50.0], [90.0, 50.0]), line([0.0, 45.0], [45.0, 45.0]), line([0.0, 5.0], [90.0, 5.0])];
-        assert_eq!(Sortie { lines, seconds: 0.0 }.lines_over(&holes), 2);
+        let craft = Craft { home: DVec2::new(-10.0, 50.0), ..craft(900.0) };
+        let one = |lines: &[Line], obstacles: &Obstacles| {
+            let all = sorties(lines, &craft, &manner, obstacles).expect("a way");
+            assert_eq!(all.len(), 1);
+            all[0].clone()
+        };
+        // There over the hole and back beside it.
+        let behind = [line([90.0, 50.0], [90.0, 90.0])];
+        let (round, straight) = (one(&behind, &obstacles), one(&behind, &Obstacles::default()));
+        assert_eq!((round.detours(), straight.detours()), (1, 0));
+        assert!(round.seconds > straight.seconds && round.metres(craft.home) > straight.metres(craft.home) + 5.0);
+        let path = round.path(craft.home);
+        assert!(path.len() > 4 && path[0] == craft.home && path[path.len() - 1] == craft.home, "{path:?}");
+        assert_eq!(one(&[line([10.0, 5.0], [90.0, 5.0])], &obstacles).detours(), 0);
+        assert_eq!(one(&[line([5.0, 10.0], [30.0, 10.0]), line([70.0, 90.0], [5.0, 90.0])], &obstacles).detours(), 1);
+        // It stands in the hole.
+        let inside = Craft { home: DVec2::splat(50.0), ..craft.clone() };
+        let refused = sorties(&behind, &inside, &manner, &obstacles).expect_err("no way").to_string();
+        assert!(refused.contains("no way leads round the holes") && refused.contains("5 m of room"), "{refused}");
     }
 
     #[test]
@@ -154,19 +207,19 @@ mod tests {
         let line =
             |k: u32| Line { from: DVec2::new(0.0, 20.0 * f64::from(k)), to: DVec2::new(400.0, 20.0 * f64::from(k)) };
         let all: Vec<Line> = (0..10).map(line).collect();
-        let one = sorties(&all, &craft(3600.0), &pace).expect("one");
+        let one = sorties(&all, &craft(3600.0), &pace, &Obstacles::default()).expect("one");
         assert_eq!((one.len(), one[0].lines.len()), (1, 10));
-        let several = sorties(&all, &craft(400.0), &pace).expect("several");
+        let several = sorties(&all, &craft(400.0), &pace, &Obstacles::default()).expect("several");
         assert!(several.len() > 2 && several.iter().all(|s| s.seconds <= 400.0));
         assert_eq!(several.iter().flat_map(|s| &s.lines).count(), 10);
         // A line too long for a battery is flown in parts.
         let long = [Line { from: DVec2::new(-2000.0, 0.0), to: DVec2::new(2000.0, 0.0) }];
-        let parts = sorties(&long, &craft(700.0), &pace).expect("parts");
+        let parts = sorties(&long, &craft(700.0), &pace, &Obstacles::default()).expect("parts");
         assert!(parts.len() > 1 && parts.iter().all(|s| s.seconds <= 700.0));
         let metres: f64 = parts.iter().flat_map(|s| &s.lines).map(Line::length).sum();
         assert!((metres - 4000.0).abs() < 1e-6);
         let far = [Line { from: DVec2::new(5000.0, 0.0), to: DVec2::new(5100.0, 0.0) }];
-        let refused = sorties(&far, &craft(600.0), &pace).expect_err("too far").to_string();
+        let refused = sorties(&far, &craft(600.0), &pace, &Obstacles::default()).expect_err("too far").to_string();
         assert!(refused.contains("5100 m from the take-off place") && refused.contains("10.0 min"), "{refused}");
     }
 }

@@ -48,7 +48,7 @@ pub(super) const EXAMPLES: &Examples = &[
         "survey",
         &[
             "dgtr survey field.geojson --aircraft 3 --picture 4056x3040 --fov-deg 62 --gsd 2 --out survey",
-            "dgtr survey --after ground --mission survey/mission.toml --gsd 2 --out again",
+            "dgtr survey --after ground",
         ],
     ),
     ("plan", &["dgtr plan --mission mission.toml", "dgtr plan --budget-mib 300 --json"]),

@@ -134,8 +134,17 @@ pub fn run(args: Args) -> Result<(), CliError> {
     };
     let Given { name, origin: [lat_deg, lon_deg, alt_m], picture, fov_deg, area_m, aircraft } = given;
     let origin = Geodetic { lat_deg, lon_deg, alt_m };
-    let text =
-        Draft { name, origin, picture, fov_deg, area: DraftArea::Box(area_m), aircraft, preset: args.preset }.text();
+    let text = Draft {
+        name,
+        origin,
+        picture,
+        fov_deg,
+        area: DraftArea::Box(area_m),
+        aircraft,
+        preset: args.preset,
+        survey: None,
+    }
+    .text();
     Mission::parse(&text, Path::new(".")).map_err(CliError::input)?;
     write_new(&args.out, &text).map_err(|e| taken(&args.out, e))?;
     let file = args.out.display();

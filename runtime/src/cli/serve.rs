@@ -9,22 +9,21 @@ use config::mission::Mission;
 use disk::Disk;
 
 use engine::ortho::{draw_file, keep_scratch_in};
-use ground::jobs::serve::{self, Board, Joining, Reception, ServeError};
+use ground::jobs::serve::{self, Board, COVERED_PCT, Joining, Reception, ServeError};
 use ground::jobs::summary;
 use job::console::Progress;
 use job::interrupt::Interrupt;
 use job::run_json::RunReport;
 use job::service::Supervisor;
 use job::session::{Owner, Session};
+use models::formats::FormatError;
 use pages::report::{Craft, REPORT, ReportData, Timing, bytes};
 
 use super::CliError;
 use super::aggregate::{Settings, finish};
 use super::ending::within_bounds;
 use super::http::HttpArgs;
-
-/// An aircraft that covered less of its region than this did not do what it was to do, percent.
-const COVERED: u32 = 75;
+use crate::survey_job::MISSION;
 
 /// Arguments of `dgtr serve`.
 #[derive(Debug, clap::Args)]
@@ -54,7 +53,7 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let mut mission = Mission::read(&args.mission)?;
+    let (mut mission, text) = Mission::read_with_text(&args.mission)?;
     args.settings.merging.apply(&mut mission.ground)?;
     mission.upload.again |= args.again;
     let timeout = match args.timeout {
@@ -77,6 +76,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
         picture: [0; 2],
     };
     let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    // With the models that belong to it: what is left is dealt by both.
+    let kept = args.out.join(MISSION);
+    if !Mission::read_with_text(&kept).is_ok_and(|(_, before)| before == text) {
+        let written = Disk::default().replace(&kept, |to| to.write_all(text.as_bytes()));
+        written.map_err(|e| FormatError::disk(&kept, e))?;
+    }
     keep_scratch_in(&args.out);
     let stop = AtomicBool::new(false);
     let supervisor = Supervisor::from_environment();
@@ -142,7 +147,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         run.stage("map", from);
     }
     let seen = board.watch().freeze();
-    data.warnings.extend(left_short(&args.out, &args.mission, &seen.aircraft, &reception.missing));
+    data.warnings.extend(left_short(&args.out, &seen.aircraft, &reception.missing));
     (data.aircraft, data.ground) = (seen.aircraft, seen.ground);
     if !reception.missing.is_empty() {
         run.outcome = "interrupted".into();
@@ -159,16 +164,17 @@ pub fn run(args: Args) -> Result<(), CliError> {
 }
 
 /// Aircraft that left ground of their region uncovered, or sent no final model: what a battery, a link or an early landing did to them.
-fn left_short(out: &Path, mission: &Path, aircraft: &[Craft], missing: &[String]) -> Option<String> {
+fn left_short(out: &Path, aircraft: &[Craft], missing: &[String]) -> Option<String> {
     let short =
-        |craft: &&Craft| missing.contains(&craft.name) || craft.covered.is_some_and(|percent| percent < COVERED);
+        |craft: &&Craft| missing.contains(&craft.name) || craft.covered.is_some_and(|percent| percent < COVERED_PCT);
     let of = |craft: &Craft| format!("{} ({} % of its region covered)", craft.name, craft.covered.unwrap_or(0));
-    let short: Vec<String> = aircraft.iter().filter(short).map(of).collect();
-    let (out, mission) = (out.display(), mission.display());
+    let short: Vec<&Craft> = aircraft.iter().filter(short).collect();
+    let without: String = short.iter().map(|craft| format!(" --without {}", craft.name)).collect();
+    let out = out.display();
     (!short.is_empty() && short.len() < aircraft.len()).then(|| {
         format!(
-            "Ground is left by {}. `dgtr survey --after {out} --mission {mission}` deals what is left of aircraft that failed to the others.",
-            short.join(", ")
+            "Ground is left by {}. `dgtr survey --after {out}{without}` deals it to the others.",
+            short.iter().map(|craft| of(craft)).collect::<Vec<_>>().join(", ")
         )
     })
 }
@@ -246,12 +252,12 @@ mod tests {
         let craft = |name: &str, covered| Craft { covered, ..Craft::new(name, "final model is here") };
         let said = |aircraft: &[Craft], missing: &[&str]| {
             let missing: Vec<String> = missing.iter().map(|id| (*id).to_owned()).collect();
-            left_short(Path::new("ground"), Path::new("m.toml"), aircraft, &missing)
+            left_short(Path::new("ground"), aircraft, &missing)
         };
         let fleet = [craft("a1", Some(99)), craft("a2", Some(48)), craft("a3", Some(97)), craft("a4", None)];
         let line = said(&fleet, &["a4"]).unwrap_or_default();
         assert!(line.contains("a2 (48 % of its region covered), a4 (0 % of its region covered)"), "{line}");
-        assert!(line.contains("`dgtr survey --after ground --mission m.toml`"), "{line}");
+        assert!(line.contains("`dgtr survey --after ground --without a2 --without a4`"), "{line}");
         // Nothing is dealt where all is well, or nobody is left.
         assert_eq!(said(&fleet[..1], &[]), None);
         assert_eq!(said(&fleet[1..2], &["a2"]), None);

@@ -1,6 +1,9 @@
 //! `dgtr survey AREA --aircraft N --out DIR`: an area dealt to a fleet, with a mission and a plan for each flight.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+use config::survey::SurveySettings;
+use job::run_json::RunReport;
 
 use super::CliError;
 use crate::cli::init::{field_of_view, numbers, size};
@@ -12,16 +15,16 @@ use crate::survey_job::{self, Camera, Flying, MISSION, Pictures, Planned, Reques
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Plans are for QGroundControl, ArduPilot and PX4. Flight times count turns, climbing and landing, in a wind from any \
-                  side. Aircraft cross others' ground at heights of their own. Holes are not photographed, but may be flown over. Check each \
-                  plan against fences, rules and obstacles."
+                  side. Aircraft cross others' ground at heights of their own. Holes are not photographed, and flown round. Check each \
+                  plan against fences, rules and obstacles. With --after, what is not given is as it was planned before."
 )]
 pub struct Args {
     /// The area: a polygon, with holes or without, as GeoJSON, KML, or the fence of a QGroundControl plan.
     #[arg(required_unless_present = "after")]
     area: Option<PathBuf>,
-    /// Folder for mission.toml, the plans, survey.svg and survey.csv.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    /// Folder for mission.toml, the plans, survey.svg and survey.csv [default with --after: a new one beside that folder].
+    #[arg(long, value_name = "DIR", required_unless_present = "after")]
+    out: Option<PathBuf>,
     /// Number of aircraft.
     #[arg(long, value_name = "N", default_value_t = 1, conflicts_with = "after")]
     aircraft: usize,
@@ -44,9 +47,9 @@ pub struct Args {
 #[derive(Debug, clap::Args)]
 struct RestArgs {
     /// Folder of dgtr serve: what its models do not cover is dealt to the aircraft that are left.
-    #[arg(long, value_name = "DIR", requires = "mission", conflicts_with = "area")]
+    #[arg(long, value_name = "DIR", conflicts_with = "area")]
     after: Option<PathBuf>,
-    /// Mission file that was flown; the one that is written has its regions changed.
+    /// Mission file that was flown [default: the one that dgtr serve keeps in that folder].
     #[arg(long, value_name = "FILE", requires = "after")]
     mission: Option<PathBuf>,
     /// An aircraft that does not fly any more, once for each [default: those whose final model did not arrive].
@@ -69,53 +72,76 @@ struct CameraArgs {
     /// Width of the sensor, millimetres.
     #[arg(long, value_name = "MM", requires = "focal_mm")]
     sensor_mm: Option<f64>,
-    /// Seconds that the camera needs from picture to picture.
-    #[arg(long, value_name = "S", default_value_t = 1.0)]
-    interval: f64,
+    /// Seconds that the camera needs from picture to picture [default: 1].
+    #[arg(long, value_name = "S")]
+    interval: Option<f64>,
 }
 
 #[derive(Debug, clap::Args)]
 struct PictureArgs {
     /// Ground sampling distance, centimetres to a pixel.
-    #[arg(long, value_name = "CM")]
-    gsd: f64,
-    /// Share of a picture seen again by the next one on the line.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.75)]
-    forward_overlap: f64,
-    /// Share of a picture seen again from the next line.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.65)]
-    side_overlap: f64,
+    #[arg(long, value_name = "CM", required_unless_present = "after")]
+    gsd: Option<f64>,
+    /// Share of a picture seen again by the next one on the line [default: 0.75].
+    #[arg(long, value_name = "SHARE")]
+    forward_overlap: Option<f64>,
+    /// Share of a picture seen again from the next line [default: 0.65].
+    #[arg(long, value_name = "SHARE")]
+    side_overlap: Option<f64>,
 }
 
 #[derive(Debug, clap::Args)]
 struct FlightArgs {
-    /// Speed over ground, m/s.
-    #[arg(long, value_name = "M/S", default_value_t = 8.0)]
-    speed: f64,
-    /// The fastest that an aircraft flies through the air, m/s.
-    #[arg(long, value_name = "M/S", default_value_t = 15.0)]
-    fastest: f64,
-    /// Wind from any side, m/s.
-    #[arg(long, value_name = "M/S", default_value_t = 5.0)]
-    wind: f64,
-    /// Minutes that a battery lasts, once or for each aircraft.
-    #[arg(long, value_name = "MIN", value_delimiter = ',', default_value = "25")]
+    /// Speed over ground, m/s [default: 8].
+    #[arg(long, value_name = "M/S")]
+    speed: Option<f64>,
+    /// The fastest that an aircraft flies through the air, m/s [default: 15].
+    #[arg(long, value_name = "M/S")]
+    fastest: Option<f64>,
+    /// Wind from any side, m/s [default: 5].
+    #[arg(long, value_name = "M/S")]
+    wind: Option<f64>,
+    /// Minutes that a battery lasts, once or for each aircraft [default: 25].
+    #[arg(long, value_name = "MIN", value_delimiter = ',')]
     endurance: Vec<f64>,
-    /// Share of the battery that is left at the landing.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.25)]
-    reserve: f64,
+    /// Share of the battery that is left at the landing [default: 0.25].
+    #[arg(long, value_name = "SHARE")]
+    reserve: Option<f64>,
     /// Where aircraft take off and land, once or for each [default: the area's corner nearest to its middle].
     #[arg(long, value_name = "LAT,LON", allow_hyphen_values = true, value_parser = numbers::<2>)]
     take_off: Vec<[f64; 2]>,
-    /// Height of the take-off places as the autopilot reports it, metres.
-    #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true, conflicts_with_all = ["terrain", "after"])]
-    home_height: f64,
-    /// Height above ground that nobody exceeds, metres.
-    #[arg(long, value_name = "M", default_value_t = 120.0)]
-    highest: f64,
+    /// Height of the take-off places as the autopilot reports it, metres [default: 0].
+    #[arg(long, value_name = "M", allow_hyphen_values = true, conflicts_with_all = ["terrain", "after"])]
+    home_height: Option<f64>,
+    /// Height above ground that nobody exceeds, metres [default: 120].
+    #[arg(long, value_name = "M")]
+    highest: Option<f64>,
+    /// Room that is kept around holes of the area, metres [default: 10].
+    #[arg(long, value_name = "M")]
+    clearance: Option<f64>,
     /// Heights of the ground, a GeoTIFF: lines follow it.
     #[arg(long, value_name = "GEOTIFF")]
     terrain: Option<PathBuf>,
+}
+
+/// What nobody said; the ground sampling distance, the endurance of each and where they take off have no such value.
+fn usual() -> SurveySettings {
+    SurveySettings {
+        gsd_cm: f64::NAN,
+        forward_overlap: 0.75,
+        side_overlap: 0.65,
+        interval_s: 1.0,
+        speed_m_s: 8.0,
+        fastest_m_s: 15.0,
+        wind_m_s: 5.0,
+        endurance_min: vec![25.0],
+        reserve: 0.25,
+        take_off: Vec::new(),
+        highest_m: 120.0,
+        clearance_m: 10.0,
+        terrain: None,
+        holes_enu: Vec::new(),
+    }
 }
 
 /// The camera that the options describe.
@@ -131,49 +157,84 @@ fn camera(args: &CameraArgs) -> Result<Camera, CliError> {
     Ok(Camera { picture, fov_deg })
 }
 
+/// What is left of a mission, from the folder of its ground station.
+fn rest(args: &RestArgs, ground: &Path) -> Result<Rest, CliError> {
+    let kept = ground.join(MISSION);
+    match &args.mission {
+        None if !kept.is_file() => Err(CliError::input(format!(
+            "{}: is not there; give the folder that was --out of dgtr serve, or the mission that was flown with --mission",
+            kept.display()
+        ))),
+        file => Ok(Rest::of(file.as_ref().unwrap_or(&kept), ground, &args.without)?),
+    }
+}
+
 fn request(args: &Args) -> Result<Request, CliError> {
     let most = fleet::deal::MOST_CRAFT;
     if args.aircraft > most {
         return Err(CliError::input(format!("--aircraft {}: must be 1 to {most}", args.aircraft)));
     }
-    let RestArgs { after, mission, without } = &args.rest;
-    let (source, name, aircraft, camera, home_m) = match (after, mission, &args.area) {
-        (Some(ground), Some(mission), _) => {
-            let rest = Rest::of(mission, ground, without)?;
+    let Args { pictures, flight, .. } = args;
+    let (source, name, aircraft, camera, home_m, before) = match (&args.rest.after, &args.area) {
+        (Some(ground), _) => {
+            let rest = rest(&args.rest, ground)?;
             let (name, aircraft, camera) = (rest.name().to_owned(), rest.aircraft(), rest.camera());
-            let home_m = rest.origin().alt_m;
-            (Source::Rest(Box::new(rest)), name, aircraft, camera, home_m)
+            let (home_m, before) = (rest.origin().alt_m, rest.settings());
+            (Source::Rest(Box::new(rest)), name, aircraft, camera, home_m, before)
         }
-        (_, _, Some(area)) => {
+        (None, Some(area)) => {
             let aircraft = (1..=args.aircraft).map(|k| (format!("a{k}"), args.link.clone())).collect();
-            (Source::File(area.clone()), args.name.clone(), aircraft, camera(&args.camera)?, args.flight.home_height)
+            let home_m = flight.home_height.unwrap_or(0.0);
+            (Source::File(area.clone()), args.name.clone(), aircraft, camera(&args.camera)?, home_m, None)
         }
-        _ => return Err(CliError::input("survey: give an area, or --after and --mission")),
+        (None, None) => return Err(CliError::input("survey: give an area, or --after")),
     };
-    let flight = &args.flight;
+    let before = before.unwrap_or_else(usual);
+    let Some(gsd_cm) = pictures.gsd.or(Some(before.gsd_cm).filter(|gsd| gsd.is_finite())) else {
+        return Err(CliError::input(
+            "survey: the mission does not say how it was planned ([survey]); give --gsd, and what else is not usual",
+        ));
+    };
     Ok(Request {
         source,
         name,
         aircraft,
         camera,
         pictures: Pictures {
-            gsd_m: args.pictures.gsd / 100.0,
-            forward_overlap: args.pictures.forward_overlap,
-            side_overlap: args.pictures.side_overlap,
-            interval_s: args.camera.interval,
+            gsd_m: gsd_cm / 100.0,
+            forward_overlap: pictures.forward_overlap.unwrap_or(before.forward_overlap),
+            side_overlap: pictures.side_overlap.unwrap_or(before.side_overlap),
+            interval_s: args.camera.interval.unwrap_or(before.interval_s),
         },
         flying: Flying {
-            speed_m_s: flight.speed,
-            fastest_m_s: flight.fastest,
-            wind_m_s: flight.wind,
-            endurance_min: flight.endurance.clone(),
-            reserve: flight.reserve,
-            take_off: flight.take_off.clone(),
-            highest_m: flight.highest,
+            speed_m_s: flight.speed.unwrap_or(before.speed_m_s),
+            fastest_m_s: flight.fastest.unwrap_or(before.fastest_m_s),
+            wind_m_s: flight.wind.unwrap_or(before.wind_m_s),
+            endurance_min: if flight.endurance.is_empty() { before.endurance_min } else { flight.endurance.clone() },
+            reserve: flight.reserve.unwrap_or(before.reserve),
+            take_off: if flight.take_off.is_empty() { before.take_off } else { flight.take_off.clone() },
+            highest_m: flight.highest.unwrap_or(before.highest_m),
+            clearance_m: flight.clearance.unwrap_or(before.clearance_m),
         },
         home_m,
-        terrain: flight.terrain.clone(),
+        terrain: flight.terrain.clone().or(before.terrain),
     })
+}
+
+/// Most folders beside a ground station's that are tried.
+const MOST_AFTER: u32 = 999;
+
+/// Where everything is written.
+fn out(args: &Args) -> Result<PathBuf, CliError> {
+    let Some(ground) = args.rest.after.as_ref().filter(|_| args.out.is_none()) else {
+        return Ok(args.out.clone().unwrap_or_default());
+    };
+    // What lies in the folder itself is put aside with it.
+    let whole = std::fs::canonicalize(ground).map_err(|e| CliError::input(format!("{}: {e}", ground.display())))?;
+    let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let named = (1..=MOST_AFTER).map(|n| whole.with_file_name(format!("{name}-after-{n}")));
+    let free = named.into_iter().find(|path| path.symlink_metadata().is_err());
+    free.ok_or_else(|| CliError::input("survey: give --out, as no folder beside that of --after has a free name"))
 }
 
 /// Runs `dgtr survey`.
@@ -181,14 +242,26 @@ fn request(args: &Args) -> Result<Request, CliError> {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let request = request(&args)?;
-    let planned = survey_job::run(&request, &args.out)?;
+    let (request, out) = (request(&args)?, out(&args)?);
+    let planned = survey_job::run(&request, &out)?;
     if let Source::Rest(rest) = &request.source {
         outln!("what {} left is dealt to the others", rest.lost.join(", "));
     }
     print(&request, &planned);
-    let mission = args.out.join(MISSION);
+    let mission = out.join(MISSION);
     outln!("next: load each plan into its aircraft; dgtr doctor --mission {}", mission.display());
+    if let (Source::Rest(rest), Some(ground)) = (&request.source, &args.rest.after) {
+        // A session that has merged everything is over, and its models are put aside.
+        let over = RunReport::read(ground).is_ok_and(|run| run.outcome == "done");
+        let again = if over { "--again " } else { "" };
+        outln!("the ground goes on: dgtr serve {again}--mission {} --out {}", mission.display(), ground.display());
+        if over {
+            let lost = rest.lost.join(", ");
+            outln!(
+                "what {lost} covered counts when its model comes once more: start its job again, or plug in its stick"
+            );
+        }
+    }
     Ok(())
 }
 
@@ -213,11 +286,10 @@ fn print(request: &Request, planned: &Planned) {
     }
     outln!("lines reach {:.0} m beyond the area", planned.beyond_m);
     if planned.holes > 0 {
-        tracing::warn!(
-            "holes of the area are left out of the pictures, and not avoided: {} lines reach into them, and {} ways to, from and between \
-             lines lead over them",
-            planned.lines_over_holes,
-            planned.over_holes
+        outln!(
+            "holes of the area are flown round, {} m off, by {} detours; lines end there",
+            request.flying.clearance_m,
+            planned.detours
         );
     }
     outln!("{:<20} {:>9} {:>8} {:>7} {:>6} {:>10}", "plan", "pictures", "min", "km", "side", "region ha");

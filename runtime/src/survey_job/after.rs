@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use config::mission::Mission;
+use config::survey::SurveySettings;
 use fleet::deal::Share;
 use fleet::ground::{Ground, Ring};
 use geometry::geodesy::{EnuFrame, Geodetic};
@@ -13,7 +14,7 @@ use models::formats::{FormatError, model};
 use survey::coverage::gaps::{self, Gap};
 use survey::coverage::{CoverageMap, CoverageRegion};
 
-use super::regions::with_regions;
+use super::regions::{with_regions, with_survey};
 use super::{Camera, SurveyError, region};
 
 /// Where `dgtr serve` keeps what it receives, below its folder.
@@ -96,8 +97,20 @@ impl Rest {
         let all = mission.aircraft.iter().try_fold(Ground::default(), |all, a| -> Result<Ground, SurveyError> {
             Ok(all.with(&self::ground(&mission, &a.id)?))
         })?;
-        let inner = all.parts.into_iter().flat_map(|part| part.into_iter().skip(1));
-        let holes = inner.filter(|ring| polygon::signed_area(ring).abs() >= LEAST_M2).collect();
+        let holes = match &mission.survey {
+            Some(survey) => {
+                survey.holes_enu.iter().map(|ring| ring.iter().copied().map(DVec2::from).collect()).collect()
+            }
+            None => {
+                let inner = all.parts.into_iter().flat_map(|part| part.into_iter().skip(1));
+                inner.filter(|ring| polygon::signed_area(ring).abs() >= LEAST_M2).collect()
+            }
+        };
+        if let Some(survey) = mission.survey.as_ref().filter(|s| s.take_off.len() != mission.aircraft.len()) {
+            let (count, wanted) = (survey.take_off.len(), mission.aircraft.len());
+            let why = format!("its [survey] is of {count} aircraft and [[aircraft]] of {wanted}; make them agree");
+            return Err(FormatError::invalid(file, why).into());
+        }
         Ok(Self { text, mission, left, holes, lost })
     }
 
@@ -117,6 +130,39 @@ impl Rest {
         self.mission.origin
     }
 
+    /// What the mission's flights were planned by, endurance and take-off places of those that fly what is left.
+    pub fn settings(&self) -> Option<SurveySettings> {
+        let survey = self.mission.survey.as_ref()?;
+        let flies = |k: &usize| !self.lost.contains(&self.mission.aircraft[*k].id);
+        let flying: Vec<usize> = (0..self.mission.aircraft.len()).filter(flies).collect();
+        Some(SurveySettings {
+            endurance_min: flying.iter().map(|k| survey.endurance_min[*k]).collect(),
+            take_off: flying.iter().map(|k| survey.take_off[*k]).collect(),
+            ..survey.clone()
+        })
+    }
+
+    /// `settings` of those that fly, with those of whoever stays in the mission and does not.
+    fn of_all(&self, settings: SurveySettings, stays: &[bool]) -> SurveySettings {
+        let before = self.mission.survey.as_ref();
+        let mut flying = settings.endurance_min.iter().zip(&settings.take_off);
+        let (mut endurance_min, mut take_off) = (Vec::new(), Vec::new());
+        for (k, aircraft) in self.mission.aircraft.iter().enumerate() {
+            let lost = self.lost.contains(&aircraft.id);
+            let of = match (lost, before) {
+                (false, _) => flying.next().map(|(minutes, place)| (*minutes, *place)),
+                (true, Some(before)) => Some((before.endurance_min[k], before.take_off[k])),
+                // Nobody said it: it does not fly.
+                (true, None) => settings.endurance_min.first().copied().zip(settings.take_off.first().copied()),
+            };
+            if let Some((minutes, place)) = of.filter(|_| stays[k]) {
+                endurance_min.push(minutes);
+                take_off.push(place);
+            }
+        }
+        SurveySettings { endurance_min, take_off, ..settings }
+    }
+
     /// The mission's camera.
     pub fn camera(&self) -> Camera {
         let c = &self.mission.camera;
@@ -128,7 +174,7 @@ impl Rest {
     ///
     /// # Errors
     /// A region with too many corners.
-    pub(super) fn mission(&self, shares: &[Share]) -> Result<String, SurveyError> {
+    pub(super) fn mission(&self, shares: &[Share], settings: SurveySettings) -> Result<String, SurveyError> {
         let mut changes = Vec::new();
         let mut dealt = shares.iter();
         for aircraft in &self.mission.aircraft {
@@ -143,15 +189,19 @@ impl Rest {
             let corners = (now.area_m2() >= LEAST_M2).then(|| region(&now, &aircraft.id)).transpose()?;
             changes.push((aircraft.id.clone(), corners));
         }
-        let text = with_regions(&self.text, &changes)?;
+        let stays: Vec<bool> = changes.iter().map(|(_, corners)| corners.is_some()).collect();
+        let settings = self.of_all(settings, &stays);
+        let text = with_survey(&with_regions(&self.text, &changes)?, &settings);
         // Text is changed where its author wrote it: what is read of it decides.
         let now = Mission::parse(&text, Path::new("."))?;
         let wanted = changes.iter().filter_map(|(id, corners)| Some((id, corners.as_ref()?)));
         let read = now.aircraft.iter().map(|a| (&a.id, now.region(a)));
-        match wanted.map(|(id, corners)| (id, corners.clone())).eq(read) {
+        match wanted.map(|(id, corners)| (id, corners.clone())).eq(read) && now.survey.as_ref() == Some(&settings) {
             true => Ok(text),
             false => Err(SurveyError::Request(
-                "the regions of the mission file cannot be exchanged; write each aircraft below a line [[aircraft]] of its own".into(),
+                "the regions of the mission file cannot be exchanged; write each aircraft below a line [[aircraft]] of its own, and \
+                 [survey] as a table"
+                    .into(),
             )),
         }
     }

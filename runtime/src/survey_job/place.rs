@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use fleet::ground::{Ground, Ring};
+use fleet::obstacles::Obstacles;
 use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::{DVec2, DVec3};
 use measure::areas::{self, Area};
@@ -75,10 +76,20 @@ pub fn moved(from: &EnuFrame, to: &EnuFrame, places: Vec<DVec2>) -> Vec<DVec2> {
 }
 
 /// Where each aircraft takes off.
-pub fn homes(flying: &Flying, frame: &EnuFrame, ground: &Ground, count: usize) -> Result<Vec<DVec2>, SurveyError> {
+pub fn homes(
+    flying: &Flying,
+    frame: &EnuFrame,
+    (ground, obstacles): (&Ground, &Obstacles),
+    count: usize,
+) -> Result<Vec<DVec2>, SurveyError> {
     let place = |[lat_deg, lon_deg]: &[f64; 2]| {
         let valid = Geodetic { lat_deg: *lat_deg, lon_deg: *lon_deg, alt_m: 0.0 }.is_valid();
         match valid.then(|| flat(frame, *lat_deg, *lon_deg)).filter(|p| p.length() < FARTHEST_M) {
+            Some(p) if obstacles.hold(p) => Err(setting(
+                "--take-off",
+                format!("{lat_deg},{lon_deg}"),
+                format!("{} m (--clearance) from every hole of the area, and a little more", obstacles.clearance_m()),
+            )),
             Some(p) => Ok(p),
             None => Err(setting(
                 "--take-off",
@@ -92,6 +103,7 @@ pub fn homes(flying: &Flying, frame: &EnuFrame, ground: &Ground, count: usize) -
             // The corner with the shortest way to all of the area.
             let middle = ground.middle();
             let corners = ground.parts.first().and_then(|part| part.first()).into_iter().flatten();
+            let corners = corners.filter(|p| !obstacles.hold(**p));
             let nearest = corners.min_by(|a, b| a.distance(middle).total_cmp(&b.distance(middle)));
             Ok(vec![nearest.copied().unwrap_or(middle); count])
         }

@@ -1,9 +1,11 @@
-//! New regions in the text of a mission file; everything else, comments included, stays as its author wrote it.
+//! New regions, and what they were planned by, in the text of a mission file; everything else, comments included, stays as its author
+//! wrote it.
 
 use std::ops::Range;
 
 use config::mission::MissionError;
 use config::settings::{SettingError, parse};
+use config::survey::SurveySettings;
 use serde::Deserialize;
 use toml::{Spanned, Value};
 
@@ -64,9 +66,25 @@ pub fn with_regions(text: &str, regions: &[(String, Option<Vec<[f64; 2]>>)]) -> 
     Ok(changed)
 }
 
+/// `text` with another table `[survey]`, which comes last.
+pub fn with_survey(text: &str, settings: &SurveySettings) -> String {
+    let mut kept = String::with_capacity(text.len());
+    let mut within = false;
+    for line in text.split_inclusive('\n') {
+        if let Some(name) = table(line) {
+            within = name == "survey";
+        }
+        if !within {
+            kept += line;
+        }
+    }
+    format!("{}\n\n{}", kept.trim_end(), settings.text())
+}
+
 /// What a line calls the table that it begins; corners of a region that stand alone on a line are no name.
 fn table(line: &str) -> Option<&str> {
     let name = line.trim_start().strip_prefix('[')?.trim_start_matches('[').trim_start();
+    let name = name.split(']').next().unwrap_or_default().trim_end();
     name.starts_with(|c: char| c.is_alphabetic() || c == '_').then_some(name)
 }
 
@@ -125,6 +143,39 @@ folder = "upload"
             let mission = Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{e}\n{text}"));
             assert_eq!(mission.aircraft.iter().map(|a| a.id.as_str()).collect::<Vec<_>>(), ["a2", "a3"]);
             assert!(mission.region(&mission.aircraft[0]) == region && text.contains("folder = \"upload\""), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_mission_holds_what_it_was_planned_by_once_however_often_it_is_planned() {
+        let settings = SurveySettings {
+            gsd_cm: 2.0,
+            forward_overlap: 0.75,
+            side_overlap: 0.65,
+            interval_s: 1.0,
+            speed_m_s: 8.0,
+            fastest_m_s: 15.0,
+            wind_m_s: 5.0,
+            endurance_min: vec![25.0; 3],
+            reserve: 0.25,
+            take_off: vec![[47.0, 8.0]; 3],
+            highest_m: 120.0,
+            clearance_m: 10.0,
+            terrain: None,
+            holes_enu: vec![vec![[1.0, 1.0], [2.0, 1.0], [1.0, 2.0]]],
+        };
+        let other = SurveySettings { wind_m_s: 9.0, ..settings.clone() };
+        let first = with_survey(TEXT, &settings);
+        // In the middle, indented, with a comment.
+        let middle = TEXT
+            .replace("[upload]", &format!("  {}\n[upload]", settings.text().replace("[survey]", "[survey] # ours")));
+        for text in [with_survey(&first, &other), with_survey(&middle, &other)] {
+            let mission = Mission::parse(&text, Path::new("/m")).unwrap_or_else(|e| panic!("{e}\n{text}"));
+            assert_eq!(mission.survey.as_ref(), Some(&other));
+            assert!(
+                mission.aircraft.len() == 3 && mission.upload.folder.is_some() && text.contains("# the field"),
+                "{text}"
+            );
         }
     }
 }

@@ -36,6 +36,8 @@ fn a_final_model_of_another_session_is_named_in_line_exit_code_run_json_and_repo
     assert!(line.contains("--again"), "{line}");
     let run: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("run.json")).unwrap()).unwrap();
     assert_eq!(run["outcome"], "interrupted");
+    // The mission lies with what belongs to it: `dgtr survey --after` needs no more than the folder.
+    assert_eq!(std::fs::read(out.join("mission.toml")).unwrap(), std::fs::read(&mission).unwrap());
     assert_eq!((&run["stale"][0], &run["missing"][0]), (&"one".into(), &"one".into()), "{run}");
     let report = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(report.contains("final model of flight 7 is not of this session"));

@@ -38,7 +38,7 @@ pub(super) fn areas() -> [(&'static str, Ground); 3] {
 }
 
 /// What every fleet must be: `deal` has checked that regions are the area; here by other means.
-fn promised(name: &str, ground: &Ground, craft: &[Craft], shares: &[Share]) {
+fn promised(name: &str, ground: &Ground, obstacles: &Obstacles, craft: &[Craft], shares: &[Share]) {
     let sum: f64 = shares.iter().map(|s| s.ground.area_m2()).sum();
     assert!((sum / ground.area_m2() - 1.0).abs() < 1e-3, "{name}: {sum} m²");
     let [low, high] = ground.bounds();
@@ -57,6 +57,10 @@ fn promised(name: &str, ground: &Ground, craft: &[Craft], shares: &[Share]) {
     for (share, craft) in shares.iter().zip(craft) {
         assert!(share.sorties.iter().all(|s| s.seconds <= craft.battery_s + 1e-6), "{name}");
         assert!(share.spacing_m <= manner().spacing_m + 1e-9, "{name}");
+        for path in share.sorties.iter().map(|s| s.path(craft.home)) {
+            let over = path.windows(2).flat_map(|w| (0..=20).map(|k| w[0].lerp(w[1], f64::from(k) / 20.0)));
+            assert_eq!(over.filter(|p| obstacles.hold(*p)).count(), 0, "{name}: places too near to a hole");
+        }
     }
 }
 
@@ -66,8 +70,11 @@ fn three_areas_are_dealt_to_one_three_and_eight_aircraft_once_and_equally() {
         let home = ground.bounds()[0];
         for count in [1, 3, 8] {
             let craft = fleet(count, home);
-            let shares = deal(&ground, &craft, &manner()).unwrap_or_else(|e| panic!("{name}, {count}: {e}"));
-            promised(name, &ground, &craft, &shares);
+            let holes: Vec<Ring> = ground.parts[0][1..].to_vec();
+            let obstacles = Obstacles::new(&holes, 10.0).expect("obstacles");
+            let shares =
+                deal(&ground, &obstacles, &craft, &manner()).unwrap_or_else(|e| panic!("{name}, {count}: {e}"));
+            promised(name, &ground, &obstacles, &craft, &shares);
             let seconds: Vec<f64> = shares.iter().map(Share::seconds).collect();
             println!(
                 "{name} {:.1} ha, {count}: {seconds:.0?} {:.1} %",
@@ -102,11 +109,15 @@ fn a_hundred_areas_by_seed_are_dealt_once_and_equally_or_refused() {
             })
             .collect();
         let Ok(ground) = Ground::new(outside, &holes) else { continue };
-        let homes = DVec2::new(random.random_range(-600.0..600.0), random.random_range(-600.0..600.0));
+        let obstacles = Obstacles::new(&holes, random.random_range(2.0..8.0)).expect("obstacles");
+        let mut homes = DVec2::new(random.random_range(-600.0..600.0), random.random_range(-600.0..600.0));
+        while obstacles.hold(homes) {
+            homes.x -= 50.0;
+        }
         let craft = fleet(random.random_range(1..9), homes);
-        match deal(&ground, &craft, &manner()) {
+        match deal(&ground, &obstacles, &craft, &manner()) {
             Ok(shares) => {
-                promised(&format!("seed {seed}"), &ground, &craft, &shares);
+                promised(&format!("seed {seed}"), &ground, &obstacles, &craft, &shares);
                 dealt += 1;
             }
             Err(e) => println!("seed {seed}: {:.1} ha, {} aircraft: {e}", ground.area_m2() / 1e4, craft.len()),
@@ -120,11 +131,12 @@ fn a_hundred_areas_by_seed_are_dealt_once_and_equally_or_refused() {
 fn lines_are_never_further_apart_than_asked() {
     let narrow = Manner { spacing_m: 0.5, beyond_m: 0.5, ..manner() };
     let wide = Ground::new(rectangle(0.0, 0.0, 3000.0, 3000.0), &[]).expect("ground");
-    let refused = deal(&wide, &fleet(1, DVec2::ZERO), &narrow).expect_err("6000 lines").to_string();
+    let refused =
+        deal(&wide, &Obstacles::default(), &fleet(1, DVec2::ZERO), &narrow).expect_err("6000 lines").to_string();
     assert!(refused.contains("too wide for lines 0.50 m apart"), "{refused}");
     // Along its length a strip is narrow enough.
     let long = Ground::new(rectangle(0.0, 0.0, 3000.0, 20.0), &[]).expect("ground");
     let craft = [Craft { battery_s: 1e9, ..fleet(1, DVec2::ZERO)[0].clone() }];
-    let shares = deal(&long, &craft, &narrow).expect("40 lines");
+    let shares = deal(&long, &Obstacles::default(), &craft, &narrow).expect("40 lines");
     assert!(shares[0].spacing_m <= 0.5 + 1e-9 && shares[0].sorties[0].lines.len() == 40, "{}", shares[0].spacing_m);
 }

@@ -25,7 +25,7 @@ pub mod admit;
 mod board;
 mod joining;
 
-pub use board::Board;
+pub use board::{Board, COVERED_PCT};
 pub use joining::{Joined, Joining};
 
 /// After the last model is here, the aircraft have so long to take their receipts.

@@ -1,7 +1,7 @@
 //! What the ground knows of every aircraft, on the live page: what is under way, and what the models that are here say.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Instant, SystemTime};
 
 use config::mission::Mission;
@@ -13,14 +13,20 @@ use survey::coverage::{CoverageMap, CoverageRegion};
 
 use super::{Progress, Received};
 
+/// An aircraft that covered less of its region than this did not do what it was to do, percent.
+pub const COVERED_PCT: u32 = 75;
+
 /// Which file was looked at last.
 type Seen = Option<(SystemTime, u64)>;
 
 /// Keeps the page up to date.
 pub struct Board<'a> {
     mission: &'a Mission,
+    out: PathBuf,
     watch: Watch,
     seen: Vec<Seen>,
+    /// Whose last model leaves ground.
+    short: Vec<bool>,
     /// When what is under way began to come, and how many of its chunks were here.
     under_way: Vec<Option<(Instant, usize)>>,
     started: Instant,
@@ -42,8 +48,10 @@ impl<'a> Board<'a> {
         });
         Self {
             mission,
+            out: out.to_owned(),
             watch,
             seen: vec![None; ids.len()],
+            short: vec![false; ids.len()],
             under_way: vec![None; ids.len()],
             started: Instant::now(),
             told: None,
@@ -73,21 +81,23 @@ impl<'a> Board<'a> {
             let here = here.get(aircraft.id.as_str()).copied();
             let under_way = transfers.get(aircraft.id.as_str()).copied();
             let left_s = self.left_s(i, under_way);
+            if let Some(received) = here {
+                self.look(i, received);
+            }
+            let short = self.short[i];
             self.watch.craft(i, |craft| {
                 (craft.chunks, craft.schedule.left_s) = (under_way, left_s);
                 craft.bytes = here.map(|r| r.size);
                 craft.schedule.progress = under_way.map(|(n, of)| n as f32 / of.max(1) as f32);
                 craft.link = if under_way.is_some() { "receiving" } else { "idle" };
                 craft.state = match (here, under_way) {
+                    (Some(r), None) if r.finished && short => "final model is here, ground was left",
                     (Some(r), None) if r.finished => "final model is here",
                     (_, Some(_)) => "sending a model",
                     (Some(_), None) => "checkpoint is here, still flying or training",
                     (None, None) => craft.state,
                 };
             });
-            if let Some(received) = here {
-                self.look(i, received);
-            }
         }
     }
 
@@ -111,11 +121,31 @@ impl<'a> Board<'a> {
         }
         // One that cannot be read is refused where it counts.
         if let Ok((header, gaussians)) = model::read_header(&received.path) {
-            self.show(i, &header, gaussians as u64);
+            let covered_pct = self.show(i, &header, gaussians as u64);
+            // Nothing more comes after the last model: whoever deals with it should know now, while the others still fly. One without
+            // views does not say what it covers.
+            let last = covered_pct.filter(|_| received.finished && !header.views.is_empty());
+            let short = last.and_then(|percent| self.left_ground(i, percent));
+            self.short[i] = short.is_some();
+            if let Some(line) = short {
+                tracing::warn!("{line}");
+            }
         }
     }
 
-    fn show(&self, i: usize, header: &ModelHeader, gaussians: u64) {
+    /// What to say of an aircraft whose last model covers so much of its region.
+    fn left_ground(&self, i: usize, covered_pct: u32) -> Option<String> {
+        let id = &self.mission.aircraft[i].id;
+        let deal = match self.mission.aircraft.len() {
+            1 => String::new(),
+            _ => format!("; `dgtr survey --after {} --without {id}` deals the rest to the others", self.out.display()),
+        };
+        let line = || format!("{id} left ground: its final model covers {covered_pct} % of its region{deal}");
+        (covered_pct < COVERED_PCT).then(line)
+    }
+
+    /// Shows a model; percent of its region that it covers.
+    fn show(&self, i: usize, header: &ModelHeader, gaussians: u64) -> Option<u32> {
         let region = self.mission.region(&self.mission.aircraft[i]);
         let rules = self.mission.coverage;
         // Where the aircraft took off the ground does not know.
@@ -127,15 +157,57 @@ impl<'a> Board<'a> {
                 map
             });
         let elapsed_s = self.started.elapsed().as_secs_f64();
+        let mut covered_pct = None;
         self.watch.update(|page| {
             page.ground.forget(i);
             header.views.iter().for_each(|(_, view)| page.ground.add(Shot::of(i, view, ground_m)));
-            let covered = map.ok().map(|map| page.ground.survey(i, &map));
+            covered_pct = map.ok().map(|map| (100.0 * page.ground.survey(i, &map)) as u32);
             let Some(craft) = page.aircraft.get_mut(i) else { return };
-            craft.covered = covered.map(|share| (100.0 * share) as u32);
+            craft.covered = covered_pct;
             craft.key_frames = Some(header.views.len() as u64);
             (craft.gaussians, craft.schedule.steps) = (Some(gaussians), Some(header.steps));
             craft.plot.curve.push(elapsed_s, header.steps as f64);
         });
+        covered_pct
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::mission;
+    use super::*;
+    use crate::testing::{carpet, model, nadir};
+
+    /// Of an aircraft whose pictures were taken from `low` to `high`, every four metres.
+    fn received(folder: &Path, id: &str, [low, high]: [[i32; 2]; 2], finished: bool) -> Received {
+        let local = model(id, &[], carpet([-40.0, -20.0], [40.0, 20.0], 1.0));
+        let middles = (low[0]..high[0]).step_by(4).flat_map(|x| (low[1]..high[1]).step_by(4).map(move |y| [x, y]));
+        let view = |[x, y]: [i32; 2]| (format!("{x},{y}.jpg"), nadir(f64::from(x) + 2.0, f64::from(y) + 2.0, 30.0));
+        let header = ModelHeader { views: middles.map(view).collect(), finished, ..local.header };
+        let path = folder.join(format!("{id}.dgtr"));
+        model::write(&path, &header, &local.cloud).expect("write");
+        let size = std::fs::metadata(&path).expect("metadata").len();
+        Received { aircraft: id.into(), path, finished, size, bound: true }
+    }
+
+    #[test]
+    fn who_left_ground_is_told_when_the_last_model_is_here_and_not_before() {
+        let folder = tempfile::tempdir().expect("temp dir");
+        let mission = mission(folder.path());
+        let out = folder.path().join("out");
+        let mut board = Board::new(&mission, &out);
+        let mut states = |models: Vec<Received>| {
+            board.round(&Progress { finished: 0, aircraft: 2, transfers: Vec::new(), bytes: 0, received: models });
+            board.watch().freeze().aircraft.iter().map(|craft| craft.state).collect::<Vec<_>>()
+        };
+        let whole = received(folder.path(), "east", [[0, -20], [40, 20]], true);
+        let half = |finished| received(folder.path(), "west", [[-40, -20], [-32, 20]], finished);
+        let flying = "checkpoint is here, still flying or training";
+        assert_eq!(states(vec![half(false), whole.clone()]), [flying, "final model is here"]);
+        assert_eq!(states(vec![half(true), whole]), ["final model is here, ground was left", "final model is here"]);
+        let line = board.left_ground(0, 52).expect("a line");
+        assert!(line.starts_with("west left ground: its final model covers 52 % of its region"), "{line}");
+        assert!(line.contains(&format!("`dgtr survey --after {} --without west`", out.display())), "{line}");
+        assert_eq!(board.left_ground(0, COVERED_PCT), None);
     }
 }

@@ -1,0 +1,316 @@
+//! What is not flown over: holes of the area with room around them, and the ways round them.
+
+use geometry::polygon;
+use glam::DVec2;
+
+use crate::FleetError;
+use crate::ground::{Ground, Ring};
+use crate::lines::Line;
+
+/// Ways bend so much further out than they need to, metres: rounding is no collision.
+const SLACK_M: f64 = 0.5;
+/// A ring is drawn with fewer corners, none of the old further off than this share of the clearance.
+const COARSE: f64 = 0.25;
+/// Most corners of all rings with their room: ways are looked for among them.
+const MOST_CORNERS: usize = 256;
+/// Shorter pieces of a line are not worth their turns, metres.
+const SHORTEST_M: f64 = 1.0;
+/// The room around a corner is an octagon.
+const AROUND: u32 = 8;
+
+/// Rings that nobody flies over, and where ways round them bend.
+#[derive(Clone, Debug, Default)]
+pub struct Obstacles {
+    /// The rings with their room.
+    closed: Ground,
+    sides: Vec<[DVec2; 2]>,
+    /// A little more: lines end here.
+    wide: Ground,
+    /// Its corners, and the metres between those that see each other.
+    corners: Vec<DVec2>,
+    apart: Vec<f64>,
+    clearance_m: f64,
+}
+
+impl Obstacles {
+    /// `holes` with `clearance_m` around them.
+    ///
+    /// # Errors
+    /// More corners than ways can be found among.
+    pub fn new(holes: &[Ring], clearance_m: f64) -> Result<Self, FleetError> {
+        let coarse_m = COARSE * clearance_m;
+        let rings: Vec<Ring> = holes.iter().map(|ring| simplified(ring, coarse_m)).collect();
+        let drawn: usize = rings.iter().map(Vec::len).sum();
+        let too_many = |count: usize| {
+            FleetError::Area(format!(
+                "has holes of {count} corners; ways round {MOST_CORNERS} can be found, so draw them simpler"
+            ))
+        };
+        if drawn > MOST_CORNERS {
+            return Err(too_many(drawn));
+        }
+        let [closed, wide] = [0.0, SLACK_M].map(|more| with_room(&rings, clearance_m + coarse_m + more));
+        let corners: Vec<DVec2> = wide.rings().flatten().copied().collect();
+        if corners.len() > MOST_CORNERS {
+            return Err(too_many(corners.len()));
+        }
+        let sides = closed.rings().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)).map(|(a, b)| [*a, *b]));
+        let mut this = Self { sides: sides.collect(), closed, wide, apart: Vec::new(), corners, clearance_m };
+        this.apart = this.corners.iter().flat_map(|a| this.corners.iter().map(|b| this.seen_m(*a, *b))).collect();
+        Ok(this)
+    }
+
+    /// Metres that are kept from every ring.
+    pub fn clearance_m(&self) -> f64 {
+        self.clearance_m
+    }
+
+    /// Whether a place lies on a ring or nearer to it than the clearance.
+    pub fn hold(&self, p: DVec2) -> bool {
+        self.closed.contains(p)
+    }
+
+    /// What of a line may be flown, in its direction.
+    pub fn clear(&self, line: &Line) -> Vec<Line> {
+        let way = line.to - line.from;
+        let sides = self.wide.rings().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)));
+        let crossed = sides.filter_map(|(a, b)| {
+            let (side, across) = (*b - *a, way.perp_dot(*b - *a));
+            let [along, at] = [side, way].map(|v| (*a - line.from).perp_dot(v) / across);
+            ((0.0..=1.0).contains(&at) && along > 0.0 && along < 1.0).then_some(along)
+        });
+        let mut shares: Vec<f64> = crossed.chain([0.0, 1.0]).collect();
+        shares.sort_by(f64::total_cmp);
+        let mut open: Vec<[f64; 2]> = Vec::new();
+        for pair in shares.windows(2) {
+            if self.wide.contains(line.from.lerp(line.to, 0.5 * (pair[0] + pair[1]))) {
+                continue;
+            }
+            match open.last_mut() {
+                Some(last) if last[1] == pair[0] => last[1] = pair[1],
+                _ => open.push([pair[0], pair[1]]),
+            }
+        }
+        let piece =
+            |[from, to]: [f64; 2]| Line { from: line.from.lerp(line.to, from), to: line.from.lerp(line.to, to) };
+        let whole = open.len() == 1 && open[0] == [0.0, 1.0];
+        open.into_iter().map(piece).filter(|piece| whole || piece.length() >= SHORTEST_M).collect()
+    }
+
+    /// Where the shortest way between two places bends, in flying order; `None` where there is none.
+    pub fn way(&self, from: DVec2, to: DVec2) -> Option<Vec<DVec2>> {
+        if self.sides.is_empty() {
+            return Some(Vec::new());
+        }
+        if self.hold(from) || self.hold(to) {
+            return None;
+        }
+        if self.seen_m(from, to).is_finite() {
+            return Some(Vec::new());
+        }
+        // Dijkstra 1959, from place to place by the corners.
+        let count = self.corners.len();
+        let mut metres: Vec<f64> = self.corners.iter().map(|c| self.seen_m(from, *c)).collect();
+        let mut before = vec![count; count];
+        let mut done = vec![false; count];
+        let mut best = (f64::INFINITY, count);
+        while let Some(k) = (0..count).filter(|k| !done[*k]).min_by(|i, j| metres[*i].total_cmp(&metres[*j])) {
+            if metres[k] >= best.0 {
+                break;
+            }
+            done[k] = true;
+            let end = metres[k] + self.seen_m(self.corners[k], to);
+            if end < best.0 {
+                best = (end, k);
+            }
+            for next in (0..count).filter(|next| !done[*next]) {
+                let longer = metres[k] + self.apart[k * count + next];
+                if longer < metres[next] {
+                    (metres[next], before[next]) = (longer, k);
+                }
+            }
+        }
+        let mut at = best.1;
+        let mut bends = Vec::new();
+        while at < count {
+            bends.push(self.corners[at]);
+            at = before[at];
+        }
+        bends.reverse();
+        (!bends.is_empty()).then_some(bends)
+    }
+
+    /// Metres between two places with nothing in between, else infinite.
+    fn seen_m(&self, from: DVec2, to: DVec2) -> f64 {
+        let [low, high] = [from.min(to), from.max(to)];
+        let side = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
+        let apart = |a: DVec2, b: DVec2, p: DVec2, q: DVec2| side(a, b, p) * side(a, b, q) <= 0.0;
+        let beside = |[a, b]: &[DVec2; 2]| a.max(*b).cmplt(low).any() || a.min(*b).cmpgt(high).any();
+        let meets = |[a, b]: &[DVec2; 2]| apart(from, to, *a, *b) && apart(*a, *b, from, to);
+        match self.sides.iter().filter(|s| !beside(s)).any(meets) {
+            true => f64::INFINITY,
+            false => from.distance(to),
+        }
+    }
+}
+
+/// Rings and all places within `metres` of them, and a little more at corners.
+fn with_room(rings: &[Ring], metres: f64) -> Ground {
+    let step = std::f64::consts::TAU / f64::from(AROUND);
+    let octagon: Vec<DVec2> =
+        (0..AROUND).map(|k| DVec2::from_angle(step * (f64::from(k) + 0.5)) * (metres / (0.5 * step).cos())).collect();
+    let around = |(a, b): (&DVec2, &DVec2)| polygon::hull(octagon.iter().flat_map(|o| [*a + *o, *b + *o]).collect());
+    let sides = rings.iter().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1))).map(around);
+    Ground::covered_by(rings.iter().cloned().chain(sides).collect())
+}
+
+/// A ring with as few corners as leave none of the old further off than `off` (Douglas and Peucker 1973).
+fn simplified(ring: &Ring, off: f64) -> Ring {
+    let Some(first) = ring.first() else { return Ring::new() };
+    let far = (0..ring.len()).max_by(|i, j| ring[*i].distance(*first).total_cmp(&ring[*j].distance(*first)));
+    let (far, last) = (far.unwrap_or(0), ring.len());
+    let at = |k: usize| ring[k % last];
+    let mut kept = Vec::new();
+    let mut open = vec![(far, last), (0, far)];
+    while let Some((from, to)) = open.pop() {
+        let error = |k: usize| from_segment_m(at(k), at(from), at(to));
+        match (from + 1..to).max_by(|i, j| error(*i).total_cmp(&error(*j))).filter(|k| error(*k) > off) {
+            Some(k) => open.extend([(k, to), (from, k)]),
+            None => kept.push(at(from)),
+        }
+    }
+    kept
+}
+
+/// How far a place is from a straight way.
+fn from_segment_m(p: DVec2, a: DVec2, b: DVec2) -> f64 {
+    let way = b - a;
+    let share = ((p - a).dot(way) / way.length_squared().max(1e-12)).clamp(0.0, 1.0);
+    p.distance(a + way * share)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_pcg::Pcg64Mcg;
+
+    use super::*;
+    use crate::ground::tests::rectangle;
+
+    /// How near a way comes to a ring; 0 over it.
+    fn nearest_m(path: &[DVec2], ring: &Ring) -> f64 {
+        let places = path.windows(2).flat_map(|w| {
+            let steps = w[0].distance(w[1]).ceil().max(1.0);
+            (0..=steps as usize).map(move |k| w[0].lerp(w[1], k as f64 / steps))
+        });
+        let from_ring = |p: DVec2| {
+            let sides = ring.iter().zip(ring.iter().cycle().skip(1));
+            let beside = sides.map(|(a, b)| from_segment_m(p, *a, *b)).fold(f64::MAX, f64::min);
+            if polygon::contains(ring, p) { 0.0 } else { beside }
+        };
+        places.map(from_ring).fold(f64::MAX, f64::min)
+    }
+
+    fn path(obstacles: &Obstacles, from: DVec2, to: DVec2) -> Vec<DVec2> {
+        let bends = obstacles.way(from, to).expect("a way");
+        std::iter::once(from).chain(bends).chain([to]).collect()
+    }
+
+    #[test]
+    fn ways_lead_round_a_hole_the_shorter_way_and_straight_where_it_is_not_in_between() {
+        let hole = rectangle(40.0, 40.0, 20.0, 20.0);
+        let obstacles = Obstacles::new(std::slice::from_ref(&hole), 10.0).expect("one");
+        let round = path(&obstacles, DVec2::new(0.0, 45.0), DVec2::new(100.0, 45.0));
+        assert!(round.len() > 2 && round[1].y < 40.0, "south is shorter: {round:?}");
+        let metres: f64 = round.windows(2).map(|w| w[0].distance(w[1])).sum();
+        assert!(metres < 110.0 && nearest_m(&round, &hole) >= 10.0, "{metres} m, {round:?}");
+        assert_eq!(path(&obstacles, DVec2::new(0.0, 5.0), DVec2::new(100.0, 5.0)).len(), 2);
+        assert!(obstacles.hold(DVec2::new(50.0, 31.0)) && !obstacles.hold(DVec2::new(50.0, 26.0)));
+        assert_eq!(obstacles.way(DVec2::new(50.0, 50.0), DVec2::ZERO), None, "it stands in the hole");
+        assert_eq!(Obstacles::default().way(DVec2::ZERO, DVec2::ONE), Some(Vec::new()));
+    }
+
+    #[test]
+    fn lines_end_before_a_hole_and_go_on_behind_it() {
+        let hole = rectangle(40.0, 40.0, 20.0, 20.0);
+        let obstacles = Obstacles::new(std::slice::from_ref(&hole), 10.0).expect("one");
+        let line = |from: [f64; 2], to: [f64; 2]| Line { from: from.into(), to: to.into() };
+        let pieces = obstacles.clear(&line([100.0, 50.0], [0.0, 50.0]));
+        assert!(pieces.len() == 2 && pieces[0].from.x == 100.0 && pieces[1].to.x == 0.0, "{pieces:?}");
+        for piece in &pieces {
+            let off = nearest_m(&[piece.from, piece.to], &hole);
+            assert!((10.0..15.0).contains(&off), "{off} m");
+        }
+        let beside = line([0.0, 5.0], [100.0, 5.0]);
+        assert_eq!(obstacles.clear(&beside), [beside]);
+        assert!(obstacles.clear(&line([45.0, 50.0], [55.0, 50.0])).is_empty());
+        assert_eq!(Obstacles::default().clear(&beside), [beside]);
+    }
+
+    #[test]
+    fn what_a_hole_encloses_is_reached_by_no_way_and_too_many_corners_are_refused() {
+        // A moat around a yard of 100 m, drawn as one ring with a slit.
+        let (outside, inside) = (rectangle(0.0, 0.0, 200.0, 200.0), rectangle(50.0, 50.0, 100.0, 100.0));
+        let mut moat = outside.clone();
+        moat.push(outside[0]);
+        moat.extend([inside[0], inside[3], inside[2], inside[1], inside[0]]);
+        let obstacles = Obstacles::new(&[moat], 5.0).expect("a moat");
+        assert_eq!(obstacles.way(DVec2::splat(100.0), DVec2::splat(-100.0)), None);
+        assert!(obstacles.way(DVec2::splat(80.0), DVec2::splat(120.0)).is_some());
+        let trees: Vec<Ring> = (0..100).map(|k| rectangle(f64::from(k) * 50.0, 0.0, 5.0, 5.0)).collect();
+        let refused = Obstacles::new(&trees, 5.0).expect_err("too many").to_string();
+        assert!(refused.contains("has holes of 400 corners") && refused.contains("draw them simpler"), "{refused}");
+    }
+
+    #[test]
+    fn a_circle_of_many_corners_is_flown_round_by_a_few() {
+        let circle: Ring = (0..360).map(|k| DVec2::from_angle(f64::from(k).to_radians()) * 30.0).collect();
+        let obstacles = Obstacles::new(std::slice::from_ref(&circle), 10.0).expect("one");
+        assert!(obstacles.corners.len() < 32, "{}", obstacles.corners.len());
+        let round = path(&obstacles, DVec2::new(-80.0, 0.0), DVec2::new(80.0, 0.0));
+        let off = nearest_m(&round, &circle);
+        assert!((10.0..16.0).contains(&off), "{off} m");
+    }
+
+    /// Stars, which overlap or not, by seed.
+    #[test]
+    fn a_thousand_ways_among_holes_by_seed_keep_their_clearance() {
+        let mut rng = Pcg64Mcg::seed_from_u64(59);
+        let mut bent = 0;
+        for _ in 0..50 {
+            let holes: Vec<Ring> = (0..rng.random_range(1..6))
+                .map(|_| {
+                    let middle = DVec2::new(rng.random_range(0.0..400.0), rng.random_range(0.0..400.0));
+                    let corners = rng.random_range(3..9);
+                    let step = std::f64::consts::TAU / f64::from(corners);
+                    (0..corners)
+                        .map(|k| middle + DVec2::from_angle(step * f64::from(k)) * rng.random_range(5.0..70.0))
+                        .collect()
+                })
+                .collect();
+            let clearance = rng.random_range(1.0..20.0);
+            let obstacles = Obstacles::new(&holes, clearance).expect("holes");
+            for _ in 0..20 {
+                let [from, to] =
+                    [0, 1].map(|_| DVec2::new(rng.random_range(-99.0..499.0), rng.random_range(-99.0..499.0)));
+                match obstacles.way(from, to) {
+                    Some(bends) => {
+                        let path: Vec<DVec2> = std::iter::once(from).chain(bends).chain([to]).collect();
+                        bent += usize::from(path.len() > 2);
+                        for hole in &holes {
+                            let off = nearest_m(&path, hole);
+                            assert!(off > clearance - 1e-6, "{off} m of {clearance} m: {path:?} round {hole:?}");
+                        }
+                    }
+                    // It begins or ends too near to a hole, or holes that overlap enclose it.
+                    None => {
+                        let closed = &obstacles.closed;
+                        let encloses = closed.rings().count() > closed.parts.len();
+                        assert!(encloses || obstacles.hold(from) || obstacles.hold(to), "{from} {to} {holes:?}");
+                    }
+                }
+            }
+        }
+        assert!(bent > 100, "{bent}");
+    }
+}
