@@ -755,6 +755,12 @@ mod tests {
     }
 
     #[test]
+    fn a_place_of_zeros_is_none() {
+        let found = read_text("name,lat,lon,alt\na.jpg,0.0,0.0,0.0\nb.jpg,46.5,7.5,400\n").unwrap();
+        assert_eq!(found.iter().map(|t| t.0.as_str()).collect::<Vec<_>>(), ["b.jpg"]);
+    }
+
+    #[test]
     fn what_is_not_certain_is_said() {
         let doubt = |text: &str| read_whole(text).unwrap().doubt.unwrap_or_default();
         assert!(doubt("name,x,y\na.jpg,12.5,40.25\n").contains("longitude and latitude"));

@@ -470,6 +470,49 @@ mod tests {
     }
 
     #[test]
+    fn gps_weeks_count_on_and_what_has_no_week_or_no_place_is_left_out() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("1.BIN");
+        let mut bytes = fmt(43, 21, "CAM", "IHLLe", "GPSTime,GPSWeek,Lat,Lng,Alt");
+        let end_ms = WEEK_S * 1e3;
+        for (ms, week, lat) in [
+            (end_ms - 4000.0, 1902.0, 46.0),
+            (end_ms - 1000.0, 1902.0, 46.0),
+            (2000.0, 1903.0, 46.0),
+            (3000.0, 0.0, 46.0),
+            (4000.0, 1903.0, 0.0),
+        ] {
+            let lng = if lat == 0.0 { 0.0 } else { 7.0 };
+            bytes.extend(message(43, "IHLLe", &[ms, week, lat, lng, 400.0]));
+        }
+        std::fs::write(&path, bytes).unwrap();
+        let exposures = read(&path).unwrap().remove(0).exposures;
+        let since: Vec<f64> = exposures.iter().map(|e| e.time_s - exposures[0].time_s).collect();
+        assert_eq!(since, [0.0, 3.0, 6.0]);
+    }
+
+    #[test]
+    fn the_rest_of_a_line_that_is_too_long_is_no_exposure() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("flight.log");
+        let long = format!("MSG, {}CAM, 2000000, 46.0, 7.0, 400\n", "x".repeat(MAX_LINE as usize - 5));
+        let text = format!("FMT, 43, 23, CAM, QLLe, TimeUS,Lat,Lng,Alt\nCAM, 1000000, 46.0, 7.0, 400\n{long}");
+        std::fs::write(&path, text).unwrap();
+        assert_eq!(read_text(&path).unwrap()[0].exposures.len(), 1);
+    }
+
+    #[test]
+    fn more_exposures_than_any_flight_has_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("1.BIN");
+        let one = message(43, "QLLe", &[7e6, 46.0, 7.0, 400.0]);
+        let bytes = [fmt(43, 23, "CAM", "QLLe", "TimeUS,Lat,Lng,Alt"), one.repeat(MAX_EXPOSURES + 1)].concat();
+        std::fs::write(&path, bytes).unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        assert!(error.contains("more than") && !error.contains('\n'), "{error}");
+    }
+
+    #[test]
     fn a_layout_that_is_described_anew_counts_from_there() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("1.BIN");

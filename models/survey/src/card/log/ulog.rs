@@ -615,10 +615,46 @@ mod tests {
         flown(5, &mut log);
         log.extend(at(9e7, 12.0));
         flown(6, &mut log);
-        flown(7, &mut log);
-        log.extend(data(1, &[&time(7.25), &[0; 8], &[0; 4], &[0], &[0; 3]]));
+        log.extend(data(1, &[&time(6.25), &[0; 8], &[0; 4], &[0], &[0; 3]]));
         let found = read_bytes(&log).unwrap().remove(0).exposures;
-        assert!((found[0].fix.position.lat_deg - 46.0 - 7.25e-5).abs() < 1e-8, "{found:?}");
+        assert!((found[0].fix.position.lat_deg - 46.0 - 6.25e-5).abs() < 1e-8, "{found:?}");
+    }
+
+    #[test]
+    fn exposures_are_in_order_and_impossible_times_places_and_attitudes_are_left_out() {
+        let mut log = head();
+        flown(5, &mut log);
+        log.extend(data(3, &[&time(6.0), &[0; 16]]));
+        log.extend(data(2, &[&time(6.0), &[0; 48], &[0; 8], &[0; 8], &400f32.to_le_bytes()]));
+        flown(6, &mut log);
+        for s in [6.9, 6.05, 5.95, 6.7, 1e13] {
+            log.extend(data(1, &[&time(s), &[0; 8], &[0; 4], &[0], &[0; 3]]));
+        }
+        let found = read_bytes(&log).unwrap().remove(0).exposures;
+        assert_eq!(
+            found.iter().map(|e| (e.time_s * 1e3).round()).collect::<Vec<_>>(),
+            [5950.0, 6050.0, 6700.0, 6900.0]
+        );
+        for e in &found {
+            assert!((e.fix.position.lat_deg - 46.0 - 1e-5 * e.time_s).abs() < 1e-8, "{e:?}");
+            let turned = e.attitude.unwrap().rotation.angle_between(nadir_rotation(90.0, 2.0, 0.0));
+            assert!(turned < 1e-3, "{e:?}");
+        }
+    }
+
+    #[test]
+    fn what_looks_like_an_exposure_before_the_next_mark_is_part_of_the_damage() {
+        let one = |s: f64| capture(s, 46.0, &q(0.0, 3.0), 1);
+        let log = [head(), one(1.0), vec![0, 0, 0xFF], one(2.0), SYNC.to_vec(), one(3.0)].concat();
+        let times: Vec<f64> = read_bytes(&log).unwrap()[0].exposures.iter().map(|e| e.time_s).collect();
+        assert_eq!(times, [1.0, 3.0]);
+    }
+
+    #[test]
+    fn more_exposures_than_any_flight_has_are_refused() {
+        let one = capture(1.0, 46.0, &q(0.0, 3.0), 1);
+        let error = read_bytes(&[head(), one.repeat(MAX_EXPOSURES + 1)].concat()).unwrap_err().to_string();
+        assert!(error.contains("more than") && !error.contains('\n'), "{error}");
     }
 
     #[test]
