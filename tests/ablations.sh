@@ -18,7 +18,7 @@ while [ $# -gt 0 ]; do
     esac
 done
 dgtr="$here/target/release/dgtr"
-[ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+[ -x "$dgtr" ] || cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime
 mkdir -p "$out"
 
 # train NAME 'SETTINGS' [train arguments]: one training, unless its run.json is already there.

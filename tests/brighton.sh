@@ -10,7 +10,7 @@ out="${1:-brighton-out}"
 seconds="${2:-60}"
 scale="${3:-0.25}"
 dgtr="$here/target/release/dgtr"
-cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime --package bench
+cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime --package bench
 mkdir -p "$out/data/images"
 python3 -m venv "$out/python" && "$out/python/bin/pip" install --quiet pillow
 "$out/python/bin/python" - "$data" "$out/data" <<'PY'

@@ -13,7 +13,7 @@ mkdir -p "$out"
 export DGTR_KERNELS=default
 how=(--epochs "${EPOCHS:-1}" --scale 0.5 --cell-m "${CELL_M:-64}")
 if [ $# = 0 ]; then
-    [ -e "$out/field/ground/received" ] || cargo run --quiet --release --locked --manifest-path "$here/Cargo.toml" --package bench -- ground --aircraft 6 --side-m 240 --out "$out/field" > /dev/null
+    [ -e "$out/field/ground/received" ] || cargo run --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package bench -- ground --aircraft 6 --side-m 240 --out "$out/field" > /dev/null
     set -- "$out"/field/ground/received/*/model.dgtr
 fi
 

@@ -17,7 +17,7 @@ while [ $# -gt 0 ]; do
     shift 2
 done
 dgtr="${DGTR:-$here/target/release/dgtr}"
-[ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+[ -x "$dgtr" ] || cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime
 rm -rf "$out"; mkdir -p "$out/disk" "$out/camera"
 cd "$out"
 limit_mib=1536 disk_mib=360 quota_mib=400

@@ -24,7 +24,7 @@ done
 seconds="${seconds:-$(awk -v n="$pictures" 'BEGIN { print n * 0.24 }')}" gaussians="${gaussians:-$((pictures * 560))}"
 on_device="${on_device:-$gaussians}"
 dgtr="${DGTR:-$here/target/release/dgtr}"
-[ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+[ -x "$dgtr" ] || cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime
 rm -rf "$out"; mkdir -p "$out/camera"
 cd "$out"
 # The memory of a software device is the host's: 512 MiB of it and 1,024 besides.

@@ -12,7 +12,7 @@ python3 -m venv "$work/python" && "$work/python/bin/pip" install --quiet rasteri
 folder=$1
 if [ "$folder" = --large ]; then
     dgtr="$here/target/release/dgtr"
-    cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime --package bench
+    cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime --package bench
     "$here/target/release/bench" --quiet map --out "$work/survey" --steps 60 --max-gaussians 30000 > "$work/figures"
     folder="$work/map"
     mkdir "$folder"

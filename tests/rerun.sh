@@ -6,7 +6,7 @@ set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 out="${1:-/tmp/dgtr-rerun}"
 rm -rf "$out" && mkdir -p "$out"
-cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime --package bench
+cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime --package bench
 cargo test --quiet --release --locked --manifest-path "$here/runtime/rerun/Cargo.toml"
 cargo build --quiet --release --locked --manifest-path "$here/runtime/rerun/Cargo.toml"
 dgtr="$here/target/release/dgtr"

@@ -23,7 +23,7 @@ while [ $# -gt 0 ]; do
     shift 2
 done
 dgtr="$here/target/release/dgtr"
-[ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+[ -x "$dgtr" ] || cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime
 mkdir -p "$out"
 if [ -n "${DGTR_SFM_PYTHON:-}" ]; then
     python="$DGTR_SFM_PYTHON"

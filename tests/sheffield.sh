@@ -11,7 +11,7 @@ data=$(cd "$data" && pwd)
 out="${1:-sheffield-out}"
 speed="${2:-12}"
 dgtr="$here/target/release/dgtr"
-[ -x "$dgtr" ] || cargo build --quiet --release --locked --manifest-path "$here/Cargo.toml" --package runtime
+[ -x "$dgtr" ] || cargo build --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime
 mkdir -p "$out"
 cp "$here/tests/missions/sheffield_cross.toml" "$out/mission.toml"
 cd "$out"

@@ -41,6 +41,24 @@ fn a_sound_scene_is_left_as_it_is_to_the_bit_with_its_large_far_and_bright_gauss
 }
 
 #[test]
+fn a_scene_of_any_unit_under_a_sky_far_beyond_it_is_left_as_it_is() {
+    for unit in [1e-4, 1.0, 1e6f32] {
+        let mut cloud = scene(20_000, 5);
+        // One in 200: too few for the sky to count as the scene's size.
+        for i in (0..cloud.len()).step_by(200) {
+            let around = 0.1 * i as f32;
+            cloud.means[i] = [3e4 * around.cos(), 3e4 * around.sin(), 1e4];
+            cloud.log_scales[i] = [3e4f32.ln(); 3];
+        }
+        cloud.means.iter_mut().flatten().for_each(|v| *v *= unit);
+        cloud.log_scales.iter_mut().flatten().for_each(|v| *v += unit.ln());
+        let before = cloud.clone();
+        assert_eq!(Plausible::of(&cloud.means).mend(&mut cloud), 0, "{unit}");
+        assert!(cloud == before, "{unit}");
+    }
+}
+
+#[test]
 fn what_a_flipped_bit_makes_of_a_value_becomes_what_the_gaussians_other_values_say() {
     let sound = scene(20_000, 7);
     let mut cloud = sound.clone();
@@ -50,13 +68,17 @@ fn what_a_flipped_bit_makes_of_a_value_becomes_what_the_gaussians_other_values_s
     cloud.log_scales[11] = [-3.0, flipped(-5.0, 30), -2.5];
     cloud.log_scales[12] = [flipped(0.4, 30), -1.0, 0.5];
     cloud.log_scales[13] = [40.0; 3];
+    cloud.log_scales[17] = [1e-30; 3];
     cloud.opacity_logits[13] = flipped(-0.4, 30);
     cloud.sh[12 * 14] = flipped(0.3, 30);
     cloud.sh[12 * 15 + 7] = flipped(-0.01, 30);
-    assert_eq!(Plausible::of(&cloud.means).mend(&mut cloud), 1 + 1 + 3 + 1 + 1 + 1);
+    assert_eq!(Plausible::of(&cloud.means).mend(&mut cloud), 1 + 1 + 3 + 3 + 1 + 1 + 1);
     assert_eq!(cloud.log_scales[11], [-3.0, -2.5, -2.5]);
     assert_eq!(cloud.log_scales[12], [0.5, -1.0, 0.5]);
-    assert_eq!(cloud.log_scales[13], [0.0; 3]);
+    // Twice the scene's diameter, of which it has the side.
+    let [long, ..] = cloud.log_scales[13];
+    assert!(cloud.log_scales[13] == [long; 3] && (1000.0..8000.0).contains(&long.exp()), "{long}");
+    assert_eq!(cloud.log_scales[17], [0.0; 3]);
     assert_eq!(cloud.opacity_logits[13], -30.0);
     assert_eq!(cloud.sh[12 * 14], 0.5 * (cloud.sh[12 * 14 + 1] + cloud.sh[12 * 14 + 2]));
     assert_eq!(cloud.sh[12 * 15 + 7], 0.0);

@@ -21,6 +21,8 @@ const DIRECTIONAL: f32 = 8.0;
 /// What values a scene's Gaussians can have.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plausible {
+    /// Median of the means.
+    middle: [f64; 3],
     /// Logarithm of twice the scene's diameter: nothing in it is longer. Trained scenes (19 models of two cards and three data sets, 500 to
     /// 500,000 Gaussians) reach 0.6 of the diameter.
     longest: f32,
@@ -30,7 +32,7 @@ impl Plausible {
     /// Of a scene whose Gaussians have these means, or of every so many of them.
     pub fn of(means: &[[f32; 3]]) -> Self {
         let sampled = || means.iter().step_by(means.len().div_ceil(SAMPLE).max(1));
-        let unknown = Self { longest: f32::INFINITY };
+        let unknown = Self { middle: [0.0; 3], longest: f32::INFINITY };
         if means.len() < LEAST {
             return unknown;
         }
@@ -44,11 +46,9 @@ impl Plausible {
         let [Some(x), Some(y), Some(z)] = [0, 1, 2].map(|k| at(0.5, &|mean| f64::from(mean[k]))) else {
             return unknown;
         };
-        let radius = at(WITHIN, &|mean| {
-            [x, y, z].iter().zip(mean).map(|(middle, v)| (f64::from(*v) - middle).powi(2)).sum::<f64>().sqrt()
-        });
-        match radius {
-            Some(radius) if radius > 0.0 => Self { longest: (4.0 * radius).ln() as f32 },
+        let middle = [x, y, z];
+        match at(WITHIN, &|mean| distance(middle, mean)) {
+            Some(radius) if radius > 0.0 => Self { middle, longest: (4.0 * radius).ln() as f32 },
             _ => unknown,
         }
     }
@@ -57,7 +57,8 @@ impl Plausible {
     /// dropped by who reads them.
     pub fn mend(&self, cloud: &mut GaussianCloud) -> usize {
         let stride = cloud.sh_stride();
-        let mut mended: usize = cloud.log_scales.iter_mut().map(|scales| self.mend_scales(scales)).sum();
+        let places = cloud.means.iter().zip(&mut cloud.log_scales);
+        let mut mended: usize = places.map(|(mean, scales)| self.mend_scales(mean, scales)).sum();
         for logit in cloud.opacity_logits.iter_mut().filter(|l| l.is_finite() && l.abs() > LOGIT) {
             *logit = LOGIT.copysign(*logit);
             mended += 1;
@@ -73,17 +74,23 @@ impl Plausible {
         mended
     }
 
-    /// An axis that cannot be so long is as long as the longest of the others.
-    fn mend_scales(&self, scales: &mut [f32; 3]) -> usize {
-        let is_bad = |s: f32| s.is_finite() && (s > self.longest || (s != 0.0 && s.abs() < NO_STEP));
-        if !scales.iter().any(|s| is_bad(*s)) {
+    /// An axis that cannot be so long is as long as the longest of the others; where all are too long, as long as can be.
+    fn mend_scales(&self, mean: &[f32; 3], scales: &mut [f32; 3]) -> usize {
+        let is_lost = |s: f32| s != 0.0 && s.abs() < NO_STEP;
+        if !scales.iter().any(|s| s.is_finite() && (*s > self.longest || is_lost(*s))) {
             return 0;
         }
-        let sound = scales.iter().copied().filter(|s| s.is_finite() && !is_bad(*s)).fold(f32::NEG_INFINITY, f32::max);
-        let instead = if sound.is_finite() { sound } else { self.longest.min(0.0) };
+        // A sky is as large as it is far away.
+        let longest = self.longest.max(distance(self.middle, mean).ln() as f32);
+        let is_bad = |s: f32| s.is_finite() && (s > longest || is_lost(s));
+        let sound = scales.iter().copied().filter(|s| s.is_finite() && !is_bad(*s)).reduce(f32::max);
         let bad = scales.iter_mut().filter(|s| is_bad(**s));
-        bad.map(|s| *s = instead).count()
+        bad.map(|s| *s = sound.unwrap_or(if is_lost(*s) { 0.0 } else { longest })).count()
     }
+}
+
+fn distance(middle: [f64; 3], mean: &[f32; 3]) -> f64 {
+    middle.iter().zip(mean).map(|(middle, v)| (f64::from(*v) - middle).powi(2)).sum::<f64>().sqrt()
 }
 
 /// A colour's channel that cannot be is as bright as the others.

@@ -53,6 +53,8 @@ pub struct Memory {
     /// What earlier sessions have is taken, too.
     again: bool,
     last: Mutex<BTreeMap<String, Last>>,
+    /// The disk has not taken all of it: what is noted again is written again.
+    is_unwritten: Mutex<bool>,
 }
 
 impl Memory {
@@ -78,7 +80,7 @@ impl Memory {
         let session = session_of(received)?;
         let number = word.map_or_else(|| binding::named(&session), binding::named);
         let (named, last) = (word.is_some(), Mutex::new(newest.found.unwrap_or_default()));
-        let memory = Self { path: Some(path), session, number, named, again, last };
+        let memory = Self { path: Some(path), session, number, named, again, last, ..Self::default() };
         // Better now than after the first model.
         memory.write()?;
         Ok(memory)
@@ -124,7 +126,7 @@ impl Memory {
         {
             let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
             let before = last.insert(offer.aircraft.clone(), now.clone());
-            if before == Some(now) {
+            if before == Some(now) && !*self.is_unwritten.lock().unwrap_or_else(PoisonError::into_inner) {
                 return Ok(());
             }
         }
@@ -133,11 +135,16 @@ impl Memory {
 
     fn write(&self) -> Result<(), DiskError> {
         let Some(path) = &self.path else { return Ok(()) };
+        // One after the other, so that nothing older is written last.
+        let mut is_unwritten = self.is_unwritten.lock().unwrap_or_else(PoisonError::into_inner);
+        *is_unwritten = true;
         let json = {
             let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
             serde_json::to_vec(&*last).map_err(|e| io(path)(e.into()))?
         };
-        Disk::default().replace_keeping(path, |out| out.write_all(&json)).map_err(|e| io(path)(e.into()))
+        Disk::default().replace_keeping(path, |out| out.write_all(&json)).map_err(|e| io(path)(e.into()))?;
+        *is_unwritten = false;
+        Ok(())
     }
 }
 
@@ -174,6 +181,25 @@ mod tests {
         assert_eq!(today.is_stale(&second, "another key"), None, "numbers begin anew with a key");
         assert_eq!(today.is_stale(&offer("m", "a2", 1), "k"), None);
         assert_eq!(open("today", true).is_stale(&second, "k"), None, "asked for");
+    }
+
+    /// A receipt would say that nothing can be lost any more.
+    #[test]
+    fn what_found_no_room_is_written_when_it_is_noted_again() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let state = dir.path().join("state");
+        let open = |session: &str| {
+            std::fs::create_dir_all(&state).expect("made");
+            Memory::open(&state, "m", &dir.path().join(session), None, false).expect("opens")
+        };
+        let (today, model) = (open("today"), offer("m", "a1", 2));
+        // In the place of its folder lies something else.
+        std::fs::remove_dir_all(&state).expect("removed");
+        std::fs::write(&state, b"").expect("written");
+        assert!((0..2).all(|_| today.note(&model, "k").is_err()));
+        std::fs::remove_file(&state).expect("removed");
+        today.note(&model, "k").expect("written");
+        assert_eq!(open("tomorrow").is_stale(&model, "k"), Some(Stale::Received(model.order)));
     }
 
     #[test]

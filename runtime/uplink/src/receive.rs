@@ -26,6 +26,7 @@ use lookout::{Lookout, QUIET};
 use sight::Sight;
 use slot::{Advance, Link, Slot};
 
+mod behind;
 mod lookout;
 mod sight;
 mod slot;

@@ -161,3 +161,31 @@ fn a_damaged_or_short_model_is_one_line_and_what_is_there_stays() {
     take(&mut second);
     assert!(trained(&mut second) == before);
 }
+
+#[test]
+fn what_flipped_bits_leave_is_mended_in_checkpoints_written_and_in_models_read() {
+    if !has_device() {
+        return;
+    }
+    let longest = |cloud: &GaussianCloud| cloud.log_scales.iter().flatten().copied().fold(f32::NEG_INFINITY, f32::max);
+    // In pieces and as a whole.
+    for on_device in [120, 300] {
+        let dir = tempfile::tempdir().expect("folder");
+        let mut first = engine(on_device, InitKind::Random);
+        take(&mut first);
+        assert_eq!(first.training.in_pieces, on_device == 120);
+        let sound = trained(&mut first);
+        let mut flipped = sound.clone();
+        flipped.log_scales[3][1] = 80.0;
+        first.training.trainer.load(&flipped).expect("loaded");
+        let (path, _) = first.checkpoint(dir.path(), false).expect("written");
+        let written = model::read(&path).expect("read").1;
+        assert_eq!((written.len(), longest(&written)), (sound.len(), longest(&sound)));
+        // One that nobody mended.
+        model::write_checkpoint(&Disk::default(), &path, first.header(), &flipped).expect("written");
+        let mut second = engine(on_device, InitKind::Random);
+        second.resume(dir.path()).expect("read");
+        take(&mut second);
+        assert_eq!(longest(&trained(&mut second)), longest(&sound));
+    }
+}

@@ -1,7 +1,8 @@
 //! Strangers on the network: whoever speaks in another's name, and whoever answers faster than the one who was asked.
 
+use std::io::Write;
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use super::*;
@@ -186,6 +187,38 @@ fn connections_that_say_nothing_keep_no_aircraft_out() {
     a1.offer_final(&path);
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?}", r.counters);
     drop(idle);
+}
+
+/// Every handshake that failed held up all others for a tenth of a second: whoever begins ten a second kept everybody out.
+#[test]
+fn strangers_whose_handshakes_fail_by_the_dozen_keep_no_aircraft_out() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let port = free_port();
+    let settings = settings(&format!("tls/127.0.0.1:{port}"));
+    let ids = identities(["a1"]);
+    let mut r = ground(&settings, &["a1"], &ids[1], &dir.path().join("g"));
+    let path = dir.path().join("m.dgtr");
+    std::fs::write(&path, noise(100_000, 8)).expect("write");
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            // The oldest are let go, as their descriptors are this process's.
+            let mut strangers = std::collections::VecDeque::new();
+            while !is_over.load(Ordering::Relaxed) {
+                let stranger = std::net::TcpStream::connect(("127.0.0.1", port));
+                strangers.extend(stranger.and_then(|mut s| s.write_all(b"no handshake").map(|()| s)));
+                strangers.drain(..strangers.len().saturating_sub(50));
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        });
+        // They are there first.
+        receive(&mut r, Duration::from_secs(2), |_| false);
+        let a1 = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
+        a1.offer_final(&path);
+        let is_here = receive(&mut r, LIMIT, |r| r.all_finished() && r.all_told());
+        is_over.store(true, Ordering::Relaxed);
+        assert!(is_here, "{:?} {:?}", r.counters, a1.status());
+    });
 }
 
 /// Off this machine encryption is the default, and nobody has to make, sign or copy certificates for it.

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use config::upload::UploadSettings;
 use disk::Disk;
 
+use super::behind::Behind;
 use super::sight::Shown;
 use super::{ANSWER, ReceiveCounters, Received};
 use crate::admission::{Admission, ModelRefusal, Refusals};
@@ -19,8 +20,6 @@ use crate::transport::{Inlet, Patience, TransportError};
 
 /// Remembered refusals of one aircraft.
 const MAX_REMEMBERED: usize = 256;
-/// Offers of one aircraft that it was told of as behind, the newest ones.
-const MOST_TOLD: usize = 16;
 /// On a slow link the wait for a chunk grows up to so many times `chunk_timeout_s`.
 const MOST_PATIENT: u32 = 32;
 
@@ -57,12 +56,8 @@ pub(super) struct Slot {
     pub(super) id: String,
     store: Store,
     target: Option<Target>,
-    /// The inlets that show an older offer than what is here: whoever made it should know.
-    behind: Vec<usize>,
-    /// What it is told of, where an earlier session received it.
-    remembered: Option<Offer>,
-    /// Its offers that it was told of as behind.
-    told_behind: Vec<Hash>,
+    /// What is older than what is here: whoever made it should know.
+    behind: Behind,
     /// A last model that is shown and is not of this session, in words.
     stale: Option<String>,
     /// Failures in a row.
@@ -88,9 +83,7 @@ impl Slot {
             id: id.into(),
             store: Store::open(&Disk::default(), dir, settings, admission),
             target: None,
-            behind: Vec::new(),
-            remembered: None,
-            told_behind: Vec::new(),
+            behind: Behind::new(Duration::from_secs_f64(settings.retry_max_s)),
             stale: None,
             failures: 0,
             source: 0,
@@ -133,21 +126,7 @@ impl Slot {
     }
 
     pub(super) fn wants_work(&self) -> bool {
-        (self.target.is_some() || !self.behind.is_empty()) && Instant::now() >= self.not_before
-    }
-
-    /// Whether an offer's sender is to be told that its numbers fell behind: once for each offer, not for each number. An aircraft that
-    /// begins with the number of an older offer on the same stick has not been told yet.
-    fn tells_behind(&mut self, offer: &Offer) -> bool {
-        let digest = offer.digest();
-        if self.told_behind.contains(&digest) {
-            return false;
-        }
-        if self.told_behind.len() >= MOST_TOLD {
-            self.told_behind.remove(0);
-        }
-        self.told_behind.push(digest);
-        true
+        (self.target.is_some() || self.behind.is_shown()) && Instant::now() >= self.not_before
     }
 
     /// Newest offer wins; but a transfer under way is finished first unless the newer one is the last of the flight or
@@ -177,14 +156,11 @@ impl Slot {
             );
             self.stale = offer.finished.then(|| why.clone()).or(self.stale.take());
             refusals.count(why);
-            if let Stale::Received(order) = stale
-                && self.tells_behind(offer)
-            {
+            if let Stale::Received(order) = stale {
                 // Its numbers may have fallen behind; then it should know.
                 let mut known = Offer::clone(offer);
                 known.order = order;
-                self.remembered = Some(known);
-                self.behind = vec![*inlet];
+                self.behind.show(offer, std::iter::once(*inlet), Some(known));
             }
         }
         let offers = offers.into_iter();
@@ -194,9 +170,7 @@ impl Slot {
             let older = |o: &Offer| o.order < done.order || (o.order == done.order && o.model != done.model);
             counters.stale += offers.clone().filter(|(o, _)| older(o)).count() as u64;
             if older(best) {
-                if self.tells_behind(best) {
-                    self.behind = offers.filter(|(o, _)| o.order == best.order).map(|&(_, i)| i).collect();
-                }
+                self.behind.show(best, offers.filter(|(o, _)| o.order == best.order).map(|&(_, i)| i), None);
                 return;
             }
             if done.model == best.model {
@@ -256,6 +230,12 @@ impl Slot {
                 tracing::debug!("serve: {}: {why}; next attempt in {pause:.1} s", self.id);
             }
         }
+        // After its transfer, to which this turn belongs.
+        let deliver = |newest: &Offer, from: &[usize]| deliver_receipt(&self.id, newest, Verdict::Received, from, link);
+        if let Err(setback) = self.behind.tell(self.store.complete(), deliver) {
+            done.counters.retries += 1;
+            tracing::debug!("serve: {}: {setback}; will be told again that its numbers fell behind", self.id);
+        }
         if let Some(target) = &mut self.target {
             match self.store.preview(&target.offer, target.previewed) {
                 Ok(bytes) => target.previewed = bytes,
@@ -267,12 +247,6 @@ impl Slot {
     }
 
     fn transfer(&mut self, done: &mut Advance, link: &Link, until: Instant) -> Result<(), Setback> {
-        if !self.behind.is_empty() {
-            let from = std::mem::take(&mut self.behind);
-            if let Some(newest) = self.store.complete().cloned().or_else(|| self.remembered.take()) {
-                self.deliver_receipt(&newest, Verdict::Received, &from, link)?;
-            }
-        }
         let Some(target) = &mut self.target else { return Ok(()) };
         let (offer, from) = (target.offer.clone(), target.from.clone());
         if self.refused_models.contains(&offer.model) {
@@ -363,7 +337,7 @@ impl Slot {
         remember(&mut self.refused_offers, offer.digest());
         remember(&mut self.refused_models, offer.model);
         self.last_word_refused = offer.finished;
-        self.deliver_receipt(offer, Verdict::Refused(why), from, link)
+        deliver_receipt(&self.id, offer, Verdict::Refused(why), from, link)
     }
 
     /// Tells the aircraft. A receipt that is lost is sent again when the same offer is seen next.
@@ -372,24 +346,25 @@ impl Slot {
         self.failures = 0;
         let Admission { identity, memory, .. } = &link.admission;
         memory.note(offer, &identity.key_of(&self.id)).map_err(StoreError::from)?;
-        self.deliver_receipt(offer, Verdict::Received, from, link)?;
+        deliver_receipt(&self.id, offer, Verdict::Received, from, link)?;
         self.confirmed = Some(offer.digest());
         Ok(())
     }
+}
 
-    fn deliver_receipt(&mut self, offer: &Offer, verdict: Verdict, from: &[usize], link: &Link) -> Result<(), Setback> {
-        let identity = &link.admission.identity;
-        let receipt = Receipt::new(offer, verdict).seal(identity);
-        // Signed for, because anybody may answer.
-        let mut accept = |answer: &[u8]| {
-            let signature = SignatureBytes::try_from(answer).ok();
-            identity.verify(&self.id, Domain::Acknowledgement, &receipt, signature.as_ref()).is_ok()
-        };
-        for inlet in from.iter().filter_map(|&i| link.inlets.get(i)) {
-            inlet.deliver_receipt(&self.id, &receipt, Patience { limit: ANSWER, stop: &link.stop }, &mut accept)?;
-        }
-        Ok(())
+/// Tells the aircraft `id`, wherever it shows the offer.
+fn deliver_receipt(id: &str, offer: &Offer, verdict: Verdict, from: &[usize], link: &Link) -> Result<(), Setback> {
+    let identity = &link.admission.identity;
+    let receipt = Receipt::new(offer, verdict).seal(identity);
+    // Signed for, because anybody may answer.
+    let mut accept = |answer: &[u8]| {
+        let signature = SignatureBytes::try_from(answer).ok();
+        identity.verify(id, Domain::Acknowledgement, &receipt, signature.as_ref()).is_ok()
+    };
+    for inlet in from.iter().filter_map(|&i| link.inlets.get(i)) {
+        inlet.deliver_receipt(id, &receipt, Patience { limit: ANSWER, stop: &link.stop }, &mut accept)?;
     }
+    Ok(())
 }
 
 fn remember(set: &mut HashSet<Hash>, hash: Hash) {
@@ -399,10 +374,13 @@ fn remember(set: &mut HashSet<Hash>, hash: Hash) {
 }
 
 /// Why a transfer did not get further this time.
+#[derive(Debug, thiserror::Error)]
 enum Setback {
     /// Worth another attempt.
+    #[error("{0}")]
     Again(String),
     /// The ground's own disk: as the others, and said.
+    #[error(transparent)]
     Disk(StoreError),
 }
 

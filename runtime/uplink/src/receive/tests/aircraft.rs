@@ -18,6 +18,8 @@ pub(super) struct Fake {
     pub(super) liars: AtomicU32,
     pub(super) asked: Mutex<Vec<usize>>,
     pub(super) receipts: Mutex<Vec<Vec<u8>>>,
+    /// Receipts to lose.
+    pub(super) deaf: AtomicU32,
     /// The aircraft's.
     pub(super) identity: Mutex<Identity>,
 }
@@ -67,6 +69,9 @@ impl Inlet for Arc<Fake> {
         _: Patience,
         accept: &mut dyn FnMut(&[u8]) -> bool,
     ) -> Result<(), TransportError> {
+        if take(&self.deaf) {
+            return Err(TransportError::Network("the aircraft did not take the receipt".into()));
+        }
         // A false signature for it comes first.
         if self.liars.load(Ordering::SeqCst) > 0 && accept(&[0; 64]) {
             return Ok(());

@@ -90,7 +90,8 @@ fn a_model_whose_reader_panics_costs_only_itself() {
 /// Ordered by the wall clock, a clock gone back hid every later model, and nobody was told.
 #[test]
 fn an_aircraft_whose_numbers_fell_behind_is_told_where_the_ground_is() {
-    let b = Bench::new();
+    let mut b = Bench::new();
+    b.settings.retry_max_s = 3600.0;
     let ids = identities(["a1"]);
     *b.fake.identity.lock().expect("lock") = ids[0].clone();
     b.publish(b.model(&noise(20_000, 26), 40, true));
@@ -108,4 +109,22 @@ fn an_aircraft_whose_numbers_fell_behind_is_told_where_the_ground_is() {
     b.publish(b.model(&noise(20_000, 27), 41, true));
     b.rounds(&mut r, 1);
     assert_eq!(bytes_here(&r), noise(20_000, 27));
+}
+
+/// It was said once. An aircraft that did not hear it, or that a full disk let begin with the same number again, waited for ever.
+#[test]
+fn that_its_numbers_fell_behind_is_said_again_while_an_aircraft_shows_the_same_offer() {
+    let b = Bench::new();
+    let ids = identities(["a1"]);
+    *b.fake.identity.lock().expect("lock") = ids[0].clone();
+    b.publish(b.model(&noise(20_000, 28), 40, true));
+    let mut r = b.receiver_of(ids[1].clone(), |_, _| Ok(()));
+    b.rounds(&mut r, 1);
+    b.fake.receipts.lock().expect("lock").clear();
+    b.fake.deaf.store(2, Ordering::SeqCst);
+    b.publish(b.model(&noise(20_000, 29), 1, true));
+    b.rounds(&mut r, 20);
+    let receipts = b.fake.receipts.lock().expect("lock").len();
+    assert!(b.fake.deaf.load(Ordering::SeqCst) == 0 && receipts > 1, "heard {receipts} times");
+    assert_eq!(r.counters.retries, 2, "what was lost is counted");
 }
