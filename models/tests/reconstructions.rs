@@ -226,6 +226,39 @@ fn nerfstudios_frames_may_each_have_their_own_lens_and_model() {
     assert!(transforms::read(&file).unwrap_err().to_string().contains("EQUIRECTANGULAR"));
 }
 
+/// A view whose focal length is no number, or none, was refused later without a word on which.
+#[test]
+fn a_lens_that_single_precision_cannot_hold_is_refused_with_its_picture() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("transforms.json");
+    let read = |lens: &str| {
+        let matrix = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+        let frame = format!(r#"{{"file_path": "a.png", "transform_matrix": {matrix}, {lens}}}"#);
+        std::fs::write(&path, format!(r#"{{"w": 64, "h": 48, "frames": [{frame}]}}"#)).unwrap();
+        transforms::read(&path).map_err(|e| e.to_string())
+    };
+    for sound in
+        [r#""fl_x": 1e9"#, r#""fl_x": 1e-9"#, r#""camera_angle_x": 3.14"#, r#""fl_x": 50, "cx": -1e6, "cy": 0"#]
+    {
+        let found = read(sound).unwrap();
+        let k = found.shots[0].lens.intrinsics((64, 48));
+        assert!([k.fx, k.fy].iter().all(|f| f.is_normal()) && k.cx.is_finite(), "{sound}: {k:?}");
+    }
+    let refused = [
+        r#""fl_x": 1e300"#,
+        r#""fl_x": 1e-300"#,
+        r#""fl_x": 50, "fl_y": 4e38"#,
+        r#""camera_angle_x": 1e-300"#,
+        r#""fl_x": 50, "cx": 1e300, "cy": 24"#,
+    ];
+    for lens in refused {
+        let why = read(lens).unwrap_err();
+        assert!(why.contains("a.png") && why.contains("transforms.json") && !why.contains('\n'), "{lens}: {why}");
+    }
+    let simple = CAMERA_MODELS.iter().find(|m| m.name == "PINHOLE").unwrap();
+    assert!(simple.describe((64, 48), &[1e300, 50.0, 32.0, 24.0]).is_err());
+}
+
 #[test]
 fn opendronemaps_reconstruction_is_a_data_set_with_points_and_an_origin() {
     let dir = tempfile::tempdir().unwrap();

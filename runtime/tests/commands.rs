@@ -20,6 +20,8 @@ mod again;
 mod begun;
 #[path = "commands/earlier.rs"]
 mod earlier;
+#[path = "commands/elsewhere.rs"]
+mod elsewhere;
 #[path = "commands/first_steps.rs"]
 mod first_steps;
 #[path = "commands/ground.rs"]

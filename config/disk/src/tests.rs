@@ -55,6 +55,26 @@ fn a_failed_write_leaves_the_old_content_and_no_temporary_file() {
     assert_eq!(bytes_below(dir.path()), 203);
 }
 
+/// `.dgtr-PID-N` could be put there first, as a link to whatever the program may write.
+#[test]
+fn a_link_in_a_temporary_files_place_is_not_written_through_and_nobody_can_foresee_its_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let [keepsake, gone, path] = ["keepsake", "gone", "model.dgtr"].map(|name| dir.path().join(name));
+    std::fs::write(&keepsake, "mine").unwrap();
+    for (n, target) in [&keepsake, &gone].into_iter().enumerate() {
+        let link = dir.path().join(format!(".dgtr-1-{n}"));
+        std::os::unix::fs::symlink(target, &link).unwrap();
+        assert_eq!(System.create(&link).unwrap_err().kind(), ErrorKind::AlreadyExists);
+    }
+    assert!(std::fs::read(&keepsake).unwrap() == b"mine" && !gone.exists());
+    let names: Vec<String> =
+        (0..1000).map(|_| temporary_beside(&path).file_name().unwrap().to_string_lossy().into_owned()).collect();
+    let made_by = format!(".dgtr-{}-", std::process::id());
+    let beginnings: std::collections::HashSet<&str> =
+        names.iter().map(|name| &name.strip_prefix(&made_by).unwrap()[..8]).collect();
+    assert!(beginnings.len() > 990, "{}", beginnings.len());
+}
+
 #[test]
 fn a_damaged_file_is_set_aside_by_name_and_none_is_overwritten() {
     let dir = tempfile::tempdir().unwrap();

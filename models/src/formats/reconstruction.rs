@@ -150,14 +150,18 @@ impl LensDescription {
     pub fn fault(&self) -> Option<&'static str> {
         let d = &self.distortion;
         let terms = [d.k1, d.k2, d.k3, d.k4, d.p1, d.p2, d.q1, d.q2, d.q3, d.sx1, d.sy1];
+        // What is computed with them is an f32.
+        let could_be = |focal: f64| focal > 0.0 && (focal as f32).is_normal();
         match self.focal {
-            Focal::Pixels(x, y) if !(x > 0.0 && y > 0.0 && x.is_finite() && y.is_finite()) => {
-                Some("its focal lengths must be positive numbers")
-            }
+            Focal::Pixels(x, y) if !(could_be(x) && could_be(y)) => Some("its focal lengths must be positive numbers"),
             Focal::FieldOfView(a) if !(a > 0.0 && a < std::f64::consts::PI) => {
                 Some("its field of view must lie between 0 and pi")
             }
-            _ if self.principal.is_some_and(|(x, y)| !(x.is_finite() && y.is_finite())) => {
+            // Of the smallest picture and of the largest one.
+            Focal::FieldOfView(_) if ![1, MAX_EDGE as u32].iter().all(|&w| could_be(self.lens((w, w)).focal[0])) => {
+                Some("no lens has so small a field of view")
+            }
+            _ if self.principal.is_some_and(|(x, y)| !((x as f32).is_finite() && (y as f32).is_finite())) => {
                 Some("its principal point is not a number")
             }
             _ if !terms.iter().all(|k| k.is_finite()) => Some("a distortion coefficient is not a number"),

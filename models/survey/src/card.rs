@@ -83,9 +83,11 @@ pub struct CardOptions {
 }
 
 impl Card {
-    /// True when there is a file with the extension of a picture or a film below `folder`.
+    /// True when there is a file with the extension of a picture or a film below `folder`, or what kept such files from being found.
     pub fn has_pictures(folder: &Path) -> bool {
-        scan::pictures(&[folder.to_owned()]).is_ok_and(|found| !found.files.is_empty() || !found.unread.is_empty())
+        let some =
+            |found: scan::Scanned| !(found.files.is_empty() && found.unread.is_empty() && found.notes.is_empty());
+        scan::pictures(&[folder.to_owned()]).is_ok_and(some)
     }
 
     /// Reads what the pictures below `folders` say of themselves; of no picture more than its head is read.
@@ -101,7 +103,7 @@ impl Card {
         let mut notes = notes::Notes::default();
         let mut records = record::read_all(files, &mut notes);
         if records.is_empty() {
-            let why: Vec<String> = notes.summary().into_iter().chain(unread).collect();
+            let why: Vec<String> = notes.summary().into_iter().chain(unread).chain(lines).collect();
             let why = if why.is_empty() { "there is none".to_owned() } else { why.join("; ") };
             return Err(CardError::NoPictures { path: first, why });
         }

@@ -317,14 +317,32 @@ fn masks_beside_the_pictures_are_no_pictures() {
     assert_eq!(card.pictures.len(), 3);
 }
 
+/// It may lead to the whole disk, and its pictures are not this card's.
 #[test]
-fn a_linked_folder_is_followed_once_even_where_it_leads_back() {
+fn a_card_with_links_to_folders_is_read_without_them_and_they_are_named() {
     let (card, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    survey(elsewhere.path(), 3, tags);
-    std::os::unix::fs::symlink(elsewhere.path().join("DCIM"), card.path().join("DCIM")).unwrap();
-    std::os::unix::fs::symlink(card.path(), elsewhere.path().join("DCIM/100MEDIA/back")).unwrap();
-    std::os::unix::fs::symlink(elsewhere.path(), card.path().join("again")).unwrap();
-    assert_eq!(open(card.path()).pictures.len(), 3);
+    survey(card.path(), 3, tags);
+    survey(elsewhere.path(), 4, tags);
+    let link = |to: &Path, name: &str| std::os::unix::fs::symlink(to, card.path().join(name)).unwrap();
+    link(Path::new("/"), "DCIM/100MEDIA/disk");
+    link(elsewhere.path(), "DCIM/elsewhere");
+    link(card.path(), "back");
+    let read = open(card.path());
+    assert_eq!((read.pictures.len(), read.found), (3, 3));
+    assert_note(&read, &["a link to a folder", "not followed", "nor are 2 more"]);
+    // Where nothing else is there, too.
+    let only = tempfile::tempdir().unwrap();
+    std::os::unix::fs::symlink(elsewhere.path(), only.path().join("DCIM")).unwrap();
+    let refused = Card::open(&[only.path().to_owned()], &CardOptions::default()).unwrap_err().to_string();
+    assert!(refused.contains("DCIM: a link to a folder") && !refused.contains('\n'), "{refused}");
+    assert_eq!(Dataset::open(only.path()).unwrap_err().to_string(), refused);
+    // By its name, and pictures by theirs, links are followed.
+    assert_eq!(open(&only.path().join("DCIM")).pictures.len(), 4);
+    std::os::unix::fs::symlink(elsewhere.path().join("DCIM/100MEDIA/DJI_0003.JPG"), card.path().join("own.jpg"))
+        .unwrap();
+    assert_eq!(open(card.path()).pictures.len(), 4);
+    let twice = Card::open(&[card.path().to_owned(), card.path().join("DCIM")], &CardOptions::default()).unwrap();
+    assert_eq!(twice.pictures.len(), 4);
 }
 
 #[test]

@@ -10,6 +10,8 @@ use super::unread::Unread;
 
 /// Names looked at below the folders given; more is no card.
 const MAX_FILES: usize = 200_000;
+/// Names of any kind looked at below the folders given: a card's thumbnails, logs and films beside its pictures, and no system's disk.
+const MAX_NAMES: usize = 5 * MAX_FILES;
 /// `DCIM/100MEDIA/…` is two deep; nobody's survey is deeper than this.
 const MAX_DEPTH: usize = 12;
 /// Folders of previews, masks, and what operating systems and other programs leave behind.
@@ -38,8 +40,12 @@ pub(super) struct Scanned {
     pub unread: Unread,
     /// One line per folder that could not be read, or for a bound that was met.
     pub notes: Vec<String>,
-    /// Device and number of the folders looked through: a link may lead back.
+    /// Device and number of the folders looked through: one may be given twice, or lie below another.
     looked_through: HashSet<(u64, u64)>,
+    /// Links to folders, which are not followed: one may lead to a whole disk.
+    links: Vec<PathBuf>,
+    /// Names of any kind so far.
+    names: usize,
 }
 
 /// Looks through `folders`; a folder given by name must be readable, one below it is passed over with a line.
@@ -52,6 +58,14 @@ pub(super) fn pictures(folders: &[PathBuf]) -> Result<Scanned, CardError> {
     }
     found.files.sort();
     found.files.dedup();
+    if let Some(first) = found.links.first() {
+        let more = found.links.len() - 1;
+        let more = if more == 0 { String::new() } else { format!(", nor are {more} more") };
+        found.notes.push(format!(
+            "{}: a link to a folder, which is not followed{more}; give that folder as well if it belongs to the survey",
+            first.display()
+        ));
+    }
     let names: HashSet<PathBuf> = found.files.iter().map(|f| f.with_extension("")).collect();
     found.files.retain(|file| !is_mask(file, &names));
     found.geotags.sort();
@@ -79,6 +93,11 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
     let mut folders = Vec::new();
     for entry in fs::read_dir(folder)? {
         let Ok(entry) = entry else { continue };
+        if found.names == MAX_NAMES {
+            found.notes.push(format!("{}: only the first {MAX_NAMES} names are looked at", folder.display()));
+            return Ok(());
+        }
+        found.names += 1;
         let name = entry.file_name().to_string_lossy().to_lowercase();
         if name.starts_with('.') {
             continue;
@@ -87,7 +106,9 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
         let Ok(kind) = entry.file_type() else { continue };
         let path = entry.path();
         let is_link = kind.is_symlink();
-        if kind.is_dir() || (is_link && path.is_dir()) {
+        if is_link && path.is_dir() {
+            found.links.push(path);
+        } else if kind.is_dir() {
             if depth < MAX_DEPTH && !SKIPPED.contains(&name.as_str()) {
                 folders.push(path);
             }
@@ -113,6 +134,9 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
     }
     folders.sort();
     for below in folders {
+        if found.names == MAX_NAMES {
+            break;
+        }
         if let Err(e) = walk(&below, depth + 1, found) {
             found.notes.push(format!("{}: cannot be read ({e}) and is passed over", below.display()));
         }

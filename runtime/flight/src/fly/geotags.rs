@@ -104,3 +104,83 @@ impl Drop for Geotags {
         }
     }
 }
+
+#[cfg(test)]
+#[cfg(feature = "lab")]
+mod tests {
+    use std::path::PathBuf;
+
+    use glam::{DQuat, DVec3};
+    use hal::camera::Picture;
+    use hal::vehicle::CameraPose;
+
+    use super::*;
+    use crate::power_cut::{Done, Recorder};
+
+    const ORIGIN: Geodetic = Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 500.0 };
+
+    fn posed(name: &str, sequence: u32) -> PosedPicture {
+        let pose = CameraPose {
+            position: DVec3::new(1.0, 2.0, 30.0),
+            rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0),
+            position_sigma_m: [0.1, 0.1, 0.3],
+            rotation_sigma_rad: [0.01; 3],
+        };
+        let picture = Picture::Path(PathBuf::from("/card").join(name));
+        PosedPicture { sequence, time_ns: 0, pose, speed_m_s: 5.0, confidence: 1.0, picture }
+    }
+
+    /// Lines written behind the last sync.
+    fn unsynced(done: &[Done<()>]) -> usize {
+        let since = done.iter().rposition(|d| matches!(d, Done::Synced(_))).map_or(0, |at| at + 1);
+        let lines = |d: &Done<()>| match d {
+            Done::Wrote(_, bytes) => bytes.iter().filter(|b| **b == b'\n').count(),
+            _ => 0,
+        };
+        done[since..].iter().map(lines).sum()
+    }
+
+    #[test]
+    fn a_power_cut_takes_few_of_the_geotags_and_none_after_the_end() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let recorder = Recorder::<()>::new(false);
+        let disk = Disk::new(recorder.clone());
+        let mut geotags = Geotags::open(&disk, folder.path(), ORIGIN).expect("a file");
+        let mut done = recorder.take();
+        for n in 0..100 {
+            geotags.note(&posed("a.jpg", n), Decision::Key);
+            done.extend(recorder.take());
+            // The line of names before the first sync is one more.
+            assert!(unsynced(&done) <= SYNC_EVERY as usize + 1, "{n}");
+        }
+        drop(geotags);
+        done.extend(recorder.take());
+        assert_eq!(unsynced(&done), 0);
+        let written = std::fs::read_to_string(folder.path().join(FILE)).expect("read");
+        assert_eq!(written.lines().count(), 101);
+    }
+
+    #[test]
+    fn a_pictures_name_is_one_field_of_one_line_whatever_is_in_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut geotags = Geotags::open(&Disk::default(), folder.path(), ORIGIN).expect("a file");
+        let names = ["a,b.jpg", "a\nb,1,2.jpg", "=HYPERLINK(\"x\").jpg", "-rf.jpg", "a\"b.jpg", "\u{1b}[31m.jpg"];
+        for (name, n) in names.into_iter().zip(0..) {
+            geotags.note(&posed(name, n), Decision::Key);
+        }
+        drop(geotags);
+        let written = std::fs::read_to_string(folder.path().join(FILE)).expect("read");
+        let mut lines = written.lines();
+        let columns = lines.next().expect("names of the columns").split(',').count();
+        for (n, line) in lines.enumerate() {
+            assert!(!line.starts_with(['=', '+', '-', '@']) && !line.starts_with("\"="), "{line}");
+            assert!(!line.contains(char::is_control), "{line:?}");
+            // Outside of quotation marks.
+            let fields: usize = 1 + line.split('"').step_by(2).map(|part| part.matches(',').count()).sum::<usize>();
+            assert_eq!(fields, columns, "{line}");
+            let rest = line.rsplitn(columns, ',').nth(columns - 2).expect("its number");
+            assert_eq!(rest, n.to_string(), "{line}");
+        }
+        assert_eq!(written.lines().count(), 1 + names.len());
+    }
+}
