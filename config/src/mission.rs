@@ -112,7 +112,7 @@ record! {
 table! {
     /// Manifests (TOML) of the user's own networks.
     pub struct NetworkSettings {
-        /// A `pair` network; absent = the embedded plane sweep.
+        /// A `pair` network; absent = semi-global matching, which needs none.
         pub pair: Option<PathBuf> = None;
         /// A monocular `depth` network for the depth loss; absent = the pair network's depth × confidence.
         pub depth: Option<PathBuf> = None;

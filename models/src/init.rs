@@ -1,10 +1,9 @@
-//! From a handful of posed pictures to a dense Gaussian cloud in seconds, without SfM: pair selection, a feed-forward
-//! network, alignment, scales and a budgeted merge; and the two baselines it is compared with.
+//! From a handful of posed pictures to a dense Gaussian cloud in seconds, without SfM: pair selection, matching or a
+//! feed-forward network, alignment, scales and a budgeted merge; and the two baselines it is compared with.
 
 mod baselines;
 mod consistency;
 mod depth_frame;
-mod edges;
 mod fill;
 mod finish;
 mod ground;
@@ -16,6 +15,7 @@ mod posed;
 mod range;
 mod report;
 mod samples;
+mod stereo;
 #[cfg(test)]
 mod tests;
 mod unposed;
@@ -29,7 +29,6 @@ pub use report::{AlignmentReport, Growth, InitReport, InitTimes, Initialisation,
 use config::error::{Error, ErrorKind};
 
 use crate::onnx::OnnxError;
-use crate::onnx::network::Network;
 
 /// Why there is no initial cloud.
 #[derive(Debug, thiserror::Error)]
@@ -91,9 +90,4 @@ impl Error for InitError {
             _ => ErrorKind::Input,
         }
     }
-}
-
-/// The network that ships inside the binary: a posed plane sweep without learned weights.
-fn embedded() -> Result<Network, OnnxError> {
-    Network::embedded(include_str!("../networks/plane_sweep.toml"), include_bytes!("../networks/plane_sweep.onnx"))
 }

@@ -11,6 +11,8 @@ use crate::camera::{Projector, Unprojector, View};
 use crate::frame_file::{AsBytes, FrameFile, Kept};
 use crate::mask::Mask;
 
+use super::stereo::Depths;
+
 /// Depth of one picture on a grid of every `stride`-th pixel.
 #[derive(Clone, Debug)]
 pub struct DepthGrid {
@@ -50,6 +52,20 @@ impl DepthGrid {
             }
         }
         (grid, non_finite)
+    }
+
+    /// Takes the depth of the cell that holds the centre of each block of `stride` pixels.
+    pub fn of_cells((width, height): (usize, usize), stride: usize, cells: &Depths<'_>) -> Self {
+        let (w, h) = ((width / stride).max(1), (height / stride).max(1));
+        let rows = cells.depth.len() / cells.width.max(1);
+        let at = |i: usize, j: usize| {
+            let cell = |k: usize, most: usize| ((k * stride + stride / 2) / cells.cell).min(most - 1);
+            cell(j, rows) * cells.width + cell(i, cells.width)
+        };
+        let places = || (0..h).flat_map(|j| (0..w).map(move |i| at(i, j)));
+        let depth = places().map(|at| cells.depth[at]).collect();
+        let confidence = places().map(|at| cells.confidence[at]).collect();
+        Self { width: w, height: h, stride, depth, confidence }
     }
 
     /// Pixel position (of the network's picture) of a sample.

@@ -1,5 +1,5 @@
-//! The order of work for posed pictures: keep them at the network's size, bound the depth, choose partners, run the
-//! network, resolve conflicts, merge into the budget. Works while flying: pictures come one by one, poses may be
+//! The order of work for posed pictures: keep them at the network's size, bound the depth, choose partners, make
+//! depths, resolve conflicts, merge into the budget. Works while flying: pictures come one by one, poses may be
 //! refined afterwards, and only depths whose geometry really changed are made again.
 
 use std::collections::HashMap;
@@ -24,7 +24,7 @@ use crate::onnx::session::check_library;
 use super::InitError;
 use super::depth_frame::DepthFrame;
 use super::pairs::{SkippedPairs, partners};
-use super::posed::PosedNetwork;
+use super::posed::PosedPairs;
 use super::range::DepthRange;
 use super::report::{InitReport, Initialisation};
 use super::unposed::{Appearance, PairNetwork};
@@ -48,13 +48,15 @@ const MARGIN: f64 = 4.0;
 const RANGE_EVERY: usize = 5;
 /// A depth is made again when its pictures' refined poses move it by more than this, pixels.
 const STALE_PX: f32 = 0.7;
+/// What a report calls the matching.
+const MATCHING: &str = "semi-global-matching";
 /// Finest voxels per Gaussian of the budget.
 const VOXELS_PER_GAUSSIAN: usize = 4;
 
-/// A pair network at work: told the poses, or not.
+/// What makes depths of pictures: told the poses, or not.
 #[derive(Debug)]
 enum Pairs {
-    Posed(PosedNetwork),
+    Posed(PosedPairs),
     Unposed(Box<PairNetwork>),
 }
 
@@ -74,11 +76,28 @@ impl Pairs {
     }
 }
 
+/// A network at work, once it was run on blank pictures.
+fn of_network(network: &Arc<Network>, settings: &InitSettings) -> Result<Pairs, InitError> {
+    let size = (settings.max_side, settings.max_side * 3 / 4);
+    LazySession::new(Arc::clone(network), settings.threads).check(size)?;
+    Ok(match &network.manifest().pair {
+        Some(pair) if pair.poses == Poses::None => {
+            Pairs::Unposed(Box::new(PairNetwork::new(Arc::clone(network), pair.clone(), settings.threads)))
+        }
+        // The manifest was refused without its [pair] table.
+        pair => {
+            let views = pair.as_ref().map_or(2, |p| p.views);
+            Pairs::Posed(PosedPairs::network(Arc::clone(network), views, settings.threads))
+        }
+    })
+}
+
 /// Posed pictures in, Gaussians out.
 #[derive(Debug)]
 pub struct Initialiser {
     settings: InitSettings,
-    network: Arc<Network>,
+    /// The user's own, where there is one.
+    network: Option<Arc<Network>>,
     pairs: Pairs,
     features: Option<FeatureNetwork>,
     /// Of the last picture that was looked at, with its camera at the size that features were found in.
@@ -101,37 +120,30 @@ pub struct Initialiser {
 }
 
 impl Initialiser {
-    /// With the embedded network, or the user's own (a manifest of contract `pair`), which is compared with its manifest
+    /// By matching, or by a network of the user's own (a manifest of contract `pair`), which is compared with its manifest
     /// and run once on blank pictures of the largest size: a network that does not work is known before a flight.
     ///
     /// # Errors
-    /// A setting, the manifest, the network's file or ONNX Runtime is bad.
+    /// A setting, the manifest, the network's file or ONNX Runtime is bad; the last is asked for by networks, and by features where
+    /// no depth range is given.
     pub fn open(settings: &InitSettings, manifest: Option<&Path>) -> Result<Self, InitError> {
         settings.check()?;
-        check_library()?;
-        let network = Arc::new(match manifest {
-            Some(path) => Network::read_as(path, Contract::Pair)?,
-            None => super::embedded()?,
-        });
-        if !network.is_embedded() {
-            let size = (settings.max_side, settings.max_side * 3 / 4);
-            LazySession::new(Arc::clone(&network), settings.threads).check(size)?;
+        if manifest.is_some() {
+            check_library()?;
         }
-        let pairs = match &network.manifest().pair {
-            Some(pair) if pair.poses == Poses::None => {
-                Pairs::Unposed(Box::new(PairNetwork::new(Arc::clone(&network), pair.clone(), settings.threads)))
-            }
-            // The manifest was refused without its [pair] table.
-            pair => {
-                let views = pair.as_ref().map_or(2, |p| p.views);
-                Pairs::Posed(PosedNetwork::new(Arc::clone(&network), views, settings.threads))
-            }
+        let network = manifest.map(|path| Network::read_as(path, Contract::Pair)).transpose()?.map(Arc::new);
+        let pairs = match &network {
+            None => Pairs::Posed(PosedPairs::matching(settings.threads)),
+            Some(network) => of_network(network, settings)?,
         };
         let features = match settings.depth_m {
             Some(_) => None,
             None => Some(FeatureNetwork::open(None, settings.threads)?),
         };
-        let report = InitReport { network: network.manifest().name.clone(), ..InitReport::default() };
+        let report = InitReport {
+            network: network.as_ref().map_or_else(|| MATCHING.to_owned(), |n| n.manifest().name.clone()),
+            ..InitReport::default()
+        };
         Ok(Self {
             settings: settings.clone(),
             network,
@@ -171,11 +183,12 @@ impl Initialiser {
         Ok(())
     }
 
-    /// The size at which the network sees pictures of this one.
+    /// The size at which pictures of this one are compared.
     fn network_size(&self, (width, height): (u32, u32)) -> (u32, u32) {
         let shrink = (f64::from(self.settings.max_side) / f64::from(width.max(height))).min(1.0);
         let fit = |side: u32| ((f64::from(side) * shrink).round() as u32).max(1);
-        self.network.manifest().input_size(fit(width), fit(height))
+        let (width, height) = (fit(width), fit(height));
+        self.network.as_ref().map_or((width, height), |network| network.manifest().input_size(width, height))
     }
 
     /// Takes a picture in; its pixels are copied at the network's size.

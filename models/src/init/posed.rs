@@ -1,9 +1,8 @@
-//! Running a posed pair network (IterMVS's signature, and the embedded plane sweep): pictures and relative
-//! projections in, depth and confidence out.
+//! Depths of pictures whose poses are known: by matching, or by a user's pair network (IterMVS's signature): pictures and
+//! relative projections in, depth and confidence out.
 //!
-//! The embedded network runs on several pictures at once, each on one thread with a session of its own: inside one picture
-//! the threads of ONNX Runtime wait for each other after every operator, between pictures they need not. A user's network,
-//! whose memory only its first run tells, is opened once and has all threads.
+//! Matching works on several pictures at once, each on one thread. A user's network, whose memory only its first run tells,
+//! is opened once and has all threads.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -17,31 +16,33 @@ use crate::onnx::picture::push_planes;
 
 use super::InitError;
 use super::depth_frame::{DepthFrame, DepthGrid};
-use super::edges;
+use super::stereo::{self, Stereo};
 
-/// Floats that the embedded network's session holds per pixel of a picture while it runs, inputs and outputs included
-/// (measured: 53).
-const EMBEDDED_FLOATS_PER_PIXEL: u64 = 64;
-/// Floats per pixel of a user's network; IterMVS with three views takes 397.
-const OTHER_FLOATS_PER_PIXEL: u64 = 420;
-/// What opening a session takes beside its weights: the graph's nodes and plans (measured: 24 MiB for the plane sweep).
+/// Floats per pixel of a picture that a network's session holds while it runs; IterMVS with three views takes 397.
+const FLOATS_PER_PIXEL: u64 = 420;
+/// What opening a session takes beside its weights: the graph's nodes and plans.
 const SESSION_BYTES: u64 = 28 << 20;
 
-/// A posed network; sessions live from the first run until [`Self::close`].
+/// Makes depths; what it needs lives from the first run until [`Self::close`].
 #[derive(Debug)]
-pub struct PosedNetwork {
-    network: Arc<Network>,
-    views: usize,
+pub struct PosedPairs {
+    sources: usize,
     lanes: Vec<Lane>,
 }
 
 /// One picture at a time.
 #[derive(Debug)]
-struct Lane {
+enum Lane {
+    Matching(Box<Stereo>),
+    Network(Box<Running>),
+}
+
+/// A network at work.
+#[derive(Debug)]
+struct Running {
     session: LazySession,
     planes: Vec<f32>,
-    /// Its windows carry a surface's depth over the edge.
-    grows_edges: bool,
+    file_bytes: u64,
 }
 
 /// One picture's depth to be made.
@@ -60,8 +61,6 @@ pub struct Made {
     pub grid: DepthGrid,
     /// Depths claimed that were not positive finite numbers.
     pub non_finite: usize,
-    /// Depths that were moved from a step's near side to the surface behind it.
-    pub moved: usize,
     /// Milliseconds of the run.
     pub run_ms: f64,
 }
@@ -91,28 +90,32 @@ fn relative_projection(reference: &View, source: &View) -> [f32; 16] {
     m.transpose().to_cols_array().map(|v| v as f32)
 }
 
-impl PosedNetwork {
-    /// Of a network of contract `pair` with `poses = "given"` that takes `views` pictures.
-    pub fn new(network: Arc<Network>, views: usize, threads: usize) -> Self {
-        let (lanes, threads) = if network.is_embedded() { (threads.max(1), 1) } else { (1, threads) };
-        let session = || LazySession::new(Arc::clone(&network), threads);
-        let lane = || Lane {
-            session: if network.is_embedded() { session().in_series() } else { session() },
-            planes: Vec::new(),
-            grows_edges: network.is_embedded(),
-        };
-        Self { views, lanes: std::iter::repeat_with(lane).take(lanes).collect(), network }
+impl PosedPairs {
+    /// By matching, on `threads` pictures at once.
+    pub fn matching(threads: usize) -> Self {
+        let lane = || Lane::Matching(Box::default());
+        Self { sources: stereo::SOURCES, lanes: std::iter::repeat_with(lane).take(threads.max(1)).collect() }
+    }
+
+    /// By a network of contract `pair` with `poses = "given"` that takes `views` pictures.
+    pub fn network(network: Arc<Network>, views: usize, threads: usize) -> Self {
+        let file_bytes = network.file_bytes();
+        let running = Running { session: LazySession::new(network, threads), planes: Vec::new(), file_bytes };
+        Self { sources: views - 1, lanes: vec![Lane::Network(Box::new(running))] }
     }
 
     /// Source pictures per run.
     pub fn sources(&self) -> usize {
-        self.views - 1
+        self.sources
     }
 
-    /// Host bytes that its sessions take while they run on pictures of a number of pixels.
+    /// Host bytes that it takes while it runs on pictures of a number of pixels.
     pub fn planned_bytes(&self, pixels: u64) -> u64 {
-        let floats = if self.network.is_embedded() { EMBEDDED_FLOATS_PER_PIXEL } else { OTHER_FLOATS_PER_PIXEL };
-        self.lanes.len() as u64 * (SESSION_BYTES + 2 * self.network.file_bytes() + pixels * floats * 4)
+        let of = |lane: &Lane| match lane {
+            Lane::Matching(_) => Stereo::planned_bytes(pixels),
+            Lane::Network(running) => SESSION_BYTES + 2 * running.file_bytes + pixels * FLOATS_PER_PIXEL * 4,
+        };
+        self.lanes.iter().map(of).sum()
     }
 
     /// Makes the depths of all requests, in their order, on every `stride`-th pixel.
@@ -122,13 +125,15 @@ impl PosedNetwork {
     pub fn run_all(&mut self, requests: &[Request<'_>], stride: usize) -> Result<Vec<Made>, InitError> {
         let next = AtomicUsize::new(0);
         let done: Mutex<Vec<(usize, Result<Made, InitError>)>> = Mutex::new(Vec::with_capacity(requests.len()));
-        let views = self.views;
+        let sources = self.sources;
         let work = |lane: &mut Lane| {
             loop {
                 let i = next.fetch_add(1, Ordering::Relaxed);
                 let Some(request) = requests.get(i) else { break };
-                let last = next.load(Ordering::Relaxed) >= requests.len();
-                let made = lane.run(views, request, stride, last);
+                let made = match lane {
+                    Lane::Matching(stereo) => matched(stereo, request, stride),
+                    Lane::Network(running) => running.run(sources, request, stride),
+                };
                 let failed = made.is_err();
                 done.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((i, made));
                 if failed {
@@ -152,23 +157,47 @@ impl PosedNetwork {
         done.into_iter().map(|(_, made)| made).collect()
     }
 
-    /// Milliseconds spent opening sessions so far, over all threads.
+    /// Milliseconds spent opening sessions so far.
     pub fn opening_ms(&self) -> f64 {
-        self.lanes.iter().map(|l| l.session.opening_ms()).sum()
+        let of = |lane: &Lane| match lane {
+            Lane::Matching(_) => 0.0,
+            Lane::Network(running) => running.session.opening_ms(),
+        };
+        self.lanes.iter().map(of).sum()
     }
 
-    /// Gives the sessions' memory back; the next run opens them again.
+    /// Gives the memory back; the next run takes it again.
     pub fn close(&mut self) {
         for lane in &mut self.lanes {
-            lane.session.close();
-            lane.planes = Vec::new();
+            match lane {
+                Lane::Matching(stereo) => stereo.close(),
+                Lane::Network(running) => {
+                    running.session.close();
+                    running.planes = Vec::new();
+                }
+            }
         }
     }
 }
 
-impl Lane {
+fn matched(stereo: &mut Stereo, request: &Request<'_>, stride: usize) -> Result<Made, InitError> {
+    let started = Instant::now();
+    let reference = request.reference;
+    let images = request.sources.iter().map(|s| s.image()).collect::<Result<Vec<_>, _>>()?;
+    let sources = request.sources.iter().zip(&images).map(|(source, image)| stereo::Source {
+        image: image.as_ref(),
+        projection: relative_projection(&reference.view, &source.view),
+    });
+    let image = reference.image()?;
+    let cells = stereo.depths(image.as_ref(), &sources.collect::<Vec<_>>(), request.range);
+    let size = (image.width() as usize, image.height() as usize);
+    let grid = DepthGrid::of_cells(size, stride, &cells);
+    Ok(Made { grid, non_finite: 0, run_ms: started.elapsed().as_secs_f64() * 1e3 })
+}
+
+impl Running {
     /// When the network wants more sources than there are, the best is given again.
-    fn run(&mut self, views: usize, request: &Request<'_>, stride: usize, last: bool) -> Result<Made, InitError> {
+    fn run(&mut self, sources: usize, request: &Request<'_>, stride: usize) -> Result<Made, InitError> {
         let started = Instant::now();
         let opened = self.session.opening_ms();
         let reference = request.reference;
@@ -176,22 +205,17 @@ impl Lane {
         let (w, h) = (k.width, k.height);
         self.planes.clear();
         push_planes(reference.image()?.as_ref(), w, h, &self.session.manifest().input, &mut self.planes);
-        let mut projections = Vec::with_capacity(16 * (views - 1));
-        for i in 0..views - 1 {
+        let mut projections = Vec::with_capacity(16 * sources);
+        for i in 0..sources {
             let source = request.sources.get(i).or(request.sources.first()).copied().unwrap_or(reference);
             push_planes(source.image()?.as_ref(), w, h, &self.session.manifest().input, &mut self.planes);
             projections.extend(relative_projection(&reference.view, &source.view));
         }
         let k_ref = [k.fx, 0.0, k.cx - 0.5, 0.0, k.fy, k.cy - 0.5, 0.0, 0.0, 1.0];
         let inputs = [self.planes.as_slice(), &projections, &request.range, &k_ref];
-        let out = if last { self.session.run((w, h), &inputs) } else { self.session.run_on((w, h), &inputs) }?;
-        let (mut grid, non_finite) = DepthGrid::sampled(w as usize, h as usize, stride, &out[0].data, &out[1].data);
-        let moved = if self.grows_edges {
-            edges::follow_the_pictures(&mut grid, &edges::Pictures::new((w, h), &self.planes, &projections))
-        } else {
-            0
-        };
+        let out = self.session.run((w, h), &inputs)?;
+        let (grid, non_finite) = DepthGrid::sampled(w as usize, h as usize, stride, &out[0].data, &out[1].data);
         let run_ms = started.elapsed().as_secs_f64() * 1e3 - (self.session.opening_ms() - opened);
-        Ok(Made { grid, non_finite, moved, run_ms })
+        Ok(Made { grid, non_finite, run_ms })
     }
 }

@@ -99,11 +99,11 @@ pub struct InitTimes {
 /// Counts and times.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct InitReport {
-    /// Name of the network.
+    /// Name of the network, or of the matching without one.
     pub network: String,
     /// Pictures taken in.
     pub pictures: usize,
-    /// Runs of the network.
+    /// Depth maps made.
     pub runs: usize,
     /// Pairs of the sliding window that were not sent to the network.
     pub skipped: SkippedPairs,
@@ -111,8 +111,6 @@ pub struct InitReport {
     pub depth_m: [f32; 2],
     /// Depths claimed by the network that were not positive finite numbers.
     pub non_finite_depths: usize,
-    /// Depths near steps that the pictures put on the surface behind.
-    pub moved_depths: usize,
     /// Median difference between pictures' colours of a place, natural logarithm, as stored and with their light taken out.
     pub light: [f32; 2],
     /// Gaussians in the cloud.

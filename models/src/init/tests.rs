@@ -1,5 +1,5 @@
-//! The whole way from pictures to Gaussians over a textured plane, with the embedded network and with a randomly
-//! initialised network of Splatt3R's signature.
+//! The whole way from pictures to Gaussians over a textured plane: by matching, with a network that is told the poses, and with a
+//! randomly initialised network of Splatt3R's signature.
 
 use super::*;
 use crate::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
@@ -149,16 +149,16 @@ fn only_depths_whose_poses_moved_are_made_again() {
         return;
     }
     let mut init = Initialiser::open(&settings(), None).unwrap();
-    for i in 0..4 {
+    for i in 0..8 {
         init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
     }
-    assert_eq!(init.build(3000, &mut no_prior).unwrap().report.runs, 4);
-    assert_eq!(init.build(1000, &mut no_prior).unwrap().report.runs, 4);
-    let mut moved = picture(3, 36.0, 0.0).view.pose;
+    assert_eq!(init.build(3000, &mut no_prior).unwrap().report.runs, 8);
+    assert_eq!(init.build(1000, &mut no_prior).unwrap().report.runs, 8);
+    let mut moved = picture(7, 84.0, 0.0).view.pose;
     moved.center.x += 2.0;
-    init.update_pose("3", &moved);
+    init.update_pose("7", &moved);
     let runs = init.build(1000, &mut no_prior).unwrap().report.runs;
-    assert!(runs > 4 && runs < 8, "{runs}");
+    assert!(runs > 8 && runs < 14, "{runs}");
 }
 
 #[test]
@@ -197,6 +197,25 @@ fn two_places_and_a_picture_taken_twice_become_one_cloud_and_useless_pairs_are_c
     let here = out.cloud.means.iter().filter(|m| m[0] < 100.0).count();
     let there = out.cloud.means.iter().filter(|m| m[0] > 4900.0).count();
     assert!(here > 500 && there > 500 && here + there == out.cloud.len(), "{here} {there}");
+}
+
+#[test]
+fn a_network_that_is_told_the_poses_finds_the_plane_as_the_matching_does() {
+    if no_runtime() {
+        return;
+    }
+    let manifest = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("networks/plane_sweep.toml");
+    let known = InitSettings { depth_m: Some([40.0, 60.0]), ..settings() };
+    for (manifest, name) in [(Some(manifest.as_path()), "plane-sweep"), (None, "semi-global-matching")] {
+        let mut init = Initialiser::open(&known, manifest).unwrap();
+        for i in 0..4 {
+            init.add(&picture(i, 12.0 * i as f64, 0.0)).unwrap();
+        }
+        let made = init.build(5000, &mut no_prior).unwrap();
+        assert_eq!((made.report.network.as_str(), made.report.runs), (name, 4));
+        let near = made.cloud.means.iter().filter(|m| m[2].abs() < 1.5).count();
+        assert!(near as f64 > 0.8 * made.cloud.len() as f64, "{name}: {near} of {}", made.cloud.len());
+    }
 }
 
 #[test]

@@ -65,11 +65,6 @@ impl Network {
     pub fn file_bytes(&self) -> u64 {
         self.bytes.len() as u64
     }
-
-    /// Compiled in rather than the user's.
-    pub fn is_embedded(&self) -> bool {
-        matches!(self.bytes, Cow::Borrowed(_))
-    }
 }
 
 /// A network whose session is opened by the first run, replaced when the size changes, and closed when it rests.
@@ -77,7 +72,6 @@ impl Network {
 pub struct LazySession {
     network: Arc<Network>,
     threads: usize,
-    in_series: bool,
     open: Option<Open>,
     opening_ms: f64,
 }
@@ -93,12 +87,7 @@ struct Open {
 impl LazySession {
     /// Opens nothing yet.
     pub fn new(network: Arc<Network>, threads: usize) -> Self {
-        Self { network, threads, in_series: false, open: None, opening_ms: 0.0 }
-    }
-
-    /// For many runs in a row, [`Self::run_on`] and a last one: the memory of a run is kept for the next.
-    pub fn in_series(self) -> Self {
-        Self { in_series: true, ..self }
+        Self { network, threads, open: None, opening_ms: 0.0 }
     }
 
     /// What the network promises.
@@ -132,23 +121,11 @@ impl LazySession {
     /// # Errors
     /// As [`Self::check`].
     pub fn run(&mut self, size: (u32, u32), inputs: &[&[f32]]) -> Result<Vec<Tensor>, OnnxError> {
-        self.run_as(size, inputs, true)
-    }
-
-    /// As [`Self::run`], where another run follows.
-    ///
-    /// # Errors
-    /// As [`Self::run`].
-    pub fn run_on(&mut self, size: (u32, u32), inputs: &[&[f32]]) -> Result<Vec<Tensor>, OnnxError> {
-        self.run_as(size, inputs, false)
-    }
-
-    fn run_as(&mut self, size: (u32, u32), inputs: &[&[f32]], last: bool) -> Result<Vec<Tensor>, OnnxError> {
         let open = match self.open.take().filter(|open| open.size == size) {
             Some(open) => open,
             None => {
                 let started = Instant::now();
-                let open = open(&self.network, size, self.threads, self.in_series)?;
+                let open = open(&self.network, size, self.threads)?;
                 self.opening_ms += started.elapsed().as_secs_f64() * 1e3;
                 open
             }
@@ -157,7 +134,7 @@ impl LazySession {
         let inputs: Vec<Input<'_>> =
             open.inputs.iter().zip(inputs).map(|(p, data)| (p.name, p.shape.as_slice(), *data)).collect();
         let wanted: Vec<&str> = open.outputs.iter().map(|p| p.name).collect();
-        let out = open.session.run(&inputs, &wanted, last)?;
+        let out = open.session.run(&inputs, &wanted)?;
         for (promise, tensor) in open.outputs.iter().zip(&out) {
             let found = || format!("f32 {}", shape_text(tensor.shape.iter().map(|&d| d as i64)));
             if !(promise.shape == tensor.shape || (promise.shape.is_empty() && tensor.data.len() == 1)) {
@@ -204,7 +181,7 @@ fn promise(name: &'static str, shape: &[usize]) -> Promise {
 /// A session at an input size whose declared tensors are those of the contract.
 ///
 /// Symbolic dimensions called `h`, `w` are pinned to the size. Extra outputs are allowed, extra inputs are not.
-fn open(network: &Network, size: (u32, u32), threads: usize, in_series: bool) -> Result<Open, OnnxError> {
+fn open(network: &Network, size: (u32, u32), threads: usize) -> Result<Open, OnnxError> {
     let manifest = &network.manifest;
     let (w, h) = (size.0 as usize, size.1 as usize);
     let mut pinned = vec![("h", h), ("w", w)];
@@ -224,7 +201,7 @@ fn open(network: &Network, size: (u32, u32), threads: usize, in_series: bool) ->
             ),
         });
     }
-    let session = NetworkSession::open(&manifest.name, &network.bytes, threads, &pinned, &manifest.names, in_series)?;
+    let session = NetworkSession::open(&manifest.name, &network.bytes, threads, &pinned, &manifest.names)?;
     compare(manifest, session.inputs(), &inputs, "input")?;
     compare(manifest, session.outputs(), &outputs, "output")?;
     if let Some(extra) = session.inputs().iter().find(|s| inputs.iter().all(|p| p.name != s.name)) {

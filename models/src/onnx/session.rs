@@ -45,8 +45,6 @@ pub type Input<'a> = (&'a str, &'a [usize], &'a [f32]);
 pub struct NetworkSession {
     name: String,
     session: Session,
-    /// Has an arena.
-    in_series: bool,
     /// Contract's name → the file's, where they differ.
     names: BTreeMap<String, String>,
     inputs: Vec<TensorSpec>,
@@ -56,7 +54,7 @@ pub struct NetworkSession {
 impl NetworkSession {
     /// Opens a network from its bytes. `dimensions` pins symbolic dimensions (`("h", 480)`) so that the runtime can
     /// plan its memory; unknown names are ignored by the runtime. `names` says what the file calls a tensor of the
-    /// contract; everywhere else it goes by the contract's name. `in_series`: runs follow each other, and memory is kept between them.
+    /// contract; everywhere else it goes by the contract's name.
     ///
     /// # Errors
     /// The library is missing or unusable, or the bytes are no network it can run.
@@ -66,13 +64,12 @@ impl NetworkSession {
         threads: usize,
         dimensions: &[(&str, usize)],
         names: &BTreeMap<String, String>,
-        in_series: bool,
     ) -> Result<Self, OnnxError> {
         let environment = environment()?;
         let fail = |e: String| OnnxError::Runtime { network: name.to_owned(), reason: e };
         let build = || -> ort::Result<Session> {
             let mut b = Session::builder(environment)?
-                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(in_series).build()])?
+                .with_execution_providers([ort::ep::CPU::default().with_arena_allocator(false).build()])?
                 .with_memory_pattern(true)?
                 .with_intra_op_spinning(false)?
                 .with_inter_op_spinning(false)?
@@ -87,7 +84,7 @@ impl NetworkSession {
         let session = build().map_err(|e| fail(one_line(e)))?;
         let specs = |outlets: &[ort::value::Outlet]| outlets.iter().map(|o| spec(o, names)).collect::<Vec<_>>();
         let (inputs, outputs) = (specs(session.inputs()), specs(session.outputs()));
-        Ok(Self { name: name.to_owned(), session, in_series, names: names.clone(), inputs, outputs })
+        Ok(Self { name: name.to_owned(), session, names: names.clone(), inputs, outputs })
     }
 
     /// What the network was called when it was opened.
@@ -105,22 +102,16 @@ impl NetworkSession {
         &self.outputs
     }
 
-    /// Runs once and copies out the outputs in `wanted`, in that order. The last one of a series gives the memory back.
+    /// Runs once and copies out the outputs in `wanted`, in that order.
     ///
     /// # Errors
     /// ONNX Runtime refused the inputs or failed; it did not end in time; an output in `wanted` is missing or not f32.
-    pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str], last: bool) -> Result<Vec<Tensor>, OnnxError> {
+    pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str]) -> Result<Vec<Tensor>, OnnxError> {
         let floats: usize = inputs.iter().map(|(_, _, data)| data.len()).sum();
-        self.run_within(time_limit(floats), inputs, wanted, last)
+        self.run_within(time_limit(floats), inputs, wanted)
     }
 
-    fn run_within(
-        &mut self,
-        limit: Duration,
-        inputs: &[Input<'_>],
-        wanted: &[&str],
-        last: bool,
-    ) -> Result<Vec<Tensor>, OnnxError> {
+    fn run_within(&mut self, limit: Duration, inputs: &[Input<'_>], wanted: &[&str]) -> Result<Vec<Tensor>, OnnxError> {
         let network = self.name.clone();
         let fail = |reason: String| OnnxError::Runtime { network: network.clone(), reason };
         let mut values = Vec::with_capacity(inputs.len());
@@ -129,10 +120,7 @@ impl NetworkSession {
                 .map_err(|e| fail(format!("input {name}: {}", one_line(e))))?;
             values.push((self.names.get(name).map_or(name, String::as_str), tensor));
         }
-        let mut options = RunOptions::new().map_err(|e| fail(one_line(e)))?;
-        if self.in_series && last {
-            options.set("memory.enable_memory_arena_shrinkage", "cpu:0").map_err(|e| fail(one_line(e)))?;
-        }
+        let options = RunOptions::new().map_err(|e| fail(one_line(e)))?;
         let watch = Watch::start(options, limit).map_err(|e| fail(one_line(e)))?;
         let watched = watch.shared.clone();
         let results = self.session.run_with_options(values, &watched.options);
@@ -322,8 +310,8 @@ mod tests {
         }
         let run = |goes_on, limit| {
             let network = network_with_a_loop(goes_on);
-            let mut session = NetworkSession::open("loop", &network, 1, &[], &BTreeMap::new(), false).unwrap();
-            session.run_within(limit, &[("a", &[], &[2.5])], &["result"], true)
+            let mut session = NetworkSession::open("loop", &network, 1, &[], &BTreeMap::new()).unwrap();
+            session.run_within(limit, &[("a", &[], &[2.5])], &["result"])
         };
         assert_eq!(run(false, Duration::from_secs(3600)).unwrap()[0].data, [2.5]);
         let line = run(true, Duration::from_secs(1)).unwrap_err().to_string();

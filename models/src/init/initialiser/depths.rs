@@ -54,7 +54,6 @@ impl Initialiser {
             let made = if sources.is_empty() { None } else { made.next() };
             if let Some(made) = &made {
                 self.report.non_finite_depths += made.non_finite;
-                self.report.moved_depths += made.moved;
                 self.report.runs += 1;
                 self.report.times.run_ms += made.run_ms;
                 self.report.searched(range);

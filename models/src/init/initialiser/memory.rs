@@ -56,7 +56,7 @@ impl Initialiser {
 
     fn planned(&self, pixels: u64, pictures: usize, max_gaussians: usize) -> u64 {
         let samples = pixels / u64::from(self.settings.stride).pow(2);
-        let network = match &self.pairs {
+        let depths = match &self.pairs {
             Pairs::Posed(n) => n.planned_bytes(pixels),
             Pairs::Unposed(n) => {
                 let edges = pictures * (self.settings.window + self.settings.covisible);
@@ -64,6 +64,7 @@ impl Initialiser {
             }
         };
         let features = if self.features.is_some() { FEATURES_BYTES } else { 0 };
+        let runtime = if self.features.is_some() || self.network.is_some() { RUNTIME_BYTES } else { 0 };
         let in_memory = match self.file {
             None => pictures,
             // Each thread's picture and its sources or witnesses, and the one that comes in.
@@ -73,8 +74,8 @@ impl Initialiser {
         in_memory as u64 * frame_bytes(&self.settings, pixels)
             // Priors on their way out, and the caller's copy of one.
             + (2 * AHEAD as u64 + 1) * 8 * samples
-            + RUNTIME_BYTES
-            + network
+            + runtime
+            + depths
             + features
             + super::super::range::MAX_POINTS as u64 * RANGE_BYTES
             + 2 * AHEAD as u64 * samples * WORK_BYTES

@@ -67,7 +67,7 @@ const DGTR: Method = Method {
     merge: Merge::ByRegion(""),
     ablation: false,
     what: "DGTR: feed-forward start, L1 + SSIM + Pearson depth with frozen shapes, merged by region and distilled",
-    departs: "posed plane sweep instead of Splatt3R and DPT; nothing is densified where the start fills its room; distilled at seams only",
+    departs: "semi-global matching instead of Splatt3R and DPT; nothing is densified where the start fills its room; distilled at seams only",
 };
 
 /// All of them, in the order of the table.
@@ -124,7 +124,7 @@ pub const METHODS: &[Method] = &[
         merge: Merge::None,
         ablation: false,
         what: "DNGaussian (Li et al. 2024) on all pictures, as in the paper's table: random start, depth-regularised with frozen shapes",
-        departs: "one Pearson term moves places and opacities together, where it has a hard and a soft one on normalised patches; plane-sweep depths",
+        departs: "one Pearson term moves places and opacities together, where it has a hard and a soft one on normalised patches; depths by semi-global matching",
     },
     Method {
         name: "dgtr-sfm",
