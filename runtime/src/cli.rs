@@ -157,7 +157,23 @@ fn program() -> clap::Command {
 
 fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Error> {
     let mut matches = program().try_get_matches_from(arguments)?;
+    if let Some(address) = address_to_write(&matches) {
+        let why = format!("--out {address}: is an address, and results are written to this machine; give a path\n");
+        return Err(clap::Error::raw(clap::error::ErrorKind::ValueValidation, why));
+    }
     Cli::from_arg_matches_mut(&mut matches).map_err(|e| e.format(&mut program()))
+}
+
+/// An `--out` such as s3://bucket/field, which would become a folder named `s3:`.
+fn address_to_write(matches: &clap::ArgMatches) -> Option<String> {
+    let (_, of) = matches.subcommand()?;
+    let mut given = of.try_get_raw("out").ok().flatten().into_iter().flatten().map(|out| out.to_string_lossy());
+    let is_address = |out: &std::borrow::Cow<'_, str>| {
+        out.split_once("://").is_some_and(|(scheme, _)| {
+            !scheme.is_empty() && scheme.chars().all(|c| c.is_ascii_alphanumeric() || "+.-".contains(c))
+        })
+    };
+    given.find(is_address).map(|out| out.into_owned()).or_else(|| address_to_write(of))
 }
 
 /// Parses `arguments` (the first is the program's name), runs the command and says how it went: results on standard

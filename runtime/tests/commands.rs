@@ -175,7 +175,7 @@ fn bad_input_is_one_line_and_exit_code_2() {
     let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
     std::fs::write(path("bad.dgtr"), b"dgtr\r\n\x1a\n rubbish that is no model").unwrap();
     data_set(&dir.path().join("set"));
-    let cases: [(&[&str], &str); 7] = [
+    let cases: [(&[&str], &str); 9] = [
         (&["export", &path("none.dgtr"), "--to", "ply"], "none.dgtr"),
         (&["export", &path("bad.dgtr"), "--to", "ply"], "bad.dgtr"),
         (&["import", &path("set/images/00.png")], "00.png"),
@@ -183,6 +183,8 @@ fn bad_input_is_one_line_and_exit_code_2() {
         (&["eval", &path("bad.dgtr"), &path("set"), "--split", "valid"], "valid"),
         (&["train", &path("nowhere"), "--out", &path("out")], "nowhere"),
         (&["plan", "--budget-mib", "1"], "MiB"),
+        (&["train", &path("set"), "--out", "s3://bucket/field"], "--out s3://bucket/field: is an address"),
+        (&["export", &path("bad.dgtr"), "--to", "ply", "--out", "https://example.org/a.ply"], "give a path"),
     ];
     for (arguments, named) in cases {
         let output = dgtr(arguments);
