@@ -37,7 +37,7 @@ impl Off {
 }
 
 /// Crossing heights of `count` aircraft that photograph from `height_m`, none above `highest_m`; one alone has no need to cross. They are
-/// so far apart that nobody is nearer than [`APART_M`] to another's crossing or lines where both are `off`.
+/// so far apart that nobody is nearer than 5 m to another's crossing or lines where both are `off`.
 ///
 /// # Errors
 /// There is no room for so many.
