@@ -11,6 +11,7 @@ mod methods;
 mod poses;
 mod scene;
 mod skips;
+mod sparse;
 mod stages;
 mod stress;
 mod time_error;
@@ -61,6 +62,8 @@ enum Command {
     Scene(scene::Args),
     /// Every skip off and on: work avoided, seconds saved, error added.
     Skips(skips::Args),
+    /// What few pictures cost: every 2nd, 3rd, 5th training picture, scored on the same held-out ones.
+    Sparse(sparse::Args),
     /// Numbers that broke other renderers: the promise, the outcome, what was counted.
     Stress(stress::Args),
     /// Seconds from the first picture against held-out error, and the Pareto front.
@@ -116,6 +119,7 @@ fn measure(command: Command) -> Result<(), CliError> {
         Command::Poses(args) => poses::run(args),
         Command::Scene(args) => scene::run(args),
         Command::Skips(args) => skips::run(args),
+        Command::Sparse(args) => sparse::run(args),
         Command::Stress(args) => stress::run(args),
         Command::TimeError(args) => time_error::run(args),
     }

@@ -19,6 +19,7 @@ pub mod methods;
 pub mod poses;
 pub mod scene;
 pub mod skips;
+pub mod sparse;
 pub mod stages;
 pub mod stress;
 pub mod time_error;

@@ -164,6 +164,27 @@ fn time_against_error_leaves_figures_a_picture_and_a_page_and_keeps_what_it_meas
 }
 
 #[test]
+fn few_pictures_are_a_row_for_each_share_and_what_was_trained_is_kept() {
+    if !has_device() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    write_data_set(&dir.path().join("world"), 3, 1.0).unwrap();
+    let (set, out) = (path("world"), path("out"));
+    let how = ["--every", "1,2", "--seeds", "1", "--init", "random", "--steps", "2", "--scale", "0.25"];
+    let arguments = [&["sparse", &set, "--out", &out, "--max-gaussians", "2000"], &how[..]].concat();
+    let text = held(&bench(&arguments));
+    assert!(text.contains("1/2") && text.contains("all"), "{text}");
+    let first = json(&dir.path().join("out/result.json"));
+    let pictures: Vec<u64> = first.as_array().unwrap().iter().map(|p| p["pictures"].as_u64().unwrap()).collect();
+    assert_eq!(pictures.len(), 2);
+    assert_eq!(pictures[1], pictures[0].div_ceil(2));
+    held(&bench(&arguments));
+    assert_eq!(json(&dir.path().join("out/result.json")), first, "what is there was trained again");
+}
+
+#[test]
 fn every_skip_is_a_row_with_a_verdict() {
     if !has_device() {
         return;

@@ -33,6 +33,7 @@ pub const EXAMPLES: &Examples = &[
     ),
     ("scene", &["cargo run --release -p bench -- scene --gaussians 5000000 --device-mib 512 --out scene"]),
     ("skips", &["cargo run --release -p bench -- skips pictures"]),
+    ("sparse", &["cargo run --release -p bench -- sparse pictures --scale 0.5 --steps 400 --seeds 1 --out sparse"]),
     ("stress", &["cargo run --release -p bench -- stress"]),
     ("time-error", &["cargo run --release -p bench -- time-error pictures --out time-error"]),
 ];
