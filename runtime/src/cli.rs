@@ -155,13 +155,12 @@ fn program() -> clap::Command {
     examples::with_examples(Cli::command(), examples::EXAMPLES)
 }
 
-fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Error> {
+/// What is asked, and an `--out` that no folder of this machine has.
+fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<(Cli, Option<String>), clap::Error> {
     let mut matches = program().try_get_matches_from(arguments)?;
-    if let Some(address) = address_to_write(&matches) {
-        let why = format!("--out {address}: is an address, and results are written to this machine; give a path\n");
-        return Err(clap::Error::raw(clap::error::ErrorKind::ValueValidation, why));
-    }
-    Cli::from_arg_matches_mut(&mut matches).map_err(|e| e.format(&mut program()))
+    let address = address_to_write(&matches);
+    let cli = Cli::from_arg_matches_mut(&mut matches).map_err(|e| e.format(&mut program()))?;
+    Ok((cli, address))
 }
 
 /// An `--out` such as s3://bucket/field, which would become a folder named `s3:`.
@@ -180,7 +179,11 @@ fn address_to_write(matches: &clap::ArgMatches) -> Option<String> {
 /// output, everything else on standard error.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     match parse(arguments) {
-        Ok(cli) => run(&cli.options, || command(cli.command)),
+        Ok((cli, Some(address))) => run(&cli.options, || {
+            let why = "is an address, and results are written to this machine; give a path";
+            Err(CliError::input(format!("--out {address}: {why}")))
+        }),
+        Ok((cli, None)) => run(&cli.options, || command(cli.command)),
         Err(e) => not_understood(&e),
     }
 }
