@@ -30,6 +30,29 @@ const LARGE: u32 = 512;
 /// What a correlation of 1 is worth in costs.
 const UNIT: i32 = 128;
 
+/// How much of what a cell's own windows say is believed, and how much of what its surroundings say.
+#[derive(Clone, Copy, Debug)]
+struct Smoothness {
+    /// Penalty of a change by one plane, as a correlation.
+    small_step: f32,
+    /// Penalty of a larger one where the picture shows no edge.
+    large_step: f32,
+    /// Share of the larger window.
+    large_window: f32,
+}
+
+impl Smoothness {
+    /// For a number of sources: few agree by chance, many know edges in depth better than their surroundings do.
+    fn of(sources: usize) -> Self {
+        let (small_step, large_step, large_window) = match sources {
+            ..3 => (1.0, 20.0, 0.5),
+            3 => (0.5, 5.0, 0.3),
+            _ => (0.3, 2.5, 0.2),
+        };
+        Self { small_step, large_step, large_window }
+    }
+}
+
 /// A picture that another one is compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct Source<'a> {
@@ -82,8 +105,9 @@ impl Stereo {
         let cell = if reference.width().max(reference.height()) > LARGE { 2 } else { 1 };
         let inverse = Inverse::over(range);
         self.features.make(reference, sources, cell);
-        self.volume.fill(&self.features, sources, inverse);
-        self.paths.run(&self.volume, &self.features);
+        let smoothness = Smoothness::of(sources.len());
+        self.volume.fill(&self.features, sources, inverse, smoothness);
+        self.paths.run(&self.volume, &self.features, smoothness);
         winner::choose(&self.paths, &self.volume, inverse, (&mut self.depth, &mut self.confidence));
         Depths { width: self.features.width, cell, depth: &self.depth, confidence: &self.confidence }
     }

@@ -2,15 +2,11 @@
 
 use super::features::Features;
 use super::volume::Volume;
-use super::{PLANES, UNIT};
+use super::{PLANES, Smoothness, UNIT};
 
-/// Penalty of a change by one plane.
-const SMALL_STEP: i16 = UNIT as i16;
-/// Penalty of a larger change where the picture shows no edge; it falls with the step in luminance, to [`LEAST`] at the lowest.
-const LARGE_STEP: f32 = 20.0 * UNIT as f32;
-/// How fast it falls.
+/// How fast the penalty of a large step falls with the step in luminance, and the least of it, in small steps.
 const EDGE: f32 = 8.0;
-const LEAST: f32 = 1.5 * UNIT as f32;
+const LEAST: f32 = 1.5;
 /// More than any sum along a path.
 const NEVER: i16 = 16_000;
 
@@ -24,14 +20,14 @@ struct Path {
 const FRESH: Path = Path { costs: [0; PLANES + 2], least: 0 };
 
 impl Path {
-    /// One cell further, whose costs are `own`; `penalty` is that of a large step. All sums of eight paths stay below 2¹⁵.
-    fn step(&self, own: &[u8; PLANES], penalty: i16, sums: &mut [i16; PLANES]) -> Self {
+    /// One cell further, whose costs are `own`, with the penalties of a small and of a large step. All sums of eight paths stay below 2¹⁵.
+    fn step(&self, own: &[u8; PLANES], [small, large]: [i16; 2], sums: &mut [i16; PLANES]) -> Self {
         let mut next = Self { costs: [NEVER; PLANES + 2], least: NEVER };
-        let jump = self.least.wrapping_add(penalty);
+        let jump = self.least.wrapping_add(large);
         let mut least = NEVER;
         for d in 0..PLANES {
             let stay = self.costs[d + 1];
-            let step = self.costs[d].min(self.costs[d + 2]).wrapping_add(SMALL_STEP);
+            let step = self.costs[d].min(self.costs[d + 2]).wrapping_add(small);
             let cost = stay.min(step).min(jump).wrapping_sub(self.least).wrapping_add(i16::from(own[d]));
             next.costs[d + 1] = cost;
             least = least.min(cost);
@@ -64,9 +60,12 @@ pub struct Paths {
     here: [Vec<Path>; 3],
 }
 
-/// What a large step costs between cells of two luminances.
-fn penalty(a: f32, b: f32) -> i16 {
-    (LARGE_STEP / (1.0 + EDGE * (a - b).abs())).max(LEAST) as i16
+impl Smoothness {
+    /// What a small and a large step cost between cells of two luminances.
+    fn penalties(&self, a: f32, b: f32) -> [i16; 2] {
+        let large = self.large_step / (1.0 + EDGE * (a - b).abs());
+        [self.small_step, large.max(LEAST * self.small_step)].map(|penalty| (UNIT as f32 * penalty) as i16)
+    }
 }
 
 impl Paths {
@@ -82,7 +81,7 @@ impl Paths {
     }
 
     /// Down the picture and up again: along each row, and from the row before straight and across.
-    pub fn run(&mut self, volume: &Volume, features: &Features) {
+    pub fn run(&mut self, volume: &Volume, features: &Features, smoothness: Smoothness) {
         let (w, h) = volume.size();
         self.sums.clear();
         self.sums.resize(w * h, [0; PLANES]);
@@ -98,15 +97,17 @@ impl Paths {
                 volume.row(y, &mut self.row);
                 let above = (k > 0).then(|| line(if back { y + 1 } else { y - 1 }));
                 let sums = &mut self.sums[y * w..][..w];
-                along(back, &self.row, line(y), sums);
+                along(back, &self.row, line(y), smoothness, sums);
                 for (side, (before, here)) in self.before.iter().zip(&mut self.here).enumerate() {
                     for x in 0..w {
                         // From the left, from straight above, from the right.
                         let from = (x + side).checked_sub(1).filter(|from| *from < w);
                         here[x] = match (above, from) {
-                            (Some(above), Some(from)) => {
-                                before[from].step(&self.row[x], penalty(line(y)[x], above[from]), &mut sums[x])
-                            }
+                            (Some(above), Some(from)) => before[from].step(
+                                &self.row[x],
+                                smoothness.penalties(line(y)[x], above[from]),
+                                &mut sums[x],
+                            ),
                             _ => Path::begin(&self.row[x], &mut sums[x]),
                         };
                     }
@@ -118,7 +119,7 @@ impl Paths {
 }
 
 /// Along a row, from its left end or, `back`, from its right end.
-fn along(back: bool, row: &[[u8; PLANES]], line: &[f32], sums: &mut [[i16; PLANES]]) {
+fn along(back: bool, row: &[[u8; PLANES]], line: &[f32], smoothness: Smoothness, sums: &mut [[i16; PLANES]]) {
     let w = row.len();
     let mut path = FRESH;
     for i in 0..w {
@@ -127,7 +128,7 @@ fn along(back: bool, row: &[[u8; PLANES]], line: &[f32], sums: &mut [[i16; PLANE
             Path::begin(&row[x], &mut sums[x])
         } else {
             let from = if back { x + 1 } else { x - 1 };
-            path.step(&row[x], penalty(line[x], line[from]), &mut sums[x])
+            path.step(&row[x], smoothness.penalties(line[x], line[from]), &mut sums[x])
         };
     }
 }

@@ -141,7 +141,7 @@ fn running_sums_of_the_volume_are_the_correlations_of_its_windows() {
                             let (u, v) = (x as f32 + shift[0] + 0.5, y as f32 + shift[1] + 0.5);
                             let is_seen = u >= 0.0 && v >= 0.0 && u < w as f32 && v < h as f32;
                             let of = |half| correlation(&stereo.features, s, (x, y), half, shift);
-                            is_seen.then(|| 0.5 * of(3) + 0.5 * of(10))
+                            is_seen.then(|| 0.8 * of(3) + 0.2 * of(10))
                         })
                         .collect();
                     found.sort_by(|a, b| b.total_cmp(a));
@@ -172,12 +172,13 @@ fn way(volume: &Volume, luminance: &[f32], (x, y): (i64, i64), step: (i64, i64))
     while from != (x, y) {
         let to = (from.0 + step.0, from.1 + step.1);
         let light = |(x, y): (i64, i64)| luminance[y as usize * w + x as usize];
-        let large = (20.0 * UNIT as f32 / (1.0 + 8.0 * (light(to) - light(from)).abs())).max(1.5 * UNIT as f32) as i32;
+        let large = (5.0 / (1.0 + 8.0 * (light(to) - light(from)).abs())).max(0.75);
+        let [small, large] = [0.5, large].map(|penalty: f32| (UNIT as f32 * penalty) as i32);
         let least = costs.iter().copied().min().unwrap_or(0);
         let here = own(to.0, to.1);
         costs = std::array::from_fn(|d| {
             let beside = [d.checked_sub(1), Some(d + 1)];
-            let beside = beside.into_iter().flatten().filter_map(|d| costs.get(d)).map(|c| c + UNIT);
+            let beside = beside.into_iter().flatten().filter_map(|d| costs.get(d)).map(|c| c + small);
             here[d] + beside.chain([costs[d], least + large]).min().unwrap_or(0) - least
         });
         from = to;
@@ -188,7 +189,7 @@ fn way(volume: &Volume, luminance: &[f32], (x, y): (i64, i64), step: (i64, i64))
 #[test]
 fn sums_of_the_paths_are_those_of_eight_directions() {
     let mut stereo = Stereo::default();
-    with_sources(&CAMERAS[..2], |reference, sources| {
+    with_sources(&CAMERAS[..3], |reference, sources| {
         stereo.depths(reference, sources, RANGE);
         let (w, _) = stereo.volume.size();
         for (x, y) in [(0, 0), (95, 0), (0, 71), (95, 71), (48, 36), (1, 50), (70, 3)] {

@@ -2,9 +2,9 @@
 //! puts them in the sources.
 
 use super::features::{Features, Finer, PRODUCT};
-use super::{PLANES, Source, UNIT};
+use super::{PLANES, Smoothness, Source, UNIT};
 
-/// Half the sides of the two windows whose correlations are averaged, cells.
+/// Half the sides of the two windows whose correlations are weighed against each other, cells.
 const SMALL: usize = 3;
 const LARGE: usize = 10;
 /// Shares of the best source and of the second: one from which the place is hidden must not veto.
@@ -59,6 +59,8 @@ struct Windows {
     sevens: Vec<i32>,
     /// Where the cells of a row lie in the source.
     places: Vec<i32>,
+    /// Share of the larger window.
+    large_share: f32,
 }
 
 impl Volume {
@@ -69,7 +71,7 @@ impl Volume {
 
     #[cfg(test)]
     pub fn held_bytes(&self) -> u64 {
-        let Windows { products, seen, columns, sevens, places } = &self.windows;
+        let Windows { products, seen, columns, sevens, places, .. } = &self.windows;
         let words = columns.iter().map(Vec::capacity).sum::<usize>() + sevens.capacity() + places.capacity();
         let shorts = self.best.capacity() + self.second.capacity() + products.capacity();
         (self.costs.capacity() + seen.capacity() + 2 * shorts + 4 * words) as u64
@@ -89,7 +91,8 @@ impl Volume {
         (self.width, self.height)
     }
 
-    pub fn fill(&mut self, features: &Features, sources: &[Source<'_>], inverse: Inverse) {
+    pub fn fill(&mut self, features: &Features, sources: &[Source<'_>], inverse: Inverse, smoothness: Smoothness) {
+        self.windows.large_share = smoothness.large_window;
         let n = features.width * features.height;
         (self.width, self.height) = (features.width, features.height);
         self.costs.resize(PLANES * n, 0);
@@ -203,8 +206,8 @@ impl Windows {
             *sum = seven(c);
         }
         let (sevens, small, seen) = (&self.sevens, &small[LARGE - SMALL..], &self.seen[y % RING * w..][..w]);
-        let gain = |half: usize| 0.5 * UNIT as f32 / (((2 * half + 1) * (2 * half + 1)) as f32 * PRODUCT);
-        let gains = [gain(SMALL), gain(LARGE)];
+        let gain = |half: usize| UNIT as f32 / (((2 * half + 1) * (2 * half + 1)) as f32 * PRODUCT);
+        let gains = [(1.0 - self.large_share) * gain(SMALL), self.large_share * gain(LARGE)];
         for x in 0..w {
             let near = seven(&small[x..x + 7]);
             let wide = sevens[x].wrapping_add(sevens[x + 7]).wrapping_add(sevens[x + 14]);
