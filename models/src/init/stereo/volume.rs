@@ -52,7 +52,10 @@ struct Windows {
     /// Products of the last rows, by row modulo [`RING`]; the first and the last are continued by half a window on either side.
     products: Vec<i16>,
     /// Whether the source sees the cells of those rows.
-    seen: Vec<bool>,
+    seen: Vec<u8>,
+    /// Middles of a row's cells in the reference, pixels, and where they lie in the source.
+    centers: Vec<f32>,
+    at: [Vec<f32>; 2],
     /// Sums of columns of the smaller and of the larger window.
     columns: [Vec<i32>; 2],
     /// Of the larger window's columns, seven at a time: three of those are its 21.
@@ -66,13 +69,14 @@ struct Windows {
 impl Volume {
     pub fn planned_bytes(cells: u64, across: u64) -> u64 {
         let padded = across + 2 * LARGE as u64;
-        cells * (PLANES as u64 + 4) + RING as u64 * (2 * padded + across) + 16 * padded
+        cells * (PLANES as u64 + 4) + RING as u64 * (2 * padded + across) + 28 * padded
     }
 
     #[cfg(test)]
     pub fn held_bytes(&self) -> u64 {
-        let Windows { products, seen, columns, sevens, places, .. } = &self.windows;
-        let words = columns.iter().map(Vec::capacity).sum::<usize>() + sevens.capacity() + places.capacity();
+        let Windows { products, seen, columns, sevens, places, centers, at, .. } = &self.windows;
+        let floats = centers.capacity() + at.iter().map(Vec::capacity).sum::<usize>();
+        let words = columns.iter().map(Vec::capacity).sum::<usize>() + sevens.capacity() + places.capacity() + floats;
         let shorts = self.best.capacity() + self.second.capacity() + products.capacity();
         (self.costs.capacity() + seen.capacity() + 2 * shorts + 4 * words) as u64
     }
@@ -117,7 +121,7 @@ impl Volume {
     /// Adds the correlations of one source at one inverse depth.
     fn correlate(&mut self, features: &Features, source: &Finer, m: &[f32; 16], inverse: f32) {
         let (w, h) = (self.width, self.height);
-        self.windows.begin(w);
+        self.windows.begin(w, features.cell as f32);
         // Rows of products are made ahead of the row whose windows they complete.
         let mut made = 0;
         for y in 0..h {
@@ -132,10 +136,13 @@ impl Volume {
 }
 
 impl Windows {
-    fn begin(&mut self, w: usize) {
+    fn begin(&mut self, w: usize, cell: f32) {
         let padded = w + 2 * LARGE;
         self.products.resize(RING * padded, 0);
-        self.seen.resize(RING * w, false);
+        self.seen.resize(RING * w, 0);
+        self.centers.clear();
+        self.centers.extend((0..w).map(|x| middle(x, cell)));
+        self.at.iter_mut().for_each(|at| at.resize(w, 0.0));
         self.places.resize(w, 0);
         self.sevens.resize(padded, 0);
         for columns in &mut self.columns {
@@ -147,24 +154,28 @@ impl Windows {
     /// Products of the features of row `y` and of the places in `source` where `inverse` puts its cells.
     fn multiply(&mut self, features: &Features, source: &Finer, m: &[f32; 16], (y, inverse): (usize, f32)) {
         let (w, cell) = (features.width, features.cell as f32);
-        let center = |k: usize| k as f32 * cell + (cell - 1.0) / 2.0;
-        let py = center(y);
+        let py = middle(y, cell);
         let start = |r: usize| m[4 * r + 1] * py + m[4 * r + 2] + m[4 * r + 3] * inverse;
         let (bx, by, bz) = (start(0), start(1), start(2));
         let (ax, ay, az) = (m[0], m[4], m[8]);
         let seen = &mut self.seen[y % RING * w..][..w];
         let (fw, fh, finer) = (source.width as f32, source.height as f32, 1.0 / source.pixels);
         let (columns, beyond) = (source.width as i32, (source.width * source.height) as i32);
-        for (x, (place, seen)) in self.places.iter_mut().zip(seen).enumerate() {
-            let px = center(x);
+        // Loop by loop, so that the first works on several cells at once.
+        let [us, vs] = &mut self.at;
+        for ((u, v), (px, seen)) in us.iter_mut().zip(vs.iter_mut()).zip(self.centers.iter().zip(seen.iter_mut())) {
             let z = az * px + bz;
             let nearness = 1.0 / z;
-            let u = ((ax * px + bx) * nearness + 0.5) * finer;
-            let v = ((ay * px + by) * nearness + 0.5) * finer;
-            *seen = (z > 1e-6) & (u >= 0.0) & (v >= 0.0) & (u < fw) & (v < fh);
-            // Signed, as that is what processors convert to several at a time; a cast of NaN is 0.
-            let (row, column) = (v.clamp(0.0, fh) as i32, u.clamp(0.0, fw) as i32);
-            *place = if *seen { row.wrapping_mul(columns).wrapping_add(column) } else { beyond };
+            let x = ((ax * px + bx) * nearness + 0.5) * finer;
+            let y = ((ay * px + by) * nearness + 0.5) * finer;
+            *seen = u8::from((z > 1e-6) & (x >= 0.0) & (y >= 0.0) & (x < fw) & (y < fh));
+            // Within what is converted, whatever the projection; what is no number compares false.
+            *u = if x >= 0.0 { x.min(fw) } else { 0.0 };
+            *v = if y >= 0.0 { y.min(fh) } else { 0.0 };
+        }
+        for ((place, seen), (u, v)) in self.places.iter_mut().zip(seen).zip(us.iter().zip(vs.iter())) {
+            let inside = (*v as i32).wrapping_mul(columns).wrapping_add(*u as i32);
+            *place = if *seen > 0 { inside } else { beyond };
         }
         let padded = w + 2 * LARGE;
         let row = &mut self.products[y % RING * padded..][..padded];
@@ -212,11 +223,16 @@ impl Windows {
             let near = seven(&small[x..x + 7]);
             let wide = sevens[x].wrapping_add(sevens[x + 7]).wrapping_add(sevens[x + 14]);
             let correlation = (gains[0] * near as f32 + gains[1] * wide as f32) as i32 as i16;
-            let correlation = if seen[x] { correlation } else { UNSEEN };
+            let correlation = if seen[x] > 0 { correlation } else { UNSEEN };
             seconds[x] = seconds[x].max(correlation.min(bests[x]));
             bests[x] = bests[x].max(correlation);
         }
     }
+}
+
+/// The middle of a cell from the middle of the first pixel, pixels.
+fn middle(k: usize, cell: f32) -> f32 {
+    k as f32 * cell + (cell - 1.0) / 2.0
 }
 
 /// Their sum; all of a window's products together stay far below the largest number.
