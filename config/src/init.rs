@@ -5,7 +5,7 @@ use crate::settings::{Limits, SettingError, table};
 table! {
     /// How pictures become the first Gaussians.
     pub struct InitSettings {
-        /// Threads of ONNX Runtime.
+        /// Pictures that are matched at once, or threads of a network.
         pub threads: usize = 2, in Limits::within(1.0, 64.0);
         /// Most key frames the job will see; host memory is planned for them.
         pub max_pictures: usize = 300, in Limits::within(2.0, 100_000.0);
@@ -23,7 +23,7 @@ table! {
         pub depth_m: Option<[f32; 2]> = None, in Limits::above(0.0);
         /// Depths of lower confidence make no Gaussian.
         pub min_confidence: f32 = 0.005, in Limits::within(0.0, 1.0);
-        /// Longest side of the pictures given to a network of any size.
+        /// Longest side of the pictures that are matched, or given to a network of any size.
         pub max_side: u32 = 640, in Limits::within(64.0, 8192.0), unit "pixels";
         /// Every how many pixels (of the network's picture) a Gaussian is proposed.
         pub stride: u32 = 2, in Limits::within(1.0, 16.0), unit "pixels";
@@ -42,7 +42,7 @@ table! {
         pub local_scale: bool = true, from "the paper";
         /// Gaussians longer than this many median extents are abnormal and removed.
         pub max_scale_ratio: f32 = 8.0, in Limits::above(1.0);
-        /// The pair network's depths for the depth loss when training starts from sparse points or at random, too; a feed-forward start
+        /// Depths of the matching or of the pair network for the depth loss when training starts from sparse points or at random, too; a feed-forward start
         /// has them anyway.
         pub depth_priors: bool = false;
         /// Opacity of a Gaussian of full confidence.

@@ -124,8 +124,8 @@ impl Initialiser {
     /// and run once on blank pictures of the largest size: a network that does not work is known before a flight.
     ///
     /// # Errors
-    /// A setting, the manifest, the network's file or ONNX Runtime is bad; the last is asked for by networks, and by features where
-    /// no depth range is given.
+    /// A setting, the manifest, the network's file or ONNX Runtime is bad. ONNX Runtime runs networks, and the features that bound
+    /// depths where no range is given.
     pub fn open(settings: &InitSettings, manifest: Option<&Path>) -> Result<Self, InitError> {
         settings.check()?;
         if manifest.is_some() {

@@ -74,9 +74,9 @@ pub struct InitTimes {
     pub add_ms: f64,
     /// Features and triangulation for the depth range.
     pub features_ms: f64,
-    /// Opening the network, summed over threads.
+    /// Opening the network.
     pub open_ms: f64,
-    /// Network runs alone, summed over threads.
+    /// Matching or network runs alone, summed over threads.
     pub run_ms: f64,
     /// Choosing partners and making depths in `build`, network runs included.
     pub depth_ms: f64,

@@ -27,6 +27,8 @@ const PLANES: usize = 64;
 pub const SOURCES: usize = 4;
 /// Pictures with a longer side, pixels, are matched at half their size, others at their own.
 const LARGE: u32 = 512;
+/// So are strips of fewer rows or columns: half of one pixel is no cell.
+const NARROW: u32 = 16;
 /// What a correlation of 1 is worth in costs.
 const UNIT: i32 = 128;
 
@@ -72,7 +74,7 @@ pub struct Depths<'a> {
     pub cell: usize,
     /// Along the optical axis, in the unit of the range.
     pub depth: &'a [f32],
-    /// Chance that the depth is right within 5 %, times the correlation of the windows, and never 0.
+    /// Estimated chance that the depth is right within 5 %, times the correlation of the windows; never 0.
     pub confidence: &'a [f32],
 }
 
@@ -102,7 +104,8 @@ impl Stereo {
     /// Depths of `reference` between the nearest and the farthest depth of `range`, by at most [`SOURCES`] others.
     pub fn depths(&mut self, reference: &RgbImage, sources: &[Source<'_>], range: [f32; 2]) -> Depths<'_> {
         let sources = &sources[..sources.len().min(SOURCES)];
-        let cell = if reference.width().max(reference.height()) > LARGE { 2 } else { 1 };
+        let (width, height) = reference.dimensions();
+        let cell = if width.max(height) > LARGE && width.min(height) >= NARROW { 2 } else { 1 };
         let inverse = Inverse::over(range);
         self.features.make(reference, sources, cell);
         let smoothness = Smoothness::of(sources.len());

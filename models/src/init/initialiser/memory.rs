@@ -35,7 +35,7 @@ fn frame_bytes(settings: &InitSettings, pixels: u64) -> u64 {
 
 impl Initialiser {
     /// Host bytes planned for a number of pictures and Gaussians: pictures at the network's size and depths on the grid (those
-    /// at work, where a file keeps them), the network's tensors, for unposed networks the pairs' pointmaps and heads, and the merge. What the
+    /// at work, where a file keeps them), what matching or the network holds, for unposed networks the pairs' pointmaps and heads, and the merge. What the
     /// caller still holds of the pictures themselves is not in it.
     pub fn planned_bytes(&self, pictures: usize, max_gaussians: usize) -> u64 {
         let pixels = self.frames.first().map_or(640 * 480, |f| f.view.intrinsics.pixels()) as u64;

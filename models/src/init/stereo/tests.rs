@@ -108,6 +108,22 @@ fn pictures_that_say_nothing_have_no_sure_depth_and_every_depth_is_a_number_with
     assert!(stereo.depths(&textured, &[], RANGE).confidence.iter().all(|c| *c < 0.5), "no source");
 }
 
+#[test]
+fn strips_of_one_row_or_column_are_matched_like_other_pictures() {
+    let mut stereo = Stereo::default();
+    for (w, h) in [(640, 1), (1, 640), (640, 15), (640, 17), (1, 1)] {
+        let image = RgbImage::from_fn(w, h, |x, y| Rgb([(x * 7 + y * 3) as u8; 3]));
+        let source = Source { image: &image, projection: projection([1.0, 0.0]) };
+        let found = stereo.depths(&image, &[source; 4], RANGE);
+        let rows = found.depth.len() / found.width;
+        assert!(rows > 0 && found.width * found.cell <= w as usize && rows * found.cell <= h as usize, "{w} × {h}");
+        assert!(found.depth.iter().all(|d| (0.99 * RANGE[0]..=1.01 * RANGE[1]).contains(d)), "{w} × {h}");
+        let grid = crate::init::depth_frame::DepthGrid::of_cells((w as usize, h as usize), 2, &found);
+        assert_eq!(grid.depth.len(), grid.width * grid.height, "{w} × {h}");
+        assert!(stereo.held_bytes() <= Stereo::planned_bytes(640 * 640), "{w} × {h}");
+    }
+}
+
 /// Products of features at cells that lie beyond the rim are those of the nearest cell within it.
 fn correlation(features: &Features, source: usize, (x, y): (i64, i64), half: i64, shift: [f32; 2]) -> f32 {
     let finer = &features.sources[source];

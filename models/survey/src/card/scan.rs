@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use super::error::CardError;
 use super::unread::Unread;
 
-/// Names looked at below the folders given; more is no card.
+/// Pictures read below the folders given; more is no card.
 const MAX_FILES: usize = 200_000;
-/// Names of any kind looked at below the folders given: a card's thumbnails, logs and films beside its pictures, and no system's disk.
+/// Names of any kind listed below the folders given: a card's thumbnails, logs and films beside its pictures, and no system's disk.
 const MAX_NAMES: usize = 5 * MAX_FILES;
 /// `DCIM/100MEDIA/…` is two deep; nobody's survey is deeper than this.
 const MAX_DEPTH: usize = 12;
@@ -94,7 +94,7 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
     for entry in fs::read_dir(folder)? {
         let Ok(entry) = entry else { continue };
         if found.names == MAX_NAMES {
-            found.notes.push(format!("{}: only the first {MAX_NAMES} names are looked at", folder.display()));
+            found.notes.push(format!("{}: only the first {MAX_NAMES} names are listed", folder.display()));
             return Ok(());
         }
         found.names += 1;
@@ -121,9 +121,7 @@ fn walk(folder: &Path, depth: usize, found: &mut Scanned) -> std::io::Result<()>
                 found.subtitles.push(path);
             } else if PICTURES.iter().any(|e| name.ends_with(e)) {
                 if found.files.len() == MAX_FILES {
-                    found
-                        .notes
-                        .push(format!("{}: only the first {MAX_FILES} pictures are looked at", folder.display()));
+                    found.notes.push(format!("{}: only the first {MAX_FILES} pictures are read", folder.display()));
                     return Ok(());
                 }
                 found.files.push(path);
