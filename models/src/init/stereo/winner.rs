@@ -9,8 +9,8 @@ const NEAR: usize = 2;
 /// Paths that are summed.
 const PATHS: f32 = 8.0;
 /// The chance of a depth, as a logistic function of its windows' correlation and of the logarithm of its margin: fitted to the depths
-/// of sheffield_cross's pictures, every third one, against those of a model of all pictures. It was fitted at the smoothness of few
-/// sources; with more sources margins are smaller, and it says less than is true or more: it ranks depths, it does not vouch for them.
+/// of sheffield_cross's pictures, every third one, against those of a model of all pictures. The fit is of the smoothness of few
+/// sources. With more sources margins are smaller: there it orders depths and is no calibrated probability.
 const CHANCE: [f32; 3] = [0.043, 7.47, 0.62];
 /// Keeps the logarithm finite where two planes cost the same.
 const NO_MARGIN: f32 = 0.05;
