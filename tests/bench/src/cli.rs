@@ -9,6 +9,7 @@ mod map;
 mod memory;
 mod methods;
 mod poses;
+mod recipe;
 mod scene;
 mod skips;
 mod sparse;

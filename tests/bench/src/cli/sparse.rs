@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::Init;
+use super::recipe::Recipe;
 use crate::sparse::{Request, measure, table};
 use runtime::cli::CliError;
 use runtime::cli::output::outln;
@@ -32,21 +33,12 @@ pub struct Args {
     /// Optimiser steps.
     #[arg(long, default_value_t = 2000)]
     pub steps: u32,
-    /// Image scale, above 0 and at most 1.
-    #[arg(long, default_value_t = 1.0)]
-    pub scale: f64,
-    /// Most Gaussians.
-    #[arg(long)]
-    pub max_gaussians: Option<usize>,
     /// Device memory, MiB.
     #[arg(long, default_value_t = 512)]
     pub budget_mib: u32,
-    /// TOML file with recipe tables for every training, as `dgtr train --settings`.
-    #[arg(long, value_name = "FILE")]
-    pub settings: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
-    #[arg(long)]
-    pub device: Option<String>,
+    /// What every training has alike.
+    #[command(flatten)]
+    pub recipe: Recipe,
     /// Train anew what is already in --out.
     #[arg(long)]
     pub again: bool,
@@ -57,19 +49,9 @@ pub struct Args {
 /// # Errors
 /// Whatever ends the command; its kind is the exit code.
 pub fn run(args: Args) -> Result<(), CliError> {
-    let mut train = Vec::new();
-    let mut argue = |flag: &str, value: String| train.extend([flag.to_owned(), value]);
-    argue("--steps", args.steps.to_string());
-    argue("--scale", args.scale.to_string());
-    argue("--budget-mib", args.budget_mib.to_string());
-    if let Some(n) = args.max_gaussians {
-        argue("--max-gaussians", n.to_string());
-    }
-    if let Some(path) = &args.settings {
-        argue("--settings", path.display().to_string());
-    }
-    if let Some(device) = &args.device {
-        argue("--device", device.clone());
+    let mut train = args.recipe.arguments();
+    for (flag, value) in [("--steps", args.steps), ("--budget-mib", args.budget_mib)] {
+        train.extend([flag.to_owned(), value.to_string()]);
     }
     let request = Request {
         datasets: args.datasets,

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use pages::report::{ReportData, Table};
 
 use super::Init;
+use super::recipe::Recipe;
 use crate::csv::csv;
 use crate::time_error::{Request, chart, groups, measure, points_table, speedups, table};
 use runtime::cli::CliError;
@@ -35,18 +36,9 @@ pub struct Args {
     /// Seconds the structure-from-motion itself took, one per data set or one for all; counted in every sfm point.
     #[arg(long, value_delimiter = ',')]
     pub sfm_seconds: Vec<f64>,
-    /// Image scale, above 0 and at most 1.
-    #[arg(long, default_value_t = 1.0)]
-    pub scale: f64,
-    /// Most Gaussians.
-    #[arg(long)]
-    pub max_gaussians: Option<usize>,
-    /// TOML file with recipe tables for every point, as `dgtr train --settings`.
-    #[arg(long, value_name = "FILE")]
-    pub settings: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
-    #[arg(long)]
-    pub device: Option<String>,
+    /// What every training has alike.
+    #[command(flatten)]
+    pub recipe: Recipe,
     /// Measure points anew that are already in --out.
     #[arg(long)]
     pub again: bool,
@@ -60,16 +52,6 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if args.seconds.iter().chain(&args.sfm_seconds).any(|s| !(*s >= 0.0 && s.is_finite())) {
         return Err(CliError::input("--seconds and --sfm-seconds must be numbers of seconds"));
     }
-    let mut train = vec!["--scale".to_owned(), args.scale.to_string()];
-    if let Some(n) = args.max_gaussians {
-        train.extend(["--max-gaussians".to_owned(), n.to_string()]);
-    }
-    if let Some(path) = &args.settings {
-        train.extend(["--settings".to_owned(), path.display().to_string()]);
-    }
-    if let Some(device) = &args.device {
-        train.extend(["--device".to_owned(), device.clone()]);
-    }
     let request = Request {
         datasets: args.datasets,
         seconds: args.seconds,
@@ -77,7 +59,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         seeds: args.seeds,
         inits: args.init.iter().map(|i| i.flag()).collect(),
         sfm_seconds: args.sfm_seconds,
-        train,
+        train: args.recipe.arguments(),
         out: args.out.clone(),
         again: args.again,
     };
