@@ -32,8 +32,10 @@ const FRESH: usize = 12;
 const LATEST_NS: u64 = 60_000_000_000;
 /// Announcements missing by their counter that are put on the list at most.
 const GAP: u32 = 8;
-/// What is less sure than this waits for the landing.
-pub const LEAST_CONFIDENCE: f32 = 0.38;
+/// What is less sure than this waits for the landing, which knows more.
+const LEAST_IN_FLIGHT: f32 = 0.25;
+/// What is less sure than this at the landing has no exposure.
+pub const LEAST_CONFIDENCE: f32 = 0.23;
 /// While something waits and nothing comes, it is aligned again after this.
 const AGAIN_NS: u64 = 100_000_000;
 /// Announcements that came late by some time may come this much later.
@@ -411,7 +413,7 @@ impl<P> Matcher<P> {
         match verdict.exposure.filter(|e| self.exposures[*e].announced) {
             // All pictures come too late, as it seems: the landing tells.
             _ if self.counted[0] == 0.0 && self.counted[1] > 0.0 && !open => self.alone(p, Reason::NoTrigger),
-            Some(e) if self.fates[e] == Fate::Waits && sure >= LEAST_CONFIDENCE => self.matched(p, e, sure),
+            Some(e) if self.fates[e] == Fate::Waits && sure >= LEAST_IN_FLIGHT => self.matched(p, e, sure),
             Some(_) if age > self.settings.patience_ns / 2 => self.alone(p, Reason::Contradictory),
             None if !open && age > self.settings.patience_ns / 2 => self.alone(p, Reason::NoTrigger),
             _ => None,

@@ -30,11 +30,14 @@ const JUMPED: f32 = 2.5;
 /// What a latency costs at most that is not the usual one, and how far from it is unusual, ns.
 const UNUSUAL: f32 = 0.3;
 const USUAL_NS: f32 = 0.15e9;
-/// A single picture that is late, by its number or its clock, and what it costs for each second.
+/// A single picture that is late, by its number or its clock, and what it costs for each second. Late ones come at any moment; that one
+/// comes just when the next exposure's picture would is a coincidence (see [`chance`]).
 const LATE: f32 = 2.0;
 const LATE_NS: f32 = 8e9;
+/// A picture that stays alone although it is, by its number or its clock, that of an announced exposure.
+const DISOWNED: f32 = 4.0;
 /// A number that does not follow the exposures: the camera skipped one, or was released by hand.
-const SKIPPED: f32 = 4.0;
+const SKIPPED: f32 = 3.0;
 const BY_HAND: f32 = 3.0;
 const MISCOUNTED_MOST: f32 = 8.0;
 /// A number that explains a gap leaves this of what the missing picture costs.
@@ -49,7 +52,7 @@ const STILL_OPEN: f32 = 0.3;
 const OVERDUE_NS: i64 = 500_000_000;
 /// A margin of its root is as likely right as wrong: the model is never as right as its likelihoods say. Of two thousand flights by seed
 /// (DGTR_FLIGHTS=2000, tests/flights_by_seed.rs) no wrong pair has a confidence above 0.9 with it.
-const DOUBT: f32 = 13.0;
+const DOUBT: f32 = 26.0;
 
 /// An exposure on the list.
 #[derive(Clone, Copy, Debug)]
@@ -189,7 +192,7 @@ impl Chain<'_> {
                     cost += late;
                     skipped -= 1.0;
                 }
-                None => cost += self.alone(p),
+                None => cost += self.alone(p) + self.disowned(a, p, b.1),
             }
         }
         skipped = skipped.max(0.0) * self.model.exposure_alone;
@@ -227,17 +230,26 @@ impl Chain<'_> {
     fn late(&self, a: (usize, usize), picture: usize, end: usize) -> Option<(usize, f32)> {
         let counted = self.counted(&self.pictures[a.0], &self.pictures[picture]);
         let mut fitting = (a.1 + 1..end).filter(|e| match counted {
-            Some(counted) => {
-                let sequences = self.exposures[*e].trigger.sequence.wrapping_sub(self.exposures[a.1].trigger.sequence);
-                i64::from(sequences) == counted && self.clock_agrees(a, (picture, *e)) != Some(false)
-            }
+            Some(counted) => self.sequences(a.1, *e) == counted && self.clock_agrees(a, (picture, *e)) != Some(false),
             None => self.clock_agrees(a, (picture, *e)) == Some(true),
         });
         let exposure = fitting.next().filter(|e| self.exposures[*e].announced)?;
         let behind = self.latency(picture, exposure) - self.latency(a.0, a.1);
-        let cost = LATE + behind.max(0) as f32 / LATE_NS;
+        let cost = LATE + chance(LATE_NS, self.model.jitter_ns2) + behind.max(0) as f32 / LATE_NS;
         let possible = behind > 0 && self.latency(picture, exposure) <= self.model.reach_ns;
-        (possible && fitting.next().is_none() && cost < self.alone(picture)).then_some((exposure, cost))
+        (possible && fitting.next().is_none() && cost < self.alone(picture) + DISOWNED).then_some((exposure, cost))
+    }
+
+    /// What it costs to leave a picture behind `a` alone, beside that it is: its number may be that of an exposure before `end`.
+    fn disowned(&self, a: (usize, usize), picture: usize, end: usize) -> f32 {
+        let Some(counted) = self.counted(&self.pictures[a.0], &self.pictures[picture]) else { return 0.0 };
+        let is_its = |e: usize| self.exposures[e].announced && self.sequences(a.1, e) == counted;
+        if (a.1 + 1..end).any(is_its) { DISOWNED } else { 0.0 }
+    }
+
+    /// Announcements from one exposure to the other.
+    fn sequences(&self, from: usize, to: usize) -> i64 {
+        self.exposures[to].trigger.sequence.wrapping_sub(self.exposures[from].trigger.sequence).into()
     }
 
     /// Exposures from one picture to the other by their numbers.
@@ -333,7 +345,8 @@ impl Chain<'_> {
                             best.take(total, late);
                             if late.is_some() {
                                 // About what it costs to leave it alone instead.
-                                let alone = self.alone(picture) - LATE + COUNTED_GAP * self.model.exposure_alone;
+                                let alone =
+                                    self.alone(picture) + DISOWNED - LATE + COUNTED_GAP * self.model.exposure_alone;
                                 best.take(total + alone.max(0.0), None);
                             }
                         }

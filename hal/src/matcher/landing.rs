@@ -6,7 +6,7 @@ use std::collections::HashSet;
 
 use super::doubled;
 use super::reconcile::Pairing;
-use super::{FIRST_JITTER_NS2, LEAST_CONFIDENCE, MatcherSettings, rarity};
+use super::{FIRST_JITTER_NS2, JITTER_NS2, LEAST_CONFIDENCE, MatcherSettings, rarity};
 use crate::traits::PictureClues;
 use crate::trigger::Trigger;
 
@@ -46,7 +46,7 @@ pub fn align(exposures: &[Trigger], pictures: &[PictureClues], settings: Matcher
     let mut bands = vec![Band::default(); pictures.len()];
     let (mut ahead, mut behind) = (vec![0.0; pictures.len() * WIDTH], vec![0.0; pictures.len() * WIDTH]);
     let mut answers = Vec::new();
-    // Twice: what stays alone the first time says how much of this flight was lost.
+    // Twice: the first time says how much of this flight was lost, and how even its latency is.
     for _ in 0..2 {
         let chain = Chain { model, exposures: &slots, pictures };
         let mut rows = Rows { width: WIDTH, bands: &mut bands, ahead: &mut ahead, behind: &mut behind };
@@ -59,6 +59,7 @@ pub fn align(exposures: &[Trigger], pictures: &[PictureClues], settings: Matcher
             .zip(pictures)
             .filter_map(|(v, clues)| Some(clues.arrived_ns.wrapping_sub(slots[v.exposure?].trigger.time_ns) as i64))
             .collect();
+        model.jitter_ns2 = jitter_ns2(&latencies);
         latencies.sort_unstable();
         model.usual_ns = latencies.get(latencies.len() / 2).copied();
         let lost = |all: usize| rarity(all.saturating_sub(matched) as f32, matched as f32);
@@ -71,6 +72,16 @@ pub fn align(exposures: &[Trigger], pictures: &[PictureClues], settings: Matcher
         other: index(v.other),
     };
     answers.iter().map(answer).collect()
+}
+
+/// Variance of the difference of two latencies, as the middle one of all neighbours in the flight tells it: most of them are right.
+fn jitter_ns2(latencies: &[i64]) -> f32 {
+    const SIGMAS: f32 = 1.4826; // of a normal distribution, by the median distance from its middle
+    let mut off: Vec<u64> = latencies.windows(2).map(|w| w[1].abs_diff(w[0])).collect();
+    off.sort_unstable();
+    let Some(middle) = off.get(off.len() / 2) else { return FIRST_JITTER_NS2 };
+    let sigma = SIGMAS * *middle as f32;
+    (sigma * sigma).clamp(*JITTER_NS2.start(), *JITTER_NS2.end())
 }
 
 /// The exposures, and between them those that the counter says were announced and did not come.
