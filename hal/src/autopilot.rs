@@ -1,6 +1,7 @@
 //! One autopilot as heard on its link: a state machine fed with frames, which keeps the clocks, the track and the announced
 //! exposures. No I/O and no allocation; [`crate::vehicle`] feeds it.
 
+mod camera_trigger;
 pub mod landing;
 mod motion;
 mod mounts;
@@ -15,8 +16,8 @@ use crate::mavlink::MessageData;
 use crate::mavlink::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, CAMERA_TRIGGER_DATA,
     EXTENDED_SYS_STATE_DATA, GIMBAL_DEVICE_ATTITUDE_STATUS_DATA, GLOBAL_POSITION_INT_DATA, GPS_GLOBAL_ORIGIN_DATA,
-    GPS_RAW_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, ODOMETRY_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA,
-    TIMESYNC_DATA,
+    GPS_RAW_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, ODOMETRY_DATA, PARAM_VALUE_DATA, SYS_STATUS_DATA,
+    SYSTEM_TIME_DATA, TIMESYNC_DATA,
 };
 use crate::pose::track::Track;
 use crate::pose::{BodyPose, PoseError};
@@ -26,6 +27,7 @@ use crate::time::unix::UnixMap;
 use crate::traits::{PoseSource, TriggerSource};
 use crate::trigger::Trigger;
 
+pub use camera_trigger::CameraTrigger;
 use landing::Landing;
 use motion::Motion;
 pub use mounts::Gimbal;
@@ -93,6 +95,7 @@ pub struct Autopilot {
     sequences: LinearMap<u8, u8, SENDERS>,
     state: AutopilotState,
     landing: Landing,
+    trigger: CameraTrigger,
     counters: HalCounters,
 }
 
@@ -113,6 +116,7 @@ impl Autopilot {
             sequences: LinearMap::new(),
             state: AutopilotState::default(),
             landing: Landing::default(),
+            trigger: CameraTrigger::default(),
             counters: HalCounters::default(),
         }
     }
@@ -163,6 +167,7 @@ impl Autopilot {
             HEARTBEAT_DATA::ID => {
                 if let Some(h) = heartbeat.filter(is_autopilot) {
                     self.state.heartbeat_ns = Some(now_ns);
+                    self.trigger.on_heartbeat(h.autopilot);
                     self.state.armed = h.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
                     self.landing.on_heartbeat(self.state.armed, now_ns);
                     return Handled::Heartbeat;
@@ -185,6 +190,7 @@ impl Autopilot {
                     self.state.battery_percent = u8::try_from(s.battery_remaining).ok().filter(|p| *p <= 100);
                 }
             }
+            PARAM_VALUE_DATA::ID => self.trigger.on_parameter(frame),
             _ => {}
         }
         Handled::Other
@@ -193,6 +199,11 @@ impl Autopilot {
     /// What the autopilot says about itself, as it counts at `now_ns`.
     pub fn state(&self, now_ns: u64) -> AutopilotState {
         AutopilotState { landed: self.landing.is_down(now_ns), ..self.state }
+    }
+
+    /// Whether it triggers a camera.
+    pub fn camera_trigger(&self) -> CameraTrigger {
+        self.trigger
     }
 
     /// The clock mapping.

@@ -46,7 +46,7 @@ impl AnyCamera {
     /// Opens the mission's source of pictures; those of a folder that were written after `since` count as new.
     ///
     /// # Errors
-    /// [`HalError::Camera`] when the folder is missing or the program cannot be started; [`HalError::Video`] when the device
+    /// [`HalError::Camera`] when the folder cannot be read or the program cannot be started; [`HalError::Video`] when the device
     /// is missing, busy or no camera of the lens's size, or when video devices were not built in.
     pub fn open(source: &CameraSource, lens: &CameraSettings, since: Option<SystemTime>) -> Result<Self, HalError> {
         Ok(match source {
@@ -85,6 +85,10 @@ impl Camera for AnyCamera {
             #[cfg(feature = "v4l2")]
             Self::V4l2(camera) => camera.is_continuous(),
         }
+    }
+
+    fn is_missing(&self) -> bool {
+        matches!(self, Self::Folder(camera) if camera.is_missing())
     }
 
     fn lost_pictures(&self) -> u64 {

@@ -86,6 +86,12 @@ pub trait Link {
         1
     }
 
+    /// Why it is not open, where it is not.
+    #[cfg(feature = "std")]
+    fn why_down(&self) -> Option<std::string::String> {
+        None
+    }
+
     /// Whether it is open; links that do not reconnect are always up and report their end as an error.
     fn state(&self) -> LinkState {
         LinkState::Up
@@ -131,6 +137,11 @@ pub trait Camera {
 
     /// True for video: its pictures belong to no announced exposure, each is posed by its own time.
     fn is_continuous(&self) -> bool {
+        false
+    }
+
+    /// True while the place that pictures come to is not there; it is waited for.
+    fn is_missing(&self) -> bool {
         false
     }
 

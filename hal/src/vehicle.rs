@@ -3,6 +3,7 @@
 //! counted and named.
 
 mod cameras;
+mod complaints;
 mod event;
 mod exposures;
 pub mod mount;
@@ -13,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use geometry::geodesy::EnuFrame;
 
+pub use complaints::Complaint;
 pub use event::{CameraPose, Event, PoseReport, PosedPicture, Unmatched, UnmatchedReason};
 pub use settings::VehicleSettings;
 
@@ -160,6 +162,7 @@ where
             self.look_at_link();
             let now_ns = self.now_ns();
             self.serve(now_ns);
+            complaints::look(self, now_ns);
             if self.finished {
                 self.hand_out(true);
             } else {
@@ -309,7 +312,9 @@ where
         loop {
             let (mut verdict, mut claims) = (Verdict::Refuse, false);
             let (peers, refused) = (&mut self.peers, &mut self.counters.link.refused_peers);
+            let complaints = &mut self.service.complaints;
             let frame = self.channel.next_frame_if(|frame| {
+                complaints.hear(frame);
                 verdict = peers.judge(peer, frame, now_ns);
                 *refused += u64::from(verdict == Verdict::Refuse);
                 claims |= verdict == Verdict::Claims;

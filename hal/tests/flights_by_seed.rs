@@ -174,7 +174,12 @@ impl Given {
     fn take(&mut self, outcome: Outcome<usize>) {
         match outcome {
             Outcome::Matched { trigger, picture, clues, confidence, .. } => {
-                self.posed.push(Posed { picture, exposure: trigger.sequence as usize - 1, confidence, in_flight: true });
+                self.posed.push(Posed {
+                    picture,
+                    exposure: trigger.sequence as usize - 1,
+                    confidence,
+                    in_flight: true,
+                });
                 self.known.push((trigger, clues));
             }
             Outcome::Picture { picture, clues, reason } if reason != Reason::Duplicate => {

@@ -28,6 +28,8 @@ mod first_steps;
 mod ground;
 #[path = "commands/keys.rs"]
 mod keys;
+#[path = "commands/listening.rs"]
+mod listening;
 #[path = "commands/manual.rs"]
 #[cfg(feature = "lab")]
 mod manual;

@@ -39,7 +39,10 @@ type Place = (u64, u64);
 /// A watched folder.
 pub struct FolderCamera {
     folder: PathBuf,
-    place: Place,
+    /// `None` while it is not there.
+    place: Option<Place>,
+    /// What was written before is of an earlier flight.
+    since: SystemTime,
     /// Hashes of the names that were handed out or given up, and of size and time of what was.
     done: HashMap<u64, u64>,
     growing: Vec<Growing>,
@@ -102,7 +105,8 @@ impl FolderCamera {
     pub fn open_since(folder: &Path, since: Option<SystemTime>) -> Result<Self, HalError> {
         let mut camera = Self {
             folder: folder.into(),
-            place: (0, 0),
+            place: None,
+            since: since.unwrap_or_else(SystemTime::now),
             done: HashMap::new(),
             growing: Vec::with_capacity(MAX_GROWING),
             ready: Vec::new(),
@@ -110,16 +114,28 @@ impl FolderCamera {
             scans: 0,
             simulated_clock: false,
         };
-        camera.place =
-            place(folder).map_err(|e| camera.wrong(format!("{e}; create it or correct the mission's camera")))?;
-        let earlier = |meta: &Metadata| since.is_none_or(|since| meta.modified().is_ok_and(|at| at <= since));
-        for path in camera.list()? {
-            let Ok(meta) = path.metadata() else { continue };
-            if earlier(&meta) && is_complete(&path).unwrap_or(false) {
-                camera.done.insert(key(&path), version(&meta));
-            }
+        camera.place = match place(folder) {
+            Ok(at) => Some(at),
+            // A medium that is mounted later.
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => None,
+            Err(e) => return Err(camera.wrong(format!("{e}; create it or correct the mission's camera"))),
+        };
+        if camera.place.is_some() {
+            camera.pass_over(since)?;
         }
         Ok(camera)
+    }
+
+    /// What lies there already is of earlier flights, unless it was written after `since`.
+    fn pass_over(&mut self, since: Option<SystemTime>) -> Result<(), HalError> {
+        let earlier = |meta: &Metadata| since.is_none_or(|since| meta.modified().is_ok_and(|at| at <= since));
+        for path in self.list()? {
+            let Ok(meta) = path.metadata() else { continue };
+            if earlier(&meta) && is_complete(&path).unwrap_or(false) {
+                self.done.insert(key(&path), version(&meta));
+            }
+        }
+        Ok(())
     }
 
     /// For a clock that is not the wall's: the age of a file says nothing then.
@@ -142,9 +158,20 @@ impl FolderCamera {
     fn scan(&mut self, now_ns: u64) -> Result<(), HalError> {
         self.scans += 1;
         let recheck = self.scans.is_multiple_of(RECHECK);
-        let now_at = place(&self.folder).unwrap_or(self.place);
-        if std::mem::replace(&mut self.place, now_at) != now_at {
-            return Err(self.wrong("another file system is there now; was its medium unmounted?".into()));
+        let now_at = place(&self.folder).ok().or(self.place);
+        match (std::mem::replace(&mut self.place, now_at), now_at) {
+            (None, None) => return Ok(()),
+            (None, Some(_)) => {
+                self.pass_over(Some(self.since))?;
+                let (folder, earlier) = (self.folder.display(), self.done.len());
+                tracing::info!(
+                    "folder {folder} is there; {earlier} pictures in it are older than the start and left out"
+                );
+            }
+            (before, now) if before != now => {
+                return Err(self.wrong("another file system is there now; was its medium unmounted?".into()));
+            }
+            _ => {}
         }
         let mut broken = None;
         for path in self.list()? {
@@ -222,6 +249,11 @@ impl Camera for FolderCamera {
         }
         Ok(self.ready.pop().map(|(clues, path)| (clues, Picture::Path(path))))
     }
+
+    /// Pictures in it when it comes are of this flight if they were written since the start.
+    fn is_missing(&self) -> bool {
+        self.place.is_none()
+    }
 }
 
 #[cfg(test)]
@@ -296,9 +328,28 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_folder_is_named() {
-        let error = FolderCamera::open(Path::new("/nonexistent/camera")).err().expect("missing");
-        assert!(error.to_string().contains("/nonexistent/camera"));
+    fn a_missing_folder_is_waited_for_and_only_what_was_written_since_counts() {
+        let above = tempfile::tempdir().expect("a folder");
+        let folder = above.path().join("camera");
+        let mut camera = FolderCamera::open(&folder).expect("it may be mounted later");
+        assert!(camera.is_missing() && camera.next_picture(0).expect("nothing is wrong").is_none());
+        std::fs::create_dir(&folder).expect("a folder");
+        for (name, age_s) in [("a_1.jpg", 3600), ("a_2.jpg", 0)] {
+            let file = std::fs::File::create(folder.join(name)).expect("a file");
+            std::io::Write::write_all(&mut &file, &jpeg()).expect("written");
+            let at = SystemTime::now() + std::time::Duration::from_secs(1) - std::time::Duration::from_secs(age_s);
+            file.set_modified(at).expect("a time");
+        }
+        let (clues, _) = camera.next_picture(SCAN_EVERY_NS).expect("it reads").expect("the new one");
+        assert_eq!((clues.number, camera.is_missing()), (Some(2), false));
+        assert!(
+            camera.next_picture(2 * SCAN_EVERY_NS).expect("it reads").is_none(),
+            "the old one is of an earlier flight"
+        );
+        let file = above.path().join("file");
+        std::fs::write(&file, "").expect("written");
+        let error = FolderCamera::open(&file.join("below")).err().expect("no folder can come there");
+        assert!(error.to_string().contains("below"), "{error}");
     }
 
     #[test]

@@ -158,6 +158,10 @@ impl Link for Reconnecting {
         if matches!(self.address, LinkAddress::TcpIn(_)) { super::tcp::CONNECTIONS } else { 1 }
     }
 
+    fn why_down(&self) -> Option<String> {
+        self.last_error.as_ref().filter(|_| self.link.is_none()).map(ToString::to_string)
+    }
+
     fn state(&self) -> LinkState {
         match (&self.link, self.ended) {
             (_, true) => LinkState::Ended,

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use glam::{DQuat, DVec3};
 
+use super::Complaint;
 use crate::camera::Picture;
 use crate::matcher::Reason;
 use crate::mavlink_camera::ParameterId;
@@ -25,6 +26,13 @@ pub enum Event {
     Posed(PosedPicture),
     /// A picture or an exposure that will not become a frame.
     Unmatched(Unmatched),
+    /// Something keeps pictures from being posed, or no longer does.
+    Complaint {
+        /// What.
+        what: Complaint,
+        /// With its figures, and how to mend it; `None` when it is over.
+        line: Option<String>,
+    },
     /// The autopilot is silent, or the link is closed; it is being reopened.
     LinkLost,
     /// The autopilot is heard again.

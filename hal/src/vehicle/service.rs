@@ -3,6 +3,7 @@
 
 use geometry::geodesy::{EnuFrame, Geodetic};
 
+use super::complaints::Complaints;
 use super::{CameraPose, Event, Vehicle, VehicleSettings};
 use crate::autopilot::{Autopilot, Gimbal};
 use crate::camera::Picture;
@@ -26,6 +27,7 @@ const WARN_EVERY_NS: u64 = 5_000_000_000;
 /// Timers and answers.
 pub(super) struct Service {
     pub(super) component: MavlinkCamera,
+    pub(super) complaints: Complaints,
     store: Option<SigningStore>,
     announces: bool,
     next_heartbeat_ns: u64,
@@ -46,6 +48,7 @@ impl Service {
         let info = CameraInfo { width: settings.lens.width, height: settings.lens.height };
         let service = Self {
             component: MavlinkCamera::new(info, settings.link.own_component),
+            complaints: Complaints::default(),
             store,
             announces: settings.link.act_as_camera,
             next_heartbeat_ns: 0,

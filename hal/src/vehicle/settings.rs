@@ -42,9 +42,11 @@ impl VehicleSettings {
     /// # Errors
     /// [`HalError::Address`] when its link cannot be understood.
     pub fn from_mission(mission: &Mission, aircraft: &Aircraft) -> Result<Self, HalError> {
+        let address: LinkAddress = aircraft.link.parse()?;
         Ok(Self {
-            address: aircraft.link.parse()?,
-            patient: false,
+            // A cable that is not plugged in yet; one that this user may not open is an error.
+            patient: matches!(&address, LinkAddress::Serial { path, .. } if !path.exists()),
+            address,
             system_id: aircraft.system_id,
             link: mission.link.clone(),
             failsafe: mission.failsafe,

@@ -13,7 +13,10 @@ use geometry::geodesy::Geodetic;
 use super::*;
 use crate::camera::FolderCamera;
 use crate::link::{LinkAddress, UdpLink, WireLink};
-use crate::mavlink::dialect::{GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, STATUSTEXT_DATA};
+use crate::mavlink::dialect::{
+    GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA,
+    STATUSTEXT_DATA,
+};
 use crate::mavlink::{Encoder, Framer};
 use crate::time::ManualClock;
 use crate::traits::Received;
@@ -93,7 +96,10 @@ fn ten_seconds(vehicle: &mut Still, clock: &ManualClock) -> Vec<Event> {
     for turn in 0..500u64 {
         clock.set(turn * 20_000_000);
         while let Some(event) = vehicle.poll(Duration::ZERO).expect("a wire does not fail") {
-            events.push(event);
+            // Nobody speaks on this line.
+            if !matches!(event, Event::Complaint { .. }) {
+                events.push(event);
+            }
         }
     }
     events
@@ -255,4 +261,164 @@ fn a_stranger_who_says_disarmed_from_another_address_ends_no_flight() {
     }
     assert_eq!(landed_s, Some(55), "three seconds after the autopilot itself has said so");
     assert_eq!(vehicle.counters().link.refused_peers, 2 * 55);
+}
+
+/// Ten seconds of a vehicle with `settings` on a line on which `speak` says something every second; what it complains of, and all
+/// that it told the ground station.
+fn complaints(
+    settings: &VehicleSettings,
+    folder: &Path,
+    speak: &mut dyn FnMut(u64, &mut WireLink),
+) -> (Vec<Complaint>, String) {
+    let clock = Arc::new(ManualClock::default());
+    let camera = FolderCamera::open(folder).expect("a folder, or none yet").on_simulated_clock();
+    let (line, mut other) = WireLink::pair();
+    let mut vehicle = Vehicle::new(line, camera, clock.clone(), settings).expect("a vehicle");
+    let (mut told, mut found) = (String::new(), Vec::<(Complaint, String)>::new());
+    for s in 0..10 {
+        speak(s, &mut other);
+        for tenth in 0..10 {
+            clock.set((s * 10 + tenth) * 100_000_000);
+            while let Some(event) = vehicle.poll(Duration::ZERO).expect("a wire does not fail") {
+                let Event::Complaint { what, line } = event else { continue };
+                found.retain(|f| f.0 != what);
+                found.extend(line.map(|line| (what, line)));
+            }
+        }
+        told.extend(texts(&mut other).into_iter().map(|(_, text)| text));
+    }
+    for (complaint, line) in &found {
+        assert!(told.contains(complaint.name()), "{complaint:?} in {told}");
+        assert!(line.contains("; ") && !line.contains('\n'), "{line}");
+    }
+    (found.into_iter().map(|f| f.0).collect(), told)
+}
+
+fn heartbeat_of(system: u8, autopilot: MavAutopilot, line: &mut WireLink) {
+    let message = HEARTBEAT_DATA { autopilot, ..HEARTBEAT_DATA::default() };
+    line.write(Encoder::new(system, 1).encode(&message, None)).expect("written");
+}
+
+/// The parameter is this, whoever asks.
+fn parameter(name: &str, param_value: f32, line: &mut WireLink) {
+    let message = PARAM_VALUE_DATA { param_id: name.into(), param_value, ..PARAM_VALUE_DATA::default() };
+    line.write(Encoder::new(1, 1).encode(&message, None)).expect("written");
+}
+
+/// As [`complaints`], with the usual settings and a camera that works.
+fn complaints_of(speak: &mut dyn FnMut(u64, &mut WireLink)) -> (Vec<Complaint>, String) {
+    let folder = tempfile::tempdir().expect("a folder");
+    complaints(&settings(), folder.path(), speak)
+}
+
+#[test]
+fn a_port_on_which_no_autopilot_speaks_is_named_within_ten_seconds() {
+    assert_eq!(complaints_of(&mut |_, _| {}).0, [Complaint::Nobody]);
+    let ground_station = MavAutopilot::MAV_AUTOPILOT_INVALID;
+    let (found, told) = complaints_of(&mut |_, line| heartbeat_of(255, ground_station, line));
+    assert!(found == [Complaint::Nobody] && told.contains("messages of others"), "{told}");
+}
+
+#[test]
+fn a_line_that_carries_no_mavlink_is_named_within_ten_seconds() {
+    assert_eq!(complaints_of(&mut |_, line| line.write(&[0xFD; 300]).expect("written")).0, [Complaint::Noise]);
+}
+
+#[test]
+fn a_wrong_system_id_is_named_within_ten_seconds_beside_those_that_are_heard() {
+    let kind = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+    let (found, told) = complaints_of(&mut |_, line| heartbeat_of(7, kind, line));
+    assert!(found == [Complaint::OtherSystem] && told.contains("7, not system_id = 1"), "{told}");
+    assert_eq!(complaints_of(&mut |_, line| heartbeat_of(1, kind, line)).0, []);
+}
+
+#[test]
+fn an_autopilot_that_triggers_no_camera_is_named_within_ten_seconds_beside_its_parameter() {
+    let (ardupilot, px4) = (MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA, MavAutopilot::MAV_AUTOPILOT_PX4);
+    for (kind, name) in [(ardupilot, "CAM1_TYPE"), (px4, "TRIG_MODE")] {
+        let speak = |value: f32| {
+            complaints_of(&mut |_, line| {
+                heartbeat_of(1, kind, line);
+                parameter(name, value, line);
+            })
+        };
+        let (found, told) = speak(0.0);
+        assert!(found == [Complaint::NoTrigger] && told.contains(&format!("{name} is 0")), "{told}");
+        assert_eq!(speak(1.0).0, []);
+    }
+}
+
+#[test]
+fn the_parameter_of_the_trigger_is_asked_for_and_not_for_ever() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let clock = Arc::new(ManualClock::default());
+    let (mut vehicle, mut line) = with_line(folder.path(), None, &clock);
+    let mut asked = Vec::new();
+    for s in 0..20 {
+        heartbeat_of(1, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA, &mut line);
+        clock.set(s * 1_000_000_000);
+        while vehicle.poll(Duration::ZERO).expect("a wire does not fail").is_some() {}
+        let (mut framer, mut bytes) = (Framer::new(), [0; 256]);
+        while let Ok(Received { bytes: count @ 1.., .. }) = line.read(&mut bytes, Duration::ZERO) {
+            framer.push(&bytes[..count]);
+            while let Some(frame) = framer.next_frame() {
+                let request = frame.message::<PARAM_REQUEST_READ_DATA>();
+                asked.extend(request.map(|r| (r.param_id.to_str().expect("UTF-8").to_owned(), r.param_index)));
+            }
+        }
+    }
+    assert_eq!(asked, vec![("CAM1_TYPE".to_owned(), -1); 3]);
+}
+
+#[test]
+fn signing_that_the_autopilot_does_not_do_is_named() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let key = folder.path().join("link.key");
+    std::fs::write(&key, [7; 32]).expect("written");
+    std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
+    let mut settings = settings();
+    settings.link.signing = config::link::Signing::Require;
+    settings.link.signing_key = Some(key);
+    let kind = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+    let (found, told) = complaints(&settings, folder.path(), &mut |_, line| heartbeat_of(1, kind, line));
+    assert!(found == [Complaint::Signing] && told.contains(" messages unsigned"), "{found:?} {told}");
+}
+
+#[test]
+fn a_missing_camera_folder_and_pictures_that_nobody_announces_are_named() {
+    let above = tempfile::tempdir().expect("a folder");
+    let folder = above.path().join("camera");
+    let of = VehicleSettings { camera: Some(config::mission::CameraSource::Folder(folder.clone())), ..settings() };
+    let kind = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+    let (found, told) = complaints(&of, &folder, &mut |_, line| heartbeat_of(1, kind, line));
+    assert!(found == [Complaint::NoFolder] && told.contains(&folder.display().to_string()), "{told}");
+    // It comes while the vehicle listens, and pictures with it, of which no exposure is announced.
+    let (found, told) = complaints(&of, &folder, &mut |s, line| {
+        heartbeat_of(1, kind, line);
+        std::fs::create_dir_all(&folder).expect("a folder");
+        if s < 3 {
+            let path = folder.join(format!("DJI_{s}.jpg"));
+            photograph(&path, ORIGIN, 2);
+            // The file system's clock is a coarse one: none of them is as old as the listening.
+            let file = std::fs::File::options().write(true).open(&path).expect("a file");
+            file.set_modified(SystemTime::now() + Duration::from_secs(1)).expect("a time");
+        }
+    });
+    assert!(found == [Complaint::Unannounced] && told.contains(" pictures; check"), "{found:?} {told}");
+}
+
+#[test]
+fn a_serial_port_that_is_not_there_yet_is_waited_for_and_named_at_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = folder.path().join("ttyACM0");
+    let settings = VehicleSettings {
+        address: LinkAddress::Serial { path: port.clone(), baud: 57_600 },
+        patient: true,
+        ..settings()
+    };
+    let mut vehicle: Vehicle = Vehicle::open(&settings).expect("it is waited for");
+    assert_eq!(vehicle.poll(Duration::ZERO).expect("silence"), Some(Event::LinkLost));
+    let event = vehicle.poll(Duration::ZERO).expect("silence");
+    let Some(Event::Complaint { what: Complaint::Closed, line: Some(line) }) = event else { panic!("{event:?}") };
+    assert!(line.contains("ttyACM0") && line.contains("waited for") && !line.contains('\n'), "{line}");
 }

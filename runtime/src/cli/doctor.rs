@@ -20,6 +20,7 @@ use vulkan::trainer::{PlanFit, TrainError, check_device, check_plan};
 use super::CliError;
 use crate::cli::output::outln;
 
+mod aircraft;
 #[cfg(feature = "lab")]
 mod report;
 mod trust;
@@ -30,7 +31,7 @@ pub struct Args {
     /// Also check this network against its manifest, and run it once (may be given more than once).
     #[arg(long, value_name = "FILE")]
     pub model: Vec<PathBuf>,
-    /// Also say what protects the deliveries of this mission, and what does not.
+    /// Also say what protects the deliveries of this mission, and listen on its links for ten seconds: who is heard, and what a flight lacks.
     #[arg(long, value_name = "FILE")]
     pub mission: Option<PathBuf>,
     /// Measure anew which kernel configuration is the fastest on each Vulkan device, and remember it. Hardware is measured
@@ -132,7 +133,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     if let Some(path) = &args.mission {
         let mission = Mission::read(path).map_err(CliError::input)?;
-        for (what, finding) in trust::findings(&mission) {
+        for (what, finding) in trust::findings(&mission).into_iter().chain(aircraft::findings(&mission)) {
             tell(what, finding);
         }
     }

@@ -275,6 +275,7 @@ where
                     self.counters.links_lost += 1;
                     tracing::warn!("link to the autopilot lost; waiting for it to come back");
                 }
+                Event::Complaint { what, line } => self.shown.complain(what, line.is_some()),
                 Event::LinkBack => tracing::info!("link to the autopilot is back"),
                 Event::Pose(report) => {
                     self.shown.at = Some(report.position.to_array());

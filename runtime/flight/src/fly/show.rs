@@ -3,6 +3,7 @@
 
 use hal::autopilot::AutopilotState;
 use hal::failsafe::State;
+use hal::vehicle::Complaint;
 use image::RgbImage;
 use models::camera::{Intrinsics, Pose, View};
 use pages::report::ground::Shot;
@@ -26,6 +27,8 @@ pub(super) struct ShownCapture {
     /// How much of the region was covered when that was last looked at, percent.
     pub(super) covered: Option<u32>,
     surveyed_ns: Option<u64>,
+    /// What keeps pictures from being posed.
+    complaints: Vec<Complaint>,
 }
 
 impl ShownCapture {
@@ -35,20 +38,28 @@ impl ShownCapture {
             let views = earlier.iter().map(|&pose| View { intrinsics: lens, pose });
             views.for_each(|view| page.ground.add(Shot::of(0, &view, 0.0)));
         });
-        Self { watch, lens, at: None, covered: None, surveyed_ns: None }
+        Self { watch, lens, at: None, covered: None, surveyed_ns: None, complaints: Vec::new() }
     }
 
     /// The aircraft as it is now.
     pub(super) fn aircraft(&self, autopilot: &AutopilotState, is_link_lost: bool, pictures: u64) {
+        let complaint = self.complaints.first().copied();
         self.watch.craft(0, |craft| {
-            craft.link = match (autopilot.heartbeat_ns, is_link_lost) {
-                (None, _) => "nothing heard yet",
-                (Some(_), true) => "lost",
-                (Some(_), false) if autopilot.armed => "heard, armed",
-                (Some(_), false) => "heard, disarmed",
+            craft.link = match (autopilot.heartbeat_ns, is_link_lost, complaint) {
+                (Some(_), true, _) => "lost",
+                (_, _, Some(complaint)) => complaint.name(),
+                (None, ..) => "nothing heard yet",
+                (Some(_), false, None) if autopilot.armed => "heard, armed",
+                (Some(_), false, None) => "heard, disarmed",
             };
             (craft.at, craft.battery, craft.pictures) = (self.at, autopilot.battery_percent, Some(pictures));
         });
+    }
+
+    /// Something keeps pictures from being posed, or no longer does.
+    pub(super) fn complain(&mut self, what: Complaint, stands: bool) {
+        self.complaints.retain(|c| *c != what);
+        self.complaints.extend(stands.then_some(what));
     }
 
     /// Nothing more is expected of link and camera.
