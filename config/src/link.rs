@@ -34,6 +34,9 @@ table! {
         /// after the landing never sees it fly.
         pub standing_limit_s: f32 = 600.0, in Limits::above(0.0).up_to(86_400.0),
             from "longer than a change of batteries";
+        /// An aircraft that has landed before its region is covered may take off again within this time, with another battery: the
+        /// flight goes on. 0: it is over with the landing.
+        pub battery_swap_s: f32 = 60.0, in Limits::within(0.0, 86_400.0);
         /// Message signing.
         pub signing: Signing = Signing::Off;
         /// File with the 32-byte key, raw or as 64 hexadecimal digits. The last time stamp is kept in the state

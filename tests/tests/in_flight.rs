@@ -27,7 +27,10 @@ fn quick_mission(at: &Path, faults: &str) {
             ("20.0]", "12.0]"),
             ("[20.0", "[12.0"),
             ("seconds = 600.0", "seconds = 1.0"),
-            ("upload = { folder = \"upload\" }", &format!("link = {{ patience_s = 2.0 }}\n{faults}")),
+            (
+                "upload = { folder = \"upload\" }",
+                &format!("link = {{ patience_s = 2.0, battery_swap_s = 0.0 }}\n{faults}"),
+            ),
         ],
     );
 }

@@ -147,7 +147,7 @@ fn a_flight_that_is_killed_again_and_again_loses_nothing_promised_and_ends_with_
                 ("t_min_m = 6.0", "t_min_m = 2.0"),
                 ("seconds = 600.0", "seconds = 1.0"),
                 ("device_mib = 96", "device_mib = 96, disk_mib = 1000"),
-                ("origin =", "link = { standing_limit_s = 8.0 }\norigin ="),
+                ("origin =", "link = { standing_limit_s = 8.0, battery_swap_s = 0.0 }\norigin ="),
             ],
         );
         // Long enough for all kills, and on the ground for as long as it takes: the last start may come after the landing.

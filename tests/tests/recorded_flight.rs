@@ -44,6 +44,7 @@ camera = { width = 640, height = 480, fx = 385.0, fy = 385.0, cx = 320.0, cy = 2
 keyframes = { t_min_m = 14.0, max = 24 }
 memory = { device_mib = 128, host_mib = 1024, max_gaussians = 20000, image_scale = 0.4 }
 training = { seconds = 5.0 }
+link = { battery_swap_s = 0.0 }
 upload = { folder = "upload" }
 
 [[aircraft]]

@@ -28,6 +28,9 @@ mod shortage;
 mod show;
 
 #[cfg(test)]
+#[path = "../../../tests/flight/battery_swap.rs"]
+mod battery_swap;
+#[cfg(test)]
 #[cfg(feature = "lab")]
 #[path = "../../../tests/flight/fault_table/mod.rs"]
 mod fault_table;

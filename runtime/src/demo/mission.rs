@@ -30,6 +30,9 @@ cx = 200.0
 cy = 150.0
 exposure_delay_ms = 60.0
 
+[link]
+battery_swap_s = 0.0
+
 [keyframes]
 t_min_m = 8.0
 max = 48

@@ -55,7 +55,7 @@ fn script(row: &Row) -> Script {
         address: LinkAddress::Pty(None),
         patient: false,
         system_id: 1,
-        link: LinkSettings::default(),
+        link: LinkSettings { battery_swap_s: 0.0, ..LinkSettings::default() },
         failsafe: config::failsafe::FailsafeSettings::default(),
         camera: None,
         pictures_since: None,

@@ -12,6 +12,7 @@ use config::mission::KeyframeSettings;
 use hal::camera::Picture;
 use hal::counters::HalCounters;
 use hal::error::HalError;
+use hal::mavlink::dialect::MavSeverity;
 use hal::traits::{Camera, Clock, Link};
 use hal::vehicle::{Event, PosedPicture, Vehicle, VehicleSettings};
 use models::camera::{Intrinsics, Pose, PoseSigma, PosedImage, View};
@@ -36,6 +37,9 @@ const LATE_PICTURES_NS: u64 = 2_000_000_000;
 pub(super) const DECODED_AHEAD: usize = 16;
 /// Events taken in one turn, so that the job's words are heard between them.
 const EVENTS_A_TURN: usize = 64;
+
+/// Of a region that is covered to this share nothing is left to fly for, percent.
+const COVERED: u32 = 95;
 
 /// When the capture is over.
 #[derive(Clone, Copy, Debug)]
@@ -117,6 +121,8 @@ enum Waiting {
 #[derive(Clone, Copy)]
 enum Phase {
     Flying,
+    /// It has landed since then, and its region is not covered: it may take off again with another battery.
+    OnGround(u64),
     /// The flight is over since then; pictures of announced exposures may still come.
     LatePictures(Ended, u64),
     /// Nothing comes any more; what was decided at the end is reported.
@@ -190,8 +196,31 @@ where
                     return Ok(Some(Ended::Asked));
                 }
                 if let Some(ended) = self.fly(wait)? {
-                    self.phase = Phase::LatePictures(ended, self.clock.now_ns());
+                    let now_ns = self.clock.now_ns();
+                    self.phase = match ended == Ended::Landed && self.may_take_off_again() {
+                        true => Phase::OnGround(now_ns),
+                        false => Phase::LatePictures(ended, now_ns),
+                    };
                 }
+            }
+            Phase::OnGround(since_ns) => {
+                let ended = self.fly(wait)?;
+                let now_ns = self.clock.now_ns();
+                let swap_ns = (f64::from(self.plan.vehicle.link.battery_swap_s) * 1e9) as u64;
+                let over = now_ns.saturating_sub(since_ns) >= swap_ns;
+                self.phase = match ended {
+                    _ if stop => return Ok(Some(Ended::Asked)),
+                    None if self.vehicle.autopilot().armed => {
+                        let line = "takes off again: the flight goes on";
+                        tracing::info!("{line}");
+                        self.say(MavSeverity::MAV_SEVERITY_INFO, format!("dgtr: {line}"));
+                        Phase::Flying
+                    }
+                    Some(Ended::RecordingOver) => Phase::LatePictures(Ended::RecordingOver, now_ns),
+                    Some(Ended::LinkLost) => Phase::LatePictures(Ended::Landed, now_ns),
+                    _ if over => Phase::LatePictures(Ended::Landed, now_ns),
+                    _ => self.phase,
+                };
             }
             Phase::LatePictures(ended, since_ns) => {
                 self.listen(wait)?;
@@ -256,6 +285,17 @@ where
             None if self.plan.end.patience.is_some_and(|p| since(self.started_ns) > p) => Some(Ended::NeverHeard),
             _ => None,
         })
+    }
+
+    /// Whether the flight may go on after this landing: some of its region is not covered. Says so.
+    fn may_take_off_again(&mut self) -> bool {
+        let swap_s = self.plan.vehicle.link.battery_swap_s;
+        let covered = self.survey().map(|coverage| coverage.percent()).filter(|_| swap_s > 0.0);
+        let Some(covered) = covered.filter(|percent| *percent < COVERED) else { return false };
+        let line = format!("landed, {covered} % of the region covered: waits {swap_s} s for another take-off");
+        tracing::info!("{line} ([link] battery_swap_s)");
+        self.say(MavSeverity::MAV_SEVERITY_INFO, format!("dgtr: {line}"));
+        true
     }
 
     /// Takes what link and camera have; true when the aircraft showed a sign of life.
