@@ -1,5 +1,6 @@
 //! Whatever strangers send to an open UDP port, a flight is what it is without them. One recorded flight is flown again beside
-//! random streams of theirs: noise, frames cut anywhere, frames in the autopilot's name. `DGTR_STREAMS` says how many (3,000).
+//! random streams of theirs, alone and several at once: noise, frames cut anywhere, frames in the autopilot's name. `DGTR_STREAMS` says
+//! how many streams (3,000).
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 use std::collections::VecDeque;
@@ -28,6 +29,9 @@ use strangers::Stranger;
 
 /// When, from whom, what.
 type Datagram = (u64, SocketAddr, Vec<u8>);
+
+/// Streams beside one flight. A port remembers eight peers, and a stranger has three addresses.
+const MOST_AT_ONCE: u64 = 15;
 
 /// Where the autopilot's come from.
 const AUTOPILOT: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 14_555);
@@ -176,16 +180,22 @@ fn whatever_strangers_send_a_flight_over_udp_is_the_flight_without_them() {
     assert!(posed >= 10, "{posed} pictures posed of a flight that has 15");
     let overheard: Vec<Vec<u8>> = flight.iter().map(|(_, _, bytes)| bytes.clone()).collect();
     let streams = std::env::var("DGTR_STREAMS").ok().and_then(|n| n.parse().ok()).unwrap_or(3000);
-    for seed in 0..streams {
-        let mut dice = Stranger(seed);
+    let (mut next, mut flights) = (0, 0);
+    while next < streams {
+        // Of one stranger, of more than a port remembers, and of every number between.
+        let seeds = next..streams.min(next + 1 + flights % MOST_AT_ONCE);
+        let mut strangers: Vec<_> = seeds.clone().map(|seed| (seed, Stranger(seed))).collect();
+        let often: Vec<_> = strangers.iter_mut().map(|(_, dice)| 1 + dice.roll(12)).collect();
         let mut all = Vec::with_capacity(2 * flight.len());
-        let often = 1 + dice.roll(12);
         for datagram in &flight {
-            while dice.roll(12) < often {
-                let bytes = dice.datagram(datagram.0, &overheard);
-                all.push((datagram.0, address(40_000 + dice.roll(3) as u16), bytes));
-                if dice.roll(2) == 0 {
-                    break;
+            for ((seed, dice), often) in strangers.iter_mut().zip(&often) {
+                while dice.roll(12) < *often {
+                    let bytes = dice.datagram(datagram.0, &overheard);
+                    let port = 40_000 + 3 * (*seed % MOST_AT_ONCE) as u16 + dice.roll(3) as u16;
+                    all.push((datagram.0, address(port), bytes));
+                    if dice.roll(2) == 0 {
+                        break;
+                    }
                 }
             }
             all.push(datagram.clone());
@@ -193,7 +203,9 @@ fn whatever_strangers_send_a_flight_over_udp_is_the_flight_without_them() {
         let beside = fly(&all, &pictures);
         if beside != alone {
             let first = beside.iter().zip(&alone).find(|(a, b)| a != b);
-            panic!("stream {seed}: {first:#?}");
+            panic!("streams {seeds:?}: {first:#?}");
         }
+        (next, flights) = (seeds.end, flights + 1);
     }
+    println!("{streams} streams beside {flights} flights");
 }

@@ -31,7 +31,7 @@ pub mod transforms;
 #[derive(Debug, thiserror::Error)]
 pub enum FormatError {
     /// The operating system said no.
-    #[error("{}: {action} failed: {source}; check the path, its permissions and the free space", path.display())]
+    #[error("{}: {action} failed: {source}; check the path, its permissions and the free space", shown(path))]
     Io {
         /// The file.
         path: PathBuf,
@@ -41,7 +41,7 @@ pub enum FormatError {
         source: std::io::Error,
     },
     /// More bytes, or more items, than the format's bound.
-    #[error("{}: {what} is {size}, at most {limit} can be taken; is it the right file?", path.display())]
+    #[error("{}: {what} is {size}, at most {limit} can be taken; is it the right file?", shown(path))]
     TooLarge {
         /// The file.
         path: PathBuf,
@@ -53,7 +53,7 @@ pub enum FormatError {
         limit: u64,
     },
     /// The file ends too early.
-    #[error("{}: ends at byte {at} in the middle of {what}; copy or write it again", path.display())]
+    #[error("{}: ends at byte {at} in the middle of {what}; copy or write it again", shown(path))]
     Truncated {
         /// The file.
         path: PathBuf,
@@ -63,13 +63,13 @@ pub enum FormatError {
         what: &'static str,
     },
     /// The content hash does not fit the content.
-    #[error("{}: its content does not match its checksum (damaged in storage or transfer); copy it again", path.display())]
+    #[error("{}: its content does not match its checksum (damaged in storage or transfer); copy it again", shown(path))]
     Damaged {
         /// The file.
         path: PathBuf,
     },
     /// The content makes no sense.
-    #[error("{}: {what}", path.display())]
+    #[error("{}: {what}", shown(path))]
     Invalid {
         /// The file.
         path: PathBuf,
@@ -175,6 +175,12 @@ pub fn one_line(error: impl std::fmt::Display) -> String {
     error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
+/// A path within an error's line: a line end in a name, which a file may have chosen, begins no line of its own.
+pub(crate) fn shown(path: &Path) -> String {
+    let escaped = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    path.to_string_lossy().chars().map(escaped).collect()
+}
+
 /// Writes a file whole or not at all, see [`Disk::replace`].
 ///
 /// # Errors
@@ -186,6 +192,23 @@ pub fn write_atomic(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::R
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_line_end_in_a_name_begins_no_line_in_an_error() {
+        let path = Path::new("a/b\n INFO forged\u{1b}[2J.json");
+        for error in [
+            FormatError::invalid(path, "is empty"),
+            FormatError::io(path, "opening", std::io::ErrorKind::NotFound.into()),
+        ] {
+            let said = error.to_string();
+            assert!(
+                said.starts_with("a/b\\n INFO forged\\u{1b}[2J.json: ") && !said.contains(char::is_control),
+                "{said}"
+            );
+        }
+        let said = crate::picture::decode(path).unwrap_err().to_string();
+        assert!(said.starts_with("a/b\\n INFO") && !said.contains(char::is_control), "{said}");
+    }
 
     #[test]
     fn names_are_ordered_as_people_count() {

@@ -20,8 +20,8 @@ use glam::DQuat;
 use image::{DynamicImage, ImageFormat, ImageReader, Limits, RgbImage, imageops};
 use jpeg_decoder::{Decoder, PixelFormat};
 
-use crate::formats::one_line;
 use crate::formats::reconstruction::{Focal, LensDescription};
+use crate::formats::{one_line, shown};
 use crate::mask::Mask;
 use values::ValueRange;
 
@@ -123,7 +123,7 @@ impl Orientation {
 
 /// A picture is missing, unreadable or not what its description says.
 #[derive(Debug, thiserror::Error)]
-#[error("{}: {what}", path.display())]
+#[error("{}: {what}", shown(path))]
 pub struct PictureError {
     /// The picture.
     pub path: PathBuf,

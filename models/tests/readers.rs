@@ -9,3 +9,5 @@ mod colmap;
 mod datasets;
 #[path = "../../tests/readers/driver.rs"]
 mod driver;
+#[path = "readers/pictures.rs"]
+mod pictures;

@@ -1,6 +1,5 @@
 //! One measurement, one process: its peak memory and its seconds are then its own, and a limit can be put on it.
 
-use std::fs::File;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
@@ -50,7 +49,7 @@ pub fn run(before: &[&str], arguments: &[String], out: &Path, limit_mib: Option<
     command.args(arguments).arg("--out").arg(out);
     // An allocation beyond the bound ends the child with one line, and a note on how to get a trace.
     command.env("RUST_BACKTRACE", "0");
-    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(File::create(&log).map_err(failed)?);
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(disk::regular::create(&log).map_err(failed)?);
     let start = Instant::now();
     let status = command.status().map_err(failed)?;
     let seconds = start.elapsed().as_secs_f64();

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use config::error::{Error, ErrorKind};
+use disk::Disk;
 use vulkan::gpu::Gpu;
 
 mod evaluate;
@@ -113,7 +114,8 @@ pub fn run(options: &DemoOptions, interrupt: &Interrupt) -> Result<Summary, Demo
     let key = |id: &str| keys::make(&out.join("keys"), id).map(|k| k.0).map_err(|e| DemoError::Report(e.to_string()));
     let [west, east] = AIRCRAFT;
     let text = mission::text(options, [key(GROUND)?, key(west)?, key(east)?]);
-    std::fs::write(&mission, text).map_err(io(&mission))?;
+    let written = Disk::default().replace(&mission, |file| file.write_all(text.as_bytes()));
+    written.map_err(|e| io(&mission)(e.into()))?;
 
     // Once, and before anything else is at work; the jobs find the result. Without a device they say so themselves.
     if let Ok(gpu) = Gpu::open(None) {

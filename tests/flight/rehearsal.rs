@@ -5,6 +5,7 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use config::coverage::CoverageSettings;
@@ -17,8 +18,11 @@ use engine::failsafe::Failsafe;
 use engine::{Reconstruct, model_path};
 use geometry::geodesy::Geodetic;
 use hal::camera::FolderCamera;
+use hal::error::HalError;
 use hal::failsafe::{Action, Cause};
+use hal::link::WireLink;
 use hal::time::ManualClock;
+use hal::traits::Link;
 use hal::vehicle::{Vehicle, VehicleSettings};
 use job::health::Health;
 use job::interrupt::Interrupt;
@@ -238,6 +242,18 @@ pub(super) fn rehearse_on(
     folder: &Path,
     promised: Box<dyn FnMut(Promise) + Send>,
 ) -> Rehearsed {
+    rehearse_over(|wire, _| (wire, Arc::default()), disk, script, world, folder, promised)
+}
+
+/// As [`rehearse_on`]; what comes over the wire from the aircraft reaches the vehicle over `line`, which says whether more can be read at once.
+pub(super) fn rehearse_over<L: Link<Error = HalError>>(
+    line: impl FnOnce(WireLink, Arc<ManualClock>) -> (L, Arc<AtomicBool>),
+    disk: &Disk,
+    script: &Script,
+    world: Arc<World>,
+    folder: &Path,
+    promised: Box<dyn FnMut(Promise) + Send>,
+) -> Rehearsed {
     let (pictures, out) = (folder.join("pictures"), folder.join("out"));
     std::fs::create_dir_all(&pictures).expect("folder");
     std::fs::create_dir_all(&out).expect("folder");
@@ -246,7 +262,8 @@ pub(super) fn rehearse_on(
     let (mut aircraft, wire) =
         Rehearsal::new(&script.sim, world, &pictures, clock.clone()).expect("a simulated aircraft");
     let camera = FolderCamera::open(&pictures).expect("the folder").on_simulated_clock();
-    let vehicle = Vehicle::new(wire, camera, clock.clone(), &script.vehicle).expect("a vehicle");
+    let (link, has_more) = line(wire, clock.clone());
+    let vehicle = Vehicle::new(link, camera, clock.clone(), &script.vehicle).expect("a vehicle");
     let (mut capture, end) = handover();
     let (mut ledger, store) = Ledger::open(disk, &script.vehicle.lens, script.vehicle.origin, &out).expect("opens");
     ledger.promised = promised;
@@ -284,7 +301,11 @@ pub(super) fn rehearse_on(
         }
         flying = flying && aircraft.turn().expect("the aircraft flies");
         if let Some(mut capturing) = intake.take() {
-            match capturing.turn(Duration::ZERO).expect("capture goes on") {
+            let mut turned = capturing.turn(Duration::ZERO).expect("capture goes on");
+            while turned.is_none() && has_more.load(Ordering::Relaxed) {
+                turned = capturing.turn(Duration::ZERO).expect("capture goes on");
+            }
+            match turned {
                 Some(ended) => over = Some((ended, capturing.finish())),
                 None => intake = Some(capturing),
             }

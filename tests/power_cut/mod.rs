@@ -24,6 +24,8 @@ pub enum Done<P> {
     Names(Vec<(PathBuf, Option<Option<FileId>>)>),
     /// Bytes written behind the end of a file.
     Wrote(FileId, Vec<u8>),
+    /// So many bytes taken off the end of a file.
+    TookOff(FileId, usize),
     /// A file's content was synced.
     Synced(FileId),
     /// A folder's names were synced.
@@ -157,6 +159,12 @@ impl<P: std::fmt::Debug + Send> Output for Recorded<P> {
         if !log.careless {
             log.done.push(Done::Synced(self.file));
         }
+        Ok(())
+    }
+
+    fn take_off(&mut self, bytes: u64) -> io::Result<()> {
+        self.inner.take_off(bytes)?;
+        self.to.log().done.push(Done::TookOff(self.file, bytes as usize));
         Ok(())
     }
 }

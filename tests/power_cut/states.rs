@@ -65,6 +65,11 @@ pub fn each<P: Clone>(done: &[Done<P>], mut each: impl FnMut(State, &[P])) -> us
         match step {
             Done::Names(change) => pending.push(change.clone()),
             Done::Wrote(file, bytes) => files.entry(*file).or_default().bytes.extend_from_slice(bytes),
+            Done::TookOff(file, bytes) => {
+                let file = files.entry(*file).or_default();
+                file.bytes.truncate(file.bytes.len() - bytes);
+                file.synced = file.synced.min(file.bytes.len());
+            }
             Done::Synced(file) => {
                 let file = files.entry(*file).or_default();
                 file.synced = file.bytes.len();

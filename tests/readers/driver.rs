@@ -1,9 +1,10 @@
 //! One driver for the readers of all crates: whatever a file or a wire brings, no reader panics, its memory stays in
-//! proportion to the input, its error is one line that names the file, and what it accepts is usable. 10⁵ inputs for each
-//! reader, from a fixed seed; `DGTR_FUZZ_INPUTS` sets another number. Overflow checks are on in the profile that builds it.
+//! proportion to the input, its error is one line that names the file, and what it accepts is usable. However deep the input is nested,
+//! it stays within the 2 MiB of a thread's stack, and it ends. Pipes, sockets, devices, folders and links in a file's place are refused or
+//! done without; none is waited for. 10⁵ inputs for each reader, or a tenth of them, from a fixed seed; `DGTR_FUZZ_INPUTS`
+//! sets another number. Overflow checks are on in the profile that builds it.
 //!
-//! `config/tests/readers.rs`, `hal/tests/readers.rs`, `models/tests/readers.rs` and `runtime/tests/readers.rs` include this file
-//! by its path.
+//! The `tests/readers.rs` of each crate that reads includes this file by its path.
 #![allow(dead_code, reason = "each crate's tests use their part")]
 
 use std::cell::RefCell;
@@ -11,14 +12,18 @@ use std::fs::File;
 use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 pub mod memory;
 mod mutation;
+mod patience;
 
 pub use mutation::Random;
 use mutation::mutate;
+use patience::Patience;
 
+/// About as large are the largest inputs.
+const LARGEST: usize = 200_000;
 /// Inputs for each reader unless the environment says otherwise.
 const INPUTS: usize = 100_000;
 
@@ -57,8 +62,13 @@ pub struct Shell {
 
 /// Feeds the reader; says how many inputs were accepted and what the most memory was.
 pub fn survive(reader: &Reader<'_>) {
+    survive_part(reader, 1);
+}
+
+/// As [`survive`], one of so many of the inputs: for a reader that opens many files for each.
+pub fn survive_part(reader: &Reader<'_>, part: usize) {
     let Reader { name, seeds, .. } = reader;
-    let inputs = std::env::var("DGTR_FUZZ_INPUTS").ok().and_then(|n| n.parse().ok()).unwrap_or(INPUTS);
+    let inputs = std::env::var("DGTR_FUZZ_INPUTS").ok().and_then(|n| n.parse().ok()).unwrap_or(INPUTS) / part;
     let (folder, input) = (memory_folder(), RefCell::new(None));
     let verdict = |bytes: &[u8]| match reader.read {
         Read::Bytes(read) => read(bytes),
@@ -72,11 +82,12 @@ pub fn survive(reader: &Reader<'_>) {
         Read::Bytes(_) => true,
         Read::File(file, _) => line.contains(file) || line.contains(&*folder.path().to_string_lossy()),
     };
+    let patience = Patience::with(name);
     for (i, seed) in seeds.iter().enumerate() {
         assert_eq!(verdict(seed), Ok(true), "{name}: whole input {i} is accepted");
     }
     let (start, mut random) = (Instant::now(), Random::new(1));
-    let (mut accepted, mut largest) = (0, 0);
+    let (mut accepted, mut largest, mut longest) = (0, 0, Duration::ZERO);
     for i in 0..inputs {
         let [seed, other] = [(); 2].map(|()| &seeds[random.below(seeds.len())]);
         let bytes = match reader.shell.filter(|_| i % 2 == 0) {
@@ -88,7 +99,10 @@ pub fn survive(reader: &Reader<'_>) {
             std::fs::write(&kept, &bytes).expect("written");
             panic!("{name} input {i}: {why}; kept as {}", kept.display())
         };
+        patience.begin(i);
+        let from = Instant::now();
         let (read, held) = memory::peak(|| catch_unwind(AssertUnwindSafe(|| verdict(&bytes))));
+        longest = longest.max(from.elapsed());
         match read {
             Err(_) => keep("the reader panicked"),
             Ok(Err(line)) if line.contains('\n') || !named(&line) => keep(&format!("says {line:?}")),
@@ -101,8 +115,25 @@ pub fn survive(reader: &Reader<'_>) {
         }
         largest = largest.max(held);
     }
-    let seconds = start.elapsed().as_secs_f64();
-    println!("{name}: {inputs} inputs, {accepted} accepted, {largest} bytes held at most, {seconds:.1} s");
+    let (seconds, longest_ms) = (start.elapsed().as_secs_f64(), longest.as_secs_f64() * 1e3);
+    println!(
+        "{name}: {inputs} inputs, {accepted} accepted, {largest} bytes held at most, {longest_ms:.1} ms at most, {seconds:.1} s"
+    );
+    if let Read::File(file, read) = reader.read {
+        for (i, kind) in patience::KINDS.into_iter().enumerate() {
+            patience.begin(inputs + i);
+            let path = folder.path().join(file);
+            patience::put(kind, &path);
+            let (said, held) = memory::peak(|| catch_unwind(AssertUnwindSafe(|| read(&path))));
+            match said {
+                Err(_) => panic!("{name}: panicked at {kind:?}"),
+                Ok(Err(line)) => assert!(!line.contains('\n') && named(&line), "{name} says {line:?} of {kind:?}"),
+                // Some readers do without the file.
+                Ok(Ok(usable)) => assert!(usable, "{name}: {kind:?} is not usable"),
+            }
+            assert!(held <= reader.memory.0 + reader.memory.1 * LARGEST, "{name}: {held} bytes held for {kind:?}");
+        }
+    }
     // Neither all refused at the door nor all let through.
     assert!(accepted * 1000 > inputs && accepted < inputs, "{name}: {accepted} of {inputs} accepted");
 }

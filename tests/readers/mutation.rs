@@ -145,8 +145,10 @@ fn in_text(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) {
         }
         6 => {
             let at = random.below(bytes.len());
-            let many = 1 + random.below(300);
-            bytes.splice(at..at, random.pick(&["[", "{\"a\":", "(", "\"", "\\", "-", "a."]).repeat(many).into_bytes());
+            // Rarely deeper than any stack that is used for each of them.
+            let many = if random.below(64) == 0 { 16_000 } else { 1 + random.below(300) };
+            let nested = random.pick(&["[", "{\"a\":", "(", "\"", "\\", "-", "a.", "<a>", "<a b='c'>"]);
+            bytes.splice(at..at, nested.repeat(many).into_bytes());
         }
         _ => {
             let at = random.below(bytes.len());

@@ -158,3 +158,34 @@ fn the_rule_of_the_autopilots_port_is_well_formed_and_every_number_is_named_once
     let before = &rules[label("dgtr_autopilot").expect("a label") - 1];
     assert_eq!((before.0.len(), before.1.get("GOTO")), (0, Some(&"dgtr_end")), "nobody else falls through");
 }
+
+#[test]
+fn onnx_runtime_has_its_version_and_hashes_in_one_place_and_whoever_fetches_it_asks_for_them() {
+    let pin = read("runtime/onnxruntime.txt");
+    let lines: Vec<&str> =
+        pin.lines().filter(|l| !l.starts_with('#')).map(|l| l.trim().trim_end_matches(" \\")).collect();
+    let version = lines[0].strip_prefix("onnxruntime==").expect("a version");
+    assert!(version.split('.').filter(|part| part.parse::<u32>().is_ok()).count() == 3, "{version}");
+    let hashes: Vec<&str> = lines[1..].iter().filter_map(|l| l.strip_prefix("--hash=sha256:")).collect();
+    assert_eq!(hashes.len(), lines.len() - 1, "{pin}");
+    assert!(hashes.len() == 2 && hashes.iter().all(|h| h.len() == 64 && h.bytes().all(|b| b.is_ascii_hexdigit())));
+    let scripts = [
+        "runtime/setup.sh",
+        "tests/package.sh",
+        "tests/package/onnxruntime.sh",
+        "tests/package/sandbox.sh",
+        "tests/arm64.sh",
+    ];
+    let mut fetched = 0;
+    for script in scripts {
+        // A command goes on in the next line.
+        let text = read(script).replace("\\\n", " ");
+        for command in text.lines().filter(|l| l.contains("pip download") || l.contains("pip install")) {
+            let is_pinned = command.contains("--require-hashes -r") && command.contains("onnxruntime");
+            assert!(is_pinned, "{script}: {command}");
+            fetched += 1;
+        }
+        assert!(!text.contains("github.com/microsoft/onnxruntime/releases"), "{script}");
+    }
+    assert_eq!(fetched, 2, "setup.sh and the packages'");
+}

@@ -95,6 +95,12 @@ impl Output for BoundedOutput {
     fn sync(&mut self) -> io::Result<()> {
         self.inner.sync()
     }
+
+    fn take_off(&mut self, bytes: u64) -> io::Result<()> {
+        self.inner.take_off(bytes)?;
+        self.room += bytes;
+        Ok(())
+    }
 }
 
 /// Bytes of all files below `folder`; what cannot be read counts nothing. Links are not followed.

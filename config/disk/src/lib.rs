@@ -7,18 +7,20 @@
 use std::fmt;
 use std::fs::File;
 use std::hash::{BuildHasher, RandomState};
-use std::io::{self, BufRead, BufReader, BufWriter, ErrorKind, Read, Seek, Write};
+use std::io::{self, BufRead, BufReader, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 pub mod bounded;
+mod lines;
 mod lock;
 mod operations;
 pub mod plan;
 pub mod regular;
 pub mod table;
 
+pub use lines::Lines;
 pub use lock::FolderLock;
 pub use operations::{Operations, Output, System};
 
@@ -186,19 +188,18 @@ impl Disk {
     ///
     /// # Errors
     /// The system's.
-    pub fn append_lines(&self, path: &Path) -> io::Result<Box<dyn Output>> {
-        match regular::open(path) {
-            Ok(mut file) => {
-                let whole = whole_lines(&file)?;
-                if whole < file.metadata()?.len() {
-                    file.rewind()?;
-                    self.replace(path, |mut out| io::copy(&mut file.take(whole), &mut out).map(|_| ()))?;
-                }
+    pub fn append_lines(&self, path: &Path) -> io::Result<Lines> {
+        let torn = match regular::open(path) {
+            Ok(file) => file.metadata()?.len() - whole_lines(&file)?,
+            Err(e) if e.kind() == ErrorKind::NotFound => {
+                self.make_folders(folder_of(path))?;
+                0
             }
-            Err(e) if e.kind() == ErrorKind::NotFound => self.make_folders(folder_of(path))?,
             Err(e) => return Err(e),
-        }
-        self.0.append(path)
+        };
+        let mut lines = Lines::new(self.0.append(path)?, torn);
+        lines.take_off_what_is_torn()?;
+        Ok(lines)
     }
 
     /// Removes a file; one that is not there is removed already.

@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::{self, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use crate::regular;
@@ -60,11 +60,23 @@ pub trait Output: Write + fmt::Debug + Send {
     /// # Errors
     /// The system's: the disk may report only here that it is full or broken.
     fn sync(&mut self) -> io::Result<()>;
+    /// Takes the last bytes off again.
+    ///
+    /// # Errors
+    /// The system's.
+    fn take_off(&mut self, bytes: u64) -> io::Result<()>;
 }
 
 impl Output for File {
     fn sync(&mut self) -> io::Result<()> {
         self.sync_all()
+    }
+
+    fn take_off(&mut self, bytes: u64) -> io::Result<()> {
+        let length = self.metadata()?.len().saturating_sub(bytes);
+        self.set_len(length)?;
+        // One that is not opened to append would leave a hole.
+        self.seek(SeekFrom::Start(length)).map(drop)
     }
 }
 

@@ -1,5 +1,6 @@
 //! Opening what somebody else named or left in a folder: only regular files, and never waiting. Opening a FIFO waits for its
-//! writer, reading a terminal for its keys, for ever.
+//! writer, reading a terminal for its keys, for ever. What is written to is never reached through a link: whoever left it there would
+//! choose the file.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -7,31 +8,53 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
 use rustix::fs::OFlags;
+use rustix::io::Errno;
 
 /// Opens the file at `path` for reading.
 ///
 /// # Errors
 /// The system's; `InvalidInput` for what is no regular file.
 pub fn open(path: &Path) -> io::Result<File> {
-    opened(path, OpenOptions::new().read(true))
+    opened(path, OpenOptions::new().read(true), OFlags::empty())
+}
+
+/// Opens the file at `path` to write it anew, made where there is none, for what is of use while it is written: a log, a trace.
+/// Everything else is written by [`crate::Disk`].
+///
+/// # Errors
+/// As [`open`]; `InvalidInput` for a link, too.
+pub fn create(path: &Path) -> io::Result<File> {
+    // Emptied only once it is known to be a file.
+    let file = written(path, OpenOptions::new().write(true).create(true).truncate(false))?;
+    file.set_len(0)?;
+    Ok(file)
 }
 
 /// Opens the file at `path`, which is made where there is none, to write behind its end.
 ///
 /// # Errors
-/// As [`open`].
+/// As [`create`].
 pub(crate) fn append(path: &Path) -> io::Result<File> {
-    opened(path, OpenOptions::new().append(true).create(true))
+    written(path, OpenOptions::new().append(true).create(true))
 }
 
-fn opened(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
-    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+fn written(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+    opened(path, options, OFlags::NOFOLLOW).map_err(|e| match e.raw_os_error() {
+        Some(code) if code == Errno::LOOP.raw_os_error() => {
+            invalid("is a link; name the file it leads to, or remove it")
+        }
+        _ => e,
+    })
+}
+
+fn invalid(what: &'static str) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidInput, what)
+}
+
+fn opened(path: &Path, options: &mut OpenOptions, also: OFlags) -> io::Result<File> {
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY | also;
     let file = options.custom_flags(flags.bits().cast_signed()).open(path)?;
-    if file.metadata()?.is_file() {
-        Ok(file)
-    } else {
-        Err(io::Error::new(io::ErrorKind::InvalidInput, "is no regular file"))
-    }
+    if file.metadata()?.is_file() { Ok(file) } else { Err(invalid("is no regular file")) }
 }
 
 /// Opens a file that holds a secret.
@@ -55,6 +78,33 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
+
+    #[test]
+    fn nothing_is_written_through_a_link_into_a_pipe_or_a_device() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("mine"), b"mine").expect("written");
+        let linked = [("link", at("mine")), ("dangling", at("none")), ("device", "/dev/null".into())];
+        for (name, to) in linked {
+            std::os::unix::fs::symlink(to, at(name)).expect("linked");
+            for open in [create, append] {
+                let said = open(&at(name)).expect_err(name).to_string();
+                assert_eq!(said, "is a link; name the file it leads to, or remove it", "{name}");
+            }
+        }
+        assert!(!at("none").exists());
+        let made = std::process::Command::new("mkfifo").arg(at("pipe")).status().expect("mkfifo");
+        assert!(made.success());
+        for path in [at("pipe"), "/dev/null".into(), folder.path().into()] {
+            assert!(create(&path).is_err() && append(&path).is_err(), "{}", path.display());
+        }
+        // A file is emptied only where that was meant.
+        append(&at("mine")).expect("opened");
+        assert_eq!(std::fs::read(at("mine")).expect("read"), b"mine");
+        create(&at("mine")).expect("opened");
+        create(&at("new")).expect("opened");
+        assert_eq!(std::fs::read(at("mine")).expect("read"), b"");
+    }
 
     #[test]
     fn a_secret_that_others_may_read_or_write_is_refused_with_what_to_do() {

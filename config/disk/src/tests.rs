@@ -121,9 +121,41 @@ fn lines_go_on_behind_the_last_whole_one() {
     for (found, whole) in [("a\nb\ntorn", "a\nb\n"), ("a\nb\0\0\0\n", "a\n"), ("torn", ""), ("a\n", "a\n")] {
         std::fs::create_dir_all(dir.path().join("out")).unwrap();
         std::fs::write(&path, found).unwrap();
-        Disk::default().append_lines(&path).unwrap().write_all(b"next\n").unwrap();
+        Disk::default().append_lines(&path).unwrap().write(b"next\n").unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), format!("{whole}next\n"));
     }
+}
+
+#[test]
+fn lines_for_which_a_disk_has_no_room_are_not_there_in_part_and_the_next_ones_follow_the_last_whole_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().canonicalize().unwrap();
+    let path = root.join("geotags.csv");
+    let disk = Disk::new(Bounded::new(System, &root, Arc::new(AtomicU64::new(14))));
+    let mut lines = disk.append_lines(&path).unwrap();
+    let written = |lines: &mut Lines, line: &str| lines.write(line.as_bytes()).map_err(|e| e.kind());
+    let found = || std::fs::read_to_string(&path).unwrap();
+    assert_eq!(written(&mut lines, "first\n"), Ok(()));
+    for _ in 0..3 {
+        assert_eq!(written(&mut lines, "much longer\n"), Err(ErrorKind::QuotaExceeded));
+        assert_eq!(found(), "first\n");
+    }
+    assert_eq!(written(&mut lines, "last\n"), Ok(()));
+    assert_eq!(found(), "first\nlast\n");
+    // One that another process tore is mended without room for a copy.
+    std::fs::write(&path, "first\nlast\ntorn....................").unwrap();
+    drop(disk.append_lines(&path).unwrap());
+    assert_eq!(found(), "first\nlast\n");
+}
+
+#[test]
+fn lines_are_not_written_behind_a_link() {
+    let dir = tempfile::tempdir().unwrap();
+    let (path, theirs) = (dir.path().join("geotags.csv"), dir.path().join("theirs"));
+    std::fs::write(&theirs, "their word, torn").unwrap();
+    std::os::unix::fs::symlink(&theirs, &path).unwrap();
+    assert!(Disk::default().append_lines(&path).is_err());
+    assert_eq!(std::fs::read_to_string(&theirs).unwrap(), "their word, torn");
 }
 
 #[test]

@@ -162,7 +162,8 @@ fn ring(mut corners: Vec<DVec2>) -> Result<Vec<DVec2>, String> {
     if corners.len() > 1 && corners.first() == corners.last() {
         corners.pop();
     }
-    if corners.len() < 3 || polygon::signed_area(&corners) == 0.0 {
+    let area = polygon::signed_area(&corners);
+    if corners.len() < 3 || area == 0.0 || !area.is_finite() {
         return Err("a ring of fewer than three corners, or without an area".into());
     }
     Ok(corners)

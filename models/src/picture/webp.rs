@@ -43,7 +43,11 @@ pub(super) fn open(path: &Path) -> Result<Option<WebPDecoder<BufReader<File>>>, 
     file.seek(SeekFrom::Start(0)).map_err(io)?;
     let mut decoder = WebPDecoder::new(file).map_err(|e| damaged(path, &e))?;
     decoder.set_memory_limit(MAX_EDGE as usize * MAX_EDGE as usize * 4);
-    Ok(Some(decoder))
+    let (w, h) = decoder.dimensions();
+    match w.max(h) <= MAX_EDGE {
+        true => Ok(Some(decoder)),
+        false => Err(bad(path, format!("has {w} x {h} pixels; at most {MAX_EDGE} a side can be taken"))),
+    }
 }
 
 /// Whether a file that begins so is WebP.

@@ -304,6 +304,7 @@ fn what_is_damaged_or_not_known_is_refused_in_one_line_that_names_the_file() {
     refused("calibrated.json", "505.0", "-5", "focal");
     refused("calibrated.json", "505.0", "[", "not as the format says");
     refused("field.opf", "./calibrated.json", "../calibrated.json", "outside of the project's folder");
+    refused("field.opf", "./calibrated.json", "./cali\\n INFO forged.json", "is no name of a file");
     refused("frame.json", "EPSG:32632", "EPSG:1", "not known");
     let folder = tempfile::tempdir().unwrap();
     let deep = format!("<document><chunk>{}</chunk></document>", "<a>".repeat(9_000));

@@ -7,3 +7,5 @@ mod cards;
 mod driver;
 #[path = "readers/maps.rs"]
 mod maps;
+#[path = "readers/projects.rs"]
+mod projects;

@@ -1,4 +1,4 @@
-//! Gaussian models: `.dgtr`, PLY, SPZ.
+//! Gaussian models: `.dgtr`, PLY, SPZ, SOG, glTF, `.splat`.
 
 use std::fmt::Display;
 use std::io::Read as _;
@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::delivery::Rounding;
-use models::formats::{model, ply, spz};
+use models::formats::{gltf, model, ply, sog, splats, spz};
 
 use crate::driver::{Random, Read, Reader, Shell, line, survive};
 
@@ -124,11 +124,39 @@ fn dgtr_models() {
     });
 }
 
+/// PlayCanvas' compressed form: bounds of a chunk, and four words for each of two Gaussians.
+fn compressed() -> Vec<u8> {
+    let bounds = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
+    let mut file = "ply\nformat binary_little_endian 1.0\nelement chunk 1\n".to_owned();
+    for side in bounds.chunks(3).flat_map(|of| ["min", "max"].map(|side| of.iter().map(move |b| (side, b)))) {
+        side.for_each(|(side, of)| file += &format!("property float {side}_{of}\n"));
+    }
+    file += "element vertex 2\n";
+    ["position", "rotation", "scale", "color"].iter().for_each(|of| file += &format!("property uint packed_{of}\n"));
+    let mut bytes = (file + "end_header\n").into_bytes();
+    let range = |low: f32, high: f32| [[low; 3], [high; 3]].concat();
+    let numbers = [range(-5.0, 5.0), range(-6.0, -1.0), range(0.0, 1.0)].concat();
+    bytes.extend(numbers.iter().flat_map(|v| v.to_le_bytes()));
+    let words =
+        [0x1234_5678u32, 0x2A55_5555, 0x7654_3210, 0x80FF_40C0, 0x9ABC_DEF0, 0x1555_5AAA, 0x0F0F_0F0F, 0xFF00_FF80];
+    bytes.extend(words.iter().flat_map(|w| w.to_le_bytes()));
+    bytes
+}
+
+/// Flat Gaussians (2DGS) as text.
+fn flat() -> Vec<u8> {
+    let names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3".split(' ');
+    let names: String = names.map(|n| format!("property float {n}\n")).collect();
+    let rows = "1 2 3 0.1 0.2 0.3 1.5 -2 -3 1 0 0 0\n-1 -2 3e1 0 0 0 -2 -2 -3.5 0.5 0.5 -0.5 0.5\n";
+    format!("ply\nformat ascii 1.0\ncomment flat\nelement vertex 2\n{names}end_header\n{rows}").into_bytes()
+}
+
 #[test]
 fn ply_models() {
+    let [small, full] = [(0, 5), (2, 2)].map(|(degree, n)| written(|path| ply::write(path, &cloud(degree, n), None)));
     survive(&Reader {
         name: "ply",
-        seeds: [(0, 5), (2, 2)].map(|(degree, n)| written(|path| ply::write(path, &cloud(degree, n), None))).into(),
+        seeds: vec![small, full, compressed(), flat()],
         text: true,
         shell: None,
         memory: (256 << 10, 64),
@@ -169,5 +197,41 @@ fn spz_models() {
         shell: Some(shell),
         memory: (512 << 10, 400),
         read: Read::File("m.spz", &|path| line(spz::read(path, spz::Axes::Rub), |model| all_valid(&model.cloud))),
+    });
+}
+
+/// Streams of zstd, each with its length in a table.
+#[test]
+fn spz_models_of_version_4() {
+    let options = spz::SpzOptions { is_latest: true, ..Default::default() };
+    survive(&Reader {
+        name: "spz, version 4",
+        seeds: [(0, 9), (3, 3)]
+            .map(|(degree, n)| written(|path| spz::write(path, &cloud(degree, n), options).map(drop)))
+            .into(),
+        text: false,
+        shell: None,
+        // A window of zstd is as large as its frame says, up to the reader's bound.
+        memory: (24 << 20, 400),
+        read: Read::File("m.spz", &|path| line(spz::read(path, spz::Axes::Rub), |model| all_valid(&model.cloud))),
+    });
+}
+
+/// What `dgtr import` does with a file of any name.
+#[test]
+fn models_that_are_known_by_their_content() {
+    survive(&Reader {
+        name: "splats",
+        seeds: vec![
+            written(|path| gltf::write(path, &cloud(0, 5))),
+            written(|path| sog::write(path, &cloud(1, 5)).map(drop)),
+            written(|path| ply::write(path, &cloud(1, 4), None)),
+            // Position, scales, colour and opacity, rotation.
+            [[0u8; 12], [60; 12]].map(|xyz| [&xyz[..], &[61; 12], &[90; 4], &[128, 200, 10, 77]].concat()).concat(),
+        ],
+        text: false,
+        shell: None,
+        memory: (24 << 20, 400),
+        read: Read::File("m.splat", &|path| line(splats::read(path, spz::Axes::Rub), |model| all_valid(&model.cloud))),
     });
 }

@@ -32,6 +32,10 @@ mod show;
 mod battery_swap;
 #[cfg(test)]
 #[cfg(feature = "lab")]
+#[path = "../../../tests/flight/beside.rs"]
+mod beside;
+#[cfg(test)]
+#[cfg(feature = "lab")]
 #[path = "../../../tests/flight/fault_table/mod.rs"]
 mod fault_table;
 #[cfg(test)]

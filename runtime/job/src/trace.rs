@@ -122,7 +122,7 @@ impl Trace {
 
     fn bounded(path: &Path, limit: u64) -> Result<Self, TraceError> {
         let failed = |source| TraceError { path: path.into(), source };
-        let mut file = BufWriter::new(File::create(path).map_err(failed)?);
+        let mut file = BufWriter::new(disk::regular::create(path).map_err(failed)?);
         file.write_all(b"[\n").map_err(failed)?;
         let sheet = Sheet { path: path.into(), file: Some(file), started: Instant::now(), left: limit, ended: None };
         let trace = Self(Arc::new(Mutex::new(sheet)));

@@ -17,7 +17,7 @@ use crate::report::ground::{Ground, Ortho};
 use crate::report::{Craft, MapRegion, ReportData, ReportError};
 
 mod access;
-mod request;
+pub mod request;
 mod respond;
 mod room;
 mod server;

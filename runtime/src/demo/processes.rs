@@ -48,7 +48,7 @@ impl Process {
             .stderr(Stdio::piped())
             .spawn()
             .map_err(failed)?;
-        let mut file = std::fs::File::create(&log).map_err(io(&log))?;
+        let mut file = disk::regular::create(&log).map_err(io(&log))?;
         let lines = child.stderr.take().map(BufReader::new);
         let tag = name.to_owned();
         let reader = std::thread::spawn(move || {

@@ -16,6 +16,7 @@ use runtime::train_job::log;
 use tuning::cache;
 use uplink::flight_number::FlightNumber;
 use uplink::keys;
+use uplink::memory::Memory;
 use vulkan::gpu::{DeviceLimits, GpuInfo};
 
 use crate::driver::{Read, Reader, Shell, Verdict, line, memory_folder, survive};
@@ -162,7 +163,8 @@ fn private_keys() {
         shell: None,
         memory: (4 << 10, 16),
         read: Read::File("west.key", &|path| {
-            std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600)).expect("own file");
+            // Of what is no file here the reader has to say so.
+            let _ = std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600));
             line(keys::make(path.parent().expect("a folder"), "west"), |(_, new)| !new)
         }),
     });
@@ -267,7 +269,37 @@ fn fits_of_pairs_of_models() {
             let mut edges = Edges::open(&disk, path.parent().expect("a folder"));
             match edges.get(&PAIR) {
                 Some(found) => Ok(found.is_none_or(|f| f.scale > 0.0 && f.shift.iter().all(|v| v.is_finite()))),
-                None => Err(edges.damaged.pop().unwrap_or_default()),
+                None => Err(edges.damaged.pop().unwrap_or_else(|| format!("{PAIR_FILE}: is not there"))),
+            }
+        }),
+    });
+}
+
+/// What earlier sessions received.
+#[test]
+fn orders_that_a_ground_remembers() {
+    let last = |flight: u32| {
+        format!("{{\n\"key\": \"ab12\",\n\"flight\": {flight},\n\"counter\": 5,\n\"session\": \"9c\"\n}}")
+    };
+    let seeds =
+        [format!("{{\n\"west\": {},\n\"east\": {}\n}}\n", last(1), last(40)), format!("{{\n\"a1\": {}\n}}\n", last(2))];
+    survive(&Reader {
+        name: "orders",
+        seeds: seeds.map(String::into_bytes).into(),
+        text: true,
+        shell: None,
+        memory: (192 << 10, 64),
+        read: Read::File("park.received.json", &|path| {
+            let folder = path.parent().expect("a folder");
+            let received = folder.join("received");
+            let memory = Memory::open(folder, "park", &received, None, false).map_err(|e| e.to_string())?;
+            // Where the file was refused it lies beside.
+            let aside = ["park.received.damaged-1.json", "park.received.previous.json"].map(|name| folder.join(name));
+            let refused = aside[0].exists();
+            aside.iter().for_each(|path| drop(std::fs::remove_file(path)));
+            match refused {
+                true => Err(format!("{} is set aside", path.display())),
+                false => Ok(memory.session() != &[0; 32]),
             }
         }),
     });

@@ -11,6 +11,7 @@ use ground::jobs::serve::admit::admit;
 use models::camera::{Intrinsics, Pose, View};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
+use pages::watch::request;
 use uplink::Source;
 use uplink::folder::{FolderInlet, FolderOutlet};
 use uplink::keys::Identity;
@@ -202,6 +203,28 @@ fn received_models() {
             }
             // The gate leaves the name to whoever asks: it lies under a temporary one.
             Err(why) => Err(format!("{}: {why}", path.display())),
+        }),
+    });
+}
+
+#[test]
+fn requests_of_a_page() {
+    let browser = "GET /thumbnail?of=3&token=abc HTTP/1.1\r\nHost: localhost:8080\r\nAccept: */*\r\n\
+                   Cookie: a=b; dgtr=uvw\r\nConnection: keep-alive\r\n\r\n";
+    let tool = "GET /state.json HTTP/1.1\r\nhost: 127.0.0.1\r\nAuthorization: Bearer xyz\r\n\r\n";
+    survive(&Reader {
+        name: "page request",
+        seeds: [browser, tool].map(|s| s.as_bytes().to_vec()).into(),
+        text: true,
+        shell: None,
+        memory: (16 << 10, 8),
+        read: Read::Bytes(&|bytes| match request::parse(bytes) {
+            Ok(Some(asked)) => {
+                let parts = asked.host.iter().chain(&asked.shown).chain(&asked.in_address).map(String::len);
+                Ok(parts.sum::<usize>() <= bytes.len())
+            }
+            Ok(None) => Err("its end has not come".into()),
+            Err(why) => Err(format!("{why:?}")),
         }),
     });
 }

@@ -15,6 +15,8 @@ use crate::xml;
 
 /// A skew that moves no corner of a picture by more than this is left out, pixels.
 const SKEW_PX: f64 = 0.5;
+/// No picture has a longer edge.
+const MOST_PIXELS: u32 = 1 << 16;
 
 pub(super) fn is_one(head: &str) -> bool {
     head.contains("<document") && head.contains("<chunk")
@@ -125,8 +127,12 @@ fn lens(sensor: Node<'_, '_>) -> Result<Option<LensDescription>, String> {
     let resolution =
         [calibration, sensor].into_iter().find_map(|n| n.children().find(|c| c.has_tag_name("resolution")));
     let resolution = resolution.ok_or("it has no resolution")?;
-    let edge = |name: &str| resolution.attribute(name).and_then(|v| v.parse::<u32>().ok()).filter(|v| *v > 0);
-    let (Some(w), Some(h)) = (edge("width"), edge("height")) else { return Err("it has no resolution".into()) };
+    let edge = |name: &str| {
+        resolution.attribute(name).and_then(|v| v.parse::<u32>().ok()).filter(|v| (1..=MOST_PIXELS).contains(v))
+    };
+    let (Some(w), Some(h)) = (edge("width"), edge("height")) else {
+        return Err("its width and height must be between 1 and 65536".into());
+    };
     let fisheye = match calibration.attribute("type").or(sensor.attribute("type")).unwrap_or("frame") {
         "frame" => false,
         "fisheye" | "equidistant_fisheye" => true,

@@ -147,6 +147,7 @@ fn beside(project: &Path, uri: &str) -> Result<PathBuf, String> {
     let name = uri.trim_start_matches("./");
     let inside = Path::new(name).components().all(|c| matches!(c, std::path::Component::Normal(_)));
     match inside && !name.contains(':') {
+        true if name.contains(char::is_control) => Err(format!("{uri:?} is no name of a file")),
         true => Ok(project.with_file_name(name)),
         false => Err(format!("{uri:?} lies outside of the project's folder")),
     }

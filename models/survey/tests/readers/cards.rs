@@ -325,3 +325,35 @@ fn logged(path: &Path) -> Verdict {
         exposures.all(|e| e.fix.position.is_valid() && e.time_s.is_finite())
     })
 }
+
+#[test]
+fn subtitles_of_a_film() {
+    let block =
+        |n: u32, at: &str, says: &str| format!("{n}\n{at} --> {at}\n<font size=\"28\">SrtCnt : {n}\n{says}</font>\n\n");
+    let new = "[iso : 110] [latitude: 46.8426] [longitude: -91.9945]\n[rel_alt: 40.100 abs_alt: 198.300]";
+    let old = "HOME(-91.9945,46.8426) GPS(-91.9945,\n46.8426,19)\nBAROMETER:40.1";
+    let film =
+        |says: &str| [block(1, "00:00:00,000", says), block(2, "00:00:00,033", says), block(3, "00:00:01,010", says)];
+    in_this_thread(|| {
+        survive(&Reader {
+            name: "subtitles",
+            seeds: [new, old].map(|says| film(says).concat().into_bytes()).into(),
+            text: true,
+            shell: None,
+            memory: (DECODER, 64),
+            // Beside frames that were taken of the film.
+            read: Read::File("DJI_0001.SRT", &|path| {
+                let folder = path.parent().expect("a folder").to_owned();
+                let frame = folder.join("DJI_0001_00001.jpg");
+                if !frame.exists() {
+                    std::fs::write(&frame, encoded(ImageFormat::Jpeg)).expect("written");
+                }
+                let options = CardOptions { geotags: Some(path.to_owned()), ..CardOptions::default() };
+                line(Card::open(&[folder], &options), |card| {
+                    card.origin.is_none_or(|origin| origin.is_valid())
+                        && card.pictures.iter().all(|p| p.prior.pose.center.is_finite())
+                })
+            }),
+        });
+    });
+}

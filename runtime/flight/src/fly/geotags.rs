@@ -2,10 +2,10 @@
 //! picture, written at once; a line that a power cut tore is taken off at the next start. Surveyors feed such files to other tools.
 
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
+use std::io;
 use std::path::Path;
 
-use disk::{Disk, Output};
+use disk::{Disk, Lines};
 use geometry::geodesy::{EnuFrame, Geodetic};
 use hal::vehicle::PosedPicture;
 
@@ -22,7 +22,7 @@ const SYNC_EVERY: u32 = 16;
 
 /// The open file.
 pub struct Geotags {
-    file: Box<dyn Output>,
+    file: Lines,
     frame: EnuFrame,
     /// The present line; reused.
     line: String,
@@ -41,7 +41,7 @@ impl Geotags {
         let path = out.join(FILE);
         let mut file = disk.append_lines(&path)?;
         if path.metadata().map_or(0, |m| m.len()) == 0 {
-            writeln!(file, "{HEADER}")?;
+            file.write(format!("{HEADER}\n").as_bytes())?;
         }
         Ok(Self { file, frame: EnuFrame::new(origin), line: String::with_capacity(512), unsynced: 0, failed: false })
     }
@@ -51,7 +51,7 @@ impl Geotags {
         if let Err(e) = self.write(frame, decision)
             && !std::mem::replace(&mut self.failed, true)
         {
-            tracing::warn!("{FILE}: {e}; pictures are no longer noted there");
+            tracing::warn!("{FILE}: {e}; pictures are missing there while that lasts");
         }
     }
 
@@ -83,8 +83,7 @@ impl Geotags {
             frame.confidence,
         );
         written.map_err(io::Error::other)?;
-        // One call per line: the lines of a torn file are whole but for the last.
-        self.file.write_all(self.line.as_bytes())?;
+        self.file.write(self.line.as_bytes())?;
         self.unsynced += 1;
         if self.unsynced >= SYNC_EVERY {
             self.unsynced = 0;
@@ -109,7 +108,11 @@ impl Drop for Geotags {
 #[cfg(feature = "lab")]
 mod tests {
     use std::path::PathBuf;
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicU64;
 
+    use disk::System;
+    use disk::bounded::Bounded;
     use glam::{DQuat, DVec3};
     use hal::camera::Picture;
     use hal::vehicle::CameraPose;
@@ -158,6 +161,27 @@ mod tests {
         assert_eq!(unsynced(&done), 0);
         let written = std::fs::read_to_string(folder.path().join(FILE)).expect("read");
         assert_eq!(written.lines().count(), 101);
+    }
+
+    #[test]
+    fn a_full_disk_leaves_whole_lines_only_and_those_that_have_room_later() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let root = folder.path().canonicalize().expect("its path");
+        let limit = Arc::new(AtomicU64::new(1000));
+        let disk = Disk::new(Bounded::new(System, &root, limit));
+        let mut geotags = Geotags::open(&disk, &root, ORIGIN).expect("a file");
+        let long = format!("{}.jpg", "a".repeat(200));
+        // Of every other picture the name is too long for what is left.
+        for n in 0..40 {
+            geotags.note(&posed(if n % 2 == 0 { "a.jpg" } else { &long }, n), Decision::Key);
+        }
+        drop(geotags);
+        let written = std::fs::read_to_string(root.join(FILE)).expect("read");
+        assert!(written.len() <= 1000 && written.ends_with('\n') && written.lines().count() > 3, "{written}");
+        let columns = HEADER.split(',').count();
+        assert!(written.lines().all(|line| line.split(',').count() == columns), "{written}");
+        let last = written.lines().last().expect("a line");
+        assert!(last.starts_with("a.jpg,"), "{last}");
     }
 
     #[test]

@@ -146,7 +146,7 @@ impl Recording {
 
     fn bounded(path: &Path, origin: Geodetic, limit: u64) -> Result<(Self, Recorder), RecordError> {
         let failed = |source| RecordError { path: path.into(), source };
-        let file = BufWriter::new(File::create(path).map_err(failed)?);
+        let file = BufWriter::new(disk::regular::create(path).map_err(failed)?);
         let channels = CHANNELS.map(|c| (c.topic, c.name, (c.schema)().to_string()));
         let sheet = Sheet { writer: Writer::new(file, &channels, CHUNK).map_err(failed)?, bytes: 0 };
         let (to, inbox) = sync_channel(WAITING);

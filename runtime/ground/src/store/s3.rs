@@ -1,7 +1,7 @@
 //! A bucket of an object store that speaks S3 (Amazon's, MinIO, Ceph, Garage …). What names it is where their own tools look:
 //! `AWS_ENDPOINT_URL`, `AWS_REGION`, `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY` and, where there is one, `AWS_SESSION_TOKEN`.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rusty_s3::actions::S3Action;
 use rusty_s3::{Credentials, UrlStyle};
@@ -14,6 +14,8 @@ use super::{Fill, StoreError};
 const SIGNED_FOR: Duration = Duration::from_secs(3600);
 /// A request that fails for a reason that may pass is made so often, with so much longer a rest each time.
 const TRIES: u32 = 5;
+/// One that is not answered in time is made only once more: a server that is there at all refuses or answers.
+const SILENT_TRIES: u32 = 2;
 const REST: Duration = Duration::from_millis(200);
 const CONNECT: Duration = Duration::from_secs(10);
 /// A request with its answer takes no longer than this, and a second for every so many bytes: 64 KiB/s is a slow link.
@@ -87,9 +89,10 @@ impl Bucket {
         send: &dyn Fn() -> Result<Response<Body>, ureq::Error>,
         read: &dyn Fn(Response<Body>) -> Result<T, String>,
     ) -> Result<T, StoreError> {
-        let mut why = String::new();
+        let (mut why, mut silent) = (String::new(), 0);
         for n in 0..TRIES {
             std::thread::sleep(REST * n);
+            let asked = Instant::now();
             match send() {
                 Ok(answer) if answer.status().is_server_error() => why = format!("the server says {}", answer.status()),
                 Ok(answer) if answer.status().is_redirection() => {
@@ -110,6 +113,10 @@ impl Bucket {
                     }
                 }
                 Err(e) => why = e.to_string(),
+            }
+            silent += u32::from(asked.elapsed() >= self.limit);
+            if silent == SILENT_TRIES {
+                break;
             }
         }
         let name = format!("s3://{}/{}", self.bucket.name(), self.key(name));
@@ -246,7 +253,19 @@ mod tests {
     }
 
     #[test]
-    fn a_server_that_stalls_before_or_in_its_answer_or_drips_is_given_up_after_so_many_tries() {
+    fn a_server_that_says_it_is_busy_is_asked_again() {
+        let (at, met) = server(|mut stream| {
+            let _ = stream.read(&mut [0; 4096]);
+            let busy = "HTTP/1.1 503 Slow Down\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
+            let _ = stream.write_all(busy.as_bytes());
+        });
+        let line = bucket(at, ANSWER).range("cells/a", 0, 10).expect_err("given up").to_string();
+        assert!(line.contains("503"), "{line}");
+        assert_eq!(met.load(Ordering::SeqCst), TRIES as usize);
+    }
+
+    #[test]
+    fn a_server_that_stalls_before_or_in_its_answer_or_drips_is_given_up_after_few_tries() {
         let hold = |bytes: &'static [u8], drips: bool| {
             server(move |mut stream| {
                 std::thread::spawn(move || {
@@ -268,7 +287,7 @@ mod tests {
             let line =
                 bucket(at, Duration::from_millis(200)).range("cells/a", 0, 5000).expect_err("given up").to_string();
             assert!(line.contains("cells/a: reading failed") && !line.contains('\n'), "{line}");
-            assert_eq!(met.load(Ordering::SeqCst), TRIES as usize);
+            assert_eq!(met.load(Ordering::SeqCst), SILENT_TRIES as usize);
         }
     }
 }
