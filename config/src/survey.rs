@@ -40,6 +40,26 @@ record! {
 }
 
 impl SurveySettings {
+    /// What one aircraft flies by when nobody said otherwise. Where it takes off has no such value.
+    pub fn usual(gsd_cm: f64) -> Self {
+        Self {
+            gsd_cm,
+            forward_overlap: 0.75,
+            side_overlap: 0.65,
+            interval_s: 1.0,
+            speed_m_s: 8.0,
+            fastest_m_s: 15.0,
+            wind_m_s: 5.0,
+            endurance_min: vec![25.0],
+            reserve: 0.25,
+            take_off: Vec::new(),
+            highest_m: 120.0,
+            clearance_m: 10.0,
+            terrain: None,
+            holes_enu: Vec::new(),
+        }
+    }
+
     fn of_one_fleet(&self) -> Result<(), SettingError> {
         match self.endurance_min.len() == self.take_off.len() {
             true => Ok(()),
@@ -69,20 +89,10 @@ mod tests {
 
     fn settings() -> SurveySettings {
         SurveySettings {
-            gsd_cm: 2.0,
-            forward_overlap: 0.75,
-            side_overlap: 0.65,
-            interval_s: 1.0,
-            speed_m_s: 8.0,
-            fastest_m_s: 15.0,
-            wind_m_s: 5.0,
             endurance_min: vec![25.0, 20.0],
-            reserve: 0.25,
             take_off: vec![[47.4, 8.5]; 2],
-            highest_m: 120.0,
-            clearance_m: 10.0,
-            terrain: None,
             holes_enu: vec![vec![[0.0, 0.0], [9.5, 0.0], [0.0, 9.0]]],
+            ..SurveySettings::usual(2.0)
         }
     }
 

@@ -26,7 +26,7 @@ mod regions;
 mod terrain;
 
 pub use after::Rest;
-use place::{area, homes, moved, placed};
+use place::{area, homes, moved, outside, placed};
 use terrain::Terrain;
 
 /// Names in the folder.
@@ -239,7 +239,11 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
     };
     let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
     let (ground, holes) = ground_in(&frame)?;
-    let obstacles = self::obstacles(&holes, request.flying.clearance_m).map_err(|e| request.in_source(e))?;
+    let mut obstacles = self::obstacles(&holes, request.flying.clearance_m).map_err(|e| request.in_source(e))?;
+    if let Some((_, area)) = &area {
+        // What a fence encloses is not left by ways round its holes.
+        obstacles = obstacles.inside(&outside(area, &frame), manner.beyond_m);
+    }
     let craft = craft(request, &homes, &manner)?;
     let shares = deal(&ground, &obstacles, &craft, &manner).map_err(|e| request.in_source(e))?;
     let settings = settings(request, &frame, &homes, &holes);

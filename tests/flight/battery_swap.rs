@@ -120,7 +120,7 @@ fn flown(flights: &[u64], swap_s: f32, seconds: u64) -> (Option<(Ended, u64)>, F
     let mut intake =
         Intake::new(plan, Vehicle::new(line, camera, clock.clone(), &vehicle).expect("a vehicle"), clock.clone(), end);
     let mut autopilot = Autopilot { line: other, encoder: Encoder::new(1, 1) };
-    let mut exposures = 0;
+    let (mut exposures, mut taken) = (0, 0);
     for turn in 0..seconds * 1000 / TURN_MS {
         let (ms, s) = (turn * TURN_MS, turn * TURN_MS / 1000);
         clock.set(ms * 1_000_000);
@@ -133,7 +133,17 @@ fn flown(flights: &[u64], swap_s: f32, seconds: u64) -> (Option<(Ended, u64)>, F
             .iter()
             .map(|from| (10.0 * (phase(from) - 2.0)).min(10.0 * (30.0 - phase(from))).clamp(0.0, 40.0))
             .sum::<f64>();
-        let boot_ms = 60_000 + ms as u32;
+        // Without a battery nothing is said; then the autopilot's clock and its count of exposures begin anew.
+        let swap = flights.get(1).map(|up_s| (up_s - 12)..(up_s - 4));
+        if swap.as_ref().is_some_and(|swap| swap.contains(&s)) {
+            exposures = 0;
+            intake.turn(Duration::ZERO).expect("capture waits");
+            continue;
+        }
+        let boot_ms = match swap.filter(|swap| s >= swap.end) {
+            Some(swap) => 2_000 + (ms - swap.end * 1000) as u32,
+            None => 60_000 + ms as u32,
+        };
         let place = autopilot.at(boot_ms, aloft.is_some(), east_m, up_m);
         if up_m >= 40.0 && ms % 2000 == 1000 {
             exposures += 1;
@@ -145,7 +155,8 @@ fn flown(flights: &[u64], swap_s: f32, seconds: u64) -> (Option<(Ended, u64)>, F
                 alt_msl: place.alt_m as f32,
                 ..CAMERA_FEEDBACK_DATA::default()
             });
-            photograph(&pictures.join(format!("IMG_{exposures:04}.jpg")), exposures);
+            taken += 1;
+            photograph(&pictures.join(format!("IMG_{taken:04}.jpg")), taken);
         }
         let ended = intake.turn(Duration::ZERO).expect("capture goes on");
         take_all(&mut job);

@@ -5,10 +5,13 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use config::link::LinkSettings;
-use config::mission::{CameraSettings, MountSettings};
+use config::mission::MountSettings;
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value};
 use geometry::geodesy::Geodetic;
+
+#[path = "../../tests/rig/lens.rs"]
+mod lens;
 
 use super::*;
 use crate::camera::FolderCamera;
@@ -20,19 +23,9 @@ use crate::mavlink::dialect::{
 use crate::mavlink::{Encoder, Framer};
 use crate::time::ManualClock;
 use crate::traits::Received;
+use lens::LENS;
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84, lon_deg: -91.99, alt_m: 200.0 };
-const LENS: CameraSettings = CameraSettings {
-    width: 32,
-    height: 24,
-    fx: 25.0,
-    fy: 25.0,
-    cx: 16.0,
-    cy: 12.0,
-    distortion: [0.0; 4],
-    exposure_delay_ms: 0.0,
-    index: None,
-};
 
 fn settings() -> VehicleSettings {
     VehicleSettings {

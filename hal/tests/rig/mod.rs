@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use config::link::LinkSettings;
-use config::mission::{CameraSettings, CameraSource, MountAttitude, MountSettings};
+use config::mission::{CameraSource, MountAttitude, MountSettings};
 use geometry::geodesy::Geodetic;
 use hal::link::LinkAddress;
 use hal::mavlink::dialect::{
@@ -15,6 +15,10 @@ use hal::mavlink::dialect::{
 };
 use hal::mavlink::{Encoder, MessageData};
 use hal::vehicle::{Event, Vehicle, VehicleSettings};
+
+mod lens;
+
+use lens::LENS;
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 };
 
@@ -113,17 +117,7 @@ pub fn with_client(python: PathBuf, script: &str) -> Ended {
         failsafe: config::failsafe::FailsafeSettings::default(),
         camera: Some(CameraSource::Folder(folder.path().into())),
         pictures_since: None,
-        lens: CameraSettings {
-            width: 32,
-            height: 24,
-            fx: 25.0,
-            fy: 25.0,
-            cx: 16.0,
-            cy: 12.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 0.0,
-            index: None,
-        },
+        lens: LENS,
         mount: MountSettings {
             attitude: MountAttitude::Fixed,
             rotation_deg: [0.0, -90.0, 0.0],

@@ -30,6 +30,16 @@ pub struct Obstacles {
     corners: Vec<DVec2>,
     apart: Vec<f64>,
     clearance_m: f64,
+    limit: Option<Limit>,
+}
+
+/// Ground that ways round holes do not leave where they need not.
+#[derive(Clone, Debug)]
+struct Limit {
+    ground: Ground,
+    sides: Vec<[DVec2; 2]>,
+    /// Metres between the corners of the holes that see each other and this ground only.
+    apart: Vec<f64>,
 }
 
 impl Obstacles {
@@ -54,10 +64,33 @@ impl Obstacles {
         if corners.len() > MOST_CORNERS {
             return Err(too_many(corners.len()));
         }
-        let sides = closed.rings().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)).map(|(a, b)| [*a, *b]));
-        let mut this = Self { sides: sides.collect(), closed, wide, apart: Vec::new(), corners, clearance_m };
-        this.apart = this.corners.iter().flat_map(|a| this.corners.iter().map(|b| this.seen_m(*a, *b))).collect();
+        let sides = sides(&closed);
+        let mut this = Self { sides, closed, wide, apart: Vec::new(), corners, clearance_m, limit: None };
+        this.apart = this.between(|a, b| this.seen_m(a, b));
         Ok(this)
+    }
+
+    /// The same ones, with ways that stay on the ground inside `outside` and `beyond_m` around it, where there is such a way.
+    pub fn inside(mut self, outside: &Ring, beyond_m: f64) -> Self {
+        if self.sides.is_empty() {
+            return self;
+        }
+        let mut coarse_m = COARSE * beyond_m;
+        let mut ring = simplified(outside, coarse_m);
+        while ring.len() > MOST_CORNERS {
+            coarse_m *= 2.0;
+            ring = simplified(outside, coarse_m);
+        }
+        let ground = with_room(&[ring], beyond_m + coarse_m);
+        let mut limit = Limit { sides: sides(&ground), ground, apart: Vec::new() };
+        limit.apart = self.between(|a, b| limit.seen_m(&self, a, b));
+        self.limit = Some(limit);
+        self
+    }
+
+    /// Metres between all corners.
+    fn between(&self, metres: impl Fn(DVec2, DVec2) -> f64) -> Vec<f64> {
+        self.corners.iter().flat_map(|a| self.corners.iter().map(|b| metres(*a, *b))).collect()
     }
 
     /// Metres that are kept from every ring.
@@ -108,9 +141,20 @@ impl Obstacles {
         if self.seen_m(from, to).is_finite() {
             return Some(Vec::new());
         }
-        // Dijkstra 1959, from place to place by the corners.
+        let inside = self.limit.as_ref();
+        let inside = inside.and_then(|limit| self.bends((from, to), &limit.apart, |a, b| limit.seen_m(self, a, b)));
+        inside.or_else(|| self.bends((from, to), &self.apart, |a, b| self.seen_m(a, b)))
+    }
+
+    /// Where the shortest way bends, by the metres between corners and from place to place (Dijkstra 1959).
+    fn bends(
+        &self,
+        (from, to): (DVec2, DVec2),
+        apart: &[f64],
+        seen_m: impl Fn(DVec2, DVec2) -> f64,
+    ) -> Option<Vec<DVec2>> {
         let count = self.corners.len();
-        let mut metres: Vec<f64> = self.corners.iter().map(|c| self.seen_m(from, *c)).collect();
+        let mut metres: Vec<f64> = self.corners.iter().map(|c| seen_m(from, *c)).collect();
         let mut before = vec![count; count];
         let mut done = vec![false; count];
         let mut best = (f64::INFINITY, count);
@@ -119,12 +163,12 @@ impl Obstacles {
                 break;
             }
             done[k] = true;
-            let end = metres[k] + self.seen_m(self.corners[k], to);
+            let end = metres[k] + seen_m(self.corners[k], to);
             if end < best.0 {
                 best = (end, k);
             }
             for next in (0..count).filter(|next| !done[*next]) {
-                let longer = metres[k] + self.apart[k * count + next];
+                let longer = metres[k] + apart[k * count + next];
                 if longer < metres[next] {
                     (metres[next], before[next]) = (longer, k);
                 }
@@ -142,16 +186,32 @@ impl Obstacles {
 
     /// Metres between two places with nothing in between, else infinite.
     fn seen_m(&self, from: DVec2, to: DVec2) -> f64 {
-        let [low, high] = [from.min(to), from.max(to)];
-        let side = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
-        let apart = |a: DVec2, b: DVec2, p: DVec2, q: DVec2| side(a, b, p) * side(a, b, q) <= 0.0;
-        let beside = |[a, b]: &[DVec2; 2]| a.max(*b).cmplt(low).any() || a.min(*b).cmpgt(high).any();
-        let meets = |[a, b]: &[DVec2; 2]| apart(from, to, *a, *b) && apart(*a, *b, from, to);
-        match self.sides.iter().filter(|s| !beside(s)).any(meets) {
-            true => f64::INFINITY,
-            false => from.distance(to),
+        if meets(&self.sides, from, to) { f64::INFINITY } else { from.distance(to) }
+    }
+}
+
+impl Limit {
+    /// Metres between two places with nothing in between and this ground below, else infinite.
+    fn seen_m(&self, obstacles: &Obstacles, from: DVec2, to: DVec2) -> f64 {
+        match self.ground.contains(from) && self.ground.contains(to) && !meets(&self.sides, from, to) {
+            true => obstacles.seen_m(from, to),
+            false => f64::INFINITY,
         }
     }
+}
+
+/// The sides of all rings.
+fn sides(ground: &Ground) -> Vec<[DVec2; 2]> {
+    ground.rings().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)).map(|(a, b)| [*a, *b])).collect()
+}
+
+/// Whether a straight way meets one of `sides`.
+fn meets(sides: &[[DVec2; 2]], from: DVec2, to: DVec2) -> bool {
+    let [low, high] = [from.min(to), from.max(to)];
+    let side = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
+    let apart = |a: DVec2, b: DVec2, p: DVec2, q: DVec2| side(a, b, p) * side(a, b, q) <= 0.0;
+    let beside = |[a, b]: &[DVec2; 2]| a.max(*b).cmplt(low).any() || a.min(*b).cmpgt(high).any();
+    sides.iter().filter(|s| !beside(s)).any(|[a, b]| apart(from, to, *a, *b) && apart(*a, *b, from, to))
 }
 
 /// Rings and all places within `metres` of them, and a little more at corners.
@@ -228,6 +288,25 @@ mod tests {
         assert!(obstacles.hold(DVec2::new(50.0, 31.0)) && !obstacles.hold(DVec2::new(50.0, 26.0)));
         assert_eq!(obstacles.way(DVec2::new(50.0, 50.0), DVec2::ZERO), None, "it stands in the hole");
         assert_eq!(Obstacles::default().way(DVec2::ZERO, DVec2::ONE), Some(Vec::new()));
+    }
+
+    #[test]
+    fn ways_round_a_hole_near_the_border_stay_inside_and_leave_only_where_there_is_no_other() {
+        let area = rectangle(0.0, 0.0, 200.0, 100.0);
+        // South of it is the shorter way, and no room between it and the border.
+        let hole = rectangle(90.0, 5.0, 20.0, 50.0);
+        let [from, to] = [[0.0, 20.0], [200.0, 20.0]].map(DVec2::from);
+        let free = Obstacles::new(std::slice::from_ref(&hole), 10.0).expect("one");
+        assert!(path(&free, from, to).iter().any(|p| p.y < -5.0));
+        let inside = free.inside(&area, 3.0);
+        let round = path(&inside, from, to);
+        assert!(round.len() > 2 && round.iter().all(|p| (0.0..=100.0).contains(&p.y)), "{round:?}");
+        assert!(nearest_m(&round, &hole) >= 10.0);
+        // A take-off place outside, and a hole across the whole area.
+        assert!(path(&inside, from, DVec2::new(100.0, -40.0)).len() > 1);
+        let across = rectangle(90.0, -5.0, 20.0, 110.0);
+        let split = Obstacles::new(&[across], 10.0).expect("one").inside(&area, 3.0);
+        assert!(path(&split, from, to).len() > 2);
     }
 
     #[test]

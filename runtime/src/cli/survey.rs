@@ -124,26 +124,6 @@ struct FlightArgs {
     terrain: Option<PathBuf>,
 }
 
-/// What nobody said; the ground sampling distance, the endurance of each and where they take off have no such value.
-fn usual() -> SurveySettings {
-    SurveySettings {
-        gsd_cm: f64::NAN,
-        forward_overlap: 0.75,
-        side_overlap: 0.65,
-        interval_s: 1.0,
-        speed_m_s: 8.0,
-        fastest_m_s: 15.0,
-        wind_m_s: 5.0,
-        endurance_min: vec![25.0],
-        reserve: 0.25,
-        take_off: Vec::new(),
-        highest_m: 120.0,
-        clearance_m: 10.0,
-        terrain: None,
-        holes_enu: Vec::new(),
-    }
-}
-
 /// The camera that the options describe.
 fn camera(args: &CameraArgs) -> Result<Camera, CliError> {
     let fov_deg = match (args.fov_deg, args.focal_mm, args.sensor_mm) {
@@ -189,7 +169,8 @@ fn request(args: &Args) -> Result<Request, CliError> {
         }
         (None, None) => return Err(CliError::input("survey: give an area, or --after")),
     };
-    let before = before.unwrap_or_else(usual);
+    // The ground sampling distance has no usual value.
+    let before = before.unwrap_or_else(|| SurveySettings::usual(f64::NAN));
     let Some(gsd_cm) = pictures.gsd.or(Some(before.gsd_cm).filter(|gsd| gsd.is_finite())) else {
         return Err(CliError::input(
             "survey: the mission does not say how it was planned ([survey]); give --gsd, and what else is not usual",

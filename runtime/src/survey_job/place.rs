@@ -51,10 +51,18 @@ fn east(deg: f64) -> f64 {
 
 /// The area in metres, and what is cut out of it.
 pub fn placed(path: &Path, area: &Area, frame: &EnuFrame) -> Result<(Ground, Vec<Ring>), SurveyError> {
-    let put = |corners: &Vec<DVec2>| -> Ring { corners.iter().map(|p| flat(frame, p.y, p.x)).collect() };
-    let holes: Vec<Ring> = area.holes.iter().map(put).collect();
-    let ground = Ground::new(put(&area.outside), &holes).map_err(|e| in_file(path, e))?;
+    let holes: Vec<Ring> = area.holes.iter().map(|hole| put(hole, frame)).collect();
+    let ground = Ground::new(outside(area, frame), &holes).map_err(|e| in_file(path, e))?;
     Ok((ground, holes))
+}
+
+/// The area's outside in metres.
+pub fn outside(area: &Area, frame: &EnuFrame) -> Ring {
+    put(&area.outside, frame)
+}
+
+fn put(corners: &[DVec2], frame: &EnuFrame) -> Ring {
+    corners.iter().map(|p| flat(frame, p.y, p.x)).collect()
 }
 
 /// A place in metres east and north. One beyond the horizon, which may lie below the origin, is as far as the straight way through Earth.

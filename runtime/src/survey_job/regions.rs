@@ -149,20 +149,10 @@ folder = "upload"
     #[test]
     fn a_mission_holds_what_it_was_planned_by_once_however_often_it_is_planned() {
         let settings = SurveySettings {
-            gsd_cm: 2.0,
-            forward_overlap: 0.75,
-            side_overlap: 0.65,
-            interval_s: 1.0,
-            speed_m_s: 8.0,
-            fastest_m_s: 15.0,
-            wind_m_s: 5.0,
             endurance_min: vec![25.0; 3],
-            reserve: 0.25,
             take_off: vec![[47.0, 8.0]; 3],
-            highest_m: 120.0,
-            clearance_m: 10.0,
-            terrain: None,
             holes_enu: vec![vec![[1.0, 1.0], [2.0, 1.0], [1.0, 2.0]]],
+            ..SurveySettings::usual(2.0)
         };
         let other = SurveySettings { wind_m_s: 9.0, ..settings.clone() };
         let first = with_survey(TEXT, &settings);
