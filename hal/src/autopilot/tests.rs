@@ -89,6 +89,32 @@ fn feedback_is_placed_from_unix_time_and_from_wrapping_boot_time() {
     );
 }
 
+/// Exposures once a second between 10 and 30 s after boot, stamped with the Unix time that `unix_us` says at a boot time, us; when they
+/// were by the boot clock, ms.
+fn exposed_by(unix_us: impl Fn(u64) -> u64) -> std::vec::Vec<u64> {
+    let mut h = Wire::new();
+    let mut times = std::vec::Vec::new();
+    for s in 10..30u32 {
+        let boot_us = u64::from(s) * 1_000_000;
+        h.fly(s * 1000, s * 1000 + 1000);
+        h.handle(&SYSTEM_TIME_DATA { time_unix_usec: unix_us(boot_us + 900_000), time_boot_ms: s * 1000 + 900 });
+        let time_usec = unix_us(boot_us + 950_000);
+        h.handle(&CAMERA_FEEDBACK_DATA { time_usec, img_idx: (s - 9) as u16, ..Default::default() });
+        times.extend(core::iter::from_fn(|| h.autopilot.next_trigger()).map(|t| t.boot_ns / 1_000_000));
+    }
+    times
+}
+
+#[test]
+fn a_rollover_of_gps_weeks_and_a_clock_that_is_set_in_mid_flight_move_no_exposure() {
+    const UNIX_US: u64 = 1_795_248_400_000_000;
+    const ROLLOVER_US: u64 = 1024 * 7 * 86_400 * 1_000_000;
+    let wanted: std::vec::Vec<u64> = (10..30).map(|s| s * 1000 + 950).collect();
+    assert_eq!(exposed_by(|boot| UNIX_US + boot), wanted);
+    assert_eq!(exposed_by(|boot| UNIX_US + boot - if boot > 20_000_000 { ROLLOVER_US } else { 0 }), wanted);
+    assert_eq!(exposed_by(|boot| boot + if boot > 20_000_000 { UNIX_US } else { 0 }), wanted);
+}
+
 #[test]
 fn px4s_second_announcement_of_an_exposure_is_a_duplicate() {
     let mut h = Wire::new();
