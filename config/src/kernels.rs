@@ -83,6 +83,46 @@ fn fixed(text: &str) -> Option<KernelChoice> {
     })
 }
 
+/// `native` (or not set) or `driver`: whose kernels run where the device is the processor.
+pub const PROCESSOR_VARIABLE: &str = "DGTR_PROCESSOR";
+
+/// Whose kernels run where the device is the processor.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ProcessorKernels {
+    /// Functions of this program.
+    #[default]
+    Native,
+    /// Those of the software driver, as on any other device.
+    Driver,
+}
+
+/// A value of [`PROCESSOR_VARIABLE`] that names nobody's kernels.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{PROCESSOR_VARIABLE}: '{0}' is neither native nor driver")]
+pub struct ProcessorKernelsError(String);
+
+impl FromStr for ProcessorKernels {
+    type Err = ProcessorKernelsError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "" | "native" => Ok(Self::Native),
+            "driver" => Ok(Self::Driver),
+            other => Err(ProcessorKernelsError(other.chars().take(40).collect())),
+        }
+    }
+}
+
+impl ProcessorKernels {
+    /// What the environment says.
+    ///
+    /// # Errors
+    /// A value that names nobody's kernels.
+    pub fn from_environment() -> Result<Self, ProcessorKernelsError> {
+        std::env::var_os(PROCESSOR_VARIABLE).unwrap_or_default().to_string_lossy().parse()
+    }
+}
+
 impl KernelChoice {
     /// What the environment says.
     ///
@@ -96,6 +136,17 @@ impl KernelChoice {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_processor_s_kernels_are_native_or_the_driver_s() {
+        for (text, expected) in
+            [("", ProcessorKernels::Native), ("native", ProcessorKernels::Native), ("driver", ProcessorKernels::Driver)]
+        {
+            assert_eq!(text.parse(), Ok(expected));
+        }
+        let refused = "gpu".parse::<ProcessorKernels>().unwrap_err().to_string();
+        assert!(refused.contains(PROCESSOR_VARIABLE) && refused.contains("gpu"), "{refused}");
+    }
 
     #[test]
     fn names_profiles_and_numbers_are_read_and_everything_else_is_refused() {

@@ -91,13 +91,12 @@ impl Arena {
 
     /// The section `name`; an unknown name has no bytes (the tests bind every kernel, so a slip shows at once).
     pub fn section(&self, name: &str) -> Section {
-        self.sections.iter().find(|s| s.0 == name).map_or(Section { offset: 0, bytes: 0 }, |s| s.1)
+        section_of(&self.sections, name)
     }
 
     /// Slot `slot` of the views.
     pub fn view_slot(&self, plan: &Plan, slot: usize) -> Section {
-        let bytes = config::plan::view_bytes(plan.pixels as u64);
-        Section { offset: self.section("views").offset + slot as u64 * bytes, bytes }
+        slot_of(self.section("views"), plan, slot)
     }
 
     /// The section's content as `T`s. The device must be idle, and the host work on the section ([`Plan::mirrored`]).
@@ -128,6 +127,14 @@ impl Arena {
         }
         // SAFETY: as in `slice`; `&mut self` makes the access exclusive on the host.
         unsafe { std::slice::from_raw_parts_mut(at.cast::<T>(), section.bytes as usize / size_of::<T>()) }
+    }
+
+    /// All of it in the host's memory; nothing where the host has a mirror.
+    pub fn in_place(&self) -> Option<InPlace<'_>> {
+        match &self.host {
+            Host::Mapped(base) => Some(InPlace { base: *base, sections: &self.sections }),
+            Host::Mirrored(_) => None,
+        }
     }
 
     /// A copy of any section's content, the kernels' own among them. The device must be idle.
@@ -179,6 +186,39 @@ impl Arena {
             Host::Mapped(_) => Ok(()),
             Host::Mirrored(mirror) => mirror.take_failure().map_or(Ok(()), Err),
         }
+    }
+}
+
+/// Slot `slot` of the section `views`.
+pub(crate) fn slot_of(views: Section, plan: &Plan, slot: usize) -> Section {
+    let bytes = config::plan::view_bytes(plan.pixels as u64);
+    Section { offset: views.offset + slot as u64 * bytes, bytes }
+}
+
+fn section_of(sections: &[(&'static str, Section)], name: &str) -> Section {
+    sections.iter().find(|s| s.0 == name).map_or(Section { offset: 0, bytes: 0 }, |s| s.1)
+}
+
+/// An arena whose sections all lie in the host's memory.
+#[derive(Clone, Copy)]
+pub(crate) struct InPlace<'a> {
+    base: *mut u8,
+    sections: &'a [(&'static str, Section)],
+}
+
+// SAFETY: it tells where sections lie; who reads and writes there answers for it.
+unsafe impl Sync for InPlace<'_> {}
+
+impl InPlace<'_> {
+    /// As [`Arena::section`].
+    pub fn section(&self, name: &str) -> Section {
+        section_of(self.sections, name)
+    }
+
+    /// Where a section begins.
+    pub fn at(&self, section: Section) -> *mut u8 {
+        // SAFETY: sections lie inside the mapping.
+        unsafe { self.base.add(section.offset as usize) }
     }
 }
 

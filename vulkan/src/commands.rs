@@ -7,9 +7,11 @@ use crate::kernels::{GROUPS, Group, KERNELS, Kernel};
 use crate::layout::Push;
 use crate::layout::Section;
 use crate::pipelines::Pipelines;
+use crate::processor::Processor;
 use crate::stages::{DEVICE_TIMES, STAGE_NAMES, Stage};
 use ash::vk;
 use std::cell::Cell;
+use std::time::Instant;
 
 /// Timestamps per submission; a submission that dispatches more leaves the rest untimed.
 const STAMPS: usize = 64;
@@ -106,7 +108,16 @@ impl Commands {
     ///
     /// # Errors
     /// The device fails.
-    pub fn begin<'a>(&'a self, pipelines: &'a Pipelines, arena: &'a Arena) -> Result<Recording<'a>, GpuError> {
+    pub fn begin<'a>(
+        &'a self,
+        pipelines: &'a Pipelines,
+        processor: Option<&'a Processor>,
+        arena: &'a Arena,
+    ) -> Result<Recording<'a>, GpuError> {
+        if processor.is_some() {
+            // Nothing is recorded: a kernel runs when it is asked for.
+            return Ok(Recording { commands: self, pipelines, processor, arena, timed: self.weight.get() > 0.0 });
+        }
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
         let timed = self.gpu.timestamp_ns() > 0.0 && (self.weight.get() > 0.0 || is_traced());
         // SAFETY: the buffer is not pending: `submit` waits.
@@ -118,7 +129,7 @@ impl Commands {
                 device.cmd_reset_query_pool(self.buffer, self.queries, 0, STAMPS as u32);
             }
         }
-        let recording = Recording { commands: self, pipelines, arena, timed };
+        let recording = Recording { commands: self, pipelines, processor, arena, timed };
         // SAFETY: the buffer is being recorded, and a recording is submitted before the host goes on.
         if unsafe { arena.before_kernels(self.buffer)? } {
             recording.barrier();
@@ -160,6 +171,23 @@ impl Commands {
     }
 }
 
+impl Commands {
+    /// Adds what a stage took that just ended.
+    fn add_time(&self, stage: Stage, group: Option<Group>, ns: u64) {
+        if is_traced() {
+            tracing::trace!(target: DEVICE_TIMES, stage = stage as u64, ago_ns = ns, took_ns = ns);
+        }
+        let (mut all, mut groups) = (self.stage_ms.get(), self.group_ms.get());
+        let ms = ns as f64 * 1e-6 * self.weight.get();
+        all[stage as usize] += ms;
+        if let Some(group) = group {
+            groups[group as usize] += ms;
+        }
+        self.stage_ms.set(all);
+        self.group_ms.set(groups);
+    }
+}
+
 /// Whether somebody wants to know when every kernel ran.
 fn is_traced() -> bool {
     tracing::enabled!(target: DEVICE_TIMES, tracing::Level::TRACE)
@@ -181,6 +209,7 @@ impl Commands {
 pub(crate) struct Recording<'a> {
     commands: &'a Commands,
     pipelines: &'a Pipelines,
+    processor: Option<&'a Processor>,
     arena: &'a Arena,
     timed: bool,
 }
@@ -188,12 +217,32 @@ pub(crate) struct Recording<'a> {
 impl Recording<'_> {
     /// Runs `kernel` on at least `lanes` lanes after everything recorded before it.
     pub fn run(&self, kernel: Kernel, lanes: usize, push: Push) {
+        if let Some(processor) = self.processor {
+            return self.run_here(processor, kernel, 0, push);
+        }
         self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, push);
         self.stamp_kernel(kernel);
     }
 
+    /// Runs `kernel` on the processor.
+    fn run_here(&self, processor: &Processor, kernel: Kernel, slot: usize, push: Push) {
+        if self.commands.gpu.computes_nothing() {
+            return;
+        }
+        let start = self.timed.then(Instant::now);
+        processor.run(self.arena, kernel, slot, push);
+        if let Some(start) = start {
+            let info = &KERNELS[kernel as usize];
+            self.commands.add_time(info.stage, Some(info.group), start.elapsed().as_nanos() as u64);
+        }
+    }
+
     /// Runs `kernel` again and again, `push.pass` counting from 0: work that goes on where the round before ended.
     pub fn run_rounds(&self, kernel: Kernel, lanes: usize, push: Push, rounds: u32) {
+        if let Some(processor) = self.processor {
+            // One round is enough: no driver ends a loop.
+            return self.run_here(processor, kernel, 0, push);
+        }
         for pass in 0..rounds {
             self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, Push { pass, ..push });
         }
@@ -202,6 +251,9 @@ impl Recording<'_> {
 
     /// As [`Self::run`], with the descriptor set of view slot `slot`.
     pub fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize, push: Push) {
+        if let Some(processor) = self.processor {
+            return self.run_here(processor, kernel, slot, push);
+        }
         self.dispatch(kernel, self.pipelines.view_set(slot), lanes, push);
         self.stamp_kernel(kernel);
     }
@@ -226,6 +278,9 @@ impl Recording<'_> {
 
     /// Zeroes a section's first `bytes` bytes (a multiple of four).
     pub fn clear(&self, section: Section, bytes: u64, stage: Stage) {
+        if let Some(processor) = self.processor {
+            return processor.clear(self.arena, section, bytes);
+        }
         // SAFETY: the range lies inside the arena's buffer, which has TRANSFER_DST usage.
         unsafe {
             let bytes = bytes.min(section.bytes);
@@ -296,6 +351,9 @@ impl Recording<'_> {
     /// Those of [`Self::submit`].
     pub fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
         let c = self.commands;
+        if self.processor.is_some() {
+            return Ok(());
+        }
         // SAFETY: the buffer is being recorded, and every kernel ends with a barrier.
         unsafe { self.arena.after_kernels(c.buffer, sections) };
         let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;

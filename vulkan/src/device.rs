@@ -18,6 +18,7 @@ use crate::kernel_config::KernelConfig;
 use crate::kernels::{Group, Kernel};
 use crate::layout::{Frame, Status};
 use crate::pipelines::Pipelines;
+use crate::processor::Processor;
 use crate::stages::STAGE_NAMES;
 use bytemuck::Zeroable;
 use config::plan::Plan;
@@ -39,6 +40,8 @@ pub struct Device {
     // Dropped in this order: what refers to the arena first, the GPU last.
     commands: Commands,
     pipelines: Pipelines,
+    /// Runs the kernels where it is the device.
+    processor: Option<Processor>,
     pub(crate) arena: Arena,
     gpu: Gpu,
     plan: Plan,
@@ -65,10 +68,14 @@ impl Device {
         kernels: &[Kernel],
     ) -> Result<Self, TrainError> {
         let arena = Arena::new(gpu, plan)?;
-        let pipelines = Pipelines::new(gpu, plan, &arena, config, own_degrees, kernels)?;
+        let processor = Processor::of(gpu, &arena, plan, own_degrees);
+        // What the processor runs needs no pipeline.
+        let compiled = if processor.is_some() { &[] } else { kernels };
+        let pipelines = Pipelines::new(gpu, plan, &arena, config, own_degrees, compiled)?;
         Ok(Self {
             commands: Commands::new(gpu)?,
             pipelines,
+            processor,
             arena,
             gpu: gpu.clone(),
             plan: plan.clone(),
@@ -135,7 +142,7 @@ impl Device {
 
     /// Begins a submission.
     pub(crate) fn begin(&self) -> Result<Recording<'_>, TrainError> {
-        Ok(self.commands.begin(&self.pipelines, &self.arena)?)
+        Ok(self.commands.begin(&self.pipelines, self.processor.as_ref(), &self.arena)?)
     }
 
     /// Puts the uniform block where the kernels read it.

@@ -9,6 +9,7 @@ pub use error::GpuError;
 pub use limits::DeviceLimits;
 
 use ash::{Device, Entry, Instance, vk};
+use config::kernels::ProcessorKernels;
 use config::plan::Lanes;
 use std::ffi::CStr;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -70,13 +71,15 @@ struct Inner {
     queue: vk::Queue,
     family: u32,
     timestamp_ns: f64,
+    /// Whose kernels run where the device is the processor.
+    kernels: ProcessorKernels,
     #[cfg(test)]
     forced: Forced,
 }
 
 /// Oddities of drivers that the tests' own does not have.
 #[cfg(test)]
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Forced {
     /// Bytes that the driver wants beyond those of a buffer.
     pub padding: u64,
@@ -84,6 +87,10 @@ pub(crate) struct Forced {
     pub computes_nothing: bool,
     /// The host cannot reach the device's memory.
     pub apart: bool,
+    /// Threads of the processor, where not as many as usual.
+    pub threads: Option<usize>,
+    /// Vectors of the processor, where not the best that it has.
+    pub level: Option<fearless_simd::Level>,
 }
 
 impl std::fmt::Debug for Gpu {
@@ -148,6 +155,7 @@ impl Gpu {
             queue,
             family,
             timestamp_ns,
+            kernels: ProcessorKernels::from_environment()?,
             #[cfg(test)]
             forced: Forced::default(),
         };
@@ -157,6 +165,20 @@ impl Gpu {
     /// What the device says about itself.
     pub fn info(&self) -> &GpuInfo {
         &self.inner.info
+    }
+
+    /// The same device, whose driver runs all kernels.
+    #[must_use]
+    pub fn by_driver(mut self) -> Self {
+        if let Some(inner) = Arc::get_mut(&mut self.inner) {
+            inner.kernels = ProcessorKernels::Driver;
+        }
+        self
+    }
+
+    /// Whether the device is the processor, and runs the functions that stand for kernels there.
+    pub fn runs_on_processor(&self) -> bool {
+        self.inner.info.is_cpu && self.inner.kernels == ProcessorKernels::Native
     }
 
     /// The same device, were its limits these.
@@ -172,10 +194,8 @@ impl Gpu {
     /// The same device, with a driver that is odd in these ways.
     #[cfg(test)]
     pub(crate) fn forced(mut self, forced: Forced) -> Self {
-        if let Some(inner) = Arc::get_mut(&mut self.inner) {
-            inner.forced = forced;
-        }
-        assert_eq!(self.inner.forced, forced, "somebody else holds this device");
+        let inner = Arc::get_mut(&mut self.inner);
+        inner.expect("nobody else holds this device").forced = forced;
         self
     }
 
@@ -193,6 +213,14 @@ impl Gpu {
         return self.inner.forced.apart;
         #[cfg(not(test))]
         false
+    }
+
+    /// Threads and vectors by which the processor computes.
+    pub(crate) fn powers(&self) -> (usize, fearless_simd::Level) {
+        let usual = (crate::processor::threads() as usize, fearless_simd::Level::new());
+        #[cfg(test)]
+        let usual = (self.inner.forced.threads.unwrap_or(usual.0), self.inner.forced.level.unwrap_or(usual.1));
+        usual
     }
 
     /// What memory the driver wants for a buffer of this device.

@@ -19,6 +19,7 @@ mod layout;
 mod model;
 mod pictures;
 mod pipelines;
+mod processor;
 pub mod reference;
 pub mod roofline;
 pub mod stages;

@@ -302,7 +302,7 @@ mod tests {
 
     /// Growth, degrees that rise, views that wait in a file: all that the host has a hand in.
     fn trained(apart: bool) -> Option<(GaussianCloud, Rendering, Vec<image::RgbImage>, u64)> {
-        let gpu = Gpu::open(None).ok()?.forced(Forced { apart, ..Forced::default() });
+        let gpu = Gpu::open(None).ok()?.by_driver().forced(Forced { apart, ..Forced::default() });
         let v = view(64, 48);
         let mut settings = plain();
         settings.density.strategy = Strategy::Relocate;

@@ -67,6 +67,9 @@ pub enum GpuError {
         /// The device's `maxTexelBufferElements`.
         limit: u32,
     },
+    /// The environment names kernels that there are not.
+    #[error(transparent)]
+    Kernels(#[from] config::kernels::ProcessorKernelsError),
     /// Kernels run and leave no trace.
     #[error(
         "this device computes nothing: kernels end without an effect; update its driver, or choose another with --device"
