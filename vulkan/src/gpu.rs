@@ -4,6 +4,7 @@
 mod error;
 mod limits;
 mod objects;
+mod processor;
 
 pub use error::GpuError;
 pub use limits::DeviceLimits;
@@ -47,6 +48,11 @@ impl GpuInfo {
             (false, true) => Lanes::BOARD,
             (false, false) => Lanes::CARD,
         }
+    }
+
+    /// Threads by which it computes where it is the processor; 0 for others, which the processor's cores do not make faster.
+    pub fn threads(&self) -> u32 {
+        if self.is_cpu { processor::threads() } else { 0 }
     }
 }
 
@@ -217,7 +223,7 @@ impl Gpu {
 
     /// Threads and vectors by which the processor computes.
     pub(crate) fn powers(&self) -> (usize, fearless_simd::Level) {
-        let usual = (crate::processor::threads() as usize, fearless_simd::Level::new());
+        let usual = (processor::threads() as usize, fearless_simd::Level::new());
         #[cfg(test)]
         let usual = (self.inner.forced.threads.unwrap_or(usual.0), self.inner.forced.level.unwrap_or(usual.1));
         usual

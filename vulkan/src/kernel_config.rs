@@ -149,7 +149,7 @@ impl fmt::Display for KernelConfig {
 
 /// A number that changes whenever any kernel does: a configuration measured with other kernels says nothing about these.
 pub fn kernels_fingerprint() -> u64 {
-    crate::kernels::fingerprint()
+    crate::kernels::fingerprint(&crate::processor::SOURCES)
 }
 
 /// Sizes whose workgroups of `lanes` each the device can run; less than a subgroup leaves lanes idle.

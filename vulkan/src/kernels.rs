@@ -1,10 +1,7 @@
 //! The list of kernels: for each its checked-in SPIR-V and the sections of the arena it binds, in binding order.
 
-use crate::arena::Arena;
 use crate::layout::Section;
-use crate::processor;
 use crate::stages::Stage;
-use config::plan::Plan;
 
 /// How many lanes a workgroup has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -157,13 +154,12 @@ kernels! {
     Optimise "optimise" Optimise Wide ["order" "status" "geometry"] ["projected" "geometry" "reduced"];
 }
 
-/// A number that changes whenever any kernel does (FNV-1a over names, SPIR-V and the processor's functions): what was measured with other
-/// kernels says nothing about these.
-pub(crate) fn fingerprint() -> u64 {
+/// A number that changes whenever any kernel does, or one of the functions in `others` (FNV-1a over names, SPIR-V and text).
+pub(crate) fn fingerprint(others: &[&str]) -> u64 {
     let variants = |k: &KernelInfo| [Some(k.spirv), k.variant, k.shared].into_iter().flatten().flat_map(|s| s.texels);
     let bytes = KERNELS.iter().flat_map(|k| k.name.bytes().chain(variants(k).copied()));
     bytes
-        .chain(processor::SOURCES.iter().flat_map(|s| s.bytes()))
+        .chain(others.iter().flat_map(|s| s.bytes()))
         .fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3))
 }
 
@@ -192,11 +188,6 @@ pub(crate) fn texel_bytes(format: ash::vk::Format) -> u64 {
 /// Bytes of SSIM's maps, which lie where the gradient slots will be: each as many vec4 as three channels of pixels need.
 pub(crate) fn part_bytes_of_slots(name: &str, pixels: usize) -> Option<u64> {
     matches!(name, "moments" | "adjoint").then_some(48 * pixels as u64)
-}
-
-/// What a kernel sees of the arena under a section's name.
-pub(crate) fn bound(arena: &Arena, plan: &Plan, name: &str) -> Section {
-    part_of_slots(name, arena.section("slots"), plan.pixels).unwrap_or_else(|| arena.section(name))
 }
 
 /// Where SSIM's maps lie.

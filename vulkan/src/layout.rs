@@ -9,6 +9,10 @@ pub(crate) const DEFERRED_STEPS: usize = 512;
 /// Cursors in the status section: the largest number of sorting lanes.
 const CURSORS: usize = Lanes::CARD.sort as usize;
 
+/// In place of a confidence: the pixel is left out of every comparison (`LEFT_OUT` of the shaders' frame.glsl). Confidences are
+/// 0 or above it.
+pub(crate) const LEFT_OUT: u8 = 1;
+
 /// A section's place in the arena, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Section {

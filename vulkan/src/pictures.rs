@@ -11,6 +11,7 @@ pub use crops::CropPlace;
 use crate::device::Device;
 use crate::device::frame::Window;
 use crate::error::TrainError;
+use crate::layout::LEFT_OUT;
 use config::plan::Plan;
 use config::training::{AdamSettings, RateSettings};
 use crops::Crop;
@@ -19,10 +20,6 @@ use models::camera::{DepthPrior, Pose, PosedImage, View};
 use models::mask::Mask;
 use pose::Adjust;
 use slots::Slots;
-
-/// In place of a confidence: the pixel is left out of every comparison (`LEFT_OUT` of the shaders' frame.glsl). Confidences are
-/// 0 or above it.
-pub(crate) const LEFT_OUT: u8 = 1;
 
 /// What a step may visit, by its index.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

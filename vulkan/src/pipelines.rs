@@ -7,7 +7,9 @@ use crate::arena::Arena;
 use crate::constants::STRIP;
 use crate::gpu::{DeviceLimits, Gpu, GpuError};
 use crate::kernel_config::KernelConfig;
-use crate::kernels::{DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, bound, part_bytes_of_slots};
+use crate::kernels::{
+    DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
+};
 use crate::kernels::{texel_bytes, texel_format};
 use crate::layout::Section;
 use ash::vk;
@@ -63,6 +65,11 @@ struct Specialisation {
     half_moments: u32,
     staged: u32,
     rolled: u32,
+}
+
+/// What a kernel sees of the arena under a section's name.
+fn bound(arena: &Arena, plan: &Plan, name: &str) -> Section {
+    part_of_slots(name, arena.section("slots"), plan.pixels).unwrap_or_else(|| arena.section(name))
 }
 
 /// Whether kernels of this kind run as their variant: more than one lane per tile or share, strips in parts.

@@ -47,15 +47,6 @@ pub(crate) const SOURCES: [&str; 10] = [
 /// Gaussians that a thread takes at once.
 const SHARE: usize = 256;
 
-/// The variable that says by how many threads Mesa's software driver computes; the functions here take as many.
-const THREADS: &str = "LP_NUM_THREADS";
-
-/// Threads by which a processor computes: one for each core, where [`THREADS`] does not say otherwise.
-pub fn threads() -> u32 {
-    let cores = || std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
-    std::env::var(THREADS).ok().and_then(|n| n.trim().parse().ok()).unwrap_or_else(cores)
-}
-
 /// A processor that runs kernels, with what is the same in all of them.
 pub(crate) struct Processor {
     pool: Pool,

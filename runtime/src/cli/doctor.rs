@@ -265,7 +265,7 @@ fn step_cost(info: &GpuInfo, autotune: bool) -> Finding {
     };
     // The point of the presets of whole pictures.
     let visibility = Visibility { gaussians: 100_000, share: 0.29, pixels: 640 * 480 };
-    let threads = match cost::threads(info) {
+    let threads = match info.threads() {
         0 => String::new(),
         n => format!(" with {n} threads"),
     };

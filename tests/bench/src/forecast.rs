@@ -2,8 +2,8 @@
 
 use pages::report::Table;
 use serde::Serialize;
+use tuning::cost::measure;
 use tuning::cost::synthetic::IN_VIEW;
-use tuning::cost::{measure, threads};
 use tuning::loads::{Footprint, Visibility};
 use tuning::model::{CostModel, load};
 use vulkan::gpu::Gpu;
@@ -91,7 +91,7 @@ pub fn table(gpu: &Gpu, model: &CostModel, all: &[Forecast]) -> Table {
         title: format!("{}: forecast of a step", gpu.info().name),
         note: format!(
             "{} threads; fixed {} ms; per Gaussian {} ns, in view {}, pixel {}, instance {}, evaluation {}.",
-            threads(gpu.info()),
+            gpu.info().threads(),
             short(model.fixed_ms),
             short(model.gaussian_ns),
             short(model.visible_ns),

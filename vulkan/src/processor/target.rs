@@ -2,11 +2,11 @@
 
 use super::Call;
 use super::pool::Parts;
-use crate::pictures;
+use crate::layout;
 use fearless_simd::dispatch;
 
 /// In place of a confidence: the pixel is left out of every comparison.
-pub(super) const LEFT_OUT: u32 = pictures::LEFT_OUT as u32;
+pub(super) const LEFT_OUT: u32 = layout::LEFT_OUT as u32;
 
 /// Blocks of `divisor` × `divisor` pixels averaged; the depth is weighted by its confidence, which is alpha. Pixels that are left out have
 /// no part in it, and a block of them is left out.

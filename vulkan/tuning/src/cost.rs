@@ -14,18 +14,6 @@ use crate::model::CostModel;
 pub mod measure;
 pub mod synthetic;
 
-/// Mesa's number of threads of its drivers for the processor.
-const LAVAPIPE_THREADS: &str = "LP_NUM_THREADS";
-
-/// Threads by which a device that is a processor computes; 0 for others, which the processor's cores do not make faster.
-pub fn threads(info: &GpuInfo) -> u32 {
-    if !info.is_cpu {
-        return 0;
-    }
-    let cores = || std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
-    std::env::var(LAVAPIPE_THREADS).ok().and_then(|n| n.trim().parse().ok()).unwrap_or_else(cores)
-}
-
 /// What steps cost on this device with kernels of `config`, as far as it was measured.
 pub fn known(info: &GpuInfo, config: KernelConfig) -> Option<CostModel> {
     kept(cache::path()?, info, config)
@@ -41,7 +29,7 @@ pub fn of(gpu: &Gpu, config: KernelConfig) -> Option<CostModel> {
 }
 
 fn kept(path: PathBuf, info: &GpuInfo, config: KernelConfig) -> Option<CostModel> {
-    cache::read_cost(&path, info, threads(info), config).unwrap_or_else(|e| {
+    cache::read_cost(&path, info, info.threads(), config).unwrap_or_else(|e| {
         tracing::warn!("what steps cost is measured anew: {e}");
         None
     })
@@ -71,7 +59,7 @@ fn now(gpu: &Gpu, config: KernelConfig, path: Option<PathBuf>) -> Option<CostMod
             return None;
         }
     };
-    let keep = |path: PathBuf| cache::write_cost(&path, info, threads(info), config, model);
+    let keep = |path: PathBuf| cache::write_cost(&path, info, info.threads(), config, model);
     if let Some(Err(e)) = path.map(keep) {
         tracing::warn!("{e}; what steps cost is measured anew next time");
     }
