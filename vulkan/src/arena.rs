@@ -1,15 +1,17 @@
 //! The one device allocation: a buffer as large as the plan says, divided into the plan's sections.
 //!
 //! Where processor and GPU share one memory, as on companion computers, the host reads and writes sections in place; of a plan that
-//! lies in a card's own memory it has a mirror.
+//! lies in a card's own memory it has a mirror. Where the processor is the device, the allocation is the host's.
 
+mod host;
 mod memory;
 mod mirror;
 
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::{Gpu, GpuError, Vulkan};
 use crate::layout::Section;
 use ash::vk;
 use config::plan::Plan;
+use host::HostMemory;
 use memory::{Placement, allocate, map, placement};
 use mirror::Mirror;
 
@@ -21,11 +23,19 @@ enum Host {
     Mirrored(Box<Mirror>),
 }
 
+/// Who allocated it.
+enum Owner {
+    /// A driver, for this device.
+    Driver { gpu: Vulkan, memory: vk::DeviceMemory },
+    /// This program.
+    Host { _memory: HostMemory },
+}
+
 pub(crate) struct Arena {
     host: Host,
-    gpu: Gpu,
+    owner: Owner,
+    /// Null where there is no driver.
     pub buffer: vk::Buffer,
-    memory: vk::DeviceMemory,
     sections: Vec<(&'static str, Section)>,
     pub total_bytes: u64,
 }
@@ -35,10 +45,13 @@ unsafe impl Send for Arena {}
 
 impl Drop for Arena {
     fn drop(&mut self) {
-        // SAFETY: the trainer waits for the device before it drops the arena; both handles are ours. Memory is unmapped when it is freed.
-        unsafe {
-            self.gpu.device().destroy_buffer(self.buffer, None);
-            self.gpu.device().free_memory(self.memory, None);
+        if let Owner::Driver { gpu, memory } = &self.owner {
+            // SAFETY: the trainer waits for the device before it drops the arena; both handles are ours. Memory is unmapped when it is
+            // freed.
+            unsafe {
+                gpu.device().destroy_buffer(self.buffer, None);
+                gpu.device().free_memory(*memory, None);
+            }
         }
     }
 }
@@ -47,12 +60,31 @@ impl Arena {
     /// # Errors
     /// The device has no such memory.
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<Self, GpuError> {
+        match gpu.vulkan() {
+            Some(gpu) => Self::by_driver(gpu, plan),
+            None => Self::by_host(plan),
+        }
+    }
+
+    fn by_host(plan: &Plan) -> Result<Self, GpuError> {
+        let memory = HostMemory::new(plan.total_bytes)?;
+        Ok(Self {
+            host: Host::Mapped(memory.first()),
+            owner: Owner::Host { _memory: memory },
+            buffer: vk::Buffer::null(),
+            sections: laid_out(plan),
+            total_bytes: plan.total_bytes,
+        })
+    }
+
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn by_driver(gpu: &Vulkan, plan: &Plan) -> Result<Self, GpuError> {
         let bytes = plan.total_bytes;
         let mut made = Self {
             host: Host::Mapped(std::ptr::null_mut()),
-            gpu: gpu.clone(),
+            owner: Owner::Driver { gpu: gpu.clone(), memory: vk::DeviceMemory::null() },
             buffer: buffer(gpu, plan)?,
-            memory: vk::DeviceMemory::null(),
             sections: laid_out(plan),
             total_bytes: bytes,
         };
@@ -61,11 +93,12 @@ impl Arena {
         // SAFETY: `made` owns buffer and memory as soon as they exist; the memory is mapped once, where it is host-visible, and written
         // within its bytes.
         unsafe {
-            made.memory = allocate(gpu, made.buffer, bytes, kind)?;
+            let allocated = allocate(gpu, made.buffer, bytes, kind)?;
+            made.owner = Owner::Driver { gpu: gpu.clone(), memory: allocated };
             // Unwritten moments and margins must read as zero.
             made.host = match placed {
                 Placement::Mapped(_) => {
-                    let mapped = map(gpu, made.memory, bytes)?;
+                    let mapped = map(gpu, allocated, bytes)?;
                     std::ptr::write_bytes(mapped, 0, bytes as usize);
                     Host::Mapped(mapped)
                 }
@@ -82,6 +115,7 @@ impl Arena {
     /// # Errors
     /// As [`Arena::new`].
     pub fn check(gpu: &Gpu, plan: &Plan) -> Result<(), GpuError> {
+        let Some(gpu) = gpu.vulkan() else { return Ok(()) };
         let buffer = buffer(gpu, plan)?;
         let placed = placement(gpu, buffer, plan);
         // SAFETY: the buffer is ours and nothing refers to it.
@@ -239,7 +273,7 @@ fn named(call: &'static str, e: vk::Result, bytes: u64) -> GpuError {
     }
 }
 
-fn buffer(gpu: &Gpu, plan: &Plan) -> Result<vk::Buffer, GpuError> {
+fn buffer(gpu: &Vulkan, plan: &Plan) -> Result<vk::Buffer, GpuError> {
     let usage = vk::BufferUsageFlags::STORAGE_BUFFER
         | vk::BufferUsageFlags::UNIFORM_BUFFER
         | vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER
@@ -262,7 +296,9 @@ mod tests {
             Plan::with_capacities(&PlanRequest { width: 64, height: 48, views: 1, ..Default::default() }, 300, 1000);
         // 256: what V3DV adds.
         for (padding, fits) in [(0, true), (256, true), (DRIVER_ROOM, true), (DRIVER_ROOM + (1 << 20), false)] {
-            let Ok(gpu) = Gpu::open(None) else { return needs::missing(needs::Need::Vulkan, "no Vulkan device") };
+            let Ok(gpu) = Gpu::open_by_driver(None) else {
+                return needs::missing(needs::Need::Vulkan, "no Vulkan device");
+            };
             let gpu = gpu.forced(Forced { padding, ..Forced::default() });
             let made = Arena::new(&gpu, &plan);
             assert_eq!(Arena::check(&gpu, &plan).err(), made.as_ref().err().cloned());

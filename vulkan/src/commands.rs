@@ -1,14 +1,15 @@
-//! One command buffer, recorded and submitted again and again: dispatches in order, a barrier and a timestamp after
-//! each stage. Nothing here allocates after start-up.
+//! Kernels in order, again and again: of a driver in one command buffer, with a barrier and a timestamp after each stage; of the processor
+//! one by one. Nothing here allocates after start-up.
 
 use crate::arena::Arena;
-use crate::gpu::{Gpu, GpuError};
-use crate::kernels::{GROUPS, Group, KERNELS, Kernel};
+use crate::gpu::{GpuError, Vulkan};
+use crate::kernels::{Group, KERNELS, Kernel};
 use crate::layout::Push;
 use crate::layout::Section;
 use crate::pipelines::Pipelines;
 use crate::processor::Processor;
-use crate::stages::{DEVICE_TIMES, STAGE_NAMES, Stage};
+use crate::stages::Stage;
+use crate::times::{self, Times};
 use ash::vk;
 use std::cell::Cell;
 use std::time::Instant;
@@ -19,20 +20,17 @@ const STAMPS: usize = 64;
 /// How long a submission may take before the device counts as lost: lavapipe on a small board may need long.
 const TIMEOUT_NS: u64 = 600_000_000_000;
 
+/// A driver's command buffer.
 pub(crate) struct Commands {
-    gpu: Gpu,
+    gpu: Vulkan,
     pool: vk::CommandPool,
     buffer: vk::CommandBuffer,
     fence: vk::Fence,
     queries: vk::QueryPool,
     stamps: Cell<usize>,
     stages: [Cell<Stage>; STAMPS],
-    stage_ms: Cell<[f64; STAGE_NAMES.len()]>,
     /// What ran up to each timestamp; none where no kernel did.
     groups: [Cell<Option<Group>>; STAMPS],
-    group_ms: Cell<[f64; GROUPS]>,
-    /// How many submissions the timed one stands for; 0: it is not timed.
-    weight: Cell<f64>,
 }
 
 impl Drop for Commands {
@@ -54,7 +52,7 @@ fn vulkan(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
 impl Commands {
     /// # Errors
     /// The device refuses a command pool, fence or query pool.
-    pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Vulkan) -> Result<Self, GpuError> {
         let device = gpu.device();
         let flags = vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER;
         let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.family()).flags(flags);
@@ -71,10 +69,7 @@ impl Commands {
                 queries: vk::QueryPool::null(),
                 stamps: Cell::new(0),
                 stages: [const { Cell::new(Stage::Target) }; STAMPS],
-                stage_ms: Cell::new([0.0; STAGE_NAMES.len()]),
                 groups: [const { Cell::new(None) }; STAMPS],
-                group_ms: Cell::new([0.0; GROUPS]),
-                weight: Cell::new(1.0),
             };
             let allocate = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
             made.buffer = device.allocate_command_buffers(&allocate).map_err(vulkan("vkAllocateCommandBuffers"))?[0];
@@ -84,26 +79,6 @@ impl Commands {
         }
     }
 
-    /// Milliseconds per stage since they were last cleared.
-    pub fn stage_ms(&self) -> [f64; STAGE_NAMES.len()] {
-        self.stage_ms.get()
-    }
-
-    /// Milliseconds that each kind of kernel took since they were last cleared (by `Group as usize`).
-    pub fn group_ms(&self) -> [f64; GROUPS] {
-        self.group_ms.get()
-    }
-
-    pub fn clear_times(&self) {
-        self.group_ms.set([0.0; GROUPS]);
-        self.stage_ms.set([0.0; STAGE_NAMES.len()]);
-    }
-
-    /// From here on a submission's times count `weight` times; with 0 it gets no timestamps.
-    pub fn weigh(&self, weight: f64) {
-        self.weight.set(weight);
-    }
-
     /// Starts a recording; the one before was submitted or dropped.
     ///
     /// # Errors
@@ -111,15 +86,11 @@ impl Commands {
     pub fn begin<'a>(
         &'a self,
         pipelines: &'a Pipelines,
-        processor: Option<&'a Processor>,
         arena: &'a Arena,
+        times: &'a Times,
     ) -> Result<Recording<'a>, GpuError> {
-        if processor.is_some() {
-            // Nothing is recorded: a kernel runs when it is asked for.
-            return Ok(Recording { commands: self, pipelines, processor, arena, timed: self.weight.get() > 0.0 });
-        }
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
-        let timed = self.gpu.timestamp_ns() > 0.0 && (self.weight.get() > 0.0 || is_traced());
+        let timed = self.gpu.timestamp_ns() > 0.0 && times.are_taken();
         // SAFETY: the buffer is not pending: `submit` waits.
         unsafe {
             let device = self.gpu.device();
@@ -129,16 +100,16 @@ impl Commands {
                 device.cmd_reset_query_pool(self.buffer, self.queries, 0, STAMPS as u32);
             }
         }
-        let recording = Recording { commands: self, pipelines, processor, arena, timed };
+        let recording = Recorded { commands: self, pipelines, arena, times, timed };
         // SAFETY: the buffer is being recorded, and a recording is submitted before the host goes on.
         if unsafe { arena.before_kernels(self.buffer)? } {
             recording.barrier();
         }
         recording.stamp(Stage::Target, None);
-        Ok(recording)
+        Ok(Recording::Driver(recording))
     }
 
-    fn collect_times(&self) {
+    fn collect_times(&self, times: &Times) {
         let stamps = self.stamps.get();
         if stamps < 2 {
             return;
@@ -154,95 +125,127 @@ impl Commands {
             )
         };
         if read.is_ok() {
-            if is_traced() {
+            if times::is_traced() {
                 self.tell_times(&ticks[..stamps]);
             }
-            let (mut all, mut groups) = (self.stage_ms.get(), self.group_ms.get());
             for i in 1..stamps {
-                let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns() * self.weight.get();
-                all[self.stages[i].get() as usize] += ns * 1e-6;
-                if let Some(group) = self.groups[i].get() {
-                    groups[group as usize] += ns * 1e-6;
-                }
+                let ns = ticks[i].saturating_sub(ticks[i - 1]) as f64 * self.gpu.timestamp_ns();
+                times.add(self.stages[i].get(), self.groups[i].get(), ns * 1e-6);
             }
-            self.stage_ms.set(all);
-            self.group_ms.set(groups);
         }
     }
-}
 
-impl Commands {
-    /// Adds what a stage took that just ended.
-    fn add_time(&self, stage: Stage, group: Option<Group>, ns: u64) {
-        if is_traced() {
-            tracing::trace!(target: DEVICE_TIMES, stage = stage as u64, ago_ns = ns, took_ns = ns);
-        }
-        let (mut all, mut groups) = (self.stage_ms.get(), self.group_ms.get());
-        let ms = ns as f64 * 1e-6 * self.weight.get();
-        all[stage as usize] += ms;
-        if let Some(group) = group {
-            groups[group as usize] += ms;
-        }
-        self.stage_ms.set(all);
-        self.group_ms.set(groups);
-    }
-}
-
-/// Whether somebody wants to know when every kernel ran.
-fn is_traced() -> bool {
-    tracing::enabled!(target: DEVICE_TIMES, tracing::Level::TRACE)
-}
-
-impl Commands {
     /// Tells of every stage in `ticks`. The two clocks are set by the end of the submission, which the host has just seen: its own
     /// way back, some microseconds, is taken for the device's.
     fn tell_times(&self, ticks: &[u64]) {
         let Some(last) = ticks.last() else { return };
         let ns = |ticks: u64| (ticks as f64 * self.gpu.timestamp_ns()) as u64;
         for (i, pair) in ticks.windows(2).enumerate() {
-            let (stage, took_ns) = (self.stages[i + 1].get() as u64, ns(pair[1].saturating_sub(pair[0])));
-            tracing::trace!(target: DEVICE_TIMES, stage, ago_ns = ns(last.saturating_sub(pair[0])), took_ns);
+            let took_ns = ns(pair[1].saturating_sub(pair[0]));
+            times::tell(self.stages[i + 1].get(), ns(last.saturating_sub(pair[0])), took_ns);
         }
     }
 }
 
-pub(crate) struct Recording<'a> {
-    commands: &'a Commands,
-    pipelines: &'a Pipelines,
-    processor: Option<&'a Processor>,
-    arena: &'a Arena,
-    timed: bool,
+/// What kernels are run with: a driver records them and runs them when they are submitted; the processor runs each when it is asked for.
+pub(crate) enum Recording<'a> {
+    Driver(Recorded<'a>),
+    Processor(Running<'a>),
 }
 
 impl Recording<'_> {
-    /// Runs `kernel` on at least `lanes` lanes after everything recorded before it.
+    /// Runs `kernel` on at least `lanes` lanes after everything before it.
     pub fn run(&self, kernel: Kernel, lanes: usize, push: Push) {
-        if let Some(processor) = self.processor {
-            return self.run_here(processor, kernel, 0, push);
+        match self {
+            Self::Driver(r) => r.run(kernel, lanes, push),
+            Self::Processor(r) => r.run(kernel, 0, push),
         }
+    }
+
+    /// Runs `kernel` again and again, `push.pass` counting from 0: work that goes on where the round before ended. For the processor one
+    /// round is enough: no driver ends its loops.
+    pub fn run_rounds(&self, kernel: Kernel, lanes: usize, push: Push, rounds: u32) {
+        match self {
+            Self::Driver(r) => r.run_rounds(kernel, lanes, push, rounds),
+            Self::Processor(r) => r.run(kernel, 0, push),
+        }
+    }
+
+    /// As [`Self::run`], with the picture in view slot `slot`.
+    pub fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize, push: Push) {
+        match self {
+            Self::Driver(r) => r.run_view(kernel, slot, lanes, push),
+            Self::Processor(r) => r.run(kernel, slot, push),
+        }
+    }
+
+    /// Zeroes a section's first `bytes` bytes (a multiple of four).
+    pub fn clear(&self, section: Section, bytes: u64, stage: Stage) {
+        match self {
+            Self::Driver(r) => r.clear(section, bytes, stage),
+            Self::Processor(r) => r.processor.clear(r.arena, section, bytes),
+        }
+    }
+
+    /// Returns when all of it is done and the host can see it.
+    ///
+    /// # Errors
+    /// The device fails or is lost.
+    pub fn submit(self) -> Result<(), GpuError> {
+        self.submit_and_read(&[])
+    }
+
+    /// As [`Self::submit`]; the host looks at the sections of these names next, which a mirror then has at once.
+    ///
+    /// # Errors
+    /// Those of [`Self::submit`].
+    pub fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
+        match self {
+            Self::Driver(r) => r.submit_and_read(sections),
+            Self::Processor(_) => Ok(()),
+        }
+    }
+}
+
+/// Kernels that the processor runs one by one.
+pub(crate) struct Running<'a> {
+    pub processor: &'a Processor,
+    pub arena: &'a Arena,
+    pub times: &'a Times,
+}
+
+impl Running<'_> {
+    fn run(&self, kernel: Kernel, slot: usize, push: Push) {
+        let start = self.times.are_taken().then(Instant::now);
+        self.processor.run(self.arena, kernel, slot, push);
+        if let Some(took) = start.map(|start| start.elapsed()) {
+            let info = &KERNELS[kernel as usize];
+            if times::is_traced() {
+                times::tell(info.stage, took.as_nanos() as u64, took.as_nanos() as u64);
+            }
+            self.times.add(info.stage, Some(info.group), took.as_secs_f64() * 1e3);
+        }
+    }
+}
+
+/// Kernels that a driver records.
+pub(crate) struct Recorded<'a> {
+    commands: &'a Commands,
+    pipelines: &'a Pipelines,
+    arena: &'a Arena,
+    times: &'a Times,
+    timed: bool,
+}
+
+impl Recorded<'_> {
+    /// Runs `kernel` on at least `lanes` lanes after everything recorded before it.
+    fn run(&self, kernel: Kernel, lanes: usize, push: Push) {
         self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, push);
         self.stamp_kernel(kernel);
     }
 
-    /// Runs `kernel` on the processor.
-    fn run_here(&self, processor: &Processor, kernel: Kernel, slot: usize, push: Push) {
-        if self.commands.gpu.computes_nothing() {
-            return;
-        }
-        let start = self.timed.then(Instant::now);
-        processor.run(self.arena, kernel, slot, push);
-        if let Some(start) = start {
-            let info = &KERNELS[kernel as usize];
-            self.commands.add_time(info.stage, Some(info.group), start.elapsed().as_nanos() as u64);
-        }
-    }
-
     /// Runs `kernel` again and again, `push.pass` counting from 0: work that goes on where the round before ended.
-    pub fn run_rounds(&self, kernel: Kernel, lanes: usize, push: Push, rounds: u32) {
-        if let Some(processor) = self.processor {
-            // One round is enough: no driver ends a loop.
-            return self.run_here(processor, kernel, 0, push);
-        }
+    fn run_rounds(&self, kernel: Kernel, lanes: usize, push: Push, rounds: u32) {
         for pass in 0..rounds {
             self.dispatch(kernel, self.pipelines.set_of(kernel), lanes, Push { pass, ..push });
         }
@@ -250,10 +253,7 @@ impl Recording<'_> {
     }
 
     /// As [`Self::run`], with the descriptor set of view slot `slot`.
-    pub fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize, push: Push) {
-        if let Some(processor) = self.processor {
-            return self.run_here(processor, kernel, slot, push);
-        }
+    fn run_view(&self, kernel: Kernel, slot: usize, lanes: usize, push: Push) {
         self.dispatch(kernel, self.pipelines.view_set(slot), lanes, push);
         self.stamp_kernel(kernel);
     }
@@ -277,10 +277,7 @@ impl Recording<'_> {
     }
 
     /// Zeroes a section's first `bytes` bytes (a multiple of four).
-    pub fn clear(&self, section: Section, bytes: u64, stage: Stage) {
-        if let Some(processor) = self.processor {
-            return processor.clear(self.arena, section, bytes);
-        }
+    fn clear(&self, section: Section, bytes: u64, stage: Stage) {
         // SAFETY: the range lies inside the arena's buffer, which has TRANSFER_DST usage.
         unsafe {
             let bytes = bytes.min(section.bytes);
@@ -338,22 +335,8 @@ impl Recording<'_> {
     }
 
     /// Submits what was recorded and waits until the device is done and the host can see it.
-    ///
-    /// # Errors
-    /// The device fails or is lost.
-    pub fn submit(self) -> Result<(), GpuError> {
-        self.submit_and_read(&[])
-    }
-
-    /// As [`Self::submit`]; the host looks at the sections of these names next, which a mirror then has at once.
-    ///
-    /// # Errors
-    /// Those of [`Self::submit`].
-    pub fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
+    fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
         let c = self.commands;
-        if self.processor.is_some() {
-            return Ok(());
-        }
         // SAFETY: the buffer is being recorded, and every kernel ends with a barrier.
         unsafe { self.arena.after_kernels(c.buffer, sections) };
         let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
@@ -376,7 +359,7 @@ impl Recording<'_> {
             }
             device.reset_fences(&[c.fence]).map_err(vulkan("vkResetFences"))?;
         }
-        c.collect_times();
+        c.collect_times(self.times);
         Ok(())
     }
 }

@@ -11,7 +11,7 @@ pub(crate) use bands::{Band, Counted};
 pub(crate) use passes::Gradients;
 
 use crate::arena::Arena;
-use crate::commands::{Commands, Recording};
+use crate::commands::{Commands, Recording, Running};
 use crate::error::TrainError;
 use crate::gpu::Gpu;
 use crate::kernel_config::KernelConfig;
@@ -20,6 +20,7 @@ use crate::layout::{Frame, Status};
 use crate::pipelines::Pipelines;
 use crate::processor::Processor;
 use crate::stages::STAGE_NAMES;
+use crate::times::Times;
 use bytemuck::Zeroable;
 use config::plan::Plan;
 
@@ -35,13 +36,17 @@ fn timed_weight(steps: u32, every: u32) -> f64 {
     }
 }
 
+/// Who runs the kernels.
+enum Runner {
+    Driver(Commands, Box<Pipelines>),
+    Processor(Box<Processor>),
+}
+
 /// Everything that training needs of one device.
 pub struct Device {
     // Dropped in this order: what refers to the arena first, the GPU last.
-    commands: Commands,
-    pipelines: Pipelines,
-    /// Runs the kernels where it is the device.
-    processor: Option<Processor>,
+    runner: Runner,
+    times: Times,
     pub(crate) arena: Arena,
     gpu: Gpu,
     plan: Plan,
@@ -68,14 +73,16 @@ impl Device {
         kernels: &[Kernel],
     ) -> Result<Self, TrainError> {
         let arena = Arena::new(gpu, plan)?;
-        let processor = Processor::of(gpu, &arena, plan, own_degrees);
-        // What the processor runs needs no pipeline.
-        let compiled = if processor.is_some() { &[] } else { kernels };
-        let pipelines = Pipelines::new(gpu, plan, &arena, config, own_degrees, compiled)?;
+        let runner = match gpu.vulkan() {
+            Some(vulkan) => Runner::Driver(
+                Commands::new(vulkan)?,
+                Box::new(Pipelines::new(vulkan, plan, &arena, config, own_degrees, kernels)?),
+            ),
+            None => Runner::Processor(Box::new(Processor::new(gpu, plan, own_degrees))),
+        };
         Ok(Self {
-            commands: Commands::new(gpu)?,
-            pipelines,
-            processor,
+            runner,
+            times: Times::new(),
             arena,
             gpu: gpu.clone(),
             plan: plan.clone(),
@@ -114,35 +121,39 @@ impl Device {
     /// Milliseconds per stage since the Gaussians were loaded, in pipeline order, of all steps as the timed ones let one
     /// expect; zeros on devices without timestamps.
     pub fn stage_ms(&self) -> [(&'static str, f64); STAGE_NAMES.len()] {
-        let ms = self.commands.stage_ms();
+        let ms = self.times.stage_ms();
         std::array::from_fn(|i| (STAGE_NAMES[i], ms[i]))
     }
 
     /// Milliseconds of the wide, the narrow and the blending kernels since then, whose sizes a [`KernelConfig`] chooses apart; zeros
     /// without timestamps.
     pub fn kind_ms(&self) -> [f64; 3] {
-        let ms = self.commands.group_ms();
+        let ms = self.times.group_ms();
         let of = |group: Group| ms[group as usize];
         [of(Group::Wide) + of(Group::Strips), of(Group::Sort) + of(Group::Walk), of(Group::Tiles)]
     }
 
     pub(crate) fn clear_times(&self) {
-        self.commands.clear_times();
+        self.times.clear();
     }
 
     /// Times the submissions of the step after `steps`, where it is one of those that are timed.
     pub(crate) fn time_step(&self, steps: u32) {
-        self.commands.weigh(timed_weight(steps, self.timed_every));
+        self.times.weigh(timed_weight(steps, self.timed_every));
     }
 
     /// Times what is submitted between steps.
     pub(crate) fn time_all(&self) {
-        self.commands.weigh(1.0);
+        self.times.weigh(1.0);
     }
 
     /// Begins a submission.
     pub(crate) fn begin(&self) -> Result<Recording<'_>, TrainError> {
-        Ok(self.commands.begin(&self.pipelines, self.processor.as_ref(), &self.arena)?)
+        let (arena, times) = (&self.arena, &self.times);
+        match &self.runner {
+            Runner::Driver(commands, pipelines) => Ok(commands.begin(pipelines, arena, times)?),
+            Runner::Processor(processor) => Ok(Recording::Processor(Running { processor, arena, times })),
+        }
     }
 
     /// Puts the uniform block where the kernels read it.

@@ -24,4 +24,5 @@ pub mod reference;
 pub mod roofline;
 pub mod stages;
 pub mod synthetic;
+mod times;
 pub mod trainer;

@@ -5,7 +5,7 @@ mod listed;
 
 use crate::arena::Arena;
 use crate::constants::STRIP;
-use crate::gpu::{DeviceLimits, Gpu, GpuError};
+use crate::gpu::{DeviceLimits, GpuError, Vulkan};
 use crate::kernel_config::KernelConfig;
 use crate::kernels::{
     DEPTH_LANES, FIRST_TEXELS, Group, KERNELS, Kernel, SCAN_LANES, part_bytes_of_slots, part_of_slots,
@@ -22,7 +22,7 @@ const STORAGE_BINDINGS: u32 = 8;
 const TEXEL_BINDINGS: u32 = 5;
 
 pub(crate) struct Pipelines {
-    gpu: Gpu,
+    gpu: Vulkan,
     set_layout: vk::DescriptorSetLayout,
     pub layout: vk::PipelineLayout,
     pool: vk::DescriptorPool,
@@ -104,7 +104,7 @@ impl Pipelines {
     /// # Errors
     /// The device refuses a kernel.
     pub fn new(
-        gpu: &Gpu,
+        gpu: &Vulkan,
         plan: &Plan,
         arena: &Arena,
         config: KernelConfig,

@@ -15,6 +15,7 @@ mod optimise;
 mod pool;
 mod project;
 mod projection;
+mod rates;
 mod target;
 #[cfg(test)]
 mod tests;
@@ -29,6 +30,7 @@ use fearless_simd::Level;
 use gaussians::{Harmonics, Moments, State, columns_up_to};
 use memory::Memory;
 use pool::{Parts, Pool};
+pub(crate) use rates::Rates;
 
 /// The text of these functions: what was measured with other ones says nothing about them.
 pub(crate) const SOURCES: [&str; 10] = [
@@ -53,19 +55,16 @@ pub(crate) struct Processor {
     level: Level,
     plan: Plan,
     own_degrees: bool,
+    /// Kernels are left out (a test).
+    computes_nothing: bool,
 }
 
 impl Processor {
-    /// The processor, where it is the device: it is a software driver's, the arena lies in the host's memory, and nobody wants the
-    /// driver's own kernels.
-    pub fn of(gpu: &Gpu, arena: &Arena, plan: &Plan, own_degrees: bool) -> Option<Self> {
+    /// The processor as `gpu` has it.
+    pub fn new(gpu: &Gpu, plan: &Plan, own_degrees: bool) -> Self {
         let (threads, level) = gpu.powers();
-        (gpu.runs_on_processor() && arena.in_place().is_some()).then(|| Self {
-            pool: Pool::new(threads),
-            level,
-            plan: plan.clone(),
-            own_degrees,
-        })
+        let computes_nothing = gpu.computes_nothing();
+        Self { pool: Pool::new(threads), level, plan: plan.clone(), own_degrees, computes_nothing }
     }
 
     /// Zeroes a section's first `bytes` bytes.
@@ -78,7 +77,7 @@ impl Processor {
 
     /// Runs `kernel`, with the picture in `slot` where it reads one. The device must be idle, and nobody else must use the arena.
     pub fn run(&self, arena: &Arena, kernel: Kernel, slot: usize, push: Push) {
-        let Some(arena) = arena.in_place() else { return };
+        let Some(arena) = arena.in_place().filter(|_| !self.computes_nothing) else { return };
         let memory = Memory { arena, plan: &self.plan, slot };
         let frame = &memory.read::<Frame>("frame")[0];
         let call = Call { memory, frame, push, pool: &self.pool, level: self.level, own_degrees: self.own_degrees };

@@ -4,6 +4,7 @@
 mod probe;
 
 use crate::gpu::{Gpu, GpuError};
+use crate::processor::Rates;
 use probe::{Kind, Probe};
 use std::time::Instant;
 
@@ -23,9 +24,9 @@ const FMA_PER_TURN: u64 = 16 * 8 * 2;
 /// Measured rates of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Roofline {
-    /// Bytes read plus bytes written per second by a compute kernel that copies.
+    /// Bytes read plus bytes written per second by a kernel that copies.
     pub kernel_bytes_per_s: f64,
-    /// Bytes read plus bytes written per second by the device's own copy command.
+    /// Bytes read plus bytes written per second by the device's own copy command, or the processor's.
     pub command_bytes_per_s: f64,
     /// Floating-point operations per second, a fused multiply-add counted as two.
     pub operations_per_s: f64,
@@ -48,24 +49,34 @@ impl Roofline {
 /// # Errors
 /// [`GpuError`], in particular when 128 MiB of device memory cannot be had.
 pub fn measure(gpu: &Gpu) -> Result<Roofline, GpuError> {
-    let probe = Probe::new(gpu, BUFFER_BYTES)?;
     let moved = 2 * BUFFER_BYTES;
+    let fma = Kind::Fma { lanes: FMA_LANES, turns: FMA_TURNS };
+    let operations = u64::from(FMA_LANES) * u64::from(FMA_TURNS) * FMA_PER_TURN;
+    let Some(driver) = gpu.vulkan() else {
+        let mut rates = Rates::new(gpu, BUFFER_BYTES as usize);
+        let mut many = |n: u32, run: &dyn Fn(&mut Rates)| {
+            (0..n).for_each(|_| run(&mut rates));
+            Ok(())
+        };
+        return Ok(Roofline {
+            kernel_bytes_per_s: rate(moved, |n| many(n, &|rates| rates.copy(false)))?,
+            command_bytes_per_s: rate(moved, |n| many(n, &|rates| rates.copy(true)))?,
+            operations_per_s: rate(operations, |n| many(n, &|rates| rates.multiply_add(operations)))?,
+        });
+    };
+    let probe = Probe::new(driver, BUFFER_BYTES)?;
     Ok(Roofline {
-        kernel_bytes_per_s: rate(&probe, Kind::CopyKernel, moved)?,
-        command_bytes_per_s: rate(&probe, Kind::CopyCommand, moved)?,
-        operations_per_s: rate(
-            &probe,
-            Kind::Fma { lanes: FMA_LANES, turns: FMA_TURNS },
-            u64::from(FMA_LANES) * u64::from(FMA_TURNS) * FMA_PER_TURN,
-        )?,
+        kernel_bytes_per_s: rate(moved, |n| probe.run(Kind::CopyKernel, n))?,
+        command_bytes_per_s: rate(moved, |n| probe.run(Kind::CopyCommand, n))?,
+        operations_per_s: rate(operations, |n| probe.run(fma, n))?,
     })
 }
 
-/// Units per second when one run of `kind` is worth `units`.
-fn rate(probe: &Probe, kind: Kind, units: u64) -> Result<f64, GpuError> {
-    let timed = |repeats: u32| {
+/// Units per second when one run is worth `units`; `run` repeats it so often.
+fn rate(units: u64, mut run: impl FnMut(u32) -> Result<(), GpuError>) -> Result<f64, GpuError> {
+    let mut timed = |repeats: u32| {
         let start = Instant::now();
-        probe.run(kind, repeats)?;
+        run(repeats)?;
         Ok::<f64, GpuError>(start.elapsed().as_secs_f64().max(1e-9))
     };
     // The first run also compiles.

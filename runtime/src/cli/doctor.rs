@@ -102,13 +102,16 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 tell("training", trains(&found, args.autotune));
             }
             for d in found {
-                let kind = if d.is_cpu { "software" } else { "hardware" };
-                let mib = d.heap_bytes >> 20;
-                let (major, minor) = d.version;
-                let text =
-                    format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {})", d.name, d.subgroup_size);
-                tell("vulkan", Finding::Ok(text));
-                tell("kernels", kernel_config(&d, args.autotune));
+                let (mib, subgroup) = (d.heap_bytes >> 20, d.subgroup_size);
+                if d.has_driver() {
+                    let kind = if d.is_cpu { "software" } else { "hardware" };
+                    let (major, minor) = d.version;
+                    let text = format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {subgroup})", d.name);
+                    tell("vulkan", Finding::Ok(text));
+                    tell("kernels", kernel_config(&d, args.autotune));
+                } else {
+                    tell("processor", Finding::Ok(format!("{}, {mib} MiB", d.name)));
+                }
                 tell("a step", step_cost(&d, args.autotune));
                 tell("device", computes(&d));
                 tell("memory plan", takes_a_plan(&d));

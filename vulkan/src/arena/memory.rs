@@ -1,7 +1,7 @@
 //! Which of the device's memories the plan is kept in, and the allocations.
 
 use super::named;
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::{GpuError, Vulkan};
 use ash::vk;
 use ash::vk::MemoryPropertyFlags as Flags;
 use config::plan::Plan;
@@ -23,7 +23,7 @@ pub(super) enum Placement {
 ///
 /// # Errors
 /// The driver wants more than the plan, or no memory is large enough.
-pub(super) fn placement(gpu: &Gpu, buffer: vk::Buffer, plan: &Plan) -> Result<Placement, GpuError> {
+pub(super) fn placement(gpu: &Vulkan, buffer: vk::Buffer, plan: &Plan) -> Result<Placement, GpuError> {
     let (needs, bytes) = (gpu.buffer_needs(buffer), plan.total_bytes);
     if needs.size > bytes {
         return Err(GpuError::PlanMismatch { wanted: needs.size, planned: bytes });
@@ -61,7 +61,7 @@ pub(super) fn placement(gpu: &Gpu, buffer: vk::Buffer, plan: &Plan) -> Result<Pl
 /// # Safety
 /// `buffer` was made by `gpu`, needs at most `bytes` of memory of type `kind`, and has none yet.
 pub(super) unsafe fn allocate(
-    gpu: &Gpu,
+    gpu: &Vulkan,
     buffer: vk::Buffer,
     bytes: u64,
     kind: u32,
@@ -85,7 +85,7 @@ pub(super) unsafe fn allocate(
 ///
 /// # Safety
 /// `memory` belongs to `gpu`, is host-visible, is not mapped, and holds `bytes`.
-pub(super) unsafe fn map(gpu: &Gpu, memory: vk::DeviceMemory, bytes: u64) -> Result<*mut u8, GpuError> {
+pub(super) unsafe fn map(gpu: &Vulkan, memory: vk::DeviceMemory, bytes: u64) -> Result<*mut u8, GpuError> {
     // SAFETY: by this function's contract.
     let mapped = unsafe { gpu.device().map_memory(memory, 0, vk::WHOLE_SIZE, vk::MemoryMapFlags::empty()) };
     mapped.map(<*mut _>::cast).map_err(|e| named("vkMapMemory", e, bytes))

@@ -6,7 +6,7 @@
 
 use super::memory::{allocate, map};
 use super::named;
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::{GpuError, Vulkan};
 use crate::layout::Section;
 use ash::vk;
 use config::plan::{Plan, view_bytes};
@@ -45,7 +45,7 @@ impl Part {
 }
 
 pub(super) struct Mirror {
-    gpu: Gpu,
+    gpu: Vulkan,
     /// The arena's.
     device_buffer: vk::Buffer,
     buffer: vk::Buffer,
@@ -82,7 +82,7 @@ impl Mirror {
     /// # Errors
     /// The host has no such memory, or the device no queue for copies.
     pub fn new(
-        gpu: &Gpu,
+        gpu: &Vulkan,
         plan: &Plan,
         device_buffer: vk::Buffer,
         sections: &[(&'static str, Section)],
@@ -302,7 +302,7 @@ mod tests {
 
     /// Growth, degrees that rise, views that wait in a file: all that the host has a hand in.
     fn trained(apart: bool) -> Option<(GaussianCloud, Rendering, Vec<image::RgbImage>, u64)> {
-        let gpu = Gpu::open(None).ok()?.by_driver().forced(Forced { apart, ..Forced::default() });
+        let gpu = Gpu::open_by_driver(None).ok()?.forced(Forced { apart, ..Forced::default() });
         let v = view(64, 48);
         let mut settings = plain();
         settings.density.strategy = Strategy::Relocate;

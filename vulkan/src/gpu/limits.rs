@@ -52,7 +52,7 @@ mod tests {
 
     /// A trainer of 10,000 Gaussians on this machine's device, were its limits these.
     fn under(limits: DeviceLimits) -> Option<Result<Fixture, TrainError>> {
-        let Ok(gpu) = Gpu::open(None) else {
+        let Ok(gpu) = Gpu::open_by_driver(None) else {
             needs::missing(needs::Need::Vulkan, "no Vulkan device");
             return None;
         };

@@ -1,12 +1,12 @@
 //! Vulkan objects that more than one part of the crate makes: compute pipelines, and texel views within the device's limit.
 
-use super::{Gpu, GpuError};
+use super::{GpuError, Vulkan};
 use crate::kernels::texel_bytes;
 use crate::layout::Section;
 use ash::vk;
 use std::io::Cursor;
 
-impl Gpu {
+impl Vulkan {
     /// A compute pipeline from checked-in SPIR-V, entry point `main`. `name` is the kernel's, for messages.
     ///
     /// # Safety

@@ -2,7 +2,7 @@
 //! so that the trainer makes no pipeline it does not train with.
 
 use crate::arena::Arena;
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::{GpuError, Vulkan};
 use ash::vk;
 use config::plan::Plan;
 
@@ -37,7 +37,7 @@ pub(super) struct Probe {
     set: vk::DescriptorSet,
     buffer: vk::CommandBuffer,
     arena: Arena,
-    gpu: Gpu,
+    gpu: Vulkan,
 }
 
 impl Drop for Probe {
@@ -86,7 +86,7 @@ impl Probe {
     ///
     /// # Errors
     /// The device refuses buffers or pipeline.
-    pub fn new(gpu: &Gpu, bytes: u64) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Vulkan, bytes: u64) -> Result<Self, GpuError> {
         let mut made = Self {
             pool: vk::CommandPool::null(),
             fence: vk::Fence::null(),
@@ -97,7 +97,7 @@ impl Probe {
             pipelines: [vk::Pipeline::null(); 2],
             set: vk::DescriptorSet::null(),
             buffer: vk::CommandBuffer::null(),
-            arena: Arena::new(gpu, &two_buffers(bytes))?,
+            arena: Arena::by_driver(gpu, &two_buffers(bytes))?,
             gpu: gpu.clone(),
         };
         let source = made.arena.section("source");

@@ -151,7 +151,7 @@ mod tests {
     fn what_a_device_refuses_of_a_plan_is_said_before_anything_is_compiled() {
         let plan = Plan::new(&PlanRequest { views: 4, ..Default::default() }).unwrap();
         let refusing = |limits: DeviceLimits, padding: u64| {
-            let gpu = Gpu::open(None).ok()?.limited(limits);
+            let gpu = Gpu::open_by_driver(None).ok()?.limited(limits);
             Some(check_plan(&gpu.forced(Forced { padding, ..Forced::default() }), &plan))
         };
         let limits = DeviceLimits { workgroup_lanes: 256, texel_elements: 1 << 27, storage_buffers: 8 };
