@@ -106,7 +106,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
                 if d.has_driver() {
                     let kind = if d.is_cpu { "software" } else { "hardware" };
                     let (major, minor) = d.version;
-                    let text = format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {subgroup})", d.name);
+                    let text =
+                        format!("{} ({kind}, Vulkan {major}.{minor}, {mib} MiB, subgroups of {subgroup})", d.name);
                     tell("vulkan", Finding::Ok(text));
                     tell("kernels", kernel_config(&d, args.autotune));
                 } else {

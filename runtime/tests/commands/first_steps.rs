@@ -82,6 +82,7 @@ fn whatever_the_doctor_finds_it_says_how_to_mend_it() {
         let nowhere = dir.path().join("nowhere");
         let output = program()
             .args(["doctor", "--model", nowhere.to_str().unwrap(), "--mission", path.to_str().unwrap()])
+            .env("DGTR_PROCESSOR", "driver")
             .envs(["VK_DRIVER_FILES", "VK_ICD_FILENAMES", "ORT_DYLIB_PATH"].map(|name| (name, &nowhere)))
             .output()
             .unwrap();
