@@ -8,7 +8,7 @@ table! {
     pub struct GroundSettings {
         /// Whose receipts the aircraft believe, as `dgtr keys` prints it; the ground and every aircraft have a key, or nobody.
         pub public_key: Option<PublicKey> = None;
-        /// Part of the name of the Vulkan device to use; absent = the best there is.
+        /// Part of the name of the device to use: processor, or a Vulkan device; absent = the fastest.
         pub device: Option<String> = None;
         /// Device memory for merging and distilling.
         pub device_mib: u32 = 1024, in Limits::within(16.0, 1_048_576.0);

@@ -152,7 +152,7 @@ record! {
         /// Corners of the region, east and north of the origin.
         #[serde(default)]
         pub region_enu: Vec<[f64; 2]> = Vec::new(), unit "metres";
-        /// Vulkan device by (part of) its name; absent = the best one.
+        /// Device by (part of) its name: processor, or a Vulkan device; absent = the fastest.
         #[serde(default)]
         pub device: Option<String> = None;
         /// Who may offer this aircraft's models, as `dgtr keys` prints it.

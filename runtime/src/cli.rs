@@ -90,7 +90,8 @@ pub fn notes() -> String {
         "Exit codes: 0 done, {}.\n\nDGTR_KERNELS=auto|default|processor|board|card: kernel configuration. auto measures it once per \
          hardware device and driver (dgtr doctor shows it); default and the three profiles measure nothing. Models do not \
          depend on it.\nDGTR_PROCESSOR=native|driver: whose kernels run where the device is the processor, the program's own or \
-         those of Mesa's software driver. Models differ by rounding.",
+         those of Mesa's software driver. Models differ by rounding.\n\
+         LP_NUM_THREADS=N: threads by which a processor computes; one for each core where it is not set.",
         codes.join(", ")
     )
 }

@@ -37,7 +37,7 @@ const SURVEY: [(&str, u32); 2] = [("--max-gaussians", 20_000), ("--budget-mib", 
 /// How much is measured.
 #[derive(Clone, Debug)]
 pub struct Extent {
-    /// Part of the Vulkan device's name.
+    /// Part of the device's name.
     pub device: Option<String>,
     /// No further kernel configuration is tried after this.
     pub autotuning: Duration,

@@ -145,7 +145,7 @@ pub struct TrainJob {
     pub auto: bool,
     /// Whether the computer is spared as in a flight.
     pub spares: bool,
-    /// Part of the Vulkan device's name.
+    /// Part of the device's name.
     pub device: Option<String>,
     /// As what encoding rounds them the last share of training has values.
     pub for_delivery: Option<Rounding>,

@@ -45,7 +45,7 @@ fn crops_of_flight(mission: &Mission) -> u32 {
 /// What a job wants of which device.
 #[derive(Clone, Debug)]
 pub struct DeviceRequest {
-    /// Part of the Vulkan device's name.
+    /// Part of the device's name.
     pub device: Option<String>,
     /// What the plan is made from.
     pub memory: Memory,

@@ -76,7 +76,7 @@ pub struct Merging {
     /// Learning rates relative to training.
     #[arg(long)]
     pub rate: Option<f32>,
-    /// Vulkan device by (part of) its name.
+    /// Device by (part of) its name: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
     /// Seed of the order of views.

@@ -31,7 +31,7 @@ pub struct Args {
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Vulkan device whose name contains this, for models.
+    /// Device whose name contains this: processor, or a Vulkan device, for models.
     #[arg(long)]
     pub device: Option<String>,
 }

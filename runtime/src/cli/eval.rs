@@ -53,7 +53,7 @@ pub struct Args {
     /// Also measure a perceptual distance: manifest of a network of contract `metric`.
     #[arg(long, value_name = "MANIFEST")]
     pub metric: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
 }

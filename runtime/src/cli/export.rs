@@ -98,7 +98,7 @@ pub struct Args {
     /// With `--to html`: so many of the cameras as small pictures to jump to, evenly chosen; 0 needs no Vulkan device.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=i64::from(viewer::MAX_THUMBNAILS)))]
     pub thumbnails: Option<u16>,
-    /// With `--to html`: Vulkan device, for the small pictures, whose name contains this.
+    /// With `--to html`: device for the small pictures, by part of its name.
     #[arg(long)]
     pub device: Option<String>,
     /// Poses and lenses of this data set (the folder that a card was trained into holds its own) instead of the model's

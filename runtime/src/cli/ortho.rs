@@ -50,7 +50,7 @@ pub struct Args {
     /// Also draw lines of equal height every M metres: contours.geojson and contours.dxf.
     #[arg(long, value_name = "M", value_parser = above_zero)]
     pub contours: Option<f64>,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
 }

@@ -58,7 +58,7 @@ pub struct Args {
     /// Adam's moments of SH in 16 bits each (`training.sh.half_moments`).
     #[arg(long)]
     pub half_moments: bool,
-    /// Vulkan device whose name contains this; without it the plan is the first device's, or a processor's.
+    /// Device whose name contains this: processor, or a Vulkan device; without it the plan is the first device's, or a processor's.
     #[arg(long)]
     pub device: Option<String>,
     /// JSON instead of a table.

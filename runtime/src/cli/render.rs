@@ -33,7 +33,7 @@ pub struct Args {
     /// Metres per unit of the depth pictures; 0 means nothing is there, 65535 this far or farther.
     #[arg(long, default_value_t = 0.01)]
     pub depth_unit: f32,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
 }

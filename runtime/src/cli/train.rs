@@ -88,7 +88,7 @@ pub struct Args {
     limits: LimitArgs,
     #[command(flatten, next_help_heading = "Memory and device")]
     memory: Memory,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long, help_heading = "Memory and device")]
     device: Option<String>,
     #[command(flatten, next_help_heading = "Recipe")]

@@ -46,7 +46,7 @@ pub struct Args {
     /// Folder for volumes.csv and volumes.json, and for the map of a model.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Vulkan device whose name contains this, for a model.
+    /// Device whose name contains this: processor, or a Vulkan device, for a model.
     #[arg(long)]
     pub device: Option<String>,
 }

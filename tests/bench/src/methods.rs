@@ -63,7 +63,7 @@ pub struct Onboard {
     /// Device memory of each aircraft, MiB.
     #[arg(long, default_value_t = 512)]
     pub budget_mib: u32,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
 }

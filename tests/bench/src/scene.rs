@@ -52,7 +52,7 @@ pub struct Request {
     pub steps: u32,
     /// Device memory, MiB.
     pub device_mib: u32,
-    /// Part of the Vulkan device's name.
+    /// Part of the device's name.
     pub device: Option<String>,
 }
 

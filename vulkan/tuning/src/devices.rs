@@ -1,4 +1,4 @@
-//! Which Vulkan device trains where nobody names one: of several the one with the faster step, measured once and kept. A board has two,
+//! Which device trains where nobody names one: of several the one with the faster step, measured once and kept. A board has two,
 //! its GPU and Mesa's driver for the processor, and it is not always the GPU that wins (on a Raspberry Pi 5 others saw the processor
 //! ahead by nine times).
 

@@ -17,7 +17,7 @@ pub struct Args {
     /// Instead of the checks, measure the device in ten minutes and write a report to send in.
     #[arg(long = "report", value_name = "FILE", conflicts_with_all = ["model", "mission", "autotune"])]
     pub path: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long, requires = "path")]
     pub device: Option<String>,
     /// No further kernel configuration is tried after so many seconds.

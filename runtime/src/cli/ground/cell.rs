@@ -29,7 +29,7 @@ pub struct Args {
     /// Every N-th cell of the plan from the I-th on, I from 0 to N − 1: the share of one of N jobs of an array.
     #[arg(long, value_name = "I/N", conflicts_with = "keys")]
     share: Option<Share>,
-    /// Vulkan device by (part of) its name.
+    /// Device by (part of) its name: processor, or a Vulkan device.
     #[arg(long)]
     device: Option<String>,
 }

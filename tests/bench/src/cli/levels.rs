@@ -21,7 +21,7 @@ pub struct Args {
     /// Where the made-up scene (scene.dgtr) and the levels (streamed) go.
     #[arg(long)]
     pub out: PathBuf,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
     /// Write everything as JSON.

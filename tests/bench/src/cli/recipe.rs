@@ -14,7 +14,7 @@ pub struct Recipe {
     /// TOML file with recipe tables for every training, as `dgtr train --settings`.
     #[arg(long, value_name = "FILE")]
     pub settings: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
 }

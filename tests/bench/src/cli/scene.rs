@@ -28,7 +28,7 @@ pub struct Args {
     /// Where the made-up scene (scene.dgtr), the trained one (model.dgtr) and its pictures go.
     #[arg(long)]
     pub out: PathBuf,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
     /// Write everything as JSON.

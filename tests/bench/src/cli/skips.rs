@@ -42,7 +42,7 @@ pub struct Args {
     /// TOML file with recipe tables that hold for every run.
     #[arg(long, value_name = "FILE")]
     pub settings: Option<PathBuf>,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
     /// Keep models and logs here; default: a temporary folder.

@@ -37,7 +37,7 @@ pub struct Args {
     /// Seed of the synthetic scenes.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
     /// Write everything as JSON.

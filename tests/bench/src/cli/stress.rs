@@ -19,7 +19,7 @@ pub struct Args {
     /// Only the CPU reference, without a device.
     #[arg(long, conflicts_with_all = ["long", "device"])]
     pub reference_only: bool,
-    /// Vulkan device whose name contains this.
+    /// Device whose name contains this: processor, or a Vulkan device.
     #[arg(long)]
     pub device: Option<String>,
     /// Write everything as JSON.

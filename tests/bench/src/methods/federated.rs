@@ -37,7 +37,7 @@ const HAS_SHARE: f64 = 0.1;
 /// How the trainer is asked for.
 #[derive(Clone, Debug)]
 pub struct Ground {
-    /// Part of the Vulkan device's name.
+    /// Part of the device's name.
     pub device: Option<String>,
     /// Device memory, MiB.
     pub device_mib: u32,
