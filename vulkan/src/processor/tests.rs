@@ -1,4 +1,4 @@
-//! What training on the processor leaves does not depend on its threads or its vectors, and is what the driver's kernels leave, up to rounding.
+//! What training on the processor leaves does not depend on its threads or its vectors.
 
 use crate::fixture::Fixture;
 use crate::gpu::{Forced, Gpu};
