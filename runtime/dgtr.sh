@@ -3,5 +3,5 @@
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 sh "$here/runtime/setup.sh"
-command -v cargo >/dev/null || { echo "dgtr: cargo not found; install Rust 1.88 or later from https://rustup.rs" >&2; exit 3; }
+command -v cargo >/dev/null || { echo "dgtr: cargo not found; install Rust 1.89 or later from https://rustup.rs" >&2; exit 3; }
 exec cargo run --quiet --release --locked --config "$here/.cargo/config.toml" --manifest-path "$here/Cargo.toml" --package runtime --bin dgtr -- "$@"
