@@ -45,7 +45,7 @@ failed=0
 # shellcheck disable=SC2086
 nice -n 10 cargo test $all --no-fail-fast --exclude tests || failed=$?
 # On a processor the program's own kernels ran; the driver's, which are those of every other device, on the same promises.
-driver="bands compiles_once degrees gradients half_moments kernel_configs masks numerical_gpu repeatable stages steady walk"
+driver="bands compiles_once degrees gradients half_moments masks numerical_gpu repeatable stages steady walk"
 # shellcheck disable=SC2086
 DGTR_PROCESSOR=driver nice -n 10 cargo test $all --no-fail-fast $(for test in $driver; do echo "--test $test"; done) || failed=$?
 wait "$flying" || failed=$?

@@ -206,7 +206,7 @@ pub fn measure(extent: &Extent, folder: &Path) -> Result<DeviceReport, JobError>
 fn device(info: &GpuInfo) -> Value {
     json!({
         "name": info.name,
-        "vulkan": format!("{}.{}", info.version.0, info.version.1),
+        "vulkan": info.has_driver().then(|| format!("{}.{}", info.version.0, info.version.1)),
         "driver_version": info.driver_version,
         "vendor": info.ids.0,
         "device": info.ids.1,

@@ -1,7 +1,6 @@
 //! The kernels as functions of the processor.
 //!
-//! Where the device is the processor itself, its memory is the host's, and a function with the compiler's vectors does a kernel's work in a
-//! third of the time of a software driver's lanes. Each function has the name, the sections and the meaning of its kernel in `shaders/`;
+//! Where the device is the processor itself, its memory is the host's and no driver is needed. Each function has the name, the sections and the meaning of its kernel in `shaders/`;
 //! the references in `crate::reference` judge both. What a step leaves does not depend on the number of threads, on the vectors of the
 //! processor, or on how many bands a picture is done in.
 
@@ -33,7 +32,7 @@ use pool::{Parts, Pool};
 pub(crate) use rates::Rates;
 
 /// The text of these functions: what was measured with other ones says nothing about them.
-pub(crate) const SOURCES: [&str; 10] = [
+pub(crate) const SOURCES: [&str; 11] = [
     include_str!("processor/blend.rs"),
     include_str!("processor/gaussians.rs"),
     include_str!("processor/halves.rs"),
@@ -43,6 +42,7 @@ pub(crate) const SOURCES: [&str; 10] = [
     include_str!("processor/pool.rs"),
     include_str!("processor/project.rs"),
     include_str!("processor/projection.rs"),
+    include_str!("processor/target.rs"),
     include_str!("processor/tiles.rs"),
 ];
 

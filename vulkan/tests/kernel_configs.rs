@@ -15,7 +15,7 @@ use vulkan::kernel_config::KernelConfig;
 use vulkan::trainer::Rendering;
 
 fn gpu() -> Option<Gpu> {
-    let gpu = Gpu::open(None);
+    let gpu = Gpu::open_by_driver(None);
     if let Err(e) = &gpu {
         needs::missing(needs::Need::Vulkan, e);
     }

@@ -4,7 +4,7 @@
 //! Threads take rows of tiles. Within a tile the Gaussians come near to far; both passes take the same decisions from the same numbers.
 
 use super::Call;
-use super::lanes::{F8, LANES, exp2, fma, ramp, splat};
+use super::lanes::{EXPONENTS, F8, LANES, exp2, fma, ramp, splat};
 use super::pool::Parts;
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TILE_HEIGHT, TILE_WIDTH, TRANSMITTANCE_MIN};
 use crate::layout::{FLAG_DEPTH, FLAG_FREEZE_SHAPE, FLAG_NO_EARLY_END, Frame};
@@ -108,7 +108,9 @@ impl<S: Simd> Values<S> {
         let change = fma(splat(s, mixed), dx, splat(s, down * (dy + (dy + 1.0))));
         let mut ratio = exp2(change.min(splat(s, STEEPEST)));
         let bend = splat(s, bend);
-        let first = exp2(exponent.min(most));
+        // Nothing is nothing in every row, however steep: the least number that is not zero would grow.
+        let is_something = exponent.simd_ge(splat(s, EXPONENTS[0]));
+        let first = is_something.select(exp2(exponent.min(most)), splat(s, 0.0));
         let second = first * ratio;
         ratio *= bend;
         let third = second * ratio;
@@ -449,4 +451,44 @@ fn totals<S: Simd>(s: S, all: [F8<S>; 4]) -> [f32; 4] {
     ab.store_slice(&mut out[..4]);
     cd.store_slice(&mut out[4..]);
     [out[0] + out[2], out[1] + out[3], out[4] + out[6], out[5] + out[7]]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fearless_simd::Level;
+
+    /// A round Gaussian of the low pass alone, at the origin, nearly opaque.
+    const SPECK: Shaded = {
+        let down = -0.5 * std::f32::consts::LOG2_E / 0.3;
+        [[0.0, 0.0, 1.0, -0.01], [down, 0.0, down, 0.035_674], [1.0, 1.0, 1.0, 0.0]]
+    };
+
+    fn values(corner: [f32; 2]) -> [[f32; LANES]; ROWS] {
+        #[inline(always)]
+        fn of<S: Simd>(s: S, corner: [f32; 2]) -> [[f32; LANES]; ROWS] {
+            let values = Values::of(s, &SPECK, corner);
+            let mut all = [[0.0; LANES]; ROWS];
+            for (row, raw) in all.iter_mut().zip(&values.raw) {
+                raw.store_slice(row);
+            }
+            all
+        }
+        dispatch!(Level::new(), s => of(s, corner))
+    }
+
+    #[test]
+    fn values_are_those_of_the_parabola_and_nothing_far_from_it_wherever_a_tile_lies() {
+        for (x, y) in (-60..60).flat_map(|x| (-60..60).map(move |y| (x, y))) {
+            let corner = [x as f32 + 0.37, y as f32 + 0.81];
+            for (j, row) in values(corner).iter().enumerate() {
+                for (i, found) in row.iter().enumerate() {
+                    let [dx, dy] = [corner[0] + i as f32, corner[1] + j as f32].map(f64::from);
+                    let exact = (f64::from(SPECK[1][0]) * (dx * dx + dy * dy) + f64::from(SPECK[0][3])).exp2();
+                    let wrong = (f64::from(*found) - exact).abs();
+                    assert!(wrong <= 1e-3 * exact + 1e-9, "{found} instead of {exact} at ({dx}, {dy})");
+                }
+            }
+        }
+    }
 }

@@ -63,7 +63,7 @@ pub(super) fn sum<S: Simd>(v: F8<S>) -> f32 {
 }
 
 /// Least and greatest exponent of [`exp2`]; the result is a normal number.
-const EXPONENTS: [f32; 2] = [-126.0, 127.0];
+pub(super) const EXPONENTS: [f32; 2] = [-126.0, 127.0];
 
 /// 2ˣ for x in [-126, 127], of the nearest bound beyond; within two units in the last place (a test). The polynomial is Cephes' `exp2f`
 /// (Moshier 1989), on [-½, ½].

@@ -259,7 +259,7 @@ mod tests {
             let busy = "HTTP/1.1 503 Slow Down\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
             let _ = stream.write_all(busy.as_bytes());
         });
-        let line = bucket(at, ANSWER).range("cells/a", 0, 10).expect_err("given up").to_string();
+        let line = bucket(at, ANSWER).range("cells/a", 0, 10).expect_err("it stalls").to_string();
         assert!(line.contains("503"), "{line}");
         assert_eq!(met.load(Ordering::SeqCst), TRIES as usize);
     }
@@ -285,7 +285,7 @@ mod tests {
         for (begun, drips) in [(&b""[..], false), (half, false), (half, true)] {
             let (at, met) = hold(begun, drips);
             let line =
-                bucket(at, Duration::from_millis(200)).range("cells/a", 0, 5000).expect_err("given up").to_string();
+                bucket(at, Duration::from_millis(200)).range("cells/a", 0, 5000).expect_err("it stalls").to_string();
             assert!(line.contains("cells/a: reading failed") && !line.contains('\n'), "{line}");
             assert_eq!(met.load(Ordering::SeqCst), SILENT_TRIES as usize);
         }
