@@ -33,9 +33,9 @@ const LATEST_NS: u64 = 60_000_000_000;
 /// Announcements missing by their counter that are put on the list at most.
 const GAP: u32 = 8;
 /// What is less sure than this waits for the landing, which knows more.
-const LEAST_IN_FLIGHT: f32 = 0.25;
+const LEAST_IN_FLIGHT: f32 = 0.49;
 /// What is less sure than this at the landing has no exposure.
-pub const LEAST_CONFIDENCE: f32 = 0.23;
+pub const LEAST_CONFIDENCE: f32 = 0.465;
 /// While something waits and nothing comes, it is aligned again after this.
 const AGAIN_NS: u64 = 100_000_000;
 /// Announcements that came late by some time may come this much later.

@@ -41,26 +41,23 @@ fn talk(python: &Path, signing: Signing, peer_key: Option<&str>) -> (serde_json:
     std::fs::write(&key, KEY).expect("written");
     std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
     let settings = VehicleSettings {
-        address: LinkAddress::Pty(None),
-        patient: false,
-        system_id: 1,
         link: LinkSettings { signing, signing_key: Some(key), ..LinkSettings::default() },
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: CameraSettings {
-            width: 640,
-            height: 480,
-            fx: 400.0,
-            fy: 400.0,
-            cx: 320.0,
-            cy: 240.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 0.0,
-            index: None,
-        },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
-        origin: Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 },
+        ..VehicleSettings::new(
+            LinkAddress::Pty(None),
+            CameraSettings {
+                width: 640,
+                height: 480,
+                fx: 400.0,
+                fy: 400.0,
+                cx: 320.0,
+                cy: 240.0,
+                distortion: [0.0; 4],
+                exposure_delay_ms: 0.0,
+                index: None,
+            },
+            Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 },
+        )
     };
     let mut vehicle = Vehicle::open(&settings).expect("a pty");
     let device = vehicle.link().link().and_then(|l| l.pty_path()).expect("its path").to_path_buf();

@@ -80,26 +80,23 @@ impl Camera for Scripted {
 
 fn settings(path: &Path) -> VehicleSettings {
     VehicleSettings {
-        address: LinkAddress::File(path.into()),
-        patient: false,
-        system_id: 1,
         link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: CameraSettings {
-            width: 640,
-            height: 480,
-            fx: 400.0,
-            fy: 400.0,
-            cx: 320.0,
-            cy: 240.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 0.0,
-            index: None,
-        },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
-        origin: ORIGIN,
+        ..VehicleSettings::new(
+            LinkAddress::File(path.into()),
+            CameraSettings {
+                width: 640,
+                height: 480,
+                fx: 400.0,
+                fy: 400.0,
+                cx: 320.0,
+                cy: 240.0,
+                distortion: [0.0; 4],
+                exposure_delay_ms: 0.0,
+                index: None,
+            },
+            ORIGIN,
+        )
     }
 }
 

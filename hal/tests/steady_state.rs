@@ -6,7 +6,6 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use config::link::LinkSettings;
 use config::mission::{CameraSettings, MountAttitude, MountSettings};
 use geometry::geodesy::Geodetic;
 use hal::link::{LinkAddress, SerialLink, TlogLink};
@@ -35,26 +34,22 @@ fn cpu() -> Duration {
 
 fn settings() -> VehicleSettings {
     VehicleSettings {
-        address: LinkAddress::Pty(None),
-        patient: false,
-        system_id: 1,
-        link: LinkSettings::default(),
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: CameraSettings {
-            width: 640,
-            height: 480,
-            fx: 400.0,
-            fy: 400.0,
-            cx: 320.0,
-            cy: 240.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 0.0,
-            index: None,
-        },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
-        origin: Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 },
+        ..VehicleSettings::new(
+            LinkAddress::Pty(None),
+            CameraSettings {
+                width: 640,
+                height: 480,
+                fx: 400.0,
+                fy: 400.0,
+                cx: 320.0,
+                cy: 240.0,
+                distortion: [0.0; 4],
+                exposure_delay_ms: 0.0,
+                index: None,
+            },
+            Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 },
+        )
     }
 }
 

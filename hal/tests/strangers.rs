@@ -121,16 +121,13 @@ fn settings() -> VehicleSettings {
         index: None,
     };
     VehicleSettings {
-        address: LinkAddress::UdpIn("0.0.0.0:14550".into()),
-        patient: false,
-        system_id: 1,
         link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens,
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
-        origin: Geodetic { lat_deg: 46.84265, lon_deg: -91.99390, alt_m: 158.6 },
+        ..VehicleSettings::new(
+            LinkAddress::UdpIn("0.0.0.0:14550".into()),
+            lens,
+            Geodetic { lat_deg: 46.84265, lon_deg: -91.99390, alt_m: 158.6 },
+        )
     }
 }
 

@@ -85,20 +85,13 @@ fn flown(flights: &[u64], swap_s: f32, seconds: u64) -> (Option<(Ended, u64)>, F
     std::fs::create_dir(&pictures).expect("a folder");
     let clock = Arc::new(ManualClock::default());
     let vehicle = VehicleSettings {
-        address: LinkAddress::Pty(None),
-        patient: false,
-        system_id: 1,
         link: LinkSettings { battery_swap_s: swap_s, ..LinkSettings::default() },
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: LENS,
         mount: MountSettings {
             attitude: MountAttitude::Fixed,
             rotation_deg: [0.0, -90.0, 0.0],
             ..MountSettings::default()
         },
-        origin: ORIGIN,
+        ..VehicleSettings::new(LinkAddress::Pty(None), LENS, ORIGIN)
     };
     let (line, other) = WireLink::pair();
     let camera = FolderCamera::open(&pictures).expect("the folder").on_simulated_clock();

@@ -42,26 +42,23 @@ pub fn accompany<R: Send>(
             scope.spawn(move || simulate(&mut |path| tell.send(path.expect("a pty").to_path_buf()).expect("told")));
         let path = told.recv_timeout(Duration::from_secs(60)).expect("ready");
         let settings = VehicleSettings {
-            address: LinkAddress::Serial { path, baud: 921_600 },
-            patient: false,
-            system_id: 1,
             link,
-            failsafe: config::failsafe::FailsafeSettings::default(),
             camera: Some(CameraSource::Folder(folder.into())),
-            pictures_since: None,
-            lens: CameraSettings {
-                width: 64,
-                height: 48,
-                fx: 50.0,
-                fy: 50.0,
-                cx: 32.0,
-                cy: 24.0,
-                distortion: [0.0; 4],
-                exposure_delay_ms: 0.0,
-                index: None,
-            },
-            mount: MountSettings::default(),
-            origin,
+            ..VehicleSettings::new(
+                LinkAddress::Serial { path, baud: 921_600 },
+                CameraSettings {
+                    width: 64,
+                    height: 48,
+                    fx: 50.0,
+                    fy: 50.0,
+                    cx: 32.0,
+                    cy: 24.0,
+                    distortion: [0.0; 4],
+                    exposure_delay_ms: 0.0,
+                    index: None,
+                },
+                origin,
+            )
         };
         let mut vehicle = Vehicle::open(&settings).expect("opens");
         let mut companion = Companion::default();

@@ -79,16 +79,9 @@ fn every_real_photograph_gets_its_own_pose() {
         });
         let path = told.recv_timeout(Duration::from_secs(30)).expect("ready");
         let mut vehicle = Vehicle::open(&VehicleSettings {
-            address: LinkAddress::Serial { path, baud: 921_600 },
-            patient: false,
-            system_id: 1,
             link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
-            failsafe: config::failsafe::FailsafeSettings::default(),
             camera: Some(CameraSource::Folder(camera.path().into())),
-            pictures_since: None,
-            lens: LENS,
-            mount: MountSettings::default(),
-            origin: playlist.home,
+            ..VehicleSettings::new(LinkAddress::Serial { path, baud: 921_600 }, LENS, playlist.home)
         })
         .expect("opens");
         let mut frames = Vec::new();
@@ -148,16 +141,14 @@ fn a_pulled_cable_is_reported_and_plugged_in_again() {
     let plug = || Channel::new(PtyLink::create(Some(&alias)).expect("a pty"), 1, 1, Signer::off());
     let mut channel = plug();
     let mut vehicle = Vehicle::open(&VehicleSettings {
-        address: LinkAddress::Serial { path: alias.clone(), baud: 921_600 },
         patient: true,
-        system_id: 1,
         link: LinkSettings { heartbeat_timeout_s: 2.0, ..LinkSettings::default() },
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: LENS,
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
-        origin: Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 0.0 },
+        ..VehicleSettings::new(
+            LinkAddress::Serial { path: alias.clone(), baud: 921_600 },
+            LENS,
+            Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 0.0 },
+        )
     })
     .expect("opens");
     while vehicle.autopilot().heartbeat_ns.is_none() {

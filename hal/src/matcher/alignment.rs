@@ -19,6 +19,9 @@ const JUMP: usize = 5;
 const BREAK: f32 = 12.0;
 /// Exposures at the beginning or the end without any picture cost no more together: the camera was not ready.
 const UNREADY: f32 = 10.0;
+/// The first picture or exposure that stays alone at the beginning or the end costs no more, however rarely one does in between: that
+/// is where cameras and links are started and stopped. One in ten.
+const AT_THE_END: f32 = 2.3;
 /// Latencies are expected to lie this far from the mission's, and what the unlikeliest costs.
 const LATENCY_SCALE_NS: f32 = 2.0e9;
 const UNLIKELY_LATENCY: f32 = 8.0;
@@ -52,7 +55,7 @@ const STILL_OPEN: f32 = 0.3;
 const OVERDUE_NS: i64 = 500_000_000;
 /// A margin of its root is as likely right as wrong: the model is never as right as its likelihoods say. Of two thousand flights by seed
 /// (DGTR_FLIGHTS=2000, tests/flights_by_seed.rs) no wrong pair has a confidence above 0.9 with it.
-const DOUBT: f32 = 26.0;
+const DOUBT: f32 = 9.0;
 
 /// An exposure on the list.
 #[derive(Clone, Copy, Debug)]
@@ -142,6 +145,28 @@ impl Chain<'_> {
         (from..to).map(|p| self.alone(p)).sum()
     }
 
+    /// The same for pictures before the first one that has an exposure.
+    fn alone_before(&self, from: usize, to: usize) -> f32 {
+        let dearest = (from..to).map(|p| self.alone(p)).fold(0.0, f32::max);
+        self.alone_between(from, to) - (dearest - AT_THE_END).max(0.0)
+    }
+
+    /// The same for pictures behind the last one. In flight none is the last.
+    fn alone_behind(&self, from: usize, to: usize) -> f32 {
+        if self.is_over() { self.alone_before(from, to) } else { self.alone_between(from, to) }
+    }
+
+    fn is_over(&self) -> bool {
+        self.model.now_ns == u64::MAX
+    }
+
+    /// What exposures without a picture before the first or behind the last one cost.
+    fn unready(&self, exposures: usize, at_an_end: bool) -> f32 {
+        let each = self.model.exposure_alone;
+        let spared = if exposures == 0 || !at_an_end { 0.0 } else { (each - AT_THE_END).max(0.0) };
+        (exposures as f32 * each - spared).min(UNREADY)
+    }
+
     /// Announced exposures in a stretch of the list.
     fn announced(&self, from: usize, to: usize) -> usize {
         self.exposures[from.min(to)..to].iter().filter(|e| e.announced).count()
@@ -160,8 +185,7 @@ impl Chain<'_> {
     fn begin(&self, picture: usize, exposure: usize) -> f32 {
         let off = self.latency(picture, exposure).saturating_sub(self.model.latency_ns).unsigned_abs() as f32
             / LATENCY_SCALE_NS;
-        let before = self.announced(0, exposure) as f32 * self.model.exposure_alone;
-        off.min(UNLIKELY_LATENCY) + before.min(UNREADY)
+        off.min(UNLIKELY_LATENCY) + self.unready(self.announced(0, exposure), true)
     }
 
     /// The picture is the last one that has an exposure.
@@ -171,8 +195,7 @@ impl Chain<'_> {
             let due = signed(e.trigger.time_ns).saturating_add(latency.max(0)).saturating_add(OVERDUE_NS);
             e.announced && due < signed(self.model.now_ns)
         };
-        let after = self.exposures[exposure + 1..].iter().filter(overdue).count() as f32 * self.model.exposure_alone;
-        after.min(UNREADY)
+        self.unready(self.exposures[exposure + 1..].iter().filter(overdue).count(), self.is_over())
     }
 
     /// From one picture with its exposure to the next one that has one by its latency; those in between stay alone, or are late.
@@ -184,7 +207,8 @@ impl Chain<'_> {
         let counted = self.counted(x, y).map(|counted| counted - (i64::from(e.sequence) - i64::from(d.sequence)));
         let per_ns = if off < 0.0 && counted == Some(0) { CAUGHT_UP_NS } else { JUMP_NS };
         let changed = (off * off / (2.0 * (self.model.jitter_ns2 + own))).min(JUMPED + off.abs() / per_ns);
-        let mut cost = changed + self.unusual(b.0, b.1);
+        // Only what jumps: of a flight that is wrong as a whole every latency is the usual one.
+        let mut cost = changed + if off.abs() > USUAL_NS { self.unusual(b.0, b.1) } else { 0.0 };
         let mut skipped = self.announced(a.1 + 1, b.1) as f32;
         for p in a.0 + 1..b.0 {
             match self.late(a, p, b.1) {
@@ -260,10 +284,11 @@ impl Chain<'_> {
 
     /// What lies behind a picture with which a chain begins.
     fn anew(&self, rows: &Rows<'_>, first: usize, picture: usize) -> f32 {
-        let Some(last) = first.checked_sub(1) else { return self.alone_between(0, picture) };
+        let none_before = self.alone_before(0, picture);
+        let Some(last) = first.checked_sub(1) else { return none_before };
         let at = last * rows.width;
         let stands = rows.ahead[at..at + rows.bands[last].len].iter().copied().fold(NEVER, f32::min);
-        stands + BREAK + self.alone_between(first, picture)
+        none_before.min(stands + BREAK + self.alone_between(first, picture))
     }
 
     /// Fills the rows from `first` on; those before it stand.
@@ -290,7 +315,7 @@ impl Chain<'_> {
         }
         for p in (first..n).rev() {
             let band = rows.bands[p];
-            let after = self.alone_between(p + 1, n);
+            let after = self.alone_behind(p + 1, n);
             for i in 0..band.len {
                 let e = band.from + i;
                 let mut best = self.end(p, e) + after;
@@ -334,7 +359,7 @@ impl Chain<'_> {
                     continue;
                 }
                 let a = (q, from.from + k);
-                best.take(so_far + self.alone_between(q + 1, n) + self.end(a.0, a.1), None);
+                best.take(so_far + self.alone_behind(q + 1, n) + self.end(a.0, a.1), None);
                 for p in picture + 1..n.min(q + 1 + JUMP) {
                     let to = rows.bands[p];
                     for l in (a.1 + 1).saturating_sub(to.from)..to.len {

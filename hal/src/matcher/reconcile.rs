@@ -83,11 +83,13 @@ struct Elected {
     votes: usize,
     /// Votes before the runner-up.
     margin: usize,
+    /// Votes of those that could have voted for it, 0 … 1: where a camera skips exposures no single offset holds for all.
+    share: f32,
 }
 
 impl Elected {
     fn confidence(&self) -> f32 {
-        1.0 - STRAY.powi(i32::try_from(self.margin).unwrap_or(i32::MAX).min(6))
+        self.share * (1.0 - STRAY.powi(i32::try_from(self.margin).unwrap_or(i32::MAX).min(6)))
     }
 }
 
@@ -144,7 +146,9 @@ impl Desk<'_> {
         let apart = |offset: i128| (offset - best.0).abs() > width;
         let second = window(&ballots, width, apart).map_or(0, |w| w.1);
         let margin = best.1.saturating_sub(second);
-        (best.1 >= 2 && margin > 0).then_some(Elected { offset: best.0, votes: best.1, margin })
+        let (exposures, pictures): (HashSet<_>, HashSet<_>) = ballots.iter().map(|b| (b.1, b.2)).unzip();
+        let share = best.1 as f32 / exposures.len().min(pictures.len()).max(1) as f32;
+        (best.1 >= 2 && margin > 0).then_some(Elected { offset: best.0, votes: best.1, margin, share: share.min(1.0) })
     }
 
     /// Pairs what the elected offset brings together, in order.
@@ -166,11 +170,36 @@ impl Desk<'_> {
         for (at, picture) in shots {
             let start = from + times[from..].partition_point(|t| t.0 < at - width);
             let near = times[start..].iter().take_while(|t| t.0 <= at + width).enumerate();
-            let near = near.filter(|(_, t)| self.is_possible(t.1, picture) && self.keeps_order(t.1, picture));
-            let Some((k, &(_, exposure))) = near.min_by_key(|(_, t)| (t.0 - at).abs()) else { continue };
+            let mut near = near.filter(|(_, t)| self.is_possible(t.1, picture) && self.keeps_order(t.1, picture));
+            // A clock that cannot tell two exposures apart says nothing of either.
+            let (Some((k, &(_, exposure))), None) = (near.next(), near.next()) else { continue };
+            let is_known = |(t, _): &(Trigger, _)| of_exposure(t).is_some_and(|known| (known - at).abs() <= width);
+            if self.known.iter().any(is_known)
+                || !self.agrees_with_neighbours(width, &of_exposure, &of_picture, (elected.offset, picture))
+            {
+                continue;
+            }
             from = start + k + 1;
             self.pairs.push(Pairing { exposure, picture, confidence: elected.confidence() });
         }
+    }
+
+    /// The certain pairs whose numbers are next to a picture's have the same offset, if there are any: in between a camera may have
+    /// skipped an exposure, or taken a picture by hand.
+    fn agrees_with_neighbours(
+        &self,
+        width: i128,
+        of_exposure: &impl Fn(&Trigger) -> Option<i128>,
+        of_picture: &impl Fn(&PictureClues) -> Option<i128>,
+        (offset, picture): (i128, usize),
+    ) -> bool {
+        let Some(own) = of_picture(&self.pictures[picture]) else { return false };
+        let offsets =
+            self.known.iter().filter_map(|(t, c)| Some((of_picture(c)? - own, of_picture(c)? - of_exposure(t)?)));
+        let offsets: Vec<(i128, i128)> = offsets.collect();
+        let before = offsets.iter().filter(|o| o.0 < 0).max();
+        let after = offsets.iter().filter(|o| o.0 > 0).min();
+        [before, after].into_iter().flatten().all(|o| (o.1 - offset).abs() <= width)
     }
 
     /// No certain pair says otherwise: a higher number is a later exposure.

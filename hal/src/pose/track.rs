@@ -9,12 +9,10 @@ use super::ring::{Around, Ring, Stamped};
 use super::{BodyPose, PoseError};
 use crate::frames::{attitude_to_enu, yaw_of_ned};
 
-/// 6 s of GLOBAL_POSITION_INT at 10 Hz.
-const POSITIONS: usize = 64;
-/// 5 s of attitude at 50 Hz.
-const ATTITUDES: usize = 256;
-/// 6 s of gimbal status at 10 to 20 Hz.
-const GIMBALS: usize = 128;
+/// An exposure may be announced seconds after it: 5 s of positions at 50 Hz, of attitudes at 100 Hz, of gimbal status at 50 Hz.
+const POSITIONS: usize = 256;
+const ATTITUDES: usize = 512;
+const GIMBALS: usize = 256;
 
 /// Samples further apart than this are not interpolated.
 const MAX_POSITION_GAP_NS: u64 = 1_500_000_000;

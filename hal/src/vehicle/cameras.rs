@@ -25,6 +25,10 @@ const MARGIN_SHARE: f64 = 0.2;
 /// Exposures of two cameras this close together are one for the pose: at 20 m/s a metre.
 const SAME_NS: u64 = 50_000_000;
 const SAME_SHARE: f64 = 0.8;
+/// The same for two of one rhythm, of both of which a fifth may be lost.
+const ECHO_SHARE: f64 = 0.6;
+/// Of fewer exposures nobody can say whether two cameras have one rhythm.
+const TELLING: usize = 8;
 /// Confidence of pictures whose camera could not be told.
 const UNDECIDED: f32 = 0.5;
 
@@ -123,12 +127,12 @@ impl Cameras {
         let (best, mut source) = *ranked.first()?;
         let margin = MARGIN.max(MARGIN_SHARE * arrived.len() as f64);
         let mut certain = true;
-        for (_, other) in ranked[1..].iter().filter(|(misfit, _)| misfit - best < margin) {
+        for (misfit, other) in &ranked[1..] {
             // Two that expose together give the same poses: the first one's count.
             if self.expose_together(source, *other) {
                 source = source.min(*other);
             } else {
-                certain = false;
+                certain &= misfit - best >= margin && !self.is_echo(source, *other);
             }
         }
         if !certain && arrived.len() < ENOUGH && !at_end {
@@ -163,6 +167,22 @@ impl Cameras {
             of.iter().filter(|t| near(t, among)).count() as f64 >= SAME_SHARE * of.len() as f64
         };
         share(&a, &b) && share(&b, &a)
+    }
+
+    /// Two of the same rhythm, one so much later than the other: what was lost of each says nothing of whose the pictures are.
+    fn is_echo(&self, a: Source, b: Source) -> bool {
+        let (a, b) = (self.times(a), self.times(b));
+        let (fewer, more) = (a.len().min(b.len()), a.len().max(b.len()));
+        if fewer < TELLING {
+            return more <= 2 * fewer;
+        }
+        let near = |at: i64, among: &[u64]| among.iter().any(|t| (*t as i64 - at).unsigned_abs() <= SAME_NS);
+        let share = |of: &[u64], among: &[u64], later: i64| {
+            of.iter().filter(|t| near(**t as i64 + later, among)).count() as f64 >= ECHO_SHARE * of.len() as f64
+        };
+        let shifts = a.iter().take(LEAST).flat_map(|from| b.iter().map(move |to| *to as i64 - *from as i64));
+        let possible = shifts.filter(|later| later.unsigned_abs() <= self.patience_ns);
+        possible.into_iter().any(|later| share(&a, &b, later) && share(&b, &a, -later))
     }
 
     /// How many pictures and exposures stay alone when the pictures are this camera's, at the latency that suits it best.

@@ -86,7 +86,7 @@ pub struct PosedPicture {
     pub pose: CameraPose,
     /// Speed at the exposure, m/s.
     pub speed_m_s: f32,
-    /// How sure it is that the picture is this exposure's, 0 … 1; 1 when they were matched in flight.
+    /// How sure it is that the picture is this exposure's, 0 … 1.
     pub confidence: f32,
     /// The picture, as it came; see [`Picture::load`] for undistorted pixels.
     pub picture: Picture,

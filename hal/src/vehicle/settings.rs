@@ -37,6 +37,22 @@ pub struct VehicleSettings {
 }
 
 impl VehicleSettings {
+    /// An autopilot of system 1 at `address`, with defaults in everything else: poses and triggers only, no camera.
+    pub fn new(address: LinkAddress, lens: CameraSettings, origin: Geodetic) -> Self {
+        Self {
+            address,
+            patient: false,
+            system_id: 1,
+            link: LinkSettings::default(),
+            failsafe: FailsafeSettings::default(),
+            camera: None,
+            pictures_since: None,
+            lens,
+            mount: MountSettings::default(),
+            origin,
+        }
+    }
+
     /// The settings of one aircraft of a mission.
     ///
     /// # Errors
@@ -46,15 +62,12 @@ impl VehicleSettings {
         Ok(Self {
             // A cable that is not plugged in yet; one that this user may not open is an error.
             patient: matches!(&address, LinkAddress::Serial { path, .. } if !path.exists()),
-            address,
             system_id: aircraft.system_id,
             link: mission.link.clone(),
             failsafe: mission.failsafe,
             camera: Some(aircraft.camera.clone()),
-            pictures_since: None,
-            lens: mission.camera,
             mount: mission.mount,
-            origin: mission.origin,
+            ..Self::new(address, mission.camera, mission.origin)
         })
     }
 }

@@ -4,8 +4,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use config::link::LinkSettings;
-use config::mission::MountSettings;
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value};
 use geometry::geodesy::Geodetic;
@@ -28,18 +26,7 @@ use lens::LENS;
 const ORIGIN: Geodetic = Geodetic { lat_deg: 46.84, lon_deg: -91.99, alt_m: 200.0 };
 
 fn settings() -> VehicleSettings {
-    VehicleSettings {
-        address: LinkAddress::Pty(None),
-        patient: false,
-        system_id: 1,
-        link: LinkSettings::default(),
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: LENS,
-        mount: MountSettings::default(),
-        origin: ORIGIN,
-    }
+    VehicleSettings::new(LinkAddress::Pty(None), LENS, ORIGIN)
 }
 
 /// One segment of a JPEG file.

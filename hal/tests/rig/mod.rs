@@ -6,7 +6,6 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use config::link::LinkSettings;
 use config::mission::{CameraSource, MountAttitude, MountSettings};
 use geometry::geodesy::Geodetic;
 use hal::link::LinkAddress;
@@ -110,20 +109,17 @@ pub fn with_client(python: PathBuf, script: &str) -> Ended {
     let folder = tempfile::tempdir().expect("a folder");
     let router = Router { vehicle: socket(), client: socket() };
     let settings = VehicleSettings {
-        address: LinkAddress::UdpOut(router.vehicle.local_addr().expect("an address").to_string()),
-        patient: false,
-        system_id: 1,
-        link: LinkSettings::default(),
-        failsafe: config::failsafe::FailsafeSettings::default(),
         camera: Some(CameraSource::Folder(folder.path().into())),
-        pictures_since: None,
-        lens: LENS,
         mount: MountSettings {
             attitude: MountAttitude::Fixed,
             rotation_deg: [0.0, -90.0, 0.0],
             ..MountSettings::default()
         },
-        origin: ORIGIN,
+        ..VehicleSettings::new(
+            LinkAddress::UdpOut(router.vehicle.local_addr().expect("an address").to_string()),
+            LENS,
+            ORIGIN,
+        )
     };
     let mut vehicle = Vehicle::open(&settings).expect("a link");
     let mut picture = std::io::Cursor::new(Vec::new());

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use config::faults::FaultSettings;
 use config::link::LinkSettings;
-use config::mission::{CameraSettings, MountSettings};
+use config::mission::CameraSettings;
 use disk::Disk;
 use geometry::geodesy::Geodetic;
 use hal::link::LinkAddress;
@@ -52,26 +52,22 @@ fn script(row: &Row) -> Script {
         prefix: "IMG_".into(),
     };
     let vehicle = VehicleSettings {
-        address: LinkAddress::Pty(None),
-        patient: false,
-        system_id: 1,
         link: LinkSettings { battery_swap_s: 0.0, ..LinkSettings::default() },
-        failsafe: config::failsafe::FailsafeSettings::default(),
-        camera: None,
-        pictures_since: None,
-        lens: CameraSettings {
-            width: 64,
-            height: 48,
-            fx: 50.0,
-            fy: 50.0,
-            cx: 32.0,
-            cy: 24.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 60.0,
-            index: None,
-        },
-        mount: MountSettings::default(),
-        origin: ORIGIN,
+        ..VehicleSettings::new(
+            LinkAddress::Pty(None),
+            CameraSettings {
+                width: 64,
+                height: 48,
+                fx: 50.0,
+                fy: 50.0,
+                cx: 32.0,
+                cy: 24.0,
+                distortion: [0.0; 4],
+                exposure_delay_ms: 60.0,
+                index: None,
+            },
+            ORIGIN,
+        )
     };
     let end = EndOfFlight { silence: Duration::from_secs(20), patience: Some(Duration::from_secs(120)) };
     let mut script = Script {

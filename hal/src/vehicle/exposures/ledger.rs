@@ -17,7 +17,9 @@ pub(super) const EXPOSURES: usize = 4096;
 pub(super) const PUT_ASIDE: usize = 4096;
 
 /// Confidence of a match by vote at most.
-const BY_VOTE: f32 = 0.9;
+const BY_VOTE: f32 = 0.85;
+/// In flight votes count beside so many pictures that were matched.
+const LEAST_KNOWN: usize = 8;
 /// A confidence above this is sure.
 const SURE: f32 = 0.9;
 
@@ -185,8 +187,17 @@ impl Exposures {
         let clues: Vec<PictureClues> = self.aside.iter().map(|a| a.clues).collect();
         let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
         let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
+        // Half a flight alone tells no offset: what is matched must agree on it.
+        if least > 0.0 && known.len() < LEAST_KNOWN {
+            return Vec::new();
+        }
         let mut pairs = reconcile(&triggers, &clues, &known);
-        pairs.retain(|p| p.confidence >= least);
+        // Behind the newest match a number may stand for another exposure: one that was not heard of, after one that was not taken.
+        let newest =
+            if least > 0.0 { known.iter().filter_map(|(_, clues)| clues.number).max() } else { Some(u64::MAX) };
+        pairs.retain(|p| {
+            p.confidence >= least && clues[p.picture].number.is_none_or(|n| newest.is_some_and(|newest| n < newest))
+        });
         // A vote between clocks or numbers cannot tell one interval from the next where the rhythm is regular.
         pairs.iter_mut().for_each(|p| p.confidence = p.confidence.min(BY_VOTE));
         self.take(&triggers, pairs)
