@@ -40,6 +40,9 @@ table! {
             from "dgtr demo --seconds 75, 5 epochs: 0.03 gains 0.06 and 0.03 dB, 0.1 0.17 and 0.08, 0.3 0.38 and 0.13, 1 0.64 and 0.19";
         /// Gaussians at or below this opacity are removed after distillation.
         pub prune_opacity: f32 = 0.005, in Limits::at_least(0.0).below(0.5), from "Fed3DGS";
+        /// An aircraft that was heard of and then not for so long is named, and so is one of which nothing is heard for so long after
+        /// another one was.
+        pub silence_s: f64 = 60.0, in Limits::within(5.0, 86_400.0);
         /// Bring the models together by what they show in common before merging (each lies where its own GPS put it).
         pub register: bool = true;
         /// Seed of the order of views.

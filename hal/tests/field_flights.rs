@@ -95,7 +95,7 @@ impl Story {
 
     /// Every picture has its own exposure's place.
     #[track_caller]
-    fn is_right(self) -> Flown {
+    fn all_right(self) -> Flown {
         let (flown, base) = self.fly();
         right(&flown, base);
         assert_eq!(flown.posed.len(), SHOTS, "{:?}", flown.unmatched);
@@ -121,10 +121,10 @@ fn story(mut each: impl FnMut(&mut Story, usize)) -> Story {
 
 #[test]
 fn a_plain_survey_is_posed_also_far_in_the_south_west_of_the_missions_origin() {
-    story(|s, k| s.exposes(k, 0.0)).is_right();
+    story(|s, k| s.exposes(k, 0.0)).all_right();
     let mut far = Story::at(DVec3::new(-1900.0, -2700.0, 0.0));
     (0..SHOTS).for_each(|k| far.exposes(k, 0.0));
-    let flown = far.is_right();
+    let flown = far.all_right();
     assert!(flown.places().iter().all(|(_, place, _)| place.x < -1800.0 && place.y < -2600.0));
 }
 
@@ -135,7 +135,7 @@ fn of_two_cameras_exposed_together_or_each_by_itself_ours_is_believed() {
         s.exposes(k, 0.0);
         s.sortie.say(shot(k) + 0.001, AUTOPILOT, &other);
     };
-    story(together).is_right();
+    story(together).all_right();
     let mut own = story(|s, k| s.exposes(k, 0.0));
     for n in 0..40u16 {
         let at = BEGIN_S + 0.7 * f64::from(n);
@@ -150,7 +150,7 @@ fn of_two_cameras_exposed_together_or_each_by_itself_ours_is_believed() {
         };
         own.sortie.say(at, AUTOPILOT, &other);
     }
-    own.is_right();
+    own.all_right();
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn px4s_captures_are_exposures_whether_they_succeeded_or_nobody_knows_and_failed
             captured(s, k, result);
             s.takes(k);
         });
-        assert_eq!(whole.is_right().exposures, SHOTS);
+        assert_eq!(whole.all_right().exposures, SHOTS);
     }
     // Two of them fail: no exposure, no picture that anybody misses.
     let failed = story(|s, k| {
@@ -198,13 +198,13 @@ fn exposures_without_a_time_with_a_number_that_stands_still_and_doubled_frames_a
         s.sortie.say(shot(k), AUTOPILOT, &message);
         s.takes(k);
     })
-    .is_right();
+    .all_right();
     story(|s, k| {
         let message = s.feedback(k, (0, 0), unix_us(shot(k)));
         s.sortie.say(shot(k), AUTOPILOT, &message);
         s.takes(k);
     })
-    .is_right();
+    .all_right();
     let doubled = story(|s, k| {
         let message = s.feedback(k, (0, k as u16 + 1), unix_us(shot(k)));
         let bytes = s.sortie.encode(AUTOPILOT, &message);
@@ -212,18 +212,18 @@ fn exposures_without_a_time_with_a_number_that_stands_still_and_doubled_frames_a
         s.sortie.arrives(shot(k) + 0.02, bytes);
         s.takes(k);
     });
-    let flown = doubled.is_right();
+    let flown = doubled.all_right();
     assert_eq!((flown.exposures, flown.counters.exposures.trigger_duplicates), (SHOTS, SHOTS as u64));
 }
 
 #[test]
 fn announcements_that_come_late_all_or_one_at_the_start_or_in_mid_flight_shift_no_picture() {
     for late_s in [1.0, 1.3, 2.0, 2.6, 3.0] {
-        story(|s, k| s.exposes(k, late_s)).is_right();
+        story(|s, k| s.exposes(k, late_s)).all_right();
     }
     for one in [0, 6, SHOTS - 1] {
         for late_s in [1.3, 2.5, 3.9] {
-            story(|s, k| s.exposes(k, if k == one { late_s } else { 0.1 })).is_right();
+            story(|s, k| s.exposes(k, if k == one { late_s } else { 0.1 })).all_right();
         }
     }
 }
@@ -239,7 +239,7 @@ fn a_hot_shoe_that_blinks_twice_is_believed_at_the_shutter() {
         s.sortie.say(written, AUTOPILOT, &card);
         s.takes_at(k, written + 0.1);
     })
-    .is_right();
+    .all_right();
 }
 
 #[test]
@@ -255,7 +255,7 @@ fn a_clock_that_goes_back_by_1024_weeks_or_is_set_in_mid_flight_moves_no_exposur
             s.sortie.say(shot(k), AUTOPILOT, &message);
             s.takes(k);
         })
-        .is_right();
+        .all_right();
     }
 }
 
@@ -299,7 +299,7 @@ fn every_way_to_ask_for_a_picture_takes_one_picture_each() {
             ask(s, k);
             s.takes(k);
         });
-        assert_eq!(story.is_right().exposures, SHOTS, "{name}");
+        assert_eq!(story.all_right().exposures, SHOTS, "{name}");
     }
 }
 
@@ -323,7 +323,7 @@ fn another_aircraft_on_the_line_with_exposures_of_its_own_is_left_out() {
         let message = story.feedback(k, (0, k as u16 + 50), unix_us(shot(k) + 0.4));
         story.sortie.say(shot(k) + 0.4, (2, 1), &message);
     }
-    assert_eq!(story.is_right().exposures, SHOTS);
+    assert_eq!(story.all_right().exposures, SHOTS);
 }
 
 #[test]
@@ -389,7 +389,7 @@ fn two_mounts_or_one_reported_twice_are_never_interpolated_into_each_other() {
         let mut story = story(|s, k| s.exposes(k, 0.0));
         story.settings.mount.attitude = MountAttitude::Gimbal;
         (0..(20.0 * shot(SHOTS)) as usize).map(|n| 2.0 + n as f64 * 0.05).for_each(|at| tell(&mut story, at));
-        let flown = story.is_right();
+        let flown = story.all_right();
         for posed in &flown.posed {
             let forward = posed.pose.rotation * DVec3::Z;
             let off = (forward.z.asin().to_degrees() - pitch_deg).abs();

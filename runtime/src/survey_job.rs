@@ -244,6 +244,9 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         // What a fence encloses is not left by ways round its holes.
         obstacles = obstacles.inside(&outside(area, &frame), manner.beyond_m);
     }
+    if let Source::Rest(rest) = &request.source {
+        obstacles = obstacles.inside(&rest.outside, manner.beyond_m);
+    }
     let craft = craft(request, &homes, &manner)?;
     let shares = deal(&ground, &obstacles, &craft, &manner).map_err(|e| request.in_source(e))?;
     let settings = settings(request, &frame, &homes, &holes);

@@ -377,6 +377,19 @@ fn many() -> KeyframeSettings {
     KeyframeSettings { max: 20_000, ..KeyframeSettings::default() }
 }
 
+/// Metres from a polygon; 0 inside.
+fn off_m(corners: &[DVec2], p: DVec2) -> f64 {
+    if polygon::contains(corners, p) {
+        return 0.0;
+    }
+    let sides = corners.iter().zip(corners.iter().cycle().skip(1));
+    let apart = sides.map(|(a, b)| {
+        let t = ((p - *a).dot(*b - *a) / (*b - *a).length_squared().max(1e-9)).clamp(0.0, 1.0);
+        p.distance(a.lerp(*b, t))
+    });
+    apart.fold(f64::INFINITY, f64::min)
+}
+
 #[test]
 fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -414,8 +427,15 @@ fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end
         survey_job::run(&Request { source, aircraft, camera, home_m: origin.alt_m, ..asked }, &again).expect("dealt");
     assert!(more.rows.iter().all(|row| row.aircraft != "a2") && more.hectares < 0.5 * planned.hectares, "{more:?}");
     let now = Mission::read(&again.join(MISSION)).expect("a mission");
+    let (frame, area) = (EnuFrame::new(mission.origin), regions(&mission));
     for (k, row) in more.rows.iter().enumerate() {
         opened(&row.plan);
+        // Nobody is sent out of the mission's area: what is dealt lies inside, as far as lines reach beyond its sides and corners.
+        for waypoint in flight_plan::read(&row.plan).expect("a plan").waypoints {
+            let p = frame.to_enu(waypoint.position).truncate();
+            let off = area.iter().map(|region| off_m(region, p)).fold(f64::INFINITY, f64::min);
+            assert!(off <= 1.5 * more.beyond_m, "{off} m outside of the area: {p}");
+        }
         let views = flown(&row.plan, &now, 10 + k as u64);
         own.entry(row.aircraft.clone()).or_default().extend(&views);
         all.extend(views);
@@ -450,6 +470,12 @@ fn what_one_of_three_left_half_way_is_dealt_to_the_others_and_covered_in_the_end
         let refused = Rest::of(&file, &ground, &without).expect_err(word).to_string();
         assert!(refused.contains(word), "{refused}");
     }
+    std::fs::copy(&file, ground.join(MISSION)).expect("kept by the ground");
+    assert!(Rest::of(&file, &ground, &["a2".into()]).is_ok());
+    let other = std::fs::read_to_string(&file).expect("a mission").replacen("lat_deg = ", "lat_deg = 1", 1);
+    std::fs::write(ground.join(MISSION), other).expect("written");
+    let refused = Rest::of(&file, &ground, &["a2".into()]).expect_err("another mission's").to_string();
+    assert!(refused.contains("give the folder and the mission of one flight"), "{refused}");
     assert!(Rest::of(&file, folder.path(), &[]).expect_err("no ground").to_string().contains("--out of dgtr serve"));
 }
 

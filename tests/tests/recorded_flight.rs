@@ -66,6 +66,8 @@ fn every_exposure_of_a_recorded_survey_becomes_a_picture_with_the_pose_it_was_ta
     let dir = tempfile::tempdir().expect("tempdir");
     let at = dir.path();
     let log = recording();
+    // The simulator that recorded it ran eight times as fast: 0.25 is twice real time, DGTR_SPEED=0.125 real time.
+    let speed = std::env::var("DGTR_SPEED").unwrap_or_else(|_| "0.25".into());
     let replay = [
         "replay",
         log.to_str().expect("path"),
@@ -76,7 +78,7 @@ fn every_exposure_of_a_recorded_survey_becomes_a_picture_with_the_pose_it_was_ta
         "--reference",
         "truth",
         "--speed",
-        "0.25", // twice real time: the simulator that recorded it ran eight times as fast
+        &speed,
         "--linger",
         "1",
     ];

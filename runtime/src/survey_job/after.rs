@@ -23,6 +23,8 @@ const RECEIVED: &str = "received";
 const LEAST_M2: f64 = 100.0;
 /// Origins nearer to each other are one, metres.
 const SAME_M: f64 = 0.1;
+/// Gaps of one region that are dealt each by itself, the largest; around all smaller ones is flown together.
+const MOST_GAPS: usize = 256;
 
 /// A mission, what is left of it, and who flies that.
 #[derive(Clone, Debug)]
@@ -33,6 +35,8 @@ pub struct Rest {
     pub left: Ground,
     /// What no aircraft's region holds, between the regions.
     pub(super) holes: Vec<Ring>,
+    /// Around all regions: no way leads out of here.
+    pub(super) outside: Ring,
     /// Aircraft that do not fly it.
     pub lost: Vec<String>,
 }
@@ -53,6 +57,7 @@ impl Rest {
             let why = "holds no models of a mission; give the folder that was --out of dgtr serve";
             return Err(FormatError::invalid(ground, why).into());
         }
+        is_of(&mission, ground)?;
         let (mut views, mut open): (Vec<View>, Vec<String>) = (Vec::new(), Vec::new());
         for aircraft in &mission.aircraft {
             let path = received.join(&aircraft.id).join("model.dgtr");
@@ -97,6 +102,11 @@ impl Rest {
         let all = mission.aircraft.iter().try_fold(Ground::default(), |all, a| -> Result<Ground, SurveyError> {
             Ok(all.with(&self::ground(&mission, &a.id)?))
         })?;
+        let outer = || all.parts.iter().filter_map(|part| part.first());
+        let outside = match outer().count() {
+            1 => outer().flatten().copied().collect(),
+            _ => polygon::hull(outer().flatten().copied().collect()),
+        };
         let holes = match &mission.survey {
             Some(survey) => {
                 survey.holes_enu.iter().map(|ring| ring.iter().copied().map(DVec2::from).collect()).collect()
@@ -111,7 +121,7 @@ impl Rest {
             let why = format!("its [survey] is of {count} aircraft and [[aircraft]] of {wanted}; make them agree");
             return Err(FormatError::invalid(file, why).into());
         }
-        Ok(Self { text, mission, left, holes, lost })
+        Ok(Self { text, mission, left, holes, outside, lost })
     }
 
     /// Ids and links of those that fly it.
@@ -207,6 +217,24 @@ impl Rest {
     }
 }
 
+/// Refuses a folder in which the ground received another mission.
+fn is_of(mission: &Mission, ground: &Path) -> Result<(), SurveyError> {
+    let kept = ground.join(super::MISSION);
+    if !kept.is_file() {
+        return Ok(());
+    }
+    let (own, _) = Mission::read_with_text(&kept)?;
+    let apart = EnuFrame::new(mission.origin).to_enu(own.origin).length();
+    if own.name == mission.name && apart <= SAME_M {
+        return Ok(());
+    }
+    let why = format!(
+        "is of mission {:?}, {apart:.1} m from {:?}; give the folder and the mission of one flight",
+        own.name, mission.name
+    );
+    Err(FormatError::invalid(&kept, why).into())
+}
+
 fn ground(mission: &Mission, id: &str) -> Result<Ground, SurveyError> {
     let corners: Ring = mission.region(mission.aircraft(Some(id))?).into_iter().map(DVec2::from).collect();
     Ok(Ground::of(vec![corners]))
@@ -222,7 +250,13 @@ fn uncovered(mission: &Mission, id: &str, views: &[View]) -> Result<Ground, Surv
     let map = region.and_then(|region| CoverageMap::new(&region, rules.ground_m.map_or(0.0, f64::from), rules));
     let mut map = map.map_err(|e| SurveyError::Request(format!("region of {id}: {e}")))?;
     views.iter().for_each(|view| map.add(view));
-    let found = gaps::find(&map);
+    let mut found = gaps::find(&map);
+    if found.len() > MOST_GAPS {
+        // The largest come first.
+        let small = found.split_off(MOST_GAPS - 1);
+        let squares = small.iter().flat_map(|gap| gap.squares.iter().copied()).collect();
+        found.extend(small.into_iter().next().map(|gap| Gap { squares, ..gap }));
+    }
     Ok(found.iter().fold(Ground::default(), |all, gap| all.with(&around(&map, gap))).common(&ground))
 }
 

@@ -136,6 +136,8 @@ pub enum Domain {
     Request,
     /// The ground names its session.
     Session,
+    /// An aircraft says how it is.
+    Word,
 }
 
 impl Domain {
@@ -146,6 +148,7 @@ impl Domain {
             Self::Acknowledgement => b"dgtr acknowledgement\0",
             Self::Request => b"dgtr request\0",
             Self::Session => b"dgtr session\0",
+            Self::Word => b"dgtr word\0",
         };
         [domain, bytes].concat()
     }

@@ -45,6 +45,7 @@ mod territory;
 #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "bad links are the network's"))]
 mod testing;
 pub mod transport;
+pub mod word;
 
 use config::error::{Error, ErrorKind};
 

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use config::upload::UploadSettings;
 
 use super::folder::FolderOutlet;
+use super::word::Condition;
 use super::{Source, UploadError};
 use inbox::{Inbox, Kind, locked};
 use worker::{Connect, Worker};
@@ -72,6 +73,11 @@ impl Offerer {
     /// the link would carry the same Gaussians twice.
     pub fn expect_last(&self, within: Duration) {
         locked(&self.shared.0).last = Instant::now().checked_add(within);
+    }
+
+    /// Says how the aircraft is; the ground hears of it every two seconds where a network leads there.
+    pub fn say(&self, condition: Condition) {
+        locked(&self.shared.0).condition = condition;
     }
 
     /// Offers a checkpoint at once, because it may be the last one.

@@ -20,8 +20,9 @@ use config::upload::UploadSettings;
 use super::UploadError;
 use super::admission::{Admission, Refusals};
 use super::folder::FolderInlet;
-use super::offer::{Offer, OfferError};
+use super::offer::{Offer, OfferError, Order};
 use super::transport::Inlet;
+use super::word::Condition;
 use lookout::{Lookout, QUIET};
 use sight::Sight;
 use slot::{Advance, Link, Slot};
@@ -107,6 +108,21 @@ struct Seat {
     is_to_choose: bool,
     /// It was at work in this round.
     has_worked: bool,
+    /// What was known of it when something last changed, and when.
+    trace: Trace,
+    heard: Option<Instant>,
+}
+
+/// What changes when an aircraft gives a sign of life: the newest offer, chunks, models.
+type Trace = (Option<Order>, (usize, usize), Option<(u64, bool)>);
+
+/// When an aircraft last gave a sign of life, and what it said of itself.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Sign {
+    /// How long ago; `None` = not in this session.
+    pub ago: Option<Duration>,
+    /// Its newest word; `None` where no network leads here.
+    pub word: Option<Condition>,
 }
 
 enum Place {
@@ -130,6 +146,8 @@ impl Seat {
             stale: None,
             is_to_choose: false,
             has_worked: false,
+            trace: Trace::default(),
+            heard: None,
         };
         seat.put_back(Box::new(slot));
         seat
@@ -252,6 +270,29 @@ impl Receiver {
         self.seats.iter().map(|s| (s.id.clone(), s.progress.0, s.progress.1)).collect()
     }
 
+    /// Of every aircraft its last sign of life.
+    pub fn signs(&self) -> Vec<Sign> {
+        let sign = |seat: &Seat| {
+            let heard = self.link.inlets.iter().filter_map(|inlet| inlet.heard(&seat.id)).max_by_key(|heard| heard.at);
+            let at = seat.heard.max(heard.map(|heard| heard.at));
+            Sign { ago: at.map(|at| at.elapsed()), word: heard.map(|heard| heard.word.condition) }
+        };
+        self.seats.iter().map(sign).collect()
+    }
+
+    /// Notes who has given a sign of life since the last time.
+    fn note_signs(&mut self) {
+        for seat in &mut self.seats {
+            let newest = self.sight.of(&seat.id).iter().map(|shown| shown.0.order).max();
+            let trace = (newest, seat.progress, seat.received.as_ref().map(|r| (r.size, r.finished)));
+            // What lay here before the session is no sign.
+            let is_first = seat.heard.is_none() && newest.is_none();
+            if std::mem::replace(&mut seat.trace, trace) != trace && !is_first {
+                seat.heard = Some(Instant::now());
+            }
+        }
+    }
+
     /// Waits for an announcement, `poll_s` at most.
     pub fn wait(&self) {
         // Woken or not, the next round looks at everything.
@@ -290,6 +331,7 @@ impl Receiver {
             }
             std::thread::sleep(LOOK_UP);
         }
+        self.note_signs();
         Ok(self.lookout.is_waiting() || self.seats.iter().any(|s| s.is_at_work() || s.wants_work()))
     }
 

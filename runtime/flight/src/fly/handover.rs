@@ -16,6 +16,7 @@ use hal::mavlink_camera::Activity;
 use image::RgbImage;
 use models::camera::{Pose, PosedImage};
 use models::mask::Mask;
+use uplink::word::Condition;
 
 use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 
@@ -40,6 +41,15 @@ pub(super) struct Told {
     pub(super) training_over: bool,
 }
 
+/// What capture sees of the flight, for the ground.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Seen {
+    /// Charge of the battery, percent.
+    pub(super) battery_pct: Option<u8>,
+    /// How much of the region was covered when that was last looked at, percent.
+    pub(super) covered_pct: Option<u32>,
+}
+
 #[derive(Default)]
 struct Shared {
     waiting: AtomicUsize,
@@ -48,6 +58,7 @@ struct Shared {
     stop: AtomicBool,
     over: AtomicBool,
     flags: Mutex<Flags>,
+    seen: Mutex<Seen>,
     told: Mutex<Told>,
     /// Training time that the ground station asks for; `None`: nothing new, `Some(None)`: the steps alone decide.
     seconds: Mutex<Option<Option<f64>>>,
@@ -192,6 +203,18 @@ impl Handover {
         *self.shared.flags.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// How the aircraft is, for the ground.
+    pub(super) fn condition(&self) -> Condition {
+        let (flags, seen) = (self.flags(), *self.shared.seen.lock().unwrap_or_else(PoisonError::into_inner));
+        Condition {
+            battery_pct: seen.battery_pct,
+            battery_low: flags.battery_low,
+            link_lost: flags.link_lost,
+            landed: !self.is_open(),
+            covered_pct: seen.covered_pct.map(|percent| percent.min(100) as u8),
+        }
+    }
+
     /// Says a line to the ground control station (STATUSTEXT); dropped when the link cannot keep up.
     pub fn say(&self, severity: MavSeverity, text: String) {
         let _ = self.words.try_send((severity, text));
@@ -260,6 +283,10 @@ impl CaptureEnd {
             came.pop_back();
             self.shared.waiting.fetch_sub(1, Ordering::AcqRel);
         }
+    }
+
+    pub(super) fn set_seen(&self, seen: Seen) {
+        *self.shared.seen.lock().unwrap_or_else(PoisonError::into_inner) = seen;
     }
 
     pub(super) fn set_flags(&self, flags: Flags) {

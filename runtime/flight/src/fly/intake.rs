@@ -20,7 +20,7 @@ use models::picture;
 use pages::watch::Watch;
 
 use super::geotags::Geotags;
-use super::handover::CaptureEnd;
+use super::handover::{CaptureEnd, Seen};
 use super::record::{Entry, Recorder};
 use super::show::ShownCapture;
 use crate::capture::{Decision, KeyframeCounters, KeyframeSelector};
@@ -273,6 +273,7 @@ where
         self.end.set_flags(self.vehicle.flags());
         let (autopilot, lost) = (self.vehicle.autopilot(), self.vehicle.is_link_lost());
         self.shown.aircraft(&autopilot, lost, self.vehicle.pictures());
+        self.end.set_seen(Seen { battery_pct: autopilot.battery_percent, covered_pct: self.shown.covered });
         if self.vehicle.autopilot().landed {
             return Ok(Some(Ended::Landed));
         }

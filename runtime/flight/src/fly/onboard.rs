@@ -141,6 +141,7 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
             return Ok(false);
         }
         self.obey(capture);
+        self.offerer.say(capture.condition());
         // Asked before looking into the channel: what was handed over before the end is still there.
         let flying = capture.is_open();
         let taken = self.take(capture)?;

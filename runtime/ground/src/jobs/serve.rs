@@ -15,7 +15,7 @@ use uplink::UploadError;
 use uplink::admission::{Admission, ModelRefusal, Refusals};
 use uplink::keys::{GROUND, Identity};
 use uplink::memory::Memory;
-use uplink::receive::{ReceiveCounters, Received, Receiver};
+use uplink::receive::{ReceiveCounters, Received, Receiver, Sign};
 
 use crate::AggregateError;
 use crate::jobs::aggregate::{self, Outcome};
@@ -24,9 +24,11 @@ use crate::member::Member;
 pub mod admit;
 mod board;
 mod joining;
+mod vigil;
 
-pub use board::{Board, COVERED_PCT};
+pub use board::Board;
 pub use joining::{Joined, Joining};
+pub use vigil::COVERED_PCT;
 
 /// After the last model is here, the aircraft have so long to take their receipts.
 const RECEIPTS: Duration = Duration::from_secs(10);
@@ -68,6 +70,8 @@ pub struct Progress {
     pub bytes: u64,
     /// The complete models.
     pub received: Vec<Received>,
+    /// Of every aircraft, in the mission's order, its last sign of life.
+    pub signs: Vec<Sign>,
 }
 
 /// What came in.
@@ -120,6 +124,7 @@ pub fn receive(
             transfers: receiver.progress().into_iter().filter(|p| p.2 > 0).collect(),
             bytes: receiver.counters.bytes,
             received,
+            signs: receiver.signs(),
         });
         if receiver.all_finished() {
             let since = complete.get_or_insert_with(Instant::now);

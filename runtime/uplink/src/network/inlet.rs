@@ -1,7 +1,9 @@
 //! The ground's end: asks every aircraft, and takes no answer for true that the caller does not accept.
 
+use std::collections::HashMap;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::SyncSender;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use config::upload::UploadSettings;
@@ -16,6 +18,7 @@ use super::{LOOK_UP, NOT_HELD, network, open};
 use crate::admission::Admission;
 use crate::binding;
 use crate::keys::{Domain, GROUND, Identity};
+use crate::word::{Heard, MAX_SEALED, Word};
 
 /// What zenoh lets pass on the ground: from each aircraft, known by its certificate's common name, what lies under its own
 /// key; to everybody, what the ground itself asks.
@@ -50,6 +53,34 @@ pub struct NetworkInlet {
     identity: Identity,
     session_number: Hash,
     max_offer: u64,
+    words: Words,
+}
+
+/// The newest word of each aircraft.
+type Words = Arc<Mutex<HashMap<String, Heard>>>;
+
+/// Listens to what the aircraft of the mission say of themselves.
+fn listen(session: &Session, admission: &Admission) -> Result<Words, TransportError> {
+    let Admission { mission, aircraft, identity, memory, .. } = admission;
+    let words = Words::default();
+    let (heard, ids, identity, number) = (words.clone(), aircraft.clone(), identity.clone(), *memory.session());
+    let prefix = format!("dgtr/{mission}/");
+    let hear = move |sample: zenoh::sample::Sample| {
+        let key = sample.key_expr().as_str();
+        let id = key.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix("/word"));
+        let Some(id) = id.filter(|id| ids.iter().any(|known| known == id)) else { return };
+        if sample.payload().len() as u64 > MAX_SEALED {
+            return;
+        }
+        let Some(word) = Word::open(&sample.payload().to_bytes(), &number, key, id, &identity) else { return };
+        // Whatever panicked elsewhere, what is in here is whole.
+        let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+        if heard.get(id).is_none_or(|before| before.word.order < word.order) {
+            heard.insert(id.to_owned(), Heard { at: Instant::now(), word });
+        }
+    };
+    session.declare_subscriber(format!("dgtr/{mission}/*/word")).callback(hear).background().wait().map_err(network)?;
+    Ok(words)
 }
 
 impl NetworkInlet {
@@ -84,8 +115,10 @@ impl NetworkInlet {
             .background()
             .wait()
             .map_err(network)?;
+        let words = listen(&session, admission)?;
         Ok(Self {
             session,
+            words,
             mission: mission.clone(),
             endpoints: settings.listen.join(", "),
             identity: identity.clone(),
@@ -192,6 +225,10 @@ impl Inlet for NetworkInlet {
             true => Ok(()),
             false => Err(network("the aircraft did not take the receipt")),
         }
+    }
+
+    fn heard(&self, aircraft: &str) -> Option<Heard> {
+        self.words.lock().unwrap_or_else(PoisonError::into_inner).get(aircraft).copied()
     }
 }
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use config::upload::UploadSettings;
 use zenoh::handlers::FifoChannel;
-use zenoh::qos::CongestionControl;
+use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
@@ -19,6 +19,7 @@ use super::super::transport::{Outlet, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
 use crate::binding;
 use crate::keys::Domain;
+use crate::word::Word;
 
 /// A model under way is let go when nobody has asked for it for so long: longer than the ground ever waits for a chunk.
 const KEPT_FOR: Duration = Duration::from_secs(900);
@@ -41,6 +42,8 @@ struct Shared {
     models: Mutex<VecDeque<Kept>>,
     /// The ground's last word.
     receipt: Mutex<Option<Receipt>>,
+    /// The session that the ground asked for last.
+    session: Mutex<Option<Hash>>,
     /// When the next chunk may leave, under `max_kib_s`.
     pace: Mutex<Instant>,
     max_kib_s: Option<u32>,
@@ -96,6 +99,7 @@ impl NetworkOutlet {
             source,
             models: Mutex::default(),
             receipt: Mutex::default(),
+            session: Mutex::default(),
             pace: Mutex::new(Instant::now()),
             max_kib_s: settings.max_kib_s,
             sent: AtomicU64::new(0),
@@ -129,6 +133,9 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
     let Some((_, rest)) = rest.split_once('/') else { return };
     let Some((_, what)) = rest.split_once('/') else { return };
     let session = session_of(shared, asked, query);
+    if session.is_some() {
+        *locked(&shared.session) = session;
+    }
     if what != "receipt" && session.is_none() {
         return;
     }
@@ -225,6 +232,19 @@ impl Outlet for NetworkOutlet {
 
     fn sent(&self) -> u64 {
         self.shared.sent.load(Ordering::Relaxed)
+    }
+
+    fn say(&mut self, word: &Word) {
+        // The session that the mission names is known before the ground asks.
+        let asked = *locked(&self.shared.session);
+        let Some(session) = self.shared.source.session.or(asked) else { return };
+        let key = format!("{}/word", self.prefix);
+        let sealed = word.seal(&session, &key, &self.shared.source.identity);
+        // Before chunks on a slow link, and dropped rather than waited for.
+        let put = self.session.put(key, sealed).congestion_control(CongestionControl::Drop);
+        if let Err(e) = put.priority(Priority::InteractiveHigh).wait() {
+            tracing::debug!("upload: a word was not sent: {e}");
+        }
     }
 }
 

@@ -15,6 +15,7 @@ use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::receive::Receiver;
 use crate::testing::{certificates, free_port, knows_localhost, noise};
+use crate::word::{Condition, EVERY};
 use crate::{Offerer, Source};
 
 const LIMIT: Duration = Duration::from_secs(60);
@@ -94,6 +95,25 @@ fn a_false_receipt_over_the_network_is_not_believed() {
     // The ground's own is.
     assert_eq!(say(receipt.seal(&ids[2])), 1);
     assert!(o.wait_delivered(LIMIT, || true));
+}
+
+/// Before its first model, and after its last sign of life, nobody knew how an aircraft was.
+#[test]
+fn the_ground_hears_how_an_aircraft_is_from_itself_alone_and_knows_for_how_long_it_has_not() {
+    let dir = tempfile::tempdir().expect("temp dir");
+    let settings = settings(&format!("tcp/127.0.0.1:{}", free_port()));
+    let ids = identities(["a1", "a2"]);
+    let mut r = ground(&settings, &["a1", "a2"], &ids[2], &dir.path().join("g"));
+    let a1 = Offerer::start(&settings, source("a1", &ids[0])).expect("offerer");
+    // Somebody says it in the name of another.
+    let rogue = Offerer::start(&settings, source("a2", &ids[0])).expect("offerer");
+    let low = Condition { battery_pct: Some(14), battery_low: true, ..Condition::default() };
+    [&a1, &rogue].into_iter().for_each(|aircraft| aircraft.say(low));
+    assert!(receive(&mut r, LIMIT, |r| r.signs()[0].word == Some(low)), "{:?}", r.signs());
+    drop(a1);
+    assert!(receive(&mut r, LIMIT, |r| r.signs()[0].ago.is_some_and(|ago| ago > 4 * EVERY)), "{:?}", r.signs());
+    assert!(r.signs()[1].ago.is_none() && r.signs()[1].word.is_none(), "{:?}", r.signs());
+    drop(rogue);
 }
 
 /// The first answer was taken for the answer, so that one liar could hide an aircraft for ever.

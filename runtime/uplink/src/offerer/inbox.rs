@@ -4,6 +4,8 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
+use crate::word::Condition;
+
 /// What has become of the offers so far.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct OffererStatus {
@@ -41,6 +43,8 @@ pub(super) struct Inbox {
     pub next: Option<(PathBuf, Kind)>,
     /// When the last model will be here, if anybody knows.
     pub last: Option<Instant>,
+    /// How the aircraft is.
+    pub condition: Condition,
     pub stop: bool,
     pub status: OffererStatus,
 }

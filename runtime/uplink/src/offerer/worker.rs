@@ -13,6 +13,7 @@ use crate::flight_number::FlightNumber;
 use crate::offer::{OfferedModel, Order};
 use crate::receipt::Delivery;
 use crate::transport::{Outlet, TransportError};
+use crate::word::{EVERY, Word};
 use crate::{Source, territory};
 
 /// A model that took so long to deliver keeps the next checkpoint back for so many times as long.
@@ -44,6 +45,9 @@ pub(super) struct Worker {
     offered: Instant,
     /// Before this time no further checkpoint is offered.
     next_checkpoint: Instant,
+    /// Words so far, and when the next one is due.
+    words: u64,
+    next_word: Instant,
 }
 
 impl Worker {
@@ -66,6 +70,8 @@ impl Worker {
             is_fetched: false,
             offered: Instant::now(),
             next_checkpoint: Instant::now(),
+            words: 0,
+            next_word: Instant::now(),
         }
     }
 
@@ -75,6 +81,7 @@ impl Worker {
         let mut pause = self.settings.retry_min_s;
         loop {
             let failed = self.catch_up();
+            self.say();
             pause = if failed { (2.0 * pause).min(self.settings.retry_max_s) } else { self.settings.retry_min_s };
             let waiting = self.model.is_some() && !self.note_delivery();
             let wait = match (failed, waiting) {
@@ -82,11 +89,24 @@ impl Worker {
                 (false, true) => Duration::from_millis(200),
                 (false, false) => Duration::from_secs(3600),
             };
+            let wait = if self.ways.is_empty() { wait } else { wait.min(EVERY) };
             let Some(next) = self.wait(wait) else { return };
             if let Some((path, kind)) = next {
                 self.take_up(&path, kind);
             }
         }
+    }
+
+    /// Says how the aircraft is, when that is due.
+    fn say(&mut self) {
+        if Instant::now() < self.next_word {
+            return;
+        }
+        self.next_word = Instant::now() + EVERY;
+        self.words += 1;
+        let order = Order { flight: self.flight.get(), counter: self.words };
+        let word = Word::new(order, locked(&self.shared.0).condition);
+        self.ways.iter_mut().filter_map(|way| way.outlet.as_mut()).for_each(|outlet| outlet.say(&word));
     }
 
     /// Waits until there is something to do; None = stop.

@@ -7,6 +7,7 @@ use engine::{Reconstruct, model_path};
 use hal::failsafe::{Cause, Flags};
 use hal::traits::Clock;
 use job::interrupt::Interrupt;
+use uplink::word::Condition;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::{CHECKPOINT_EVERY_NS, Handover, Job, JobEnd};
@@ -25,6 +26,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         flight: &FlightCounters,
         interrupt: &Interrupt,
     ) -> Result<JobEnd<R>, FlightError> {
+        let covered_pct = flight.coverage.as_ref().map(|coverage| coverage.percent().min(100) as u8);
+        self.offerer.say(Condition { landed: true, link_lost: false, covered_pct, ..capture.condition() });
         if !self.training_failed {
             let finished = self.finish_schedule(capture, interrupt);
             self.survive(finished)?;

@@ -11,10 +11,11 @@ use pages::report::ground::Shot;
 use pages::watch::Watch;
 use survey::coverage::{CoverageMap, CoverageRegion};
 
+use super::vigil::{COVERED_PCT, Vigil};
 use super::{Progress, Received};
 
-/// An aircraft that covered less of its region than this did not do what it was to do, percent.
-pub const COVERED_PCT: u32 = 75;
+/// What is said of an aircraft that nobody has heard of.
+const NOTHING: &str = "nothing has arrived yet";
 
 /// Which file was looked at last.
 type Seen = Option<(SystemTime, u64)>;
@@ -31,13 +32,16 @@ pub struct Board<'a> {
     under_way: Vec<Option<(Instant, usize)>>,
     started: Instant,
     told: Option<(usize, usize)>,
+    vigil: Vigil,
+    /// Percent of each region that the newest model covers.
+    covered: Vec<Option<u32>>,
 }
 
 impl<'a> Board<'a> {
     /// A page on which no aircraft has been heard of.
     pub fn new(mission: &'a Mission, out: &Path) -> Self {
         let ids: Vec<&str> = mission.aircraft.iter().map(|a| a.id.as_str()).collect();
-        let watch = Watch::of(mission, &ids, "nothing has arrived yet", out);
+        let watch = Watch::of(mission, &ids, NOTHING, out);
         watch.update(|page| {
             page.title = format!("Mission {}: ground", mission.name);
             for craft in &mut page.aircraft {
@@ -55,6 +59,8 @@ impl<'a> Board<'a> {
             under_way: vec![None; ids.len()],
             started: Instant::now(),
             told: None,
+            vigil: Vigil::new(mission, out),
+            covered: vec![None; ids.len()],
         }
     }
 
@@ -84,8 +90,15 @@ impl<'a> Board<'a> {
             if let Some(received) = here {
                 self.look(i, received);
             }
-            let short = self.short[i];
+            let sign = progress.signs.get(i).copied().unwrap_or_default();
+            let finished = here.is_some_and(|r| r.finished);
+            for line in self.vigil.look(i, &sign, finished, self.covered[i], Instant::now()) {
+                // The log's warnings stand on the page and in the report, too.
+                tracing::warn!("{line}");
+            }
+            let (short, trouble) = (self.short[i], self.vigil.state(i));
             self.watch.craft(i, |craft| {
+                craft.battery = sign.word.and_then(|word| word.battery_pct).or(craft.battery);
                 (craft.chunks, craft.schedule.left_s) = (under_way, left_s);
                 craft.bytes = here.map(|r| r.size);
                 craft.schedule.progress = under_way.map(|(n, of)| n as f32 / of.max(1) as f32);
@@ -95,8 +108,10 @@ impl<'a> Board<'a> {
                     (Some(r), None) if r.finished => "final model is here",
                     (_, Some(_)) => "sending a model",
                     (Some(_), None) => "checkpoint is here, still flying or training",
-                    (None, None) => craft.state,
+                    (None, None) if sign.ago.is_some() => "no model is here yet",
+                    (None, None) => NOTHING,
                 };
+                craft.state = trouble.unwrap_or(craft.state);
             });
         }
     }
@@ -122,6 +137,7 @@ impl<'a> Board<'a> {
         // One that cannot be read is refused where it counts.
         if let Ok((header, gaussians)) = model::read_header(&received.path) {
             let covered_pct = self.show(i, &header, gaussians as u64);
+            self.covered[i] = covered_pct.filter(|_| !header.views.is_empty());
             // Nothing more comes after the last model: whoever deals with it should know now, while the others still fly. One without
             // views does not say what it covers.
             let last = covered_pct.filter(|_| received.finished && !header.views.is_empty());
@@ -197,7 +213,14 @@ mod tests {
         let out = folder.path().join("out");
         let mut board = Board::new(&mission, &out);
         let mut states = |models: Vec<Received>| {
-            board.round(&Progress { finished: 0, aircraft: 2, transfers: Vec::new(), bytes: 0, received: models });
+            board.round(&Progress {
+                finished: 0,
+                aircraft: 2,
+                transfers: Vec::new(),
+                bytes: 0,
+                received: models,
+                signs: Vec::new(),
+            });
             board.watch().freeze().aircraft.iter().map(|craft| craft.state).collect::<Vec<_>>()
         };
         let whole = received(folder.path(), "east", [[0, -20], [40, 20]], true);
