@@ -5,7 +5,7 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use config::link::LinkSettings;
-use config::mission::{CameraSettings, CameraSource, MountSettings};
+use config::mission::{CameraSettings, CameraSource};
 use geometry::geodesy::Geodetic;
 
 use hal::counters::HalCounters;
