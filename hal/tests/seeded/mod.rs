@@ -206,6 +206,11 @@ impl Conditions {
         !self.regular && (self.named || !shifted)
     }
 
+    /// Nothing waits until it is known which camera is ours.
+    pub fn knows_its_camera(&self) -> bool {
+        self.named || self.others.is_empty()
+    }
+
     pub fn settings(&self) -> VehicleSettings {
         let mut settings = settings(self.system);
         settings.lens.index = self.named.then_some(self.ours);
