@@ -50,7 +50,7 @@ mod with_std {
             why: &'static str,
         },
         /// A link that could not be opened.
-        #[error("cannot open link {address}: {source}")]
+        #[error("cannot open link {address}: {source}{}", remedy(source))]
         Open {
             /// The address.
             address: String,
@@ -70,7 +70,7 @@ mod with_std {
             address: String,
         },
         /// Reading or writing an open link failed.
-        #[error("link {address}: {source}")]
+        #[error("link {address}: {source}{}", remedy(source))]
         Link {
             /// The address.
             address: String,
@@ -119,6 +119,22 @@ mod with_std {
             /// What is wrong with its light.
             blank: crate::blank::Blank,
         },
+    }
+
+    /// What helps where the system itself refuses a link; words of our own say it themselves.
+    fn remedy(source: &std::io::Error) -> &'static str {
+        use std::io::ErrorKind as Io;
+        match source.kind() {
+            Io::NotFound => "; check the path, and whether the device is plugged in",
+            Io::PermissionDenied => {
+                "; give this user the rights to it: the group dialout for a serial port, a port above 1023"
+            }
+            Io::AddrInUse | Io::ResourceBusy => "; end the program that uses it, or name another",
+            Io::AddrNotAvailable => "; no interface of this machine has that address",
+            Io::ConnectionRefused => "; nobody listens there: start what should, or check host and port",
+            _ if source.get_ref().is_some() => "",
+            _ => "; check cable, power and address",
+        }
     }
 
     impl config::error::Error for HalError {

@@ -31,7 +31,7 @@ pub mod transforms;
 #[derive(Debug, thiserror::Error)]
 pub enum FormatError {
     /// The operating system said no.
-    #[error("{}: {action} failed: {source}; check the path, its permissions and the free space", shown(path))]
+    #[error("{}: {action} failed: {}", shown(path), disk::told(source))]
     Io {
         /// The file.
         path: PathBuf,
@@ -69,7 +69,7 @@ pub enum FormatError {
         path: PathBuf,
     },
     /// The content makes no sense.
-    #[error("{}: {what}", shown(path))]
+    #[error("{}: {}", shown(path), escaped(what))]
     Invalid {
         /// The file.
         path: PathBuf,
@@ -172,13 +172,18 @@ pub fn without_mark(bytes: &[u8]) -> &[u8] {
 
 /// What another library says, on one line: decoders' and ONNX Runtime's messages span several.
 pub fn one_line(error: impl std::fmt::Display) -> String {
-    error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
+    escaped(&error.to_string().split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
 /// A path within an error's line: a line end in a name, which a file may have chosen, begins no line of its own.
 pub(crate) fn shown(path: &Path) -> String {
+    escaped(&path.to_string_lossy())
+}
+
+/// What a file chose of an error's line, or a parser quotes of it: no line ends in it, and nothing that a terminal obeys.
+pub fn escaped(text: &str) -> String {
     let escaped = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
-    path.to_string_lossy().chars().map(escaped).collect()
+    text.chars().map(escaped).collect()
 }
 
 /// Writes a file whole or not at all, see [`Disk::replace`].
@@ -199,6 +204,8 @@ mod tests {
         for error in [
             FormatError::invalid(path, "is empty"),
             FormatError::io(path, "opening", std::io::ErrorKind::NotFound.into()),
+            // As parsers quote what they met.
+            FormatError::invalid(path, "expected '>' not '\n' or '\u{1b}'"),
         ] {
             let said = error.to_string();
             assert!(
@@ -206,6 +213,7 @@ mod tests {
                 "{said}"
             );
         }
+        assert_eq!(one_line("at line 6\n| a = \"\u{1}\""), "at line 6 | a = \"\\u{1}\"");
         let said = crate::picture::decode(path).unwrap_err().to_string();
         assert!(said.starts_with("a/b\\n INFO") && !said.contains(char::is_control), "{said}");
     }

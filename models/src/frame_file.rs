@@ -52,7 +52,7 @@ impl<T: AsBytes> Kept<T> {
     /// As [`Self::new`]; what cannot be written stays in memory.
     pub fn at_best(value: T, file: Option<&Arc<FrameFile>>) -> Self {
         Self::new(value.clone(), file).unwrap_or_else(|e| {
-            tracing::warn!("the file of what waits of key frames: {e}; kept in memory");
+            tracing::warn!("the file of what waits of key frames: {}; until then it is kept in memory", disk::told(&e));
             Self::Memory(value)
         })
     }

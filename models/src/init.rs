@@ -75,7 +75,7 @@ pub enum InitError {
         skipped: usize,
     },
     /// The file of what waits of the pictures.
-    #[error("initialisation: the file of the pictures' depths: {0}")]
+    #[error("initialisation: the file of the pictures' depths: {}", disk::told(.0))]
     FrameFile(#[from] std::io::Error),
     /// The network or ONNX Runtime.
     #[error(transparent)]

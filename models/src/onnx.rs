@@ -2,7 +2,7 @@
 //! network that pose refinement and pair selection share.
 //!
 //! A session is opened when it is needed and dropped when it is not; nothing here is global except the runtime
-//! library itself, which ONNX Runtime allows only once per process.
+//! library itself, which ONNX Runtime allows only once per process, and the request to end that process.
 
 pub mod depth;
 mod external;
@@ -63,6 +63,12 @@ pub enum OnnxError {
         /// What the file says.
         found: Box<str>,
     },
+    /// The process was asked to end while it ran.
+    #[error("network {network}: stopped on request")]
+    Stopped {
+        /// Name of the network.
+        network: String,
+    },
     /// ONNX Runtime failed while loading or running.
     #[error("network {network}: {reason}")]
     Runtime {
@@ -78,6 +84,7 @@ impl Error for OnnxError {
         match self {
             Self::LibraryMissing { .. } | Self::Library { .. } => ErrorKind::Device,
             Self::File(e) => e.kind(),
+            Self::Stopped { .. } => ErrorKind::Interrupted,
             _ => ErrorKind::Input,
         }
     }

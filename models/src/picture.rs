@@ -260,40 +260,9 @@ fn jpeg(path: &Path) -> Result<Option<Vec<u8>>, PictureError> {
     let mut bytes = Vec::with_capacity(size as usize);
     file.seek(SeekFrom::Start(0)).map_err(io)?;
     file.take(MAX_FILE).read_to_end(&mut bytes).map_err(io)?;
-    match has_end(&bytes) {
-        true => Ok(Some(bytes)),
-        false => Err(bad(path, "is cut off or damaged (its end marker is missing); copy it again")),
-    }
-}
-
-/// Whether a JPEG's segments and scans lead to its end marker (ITU-T T.81, annex B). What lies behind it does not matter, nor
-/// do end markers of previews within a segment.
-fn has_end(jpeg: &[u8]) -> bool {
-    let (mut at, mut in_scan) = (2, false);
-    loop {
-        if in_scan {
-            let Some(skipped) = jpeg.get(at..).and_then(|rest| rest.iter().position(|b| *b == 0xFF)) else {
-                return false;
-            };
-            at += skipped;
-        } else if jpeg.get(at) != Some(&0xFF) {
-            return false;
-        }
-        // Fill bytes may stand before a marker.
-        let Some(fill) = jpeg.get(at..).and_then(|rest| rest.iter().position(|b| *b != 0xFF)) else { return false };
-        let marker = jpeg[at + fill];
-        at += fill + 1;
-        match marker {
-            0xD9 => return true,
-            0 | 0xD0..=0xD7 if in_scan => {}
-            0x01 => {}
-            0 | 0xD0..=0xD8 => return false,
-            _ => {
-                let Some(&[high, low]) = jpeg.get(at..at + 2) else { return false };
-                at += usize::from(u16::from_be_bytes([high, low]));
-                in_scan = marker == 0xDA;
-            }
-        }
+    match jpeg::flaw(&bytes) {
+        None => Ok(Some(bytes)),
+        Some(flaw) => Err(bad(path, format!("is cut off or damaged ({flaw}); copy it again"))),
     }
 }
 
@@ -421,6 +390,10 @@ mod tests {
         for keep in [whole.len() / 4, whole.len() / 2, whole.len() * 9 / 10, whole.len() - 1] {
             std::fs::write(&path, &whole[..keep]).unwrap();
             assert!(decode(&path).is_err_and(|e| e.what.contains("cut off")), "{keep} bytes at full size");
+            // Whatever ends it.
+            std::fs::write(&path, [&whole[..keep - 1], &[0xFF, 0xD9]].concat()).unwrap();
+            let refused = |wanted| decode_at_least(&path, wanted).is_err_and(|e| e.what.contains("cut off"));
+            assert!(keep == whole.len() - 1 || refused((160, 120)) && refused((20, 15)), "{keep} bytes and an end");
         }
         // Bytes behind the end belong to nobody.
         std::fs::write(&path, [whole.as_slice(), &[7; 999]].concat()).unwrap();

@@ -44,7 +44,7 @@ pub struct DemoOptions {
 #[derive(Debug, thiserror::Error)]
 pub enum DemoError {
     /// A file or folder.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {}", path.display(), disk::told(source))]
     Io {
         /// Where.
         path: PathBuf,

@@ -76,7 +76,7 @@ pub enum JobError {
     #[error(transparent)]
     Interrupt(#[from] InterruptError),
     /// A file or folder that no format owns.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {}", path.display(), disk::told(source))]
     Io {
         /// Where.
         path: PathBuf,

@@ -18,6 +18,8 @@ use models::formats::transforms::pose_to_opengl;
 mod again;
 #[path = "commands/begun.rs"]
 mod begun;
+#[path = "commands/crowded.rs"]
+mod crowded;
 #[path = "commands/earlier.rs"]
 mod earlier;
 #[path = "commands/elsewhere.rs"]

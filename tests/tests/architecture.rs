@@ -1,5 +1,5 @@
 //! Who imports whom: no circle of files or of top-level modules in any crate, and nothing but the command line knows the command
-//! line. How large types are: [`types`].
+//! line. How large types are: [`types`]. What errors of the system say: [`remedies`].
 //!
 //! An import is a path that leads to another file of the same crate, in a `use` or in the code. A file may use what its
 //! parent module declares (Rust's privacy makes a module and its children one unit), so arrows to an ancestor do not count;
@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree};
 
+#[path = "architecture/remedies.rs"]
+mod remedies;
 #[path = "architecture/types.rs"]
 mod types;
 

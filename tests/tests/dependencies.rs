@@ -41,8 +41,8 @@ const LIVED_WITH: [(&str, &str); 3] = [
     ),
     (
         "RUSTSEC-2024-0436",
-        "paste, a macro that token-cell (of zenoh 1.10.2, the newest) and simba (of nalgebra 0.34; 0.35 needs a newer Rust than 1.88) run while \
-         they are compiled; nobody maintains it, nothing is wrong with it",
+        "paste, a macro that token-cell (of zenoh 1.10.2, the newest) and simba (of nalgebra 0.34) run while they are \
+         compiled; nobody maintains it, nothing is wrong with it",
     ),
     (
         "RUSTSEC-2025-0134",

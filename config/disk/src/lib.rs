@@ -18,11 +18,13 @@ mod lock;
 mod operations;
 pub mod plan;
 pub mod regular;
+mod remedy;
 pub mod table;
 
 pub use lines::Lines;
 pub use lock::FolderLock;
 pub use operations::{Operations, Output, System};
+pub use remedy::{Told, told};
 
 /// What every temporary file's name begins with.
 const TEMPORARY: &str = ".dgtr-";

@@ -13,7 +13,7 @@ pub enum SimError {
     #[error(transparent)]
     Link(#[from] HalError),
     /// A file or folder that cannot be written or read.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {}", path.display(), disk::told(source))]
     Folder {
         /// Where.
         path: PathBuf,

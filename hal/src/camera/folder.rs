@@ -195,7 +195,9 @@ impl FolderCamera {
                     (g.size, g.since_ns) = (meta.len(), now_ns);
                 } else if now_ns.saturating_sub(g.since_ns) > STALLED_NS {
                     self.done.insert(key(&path), version(&meta));
-                    let why = complete.err().map_or("half written and no longer growing".into(), |e| e.to_string());
+                    let why = complete
+                        .err()
+                        .map_or("half written and no longer growing".into(), |e| disk::told(&e).to_string());
                     broken = Some((path, why));
                 }
             } else if self.growing.len() < MAX_GROWING {

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 
 use config::mission::CameraSettings;
-use image::{ImageReader, RgbImage};
+use image::{ImageFormat, ImageReader, RgbImage};
 
 use super::jpeg::marked_as_mjpeg;
 use super::undistort::undistort;
@@ -39,7 +39,7 @@ impl Picture {
     pub fn decode(&self, lens: &CameraSettings) -> Result<RgbImage, HalError> {
         let image = match self {
             Self::Path(path) => {
-                let wrong = |e: std::io::Error| HalError::Picture { path: path.clone(), why: e.to_string() };
+                let wrong = |e| HalError::Picture { path: path.clone(), why: disk::told(&e).to_string() };
                 decode(BufReader::new(regular::open(path).map_err(wrong)?), path, lens)?
             }
             Self::Jpeg(bytes) => decode(Cursor::new(marked_as_mjpeg(bytes)), &self.name(), lens)?,
@@ -61,8 +61,10 @@ impl Picture {
         let mut bytes = Vec::new();
         match self {
             Self::Path(path) => {
-                let file = regular::open(path).map_err(|e| wrong(e.to_string()))?;
-                file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|e| wrong(e.to_string()))?;
+                let file = regular::open(path).map_err(|e| wrong(disk::told(&e).to_string()))?;
+                file.take(limit.saturating_add(1))
+                    .read_to_end(&mut bytes)
+                    .map_err(|e| wrong(disk::told(&e).to_string()))?;
             }
             Self::Jpeg(jpeg) => bytes = marked_as_mjpeg(jpeg),
             Self::Rgb(image) => image
@@ -98,6 +100,10 @@ fn wrong_size(path: &Path, (w, h): (u32, u32), lens: &CameraSettings) -> HalErro
     HalError::Picture { path: path.into(), why }
 }
 
+/// Bytes that a JPEG may have for each pixel, and beside them: metadata, previews, a film.
+const PIXEL: u64 = 8;
+const BESIDE: u64 = 64 << 20;
+
 /// Decodes after a look at the header: a picture of another size is refused before it is allocated.
 fn decode(mut from: impl BufRead + Seek, path: &Path, lens: &CameraSettings) -> Result<RgbImage, HalError> {
     // The decoders' messages may span lines.
@@ -112,5 +118,21 @@ fn decode(mut from: impl BufRead + Seek, path: &Path, lens: &CameraSettings) -> 
     }
     from.rewind().map_err(|e| wrong(e.to_string()))?;
     let reader = ImageReader::new(from).with_guessed_format().map_err(|e| wrong(e.to_string()))?;
-    Ok(reader.decode().map_err(|e| wrong(e.to_string()))?.into_rgb8())
+    let decoded = match reader.format() {
+        // The decoder would make grey of what is missing.
+        Some(ImageFormat::Jpeg) => {
+            let limit = PIXEL * u64::from(size.0) * u64::from(size.1) + BESIDE;
+            let mut bytes = Vec::new();
+            let read = reader.into_inner().take(limit + 1).read_to_end(&mut bytes);
+            if read.map_err(|e| wrong(e.to_string()))? as u64 > limit {
+                return Err(wrong(format!("has more than the {limit} bytes that such a picture can have")));
+            }
+            if let Some(flaw) = jpeg::flaw(&bytes) {
+                return Err(wrong(format!("is cut off or damaged ({flaw})")));
+            }
+            ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg).decode()
+        }
+        _ => reader.decode(),
+    };
+    Ok(decoded.map_err(|e| wrong(e.to_string()))?.into_rgb8())
 }

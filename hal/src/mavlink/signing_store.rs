@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use config::link::{LinkSettings, Signing};
-use disk::Disk;
+use disk::{Disk, told};
 
 use super::signing::{Signer, SigningMode, timestamp_of_unix_us};
 use crate::error::HalError;
@@ -67,8 +67,8 @@ fn usable(key: [u8; 32]) -> Result<[u8; 32], String> {
 
 fn read_key(path: &Path) -> Result<[u8; 32], HalError> {
     let wrong = |why: String| HalError::Signing { path: path.into(), why };
-    let file = disk::regular::open_secret(path).map_err(|e| wrong(e.to_string()))?;
-    let bytes = bounded(file).map_err(|e| wrong(e.to_string()))?;
+    let file = disk::regular::open_secret(path).map_err(|e| wrong(told(&e).to_string()))?;
+    let bytes = bounded(file).map_err(|e| wrong(told(&e).to_string()))?;
     if let Ok(key) = <[u8; 32]>::try_from(bytes.as_slice()) {
         return usable(key).map_err(wrong);
     }
@@ -107,7 +107,7 @@ impl SigningStore {
             let stamp = text.trim().parse().ok().filter(|stamp: &u64| stamp >> 48 == 0);
             stamp.ok_or_else(|| format!("{}: not a time stamp", path.display()))
         };
-        let wrong = |e: std::io::Error| HalError::Signing { path: self.path.clone(), why: e.to_string() };
+        let wrong = |e: std::io::Error| HalError::Signing { path: self.path.clone(), why: told(&e).to_string() };
         let newest = Disk::default().newest(&self.path, stamp).map_err(wrong)?;
         newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));
         let skipped = if newest.damaged.is_empty() { 0 } else { 2 * RESERVE };
@@ -124,7 +124,7 @@ impl SigningStore {
         }
         let stamp = signer.timestamp() + RESERVE;
         let written = Disk::default().replace_keeping(&self.path, |out| writeln!(out, "{stamp}"));
-        written.map_err(|e| HalError::Signing { path: self.path.clone(), why: e.to_string() })?;
+        written.map_err(|e| HalError::Signing { path: self.path.clone(), why: told(&e.source).to_string() })?;
         self.stored = stamp;
         Ok(())
     }

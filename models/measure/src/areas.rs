@@ -368,6 +368,14 @@ mod tests {
     }
 
     #[test]
+    fn what_the_parser_quotes_of_a_file_begins_no_line_of_its_own() {
+        for text in ["<kml/\n>", "<kml a='b'\u{1b}[2J/>", "{\"type\":\"a\\nb\"}"] {
+            let said = read_text(text, None).unwrap_err();
+            assert!(!said.contains(char::is_control), "{said:?}");
+        }
+    }
+
+    #[test]
     fn degrees_a_named_system_and_the_maps_own_metres_meet_in_one_place() {
         let geojson = |crs: &str, at: [[f64; 2]; 3]| {
             let ring: Vec<_> = at.iter().chain(&at[..1]).collect();

@@ -1,13 +1,15 @@
 //! One ONNX Runtime session with bounded memory: spinning threads are off (a companion computer shares its cores), and so is the
-//! arena but for series of runs, memory is planned from fixed shapes, and one or two threads work.
+//! arena, memory is planned from fixed shapes, and one or two threads work. A run ends when it takes too long or when the process is
+//! asked to end.
 //!
 //! The library is loaded at run time, so that the binary starts on a board without it and says what is missing.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, OnceLock, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ort::environment::Environment;
 use ort::session::builder::GraphOptimizationLevel;
@@ -108,10 +110,17 @@ impl NetworkSession {
     /// ONNX Runtime refused the inputs or failed; it did not end in time; an output in `wanted` is missing or not f32.
     pub fn run(&mut self, inputs: &[Input<'_>], wanted: &[&str]) -> Result<Vec<Tensor>, OnnxError> {
         let floats: usize = inputs.iter().map(|(_, _, data)| data.len()).sum();
-        self.run_within(time_limit(floats), inputs, wanted)
+        let asked = ASKED.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        self.run_within(time_limit(floats), asked, inputs, wanted)
     }
 
-    fn run_within(&mut self, limit: Duration, inputs: &[Input<'_>], wanted: &[&str]) -> Result<Vec<Tensor>, OnnxError> {
+    fn run_within(
+        &mut self,
+        limit: Duration,
+        asked: Option<Arc<AtomicBool>>,
+        inputs: &[Input<'_>],
+        wanted: &[&str],
+    ) -> Result<Vec<Tensor>, OnnxError> {
         let network = self.name.clone();
         let fail = |reason: String| OnnxError::Runtime { network: network.clone(), reason };
         let mut values = Vec::with_capacity(inputs.len());
@@ -121,12 +130,16 @@ impl NetworkSession {
             values.push((self.names.get(name).map_or(name, String::as_str), tensor));
         }
         let options = RunOptions::new().map_err(|e| fail(one_line(e)))?;
-        let watch = Watch::start(options, limit).map_err(|e| fail(one_line(e)))?;
+        let watch = Watch::start(options, limit, asked).map_err(|e| fail(one_line(e)))?;
         let watched = watch.shared.clone();
         let results = self.session.run_with_options(values, &watched.options);
-        let is_over_time = watch.end();
+        let ending = watch.end();
         let too_long = || format!("did not end within {} s; an endless loop, or too large a network", limit.as_secs());
-        let results = results.map_err(|e| fail(if is_over_time { too_long() } else { one_line(e) }))?;
+        let results = results.map_err(|e| match ending {
+            Ending::Asked => OnnxError::Stopped { network: network.clone() },
+            Ending::OverTime => fail(too_long()),
+            Ending::Itself => fail(one_line(e)),
+        })?;
         wanted
             .iter()
             .map(|&name| {
@@ -142,11 +155,32 @@ impl NetworkSession {
 
 /// A run is ended after this, and so much longer for every million numbers that go in: ten times what the slowest network in use takes
 /// on a Raspberry Pi 5. A network's loop may have no end.
-const LIMIT: Duration = Duration::from_secs(15);
+const LIMIT: Duration = Duration::from_secs(5);
 const LIMIT_PER_MILLION: f64 = 120.0;
 
 fn time_limit(floats: usize) -> Duration {
     LIMIT + Duration::from_secs_f64(LIMIT_PER_MILLION * floats as f64 / 1e6)
+}
+
+/// How often it is looked whether somebody asks for the end.
+const LOOK_UP: Duration = Duration::from_millis(200);
+/// Set when the process is asked to end.
+static ASKED: Mutex<Option<Arc<AtomicBool>>> = Mutex::new(None);
+
+/// From now on every run ends soon after `asked` is set.
+pub fn end_when(asked: Arc<AtomicBool>) {
+    *ASKED.lock().unwrap_or_else(PoisonError::into_inner) = Some(asked);
+}
+
+/// Why a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ending {
+    /// It was done, or failed.
+    Itself,
+    /// It took too long.
+    OverTime,
+    /// The process was asked to end.
+    Asked,
 }
 
 /// What the run and its watch share.
@@ -156,34 +190,44 @@ struct Watched {
     bell: Condvar,
 }
 
-/// Ends a run that takes too long.
+/// Ends a run that takes too long, or that nobody waits for any more.
 struct Watch {
     shared: Arc<Watched>,
-    thread: JoinHandle<bool>,
+    thread: JoinHandle<Ending>,
 }
 
 impl Watch {
-    fn start(options: RunOptions, limit: Duration) -> std::io::Result<Self> {
+    fn start(options: RunOptions, limit: Duration, asked: Option<Arc<AtomicBool>>) -> std::io::Result<Self> {
         let shared = Arc::new(Watched { options, ended: Mutex::new(false), bell: Condvar::new() });
         let watched = shared.clone();
         let watch = move || {
-            let ended = watched.ended.lock().unwrap_or_else(PoisonError::into_inner);
-            let waited = watched.bell.wait_timeout_while(ended, limit, |ended| !*ended);
-            let is_over_time = waited.is_ok_and(|(ended, _)| !*ended);
-            if is_over_time {
+            let until = Instant::now() + limit;
+            let mut ended = watched.ended.lock().unwrap_or_else(PoisonError::into_inner);
+            let ending = loop {
+                let left = until.saturating_duration_since(Instant::now());
+                match () {
+                    () if *ended => break Ending::Itself,
+                    () if left.is_zero() => break Ending::OverTime,
+                    () if asked.as_ref().is_some_and(|asked| asked.load(Ordering::Relaxed)) => break Ending::Asked,
+                    () => {}
+                }
+                let wait = if asked.is_some() { left.min(LOOK_UP) } else { left };
+                ended = watched.bell.wait_timeout(ended, wait).unwrap_or_else(PoisonError::into_inner).0;
+            };
+            if ending != Ending::Itself {
                 // It can only fail where there is nothing to end.
                 let _ = watched.options.terminate();
             }
-            is_over_time
+            ending
         };
         Ok(Self { shared, thread: std::thread::Builder::new().name("onnx-limit".into()).spawn(watch)? })
     }
 
-    /// The run is over; whether it was ended.
-    fn end(self) -> bool {
+    /// The run is over; what ended it.
+    fn end(self) -> Ending {
         *self.shared.ended.lock().unwrap_or_else(PoisonError::into_inner) = true;
         self.shared.bell.notify_all();
-        self.thread.join().unwrap_or(false)
+        self.thread.join().unwrap_or(Ending::Itself)
     }
 }
 
@@ -308,14 +352,20 @@ mod tests {
             needs::missing(needs::Need::OnnxRuntime, "no ONNX Runtime");
             return;
         }
+        let (hour, asked) = (Duration::from_secs(3600), Arc::new(AtomicBool::new(false)));
         let run = |goes_on, limit| {
             let network = network_with_a_loop(goes_on);
             let mut session = NetworkSession::open("loop", &network, 1, &[], &BTreeMap::new()).unwrap();
-            session.run_within(limit, &[("a", &[], &[2.5])], &["result"])
+            session.run_within(limit, Some(Arc::clone(&asked)), &[("a", &[], &[2.5])], &["result"])
         };
-        assert_eq!(run(false, Duration::from_secs(3600)).unwrap()[0].data, [2.5]);
+        assert_eq!(run(false, hour).unwrap()[0].data, [2.5]);
         let line = run(true, Duration::from_secs(1)).unwrap_err().to_string();
         assert!(line.contains("did not end within 1 s") && !line.contains('\n'), "{line}");
+        std::thread::scope(|scope| {
+            let endless = scope.spawn(|| run(true, hour));
+            asked.store(true, Ordering::Relaxed);
+            assert!(matches!(endless.join().unwrap(), Err(OnnxError::Stopped { .. })));
+        });
         assert!(time_limit(0) == LIMIT && time_limit(1_000_000) > 8 * LIMIT);
     }
 

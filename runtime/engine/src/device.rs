@@ -124,7 +124,7 @@ impl DeviceRequest {
 /// The folder cannot be made or written to, or has no room.
 pub(super) fn scratch_file(folder: &Path, bytes: u64) -> Result<File, TrainError> {
     allocated(folder, bytes)
-        .map_err(|e| TrainError::ViewFile(format!("{} MiB in {}: {e}", bytes >> 20, folder.display())))
+        .map_err(|e| TrainError::ViewFile(format!("{} MiB in {}: {}", bytes >> 20, folder.display(), disk::told(&e))))
 }
 
 fn allocated(folder: &Path, bytes: u64) -> std::io::Result<File> {

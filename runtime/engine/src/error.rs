@@ -65,7 +65,7 @@ pub enum EngineError {
     #[error("figures cannot be written as JSON: {0}")]
     Json(#[from] serde_json::Error),
     /// A file or folder that no format owns.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {}", path.display(), disk::told(source))]
     Io {
         /// Where.
         path: PathBuf,

@@ -274,7 +274,7 @@ impl Choice {
     /// The folder cannot be written to.
     pub fn keep(&self, out: &Path) -> Result<(), FormatError> {
         let path = Self::path(out);
-        std::fs::create_dir_all(out).map_err(|e| FormatError::Invalid { path: out.into(), what: e.to_string() })?;
+        std::fs::create_dir_all(out).map_err(|e| FormatError::io(out, "making the folder", e))?;
         write_atomic(&path, |file| {
             serde_json::to_writer_pretty(&mut *file, self)?;
             file.write_all(b"\n")

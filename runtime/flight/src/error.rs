@@ -25,7 +25,7 @@ pub enum FlightError {
     #[error(transparent)]
     Upload(#[from] UploadError),
     /// A file or folder that no format owns.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {}", path.display(), disk::told(source))]
     Io {
         /// Where.
         path: PathBuf,

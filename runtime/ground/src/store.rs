@@ -18,7 +18,7 @@ const BUCKET: &str = "s3://";
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The operating system said no.
-    #[error("{name}: {action} failed: {source}; check the path, its permissions and the free space")]
+    #[error("{name}: {action} failed: {}", disk::told(source))]
     Disk {
         /// The file.
         name: String,

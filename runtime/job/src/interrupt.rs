@@ -33,6 +33,8 @@ impl Interrupt {
             signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag))?;
             signal_hook::flag::register(signal, Arc::clone(&flag))?;
         }
+        // A user's network may run for minutes.
+        models::onnx::session::end_when(Arc::clone(&flag));
         Ok(Self(flag))
     }
 

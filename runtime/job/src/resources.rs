@@ -50,6 +50,23 @@ pub fn survive_file_size_limit() -> std::io::Result<()> {
     signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default()).map(drop)
 }
 
+/// Most descriptors that are asked for: twice as many as one host has ports.
+const MOST_OPEN: u64 = 1 << 17;
+
+/// Lets this process have as many descriptors as the system leaves it. Each connection that says nothing holds one until it is ended;
+/// a ground without any can neither receive nor write.
+///
+/// # Errors
+/// The system's.
+pub fn open_many_files() -> std::io::Result<()> {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let wanted = maximum.unwrap_or(MOST_OPEN).min(MOST_OPEN);
+    if current.is_some_and(|now| now < wanted) {
+        setrlimit(Resource::Nofile, Rlimit { current: Some(wanted), maximum })?;
+    }
+    Ok(())
+}
+
 /// One `Name:  N kB` line of /proc/self/status, in bytes; None where there is no procfs.
 fn status_bytes(name: &str) -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

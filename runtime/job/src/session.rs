@@ -27,7 +27,7 @@ pub enum SessionError {
     #[error("{}: another dgtr is writing there; wait for it or give another --out", .0.display())]
     Busy(PathBuf),
     /// The system says no.
-    #[error("{}: {source}; check the path, its permissions and the free space", path.display())]
+    #[error("{}: {} failed: {}", path.display(), source.action, disk::told(&source.source))]
     Disk {
         /// The folder or file.
         path: PathBuf,

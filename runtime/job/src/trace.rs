@@ -31,7 +31,7 @@ const DEVICE_TRACK: u32 = 0;
 
 /// Why there is no trace.
 #[derive(Debug, thiserror::Error)]
-#[error("--trace {}: {source}; check the path, its permissions and the free space", path.display())]
+#[error("--trace {}: {}", path.display(), disk::told(source))]
 pub struct TraceError {
     path: PathBuf,
     source: std::io::Error,
@@ -74,7 +74,7 @@ impl Sheet {
             writeln!(file, "{event},")
         };
         if let Err(e) = written {
-            self.ended = Some(e.to_string());
+            self.ended = Some(disk::told(&e).to_string());
         }
         if self.ended.is_some() {
             self.file = None;
@@ -159,7 +159,7 @@ impl Trace {
             if let Some(mut file) = sheet.file.take()
                 && let Err(e) = file.write_all(last.as_bytes()).and_then(|()| file.flush())
             {
-                sheet.ended = Some(e.to_string());
+                sheet.ended = Some(disk::told(&e).to_string());
             }
             (sheet.path.clone(), sheet.ended.take())
         };

@@ -25,7 +25,7 @@ pub struct Args {
 /// The folder cannot be written to.
 pub fn run(args: Args, program: Command, is_lab: impl Fn(&str) -> bool) -> Result<(), CliError> {
     let program = with_subcommands(&program, |c| !(c.is_hide_set() || args.onboard && is_lab(c.get_name())));
-    write(&args.out, program).map_err(|e| CliError::input(format!("{}: {e}", args.out.display())))
+    write(&args.out, program).map_err(|e| CliError::input(format!("{}: {}", args.out.display(), disk::told(&e))))
 }
 
 /// `program` with some of its subcommands: clap hides them from the help only, not from completions.

@@ -40,7 +40,9 @@ pub fn write(text: Arguments<'_>) {
 pub(super) fn arrived() -> Result<(), CliError> {
     let flushed = std::io::stdout().lock().flush();
     match FAILED.get().or(flushed.as_ref().err()) {
-        Some(e) if e.kind() != ErrorKind::BrokenPipe => Err(CliError::failed(format!("standard output: {e}"))),
+        Some(e) if e.kind() != ErrorKind::BrokenPipe => {
+            Err(CliError::failed(format!("standard output: {}", disk::told(e))))
+        }
         _ => Ok(()),
     }
 }

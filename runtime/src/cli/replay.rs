@@ -84,7 +84,8 @@ pub fn run(args: Args) -> Result<(), CliError> {
         }
     };
     if let Some(folder) = &args.camera_dir {
-        std::fs::create_dir_all(folder).map_err(|e| CliError::input(format!("{}: {e}", folder.display())))?;
+        std::fs::create_dir_all(folder)
+            .map_err(|e| CliError::input(format!("{}: {}", folder.display(), disk::told(&e))))?;
     }
     let camera_dir = args.camera_dir.as_deref();
     let completed = if args.dataset.is_file() {

@@ -13,6 +13,7 @@ use ground::jobs::serve::{self, Board, COVERED_PCT, Joining, Reception, ServeErr
 use ground::jobs::summary;
 use job::console::Progress;
 use job::interrupt::Interrupt;
+use job::resources;
 use job::run_json::RunReport;
 use job::service::Supervisor;
 use job::session::{Owner, Session};
@@ -61,6 +62,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
         None => None,
     };
     let interrupt = Interrupt::install()?;
+    if let Err(e) = resources::open_many_files() {
+        tracing::debug!("descriptors: {e}");
+    }
     let mut board = Board::new(&mission, &args.out);
     let _server = args.http.serve(&mission.http, board.watch())?;
     let owner = Owner {

@@ -235,6 +235,7 @@ pub fn camera_dir(asked: Option<PathBuf>, camera: &CameraSource) -> Result<PathB
             return Err(CliError::input("the mission's camera is no folder; say where pictures go with --camera-dir"));
         }
     };
-    std::fs::create_dir_all(&folder).map_err(|e| CliError::input(format!("{}: {e}", folder.display())))?;
+    std::fs::create_dir_all(&folder)
+        .map_err(|e| CliError::input(format!("{}: {}", folder.display(), disk::told(&e))))?;
     Ok(folder)
 }

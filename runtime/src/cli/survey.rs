@@ -211,7 +211,8 @@ fn out(args: &Args) -> Result<PathBuf, CliError> {
         return Ok(args.out.clone().unwrap_or_default());
     };
     // What lies in the folder itself is put aside with it.
-    let whole = std::fs::canonicalize(ground).map_err(|e| CliError::input(format!("{}: {e}", ground.display())))?;
+    let whole = std::fs::canonicalize(ground)
+        .map_err(|e| CliError::input(format!("{}: {}", ground.display(), disk::told(&e))))?;
     let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let named = (1..=MOST_AFTER).map(|n| whole.with_file_name(format!("{name}-after-{n}")));
     let free = named.into_iter().find(|path| path.symlink_metadata().is_err());

@@ -7,7 +7,7 @@ use super::supervised::mission;
 use super::{dgtr, error_line};
 
 /// Puts a final model of the mission's aircraft on its stick, made for the session `session`.
-fn put_on_stick(dir: &std::path::Path, session: [u8; 32]) {
+pub(super) fn put_on_stick(dir: &std::path::Path, session: [u8; 32]) {
     let path = dir.join("m.dgtr");
     std::fs::write(&path, [7; 9000]).unwrap();
     let mission = config::mission::Mission::read(&dir.join("mission.toml")).unwrap();

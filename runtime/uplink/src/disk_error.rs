@@ -6,7 +6,7 @@ use config::error::{Error, ErrorKind};
 
 /// A file or folder could not be read or written.
 #[derive(Debug, thiserror::Error)]
-#[error("{path}: {source}; is the disk full or read-only?")]
+#[error("{path}: {}", disk::told(source))]
 pub struct DiskError {
     /// The file or folder.
     path: String,

@@ -39,7 +39,11 @@ impl FlightNumber {
         if let Some(path) = &self.path
             && let Err(e) = write_whole(path, format!("{}\n", self.number).as_bytes())
         {
-            tracing::warn!("upload: {}: {e}; the number of this flight will be used again", path.display());
+            tracing::warn!(
+                "upload: {}: the number of this flight will be used again: {}",
+                path.display(),
+                disk::told(&e)
+            );
         }
     }
 }
@@ -49,7 +53,7 @@ pub(crate) fn go_on(before: &Path, now: &Path) {
     if let Ok(number) = read_bounded(before, 64)
         && let Err(e) = write_whole(now, &number)
     {
-        tracing::warn!("upload: {}: {e}", now.display());
+        tracing::warn!("upload: {}: {}", now.display(), disk::told(&e));
     }
 }
 

@@ -225,6 +225,7 @@ impl Inlet for FolderInlet {
         if let Err(e) = self.say_session() {
             tracing::debug!("serve: {e}");
         }
+        without_links(&self.root, &self.dir).map_err(TransportError::io(&self.dir))?;
         let entries = match std::fs::read_dir(&self.dir) {
             Ok(entries) => entries,
             // Nobody has offered anything yet, or the stick is not plugged in yet.
@@ -257,6 +258,7 @@ impl Inlet for FolderInlet {
     ) -> Result<Vec<u8>, TransportError> {
         let hash = offer.chunks[index];
         let path = self.dir.join(&offer.aircraft).join("chunk").join(hex(&hash));
+        without_links(&self.root, &path).map_err(TransportError::io(&path))?;
         match read_bounded(&path, offer.chunk_len(index)) {
             Ok(bytes) if accept(&bytes) => Ok(bytes),
             Ok(_) => Err(TransportError::Corrupt(hash)),
@@ -276,7 +278,7 @@ impl Inlet for FolderInlet {
         _: &mut dyn FnMut(&[u8]) -> bool,
     ) -> Result<(), TransportError> {
         let path = self.dir.join(aircraft).join("receipt");
-        without_links(&self.dir, &path).map_err(TransportError::io(&path))?;
+        without_links(&self.root, &path).map_err(TransportError::io(&path))?;
         if let Err(e) = write_whole(&path, receipt) {
             tracing::debug!("serve: {}: {e}", path.display());
         }
@@ -326,6 +328,32 @@ mod tests {
             assert!(error.contains("is a link"), "{error}");
             assert!(keepsakes.iter().all(|k| std::fs::read(k).is_ok_and(|b| b == b"mine")), "{linked}");
             assert_eq!(std::fs::read_dir(&elsewhere).expect("there").count(), 2, "{linked}");
+        }
+    }
+
+    #[test]
+    fn of_a_stick_with_links_in_the_place_of_folders_the_ground_reads_nothing_and_writes_nothing_elsewhere() {
+        for linked in ["m", "m/a1"] {
+            let dir = tempfile::tempdir().expect("a folder");
+            let (stick, elsewhere) = (dir.path().join("stick"), dir.path().join("elsewhere"));
+            let source = Source::unsigned("m", "a1");
+            let model = offered(dir.path(), &source);
+            FolderOutlet::new(&dir.path().join("whole"), source).offer(&model).expect("offered");
+            let link = stick.join(linked);
+            std::fs::create_dir_all(link.parent().expect("a folder")).expect("made");
+            std::fs::rename(dir.path().join("whole").join(linked), &elsewhere).expect("moved");
+            symlink(&elsewhere, &link).expect("linked");
+            let inlet = FolderInlet::new(&stick, "m", &[1; 32], &Identity::unsigned(), 4096);
+            let stop = std::sync::atomic::AtomicBool::new(false);
+            let patience = Patience { limit: std::time::Duration::ZERO, stop: &stop };
+            let mut seen = 0;
+            let read = inlet.offers(patience, &mut |_| seen += 1);
+            assert!(seen == 0 && (read.is_err() || linked != "m"), "{linked}");
+            assert!(inlet.chunk(&model.offer, 0, patience, &mut |_| true).is_err(), "{linked}");
+            let refused = inlet.deliver_receipt("a1", b"it is here", patience, &mut |_| true).expect_err(linked);
+            assert!(refused.to_string().contains("is a link"), "{refused}");
+            let written = ["receipt", "a1/receipt", SESSION].map(|name| elsewhere.join(name).exists());
+            assert_eq!(written, [false; 3], "{linked}");
         }
     }
 

@@ -26,9 +26,12 @@ use super::transport::TransportError;
 
 /// Longest time for a connection to come about, milliseconds.
 const HANDSHAKE_MS: u64 = 60_000;
-/// A connection that has not said who it is by then is ended, milliseconds; so many may be about it at the same time.
+/// A connection that has not said who it is by then is ended, milliseconds; so many may be about it at the same time, as many as one host
+/// has ports, and no more than leave descriptors for everything else. Of those that have said so fewer are more than a mission has aircraft.
 const ACCEPT_MS: u64 = 15_000;
-const PENDING: u64 = 4096;
+const PENDING: u64 = 1 << 16;
+const OTHER_DESCRIPTORS: u64 = 256;
+const SESSIONS: u64 = 4096;
 /// How often a waiting thread looks whether it should stop.
 const LOOK_UP: Duration = Duration::from_millis(100);
 /// What the aircraft answers for a chunk it does not have.
@@ -36,6 +39,12 @@ const NOT_HELD: &[u8] = b"not held";
 
 fn network(e: impl std::fmt::Display) -> TransportError {
     TransportError::Network(e.to_string().replace('\n', " "))
+}
+
+/// How many connections may be about saying who they are.
+fn pending() -> u64 {
+    let open = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
+    open.map_or(PENDING, |open| open.saturating_sub(OTHER_DESCRIPTORS).clamp(OTHER_DESCRIPTORS, PENDING))
 }
 
 /// Opens a session of this end only: `listen` for the ground, `connect` for the aircraft. `access` says who may say what.
@@ -61,7 +70,7 @@ fn open(
         "transport": {
             // A handshake over a link with a delay of seconds.
             "unicast": {
-                "open_timeout": HANDSHAKE_MS, "accept_timeout": ACCEPT_MS, "accept_pending": PENDING, "max_sessions": PENDING,
+                "open_timeout": HANDSHAKE_MS, "accept_timeout": ACCEPT_MS, "accept_pending": pending(), "max_sessions": SESSIONS,
             },
             "link": { "rx": { "max_message_size": largest } },
         },

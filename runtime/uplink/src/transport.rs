@@ -15,7 +15,7 @@ use super::word::{Heard, Word};
 #[derive(Debug, thiserror::Error)]
 pub enum TransportError {
     /// A file or directory of the folder transport.
-    #[error("{path}: {source}")]
+    #[error("{path}: {}", disk::told(source))]
     Io {
         /// What was read or written.
         path: String,

@@ -69,7 +69,7 @@ impl Slots {
 }
 
 fn failed(picture: Picture, e: std::io::Error) -> TrainError {
-    TrainError::ViewFile(format!("{picture}: {e}"))
+    TrainError::ViewFile(format!("{picture}: {e}; see whether its disk fails"))
 }
 
 impl PictureStore {

@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use disk::{Disk, Lines};
 use geometry::geodesy::{EnuFrame, Geodetic};
@@ -22,14 +22,17 @@ const SYNC_EVERY: u32 = 16;
 
 /// The open file.
 pub struct Geotags {
+    path: PathBuf,
     file: Lines,
     frame: EnuFrame,
     /// The present line; reused.
     line: String,
     /// Lines since the last sync.
     unsynced: u32,
-    /// The disk failed once; said once.
-    failed: bool,
+    /// Pictures that are missing, as the disk failed.
+    missing: u64,
+    /// That lines may be lost was said.
+    warned: bool,
 }
 
 impl Geotags {
@@ -43,16 +46,36 @@ impl Geotags {
         if path.metadata().map_or(0, |m| m.len()) == 0 {
             file.write(format!("{HEADER}\n").as_bytes())?;
         }
-        Ok(Self { file, frame: EnuFrame::new(origin), line: String::with_capacity(512), unsynced: 0, failed: false })
+        let (frame, line) = (EnuFrame::new(origin), String::with_capacity(512));
+        Ok(Self { path, file, frame, line, unsynced: 0, missing: 0, warned: false })
     }
 
     /// Notes a matched picture. A full disk must not end a flight: the first failure is said, later ones are not.
     pub fn note(&mut self, frame: &PosedPicture, decision: Decision) {
-        if let Err(e) = self.write(frame, decision)
-            && !std::mem::replace(&mut self.failed, true)
-        {
-            tracing::warn!("{FILE}: {e}; pictures are missing there while that lasts");
+        if let Err(e) = self.write(frame, decision) {
+            self.missing += 1;
+            if self.missing == 1 {
+                tracing::warn!("{}", self.complaint("pictures are missing while this lasts", &e));
+            }
+            return;
         }
+        self.unsynced += 1;
+        if self.unsynced >= SYNC_EVERY {
+            self.sync();
+        }
+    }
+
+    fn sync(&mut self) {
+        self.unsynced = 0;
+        if let Err(e) = self.file.sync()
+            && !std::mem::replace(&mut self.warned, true)
+        {
+            tracing::warn!("{}", self.complaint("its last lines may be lost", &e));
+        }
+    }
+
+    fn complaint(&self, what: &str, e: &io::Error) -> String {
+        format!("{}: {what}: {}", self.path.display(), disk::told(e))
     }
 
     fn write(&mut self, frame: &PosedPicture, decision: Decision) -> io::Result<()> {
@@ -83,23 +106,17 @@ impl Geotags {
             frame.confidence,
         );
         written.map_err(io::Error::other)?;
-        self.file.write(self.line.as_bytes())?;
-        self.unsynced += 1;
-        if self.unsynced >= SYNC_EVERY {
-            self.unsynced = 0;
-            self.file.sync()?;
-        }
-        Ok(())
+        self.file.write(self.line.as_bytes())
     }
 }
 
 impl Drop for Geotags {
     fn drop(&mut self) {
-        if self.unsynced > 0
-            && let Err(e) = self.file.sync()
-            && !self.failed
-        {
-            tracing::warn!("{FILE}: {e}; its last lines may be lost");
+        if self.unsynced > 0 {
+            self.sync();
+        }
+        if self.missing > 0 {
+            tracing::warn!("{}: {} pictures are missing, as its disk failed", self.path.display(), self.missing);
         }
     }
 }
@@ -175,9 +192,14 @@ mod tests {
         for n in 0..40 {
             geotags.note(&posed(if n % 2 == 0 { "a.jpg" } else { &long }, n), Decision::Key);
         }
+        let missing = geotags.missing as usize;
+        let e = geotags.write(&posed(&long, 40), Decision::Key).expect_err("it is full");
+        let line = geotags.complaint("pictures are missing", &e);
+        assert!(line.starts_with(&root.join(FILE).display().to_string()) && line.contains("make room"), "{line}");
         drop(geotags);
         let written = std::fs::read_to_string(root.join(FILE)).expect("read");
         assert!(written.len() <= 1000 && written.ends_with('\n') && written.lines().count() > 3, "{written}");
+        assert_eq!(written.lines().count() - 1 + missing, 40, "what is missing is counted");
         let columns = HEADER.split(',').count();
         assert!(written.lines().all(|line| line.split(',').count() == columns), "{written}");
         let last = written.lines().last().expect("a line");

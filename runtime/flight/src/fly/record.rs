@@ -50,7 +50,7 @@ const FRAME: &str = "enu";
 
 /// Why there is no recording.
 #[derive(Debug, thiserror::Error)]
-#[error("--record {}: {source}; check the path, its permissions and the free space", path.display())]
+#[error("--record {}: {}", path.display(), disk::told(source))]
 pub struct RecordError {
     path: PathBuf,
     source: std::io::Error,
@@ -168,7 +168,7 @@ impl Drop for Recording {
         self.over.store(true, Ordering::Relaxed);
         let path = self.path.display();
         match self.thread.take().map(JoinHandle::join) {
-            Some(Ok(Err(e))) => tracing::warn!("{path}: the recording ends before the flight: {e}"),
+            Some(Ok(Err(e))) => tracing::warn!("{path}: the recording ends before the flight: {}", disk::told(&e)),
             Some(Err(_)) => tracing::warn!("{path}: the recording ended abnormally"),
             _ => {}
         }

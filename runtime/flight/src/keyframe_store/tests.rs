@@ -99,6 +99,12 @@ fn a_jpeg_that_is_cut_anywhere_is_set_aside() {
         let whole = std::fs::read(&picture).expect("picture");
         std::fs::write(&picture, &whole[..whole.len() - cut]).expect("cut");
         assert!(store.load(0).is_err_and(|e| e.to_string().contains("cut off")), "{cut}");
+        // Whatever ends it.
+        let scan = whole.windows(2).rposition(|w| w == [0xFF, 0xDA]).expect("a scan") + 14;
+        let ended = [&whole[..scan + (whole.len() - scan) / 4], &[0xFF, 0xD9]].concat();
+        std::fs::write(&picture, ended).expect("cut");
+        assert!(store.load(0).is_err_and(|e| e.to_string().contains("cut off")), "an end");
+        std::fs::write(&picture, &whole[..whole.len() - cut]).expect("cut");
         assert!(store.sound(0).is_none());
     }
 }

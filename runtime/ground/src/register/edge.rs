@@ -123,7 +123,9 @@ impl Edges {
         bytes.extend(key);
         bytes.extend(postcard::to_allocvec(&found).map_err(|e| e.to_string())?);
         bytes.extend(blake3::hash(&bytes).as_bytes());
-        self.disk.replace(&path, |out| out.write_all(&bytes)).map_err(|e| format!("{}: {e}", path.display()))?;
+        self.disk
+            .replace(&path, |out| out.write_all(&bytes))
+            .map_err(|e| format!("{}: {}", path.display(), disk::told(&e.source)))?;
         self.known.insert(*key, found);
         Ok(())
     }

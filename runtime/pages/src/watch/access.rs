@@ -34,7 +34,7 @@ impl Token {
         let refused = |what: String| HttpError::Token { path: path.into(), what };
         let mut bytes = Vec::new();
         let read = disk::regular::open_secret(path).and_then(|file| file.take(FILE_BYTES).read_to_end(&mut bytes));
-        read.map_err(|e| refused(e.to_string()))?;
+        read.map_err(|e| refused(disk::told(&e).to_string()))?;
         let text = std::str::from_utf8(&bytes).unwrap_or_default().trim();
         let fits = |c: char| c.is_ascii_alphanumeric() || "-._~".contains(c);
         if !LENGTH.contains(&text.len()) || !text.chars().all(fits) {

@@ -152,7 +152,7 @@ fn answer(shared: &Shared, prefix: &str, query: &Query) {
                     Some(bytes)
                 }
                 Err(e) => {
-                    tracing::warn!("upload: model file cannot be read back: {e}");
+                    tracing::warn!("upload: model file cannot be read back: {}", disk::told(&e));
                     None
                 }
             },

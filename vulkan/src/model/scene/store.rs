@@ -239,7 +239,7 @@ fn no_file() -> TrainError {
 }
 
 fn failed(what: &str, e: &std::io::Error) -> TrainError {
-    TrainError::SceneFile(format!("{what} it: {e}"))
+    TrainError::SceneFile(format!("{what} it: {e}; see whether its disk fails"))
 }
 
 #[cfg(test)]

@@ -1,0 +1,84 @@
+#![allow(clippy::expect_used, reason = "a test fails by panicking")]
+
+use std::io::Cursor;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
+
+use super::*;
+
+fn picture(width: u32, height: u32) -> DynamicImage {
+    let noise = |x: u32, y: u32, k: u32| ((x * (7 + k)) ^ (y * (11 + 3 * k)) ^ (x * y * k)) as u8;
+    DynamicImage::ImageRgb8(RgbImage::from_fn(width, height, |x, y| Rgb([0, 1, 2].map(|k| noise(x, y, k)))))
+}
+
+fn encoded(picture: &DynamicImage, quality: u8) -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, quality)).expect("encoded");
+    bytes.into_inner()
+}
+
+#[test]
+fn pictures_of_any_size_quality_and_colour_are_whole() {
+    for (width, height) in [(1, 1), (8, 8), (17, 9), (160, 120), (333, 111)] {
+        for quality in [1, 50, 90, 100] {
+            let color = picture(width, height);
+            for picture in [color.clone(), DynamicImage::ImageLuma8(color.into_luma8())] {
+                let jpeg = encoded(&picture, quality);
+                assert_eq!(flaw(&jpeg), None, "{width} x {height}, {quality}");
+                // What a camera writes behind the end, and fill before it.
+                assert_eq!(flaw(&[&jpeg[..], &[0; 4096], b"notes"].concat()), None);
+                assert_eq!(flaw(&[&jpeg[..jpeg.len() - 2], &[0xFF; 9], &[0xD9]].concat()), None);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_picture_cut_anywhere_is_found_out_whatever_ends_it() {
+    let jpeg = encoded(&picture(160, 120), 90);
+    let scan = jpeg.windows(2).position(|w| w == [0xFF, 0xDA]).expect("a scan");
+    for keep in (2..jpeg.len() - 64).step_by(97) {
+        assert!(flaw(&jpeg[..keep]).is_some(), "{keep}");
+        if keep > scan + 14 && jpeg[keep - 1] != 0xFF {
+            let ended = [&jpeg[..keep], &[0xFF, 0xD9]].concat();
+            assert!(matches!(flaw(&ended), Some(CUT | DAMAGED)), "{keep}: {:?}", flaw(&ended));
+            // As a decoder has it, which notices nothing.
+            let decoded = image::load_from_memory_with_format(&ended, ImageFormat::Jpeg);
+            assert!(decoded.is_ok_and(|d| d.width() == 160), "{keep}");
+        }
+    }
+}
+
+#[test]
+fn a_hole_in_a_scan_is_found_out() {
+    let jpeg = encoded(&picture(320, 240), 90);
+    let (from, to) = (jpeg.len() / 2, 3 * jpeg.len() / 4);
+    assert!(flaw(&[&jpeg[..from], &jpeg[to..]].concat()).is_some());
+}
+
+#[test]
+fn tables_and_headers_that_are_none_end_in_time_and_find_no_fault_of_their_own() {
+    let jpeg = encoded(&picture(64, 48), 90);
+    for at in 2..jpeg.len().min(700) {
+        for value in [0, 1, 0x7F, 0xFF] {
+            let mut other = jpeg.clone();
+            other[at] = value;
+            // Whatever it says, it says it.
+            let _ = flaw(&other);
+        }
+    }
+    assert_eq!((flaw(&[]), flaw(&[0xFF, 0xD8])), (Some(NO_END), Some(NO_END)));
+}
+
+/// As the pictures of a film are stored.
+#[test]
+fn a_picture_without_tables_is_not_looked_into() {
+    let mut bare = encoded(&picture(160, 120), 90);
+    while let Some(at) = bare.windows(2).position(|w| w == [0xFF, 0xC4]) {
+        let length = usize::from(u16::from_be_bytes([bare[at + 2], bare[at + 3]]));
+        bare.drain(at..at + 2 + length);
+    }
+    assert_eq!(flaw(&bare), None);
+    assert_eq!(flaw(&bare[..bare.len() / 2]), Some(NO_END));
+}
