@@ -457,6 +457,17 @@ fn aircraft_of_one_rhythm_are_refused_with_the_candidates_until_one_is_named() {
     assert!(error.contains("it holds system 1") && error.contains("system 2"), "{error}");
 }
 
+/// The camera's clock is unknown: how many pictures each flight explains tells.
+#[test]
+fn of_two_flights_in_one_log_the_pictures_are_those_of_the_one_that_has_all_of_them() {
+    let dir = dumb_camera(&UNEVEN);
+    let mut both = flown(of(1, 0), &UNEVEN[..9], -1800.0, 1000.0);
+    both.exposures.extend(flown(of(1, 0), &UNEVEN, 0.0, 0.0).exposures);
+    let card = matched(dir.path(), &[both], None, None).unwrap();
+    assert_note(&card, &["14 of 14"]);
+    assert!(off_m(&card) < 0.01, "{}", off_m(&card));
+}
+
 #[test]
 fn places_that_the_pictures_state_tell_aircraft_of_one_rhythm_apart() {
     let dir = tempfile::tempdir().unwrap();

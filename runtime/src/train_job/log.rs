@@ -342,6 +342,18 @@ mod tests {
     }
 
     #[test]
+    fn a_log_of_two_flights_holds_the_exposures_of_both_in_their_order() {
+        let Some(path) = needs::shared("field/mavlink/inputs/twoflights.tlog") else { return };
+        let found = read(&path, None, None).unwrap().series;
+        let [Series { exposures, .. }] = found.as_slice() else { panic!("{} series", found.len()) };
+        let steps: Vec<f64> = exposures.windows(2).map(|w| w[1].time_s - w[0].time_s).collect();
+        assert!(exposures.len() == 30 && steps.iter().all(|step| *step > 0.0), "{steps:?}");
+        let between: Vec<usize> = (0..steps.len()).filter(|k| steps[*k] > 600.0).collect();
+        assert_eq!(between, [11], "twelve of the first flight, whose counter starts anew");
+        assert!(exposures[0].fix.position.lat_deg - exposures[12].fix.position.lat_deg > 0.009, "another place");
+    }
+
+    #[test]
     fn logs_of_ground_stations_as_others_wrote_them_are_told_apart_by_system() {
         for (name, systems) in [
             ("fb_ok", &[1][..]),

@@ -190,6 +190,11 @@ impl<'a> Board<'a> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use uplink::receive::Sign;
+    use uplink::word::Condition;
+
     use super::super::tests::mission;
     use super::*;
     use crate::testing::{carpet, model, nadir};
@@ -232,5 +237,24 @@ mod tests {
         assert!(line.starts_with("west left ground: its final model covers 52 % of its region"), "{line}");
         assert!(line.contains(&format!("`dgtr survey --after {} --without west`", out.display())), "{line}");
         assert_eq!(board.left_ground(0, COVERED_PCT), None);
+    }
+
+    #[test]
+    fn an_aircraft_that_falls_silent_is_shown_as_that_while_the_others_fly_and_as_before_when_it_is_back() {
+        let folder = tempfile::tempdir().expect("temp dir");
+        let mission = mission(folder.path());
+        let mut board = Board::new(&mission, &folder.path().join("out"));
+        let half = received(folder.path(), "west", [[-40, -20], [-32, 20]], false);
+        let mut state = |ago_s: u64| {
+            let heard = |ago_s| Sign { ago: Some(Duration::from_secs(ago_s)), word: Some(Condition::default()) };
+            let signs = vec![heard(ago_s), heard(1)];
+            let (transfers, received) = (Vec::new(), vec![half.clone()]);
+            board.round(&Progress { finished: 0, aircraft: 2, transfers, bytes: 0, received, signs });
+            board.watch().freeze().aircraft.iter().map(|craft| craft.state).collect::<Vec<_>>()
+        };
+        let flying = ["checkpoint is here, still flying or training", "no model is here yet"];
+        assert_eq!(state(2), flying);
+        assert_eq!(state(61), ["silent", "no model is here yet"]);
+        assert_eq!(state(1), flying);
     }
 }
