@@ -112,7 +112,8 @@ impl Gpu {
                 all => Ok(all),
             },
             ProcessorKernels::Native => {
-                let drivers = vulkan::list().unwrap_or_else(|e| {
+                let drivers = if vulkan::has_gpu() { vulkan::list() } else { Ok(Vec::new()) };
+                let drivers = drivers.unwrap_or_else(|e| {
                     tracing::debug!("no Vulkan device: {e}");
                     Vec::new()
                 });

@@ -19,6 +19,7 @@ mod target;
 #[cfg(test)]
 mod tests;
 mod tiles;
+mod vectors;
 
 use crate::arena::Arena;
 use crate::gpu::Gpu;
@@ -32,7 +33,7 @@ use pool::{Parts, Pool};
 pub(crate) use rates::Rates;
 
 /// The text of these functions: what was measured with other ones says nothing about them.
-pub(crate) const SOURCES: [&str; 11] = [
+pub(crate) const SOURCES: [&str; 12] = [
     include_str!("processor/blend.rs"),
     include_str!("processor/gaussians.rs"),
     include_str!("processor/halves.rs"),
@@ -44,6 +45,7 @@ pub(crate) const SOURCES: [&str; 11] = [
     include_str!("processor/projection.rs"),
     include_str!("processor/target.rs"),
     include_str!("processor/tiles.rs"),
+    include_str!("processor/vectors.rs"),
 ];
 
 /// Gaussians that a thread takes at once.
@@ -101,8 +103,8 @@ impl Processor {
             Kernel::RasteriseMedian => blend::rasterise_median(&call),
             Kernel::DepthSums => loss::depth_sums(&call),
             Kernel::DepthFinish => loss::depth_finish(&call),
-            Kernel::SsimRows => loss::ssim_rows(&call),
-            Kernel::SsimColumns => loss::ssim_columns(&call),
+            // What these leave for the next one never goes to memory here.
+            Kernel::SsimRows | Kernel::SsimColumns => (),
             Kernel::SsimBackRows => loss::ssim_back_rows(&call),
             Kernel::LossGradient => loss::loss_gradient(&call),
             Kernel::ExposureSums => loss::exposure_sums(&call),
@@ -135,6 +137,16 @@ impl Call<'_> {
 
     fn loop_lanes(&self) -> usize {
         self.memory.plan.lanes.loops as usize
+    }
+
+    /// Shares of all Gaussians, each for one thread.
+    fn shares(&self) -> usize {
+        (self.frame.gaussians as usize).div_ceil(SHARE)
+    }
+
+    /// The Gaussians of a share.
+    fn share(&self, share: usize) -> std::ops::Range<usize> {
+        share * SHARE..((share + 1) * SHARE).min(self.frame.gaussians as usize)
     }
 
     /// Highest degree of the plan.

@@ -3,6 +3,7 @@
 use super::{DeviceLimits, GpuError, GpuInfo};
 use ash::{Device, Entry, Instance, vk};
 use std::ffi::CStr;
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// What the kernels with several lanes per tile ask of a subgroup.
@@ -46,6 +47,27 @@ impl Drop for Inner {
 /// [`GpuError::NoLoader`] without a Vulkan loader; what the driver says.
 pub(super) fn list() -> Result<Vec<GpuInfo>, GpuError> {
     Ok(devices(instance()?)?.into_iter().map(|d| d.1).collect())
+}
+
+/// Whether the system has a device file of a GPU. Without one no driver finds hardware, and the loader would only bring in software
+/// renderers, of which Mesa's takes 50 MB until the process ends. Linux alone is asked; elsewhere there may be one.
+pub(super) fn has_gpu() -> bool {
+    has_gpu_in(Path::new("/dev"))
+}
+
+fn has_gpu_in(devices: &Path) -> bool {
+    /// Render nodes, and what drivers outside DRM name theirs: NVIDIA (Jetson: nvhost, nvgpu, nvmap), Arm Mali, Qualcomm Adreno,
+    /// Imagination, Vivante, and Windows' under WSL.
+    const NODES: [&str; 10] =
+        ["dri/renderD", "nvidia", "nvhost", "nvgpu", "nvmap", "mali", "kgsl", "pvr", "galcore", "dxg"];
+    if !cfg!(target_os = "linux") {
+        return true;
+    }
+    NODES.iter().any(|node| {
+        let (folder, begins) = node.rsplit_once('/').unwrap_or(("", node));
+        let names = std::fs::read_dir(devices.join(folder)).into_iter().flatten().flatten();
+        names.map(|entry| entry.file_name()).any(|name| name.to_string_lossy().starts_with(begins))
+    })
 }
 
 impl Vulkan {
@@ -240,4 +262,27 @@ fn open_in(
     let device = unsafe { instance.create_device(physical, &create, None) }
         .map_err(|e| GpuError::from_vk("vkCreateDevice", e))?;
     Ok((physical, info, device, family, timestamp_ns))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn a_gpu_is_looked_for_only_where_the_system_has_a_device_file_of_one() {
+        let devices = tempfile::tempdir().unwrap();
+        let node = |name: &str| std::fs::write(devices.path().join(name), "").unwrap();
+        node("null");
+        node("nvram");
+        std::fs::create_dir(devices.path().join("dri")).unwrap();
+        node("dri/card0");
+        assert!(!has_gpu_in(devices.path()), "a display alone computes nothing");
+        for name in ["dri/renderD128", "nvidia0", "nvhost-gpu", "mali0", "kgsl-3d0", "dxg"] {
+            node(name);
+            assert!(has_gpu_in(devices.path()), "{name}");
+            std::fs::remove_file(devices.path().join(name)).unwrap();
+        }
+        assert!(!has_gpu_in(Path::new("/nowhere")));
+    }
 }

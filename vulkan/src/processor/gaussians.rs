@@ -2,8 +2,11 @@
 //! `moments.glsl`, `adam.glsl`).
 
 use super::halves;
+use super::lanes::{F8, LANES, load, splat, store};
 use super::pool::Parts;
 use crate::layout::{Frame, MissedSteps};
+use fearless_simd::Simd;
+use fearless_simd::prelude::*;
 
 /// Four numbers that lie together.
 pub(super) type Vec4 = [f32; 4];
@@ -51,6 +54,9 @@ pub(super) fn steps_behind(last: u32, now: u32) -> usize {
     (now.wrapping_sub(last) & STATE_STEPS).min(MOST_BEHIND) as usize
 }
 
+/// Second moments up to this have no root to divide by.
+const LEAST: f32 = 1.0e-37;
+
 /// Lazy updates: k steps with a zero gradient decay the moments, and move the parameters by a sum that depends on k alone.
 #[inline(always)]
 pub(super) fn catch_up<const N: usize>(
@@ -60,7 +66,6 @@ pub(super) fn catch_up<const N: usize>(
     step_sum: &[f32; N],
     missed: &MissedSteps,
 ) {
-    const LEAST: f32 = 1.0e-37;
     for i in 0..N {
         let ratio = if v[i] <= LEAST { 0.0 } else { m[i] / v[i].max(LEAST).sqrt() };
         p[i] -= step_sum[i] * ratio;
@@ -150,46 +155,49 @@ pub(super) enum Moments<'a> {
 }
 
 impl Moments<'_> {
-    /// `count` moments from number `at` on, zeros beyond.
+    /// `count` moments, at most eight, from number `at` on: zeros beyond.
     ///
     /// # Safety
     /// Nobody else has these moments meanwhile.
     #[inline(always)]
-    pub unsafe fn fetch(&self, frame: &Frame, at: usize, count: usize) -> [Numbers; 2] {
-        let [mut m, mut v] = [[0.0; MOST]; 2];
+    pub unsafe fn fetch<S: Simd>(&self, s: S, frame: &Frame, at: usize, count: usize) -> [F8<S>; 2] {
         // SAFETY: by contract.
         unsafe {
             match self {
-                Self::Whole(first, second) => {
-                    m[..count].copy_from_slice(first.range(at, count));
-                    v[..count].copy_from_slice(second.range(at, count));
-                }
+                Self::Whole(first, second) => [load(s, first.range(at, count)), load(s, second.range(at, count))],
                 Self::Half(first, second) => {
-                    let (first, second) = (first.range(at, count), second.range(at, count));
-                    for i in 0..count {
-                        let root = halves::widen(second[i]) / frame.moment_scale;
-                        (m[i], v[i]) = (halves::widen(first[i]) / frame.moment_scale, root * root);
+                    let mut all = [[0.0; LANES]; 2];
+                    for (all, halves) in all.iter_mut().zip([first.range(at, count), second.range(at, count)]) {
+                        for (wide, half) in all.iter_mut().zip(halves) {
+                            *wide = halves::widen(*half);
+                        }
                     }
+                    let scale = splat(s, frame.moment_scale);
+                    let (m, root) = (F8::from_slice(s, &all[0]) / scale, F8::from_slice(s, &all[1]) / scale);
+                    [m, root * root]
                 }
             }
         }
-        [m, v]
     }
 
-    /// Keeps `count` moments from number `at` on.
+    /// Keeps `count` moments from number `at` on: four or eight.
     ///
     /// # Safety
     /// As [`Self::fetch`].
     #[inline(always)]
-    pub unsafe fn store(&self, frame: &Frame, at: usize, count: usize, [mut m, mut v]: [Numbers; 2]) {
+    pub unsafe fn store<S: Simd>(&self, frame: &Frame, at: usize, count: usize, [m, v]: [F8<S>; 2]) {
         // SAFETY: by contract.
         unsafe {
             match self {
                 Self::Whole(first, second) => {
-                    first.range(at, count).copy_from_slice(&m[..count]);
-                    second.range(at, count).copy_from_slice(&v[..count]);
+                    store(m, first.range(at, count));
+                    store(v, second.range(at, count));
                 }
                 Self::Half(first, second) => {
+                    let mut all = [[0.0; LANES]; 2];
+                    m.store_slice(&mut all[0]);
+                    v.store_slice(&mut all[1]);
+                    let [m, v] = &mut all;
                     for column in 0..count / 4 {
                         round(frame, (at / 4 + column) as u32, &mut m[4 * column..][..4], &mut v[4 * column..][..4]);
                     }
@@ -200,6 +208,58 @@ impl Moments<'_> {
                 }
             }
         }
+    }
+}
+
+/// Lazy updates of eight numbers, as [`catch_up`].
+pub(super) struct Lazy<S: Simd> {
+    first_decay: F8<S>,
+    second_decay: F8<S>,
+}
+
+impl<S: Simd> Lazy<S> {
+    #[inline(always)]
+    pub fn of(s: S, missed: &MissedSteps) -> Self {
+        Self { first_decay: splat(s, missed.first_decay), second_decay: splat(s, missed.second_decay) }
+    }
+
+    /// What numbers and moments become.
+    #[inline(always)]
+    pub fn catch_up(&self, p: F8<S>, [m, v]: [F8<S>; 2], step_sum: F8<S>) -> (F8<S>, [F8<S>; 2]) {
+        let s = p.token();
+        let least = splat(s, LEAST);
+        let ratio = v.simd_gt(least).select(m / v.max(least).sqrt(), splat(s, 0.0));
+        (p - step_sum * ratio, [m * self.first_decay, v * self.second_decay])
+    }
+}
+
+/// One step of Adam on eight numbers at a time.
+pub(super) struct Adam<S: Simd> {
+    by_first: F8<S>,
+    by_second: F8<S>,
+    first_bias: F8<S>,
+    second_bias: F8<S>,
+    epsilon: F8<S>,
+}
+
+impl<S: Simd> Adam<S> {
+    #[inline(always)]
+    pub fn of(s: S, frame: &Frame) -> Self {
+        Self {
+            by_first: splat(s, 1.0 - frame.beta1),
+            by_second: splat(s, 1.0 - frame.beta2),
+            first_bias: splat(s, frame.first_bias),
+            second_bias: splat(s, frame.second_bias),
+            epsilon: splat(s, frame.epsilon),
+        }
+    }
+
+    /// What numbers and moments become by a gradient.
+    #[inline(always)]
+    pub fn step(&self, p: F8<S>, [m, v]: [F8<S>; 2], g: F8<S>, rate: F8<S>) -> (F8<S>, [F8<S>; 2]) {
+        let m = m + (g - m) * self.by_first;
+        let v = v + (g * g - v) * self.by_second;
+        (p - rate * (m * self.first_bias) / ((v * self.second_bias).sqrt() + self.epsilon), [m, v])
     }
 }
 

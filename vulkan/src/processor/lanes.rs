@@ -82,6 +82,50 @@ pub(super) fn exp2<S: Simd>(x: F8<S>) -> F8<S> {
     p * F8::from_bits(bits)
 }
 
+/// eˣ, by [`exp2`].
+#[inline(always)]
+pub(super) fn exp<S: Simd>(x: F8<S>) -> F8<S> {
+    exp2(x * std::f32::consts::LOG2_E)
+}
+
+/// The logistic function.
+#[inline(always)]
+pub(super) fn sigmoid<S: Simd>(x: F8<S>) -> F8<S> {
+    let one = splat(x.token(), 1.0);
+    one / (one + exp(-x))
+}
+
+/// log₂ x for normal x > 0, within 1e-6 of 1 + |log₂ x| (a test); of others any number. The polynomial is Cephes' `logf` (Moshier 1989),
+/// on [√½, √2].
+#[inline(always)]
+pub(super) fn log2<S: Simd>(x: F8<S>) -> F8<S> {
+    const ONE: i32 = 127 << 23;
+    let s = x.token();
+    let (one, root) = (splat(s, 1.0), splat(s, std::f32::consts::SQRT_2));
+    let bits: i32x8<S> = x.bitcast();
+    let high: F8<S> = ((bits & 0x7F_FFFF) | ONE).bitcast();
+    let exponent: F8<S> = ((bits >> 23) - 127).to_float();
+    let above = high.simd_gt(root);
+    let m = above.select(high * 0.5, high) - one;
+    let exponent = exponent + above.select(one, splat(s, 0.0));
+    let mut p = splat(s, 7.037_683_6e-2);
+    for c in [
+        -1.151_461e-1,
+        1.167_699_9e-1,
+        -1.242_014_1e-1,
+        1.424_932_3e-1,
+        -1.666_805_7e-1,
+        2.000_071_5e-1,
+        -2.499_999_4e-1,
+        3.333_333e-1,
+    ] {
+        p = fma(p, m, splat(s, c));
+    }
+    let square = m * m;
+    let natural = fma(p * m, square, fma(splat(s, -0.5), square, m));
+    fma(natural, splat(s, std::f32::consts::LOG2_E), exponent)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -106,6 +150,22 @@ mod tests {
         assert!(worst < 2.0 * f64::from(f32::EPSILON), "{worst:e}");
         for (x, bound) in [(-1.0e30, -126.0f32), (f32::NEG_INFINITY, -126.0), (1.0e30, 127.0), (f32::INFINITY, 127.0)] {
             assert_eq!(dispatch!(level, s => exp2_of(s, x)), bound.exp2(), "{x}");
+        }
+    }
+
+    #[test]
+    fn a_logarithm_is_within_a_millionth_over_all_normal_numbers() {
+        #[inline(always)]
+        fn log2_of<S: Simd>(s: S, x: f32) -> f32 {
+            let mut all = [0.0; LANES];
+            log2(splat(s, x)).store_slice(&mut all);
+            all[0]
+        }
+        let level = Level::new();
+        for i in -126_000..127_000 {
+            let x = (i as f32 / 1000.0).exp2();
+            let (found, exact) = (f64::from(dispatch!(level, s => log2_of(s, x))), f64::from(x).log2());
+            assert!((found - exact).abs() < 1e-6 * (1.0 + exact.abs()), "{x}: {found} instead of {exact}");
         }
     }
 

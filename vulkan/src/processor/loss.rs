@@ -1,9 +1,9 @@
 //! Stage *loss*: L1, SSIM and Pearson depth, and their gradient at every pixel (`shaders/ssim_*.comp`, `loss_gradient.comp`,
 //! `depth_*.comp`, `exposure_sums.comp`; reference: `crate::reference::loss`).
 //!
-//! SSIM's window is separable: along rows, along columns, and for the gradient once more along both. What lies between the four passes are
-//! planes of the picture's size, three channels of four or three maps, in the sections of the plan. Strips of [`STRIP`] rows are the parts
-//! that threads take; sums are of a strip, so that they do not depend on the number of threads.
+//! SSIM's window is separable: along rows, along columns, and for the gradient once more along both. Threads take [`CHUNK`] rows. The means
+//! of the rows that a window reaches stay in a ring, which a core's cache holds; of the derivatives, blurred along rows, whole planes are
+//! left for the last pass. Sums are of a strip of [`STRIP`] rows, so that they do not depend on the number of threads.
 
 use super::Call;
 use super::lanes::{F8, LANES, fma, load, splat, store, sum};
@@ -20,6 +20,11 @@ use fearless_simd::{Simd, dispatch};
 const STRIP: usize = constants::STRIP as usize;
 /// Rows that the window of a strip's rows reaches.
 const REACH: usize = STRIP + 2 * SSIM_RADIUS;
+/// Strips that a thread takes at once.
+const CHUNK_STRIPS: usize = 5;
+/// Rows of those. The means of [`REACH`] rows of every chunk lie where those of a whole picture would.
+const CHUNK: usize = CHUNK_STRIPS * STRIP;
+const _: () = assert!(2 * REACH <= CHUNK + 1);
 /// Pixels of a row that are blurred at once.
 const BLOCK: usize = 64;
 /// Those and the window's reach on either side, whole vectors.
@@ -58,12 +63,16 @@ impl Size {
         Self { width, height }
     }
 
-    fn pixels(self) -> usize {
-        self.width * self.height
-    }
-
     fn strips(self) -> usize {
         self.height.div_ceil(STRIP)
+    }
+
+    fn chunks(self) -> usize {
+        self.height.div_ceil(CHUNK)
+    }
+
+    fn strips_of(self, chunk: usize) -> std::ops::Range<usize> {
+        chunk * CHUNK_STRIPS..((chunk + 1) * CHUNK_STRIPS).min(self.strips())
     }
 
     /// Rows of a strip.
@@ -80,53 +89,116 @@ fn compared_in(frame: &Frame, c: usize, rendered: f32, texel: u32) -> (f32, f32)
     (x, if texel >> 24 == LEFT_OUT { x } else { y })
 }
 
-/// Part of a row blurred along itself: `values` begins [`LANES`] before it, and is zero outside the picture.
+/// Eight columns blurred along their row, which holds them from place `at` on.
 #[inline(always)]
-fn blur_block<S: Simd>(s: S, values: &[f32; BLOCK_REACH], out: &mut [f32]) {
-    const FIRST: usize = LANES - SSIM_RADIUS;
-    for (x, out) in (0..BLOCK).step_by(LANES).zip(out.chunks_mut(LANES)) {
-        let mut v = [splat(s, 0.0); TAPS];
-        for (j, v) in v.iter_mut().enumerate() {
-            *v = F8::from_slice(s, &values[x + FIRST + j..x + FIRST + j + LANES]);
-        }
-        store(weighted(s, &v), out);
+fn blur_along<S: Simd>(s: S, row: &[f32; BLOCK_REACH], at: usize) -> F8<S> {
+    let mut v = [splat(s, 0.0); TAPS];
+    for (j, v) in v.iter_mut().enumerate() {
+        *v = F8::from_slice(s, &row[at + j - SSIM_RADIUS..at + j - SSIM_RADIUS + LANES]);
+    }
+    weighted(s, &v)
+}
+
+/// Where numbers of several maps lie: row by row, eight columns of one map after those of the other, so that a pass over a strip reads
+/// each row from its beginning to its end.
+#[derive(Clone, Copy)]
+struct Maps {
+    width: usize,
+    maps: usize,
+}
+
+impl Maps {
+    /// Numbers of a row.
+    fn row(self) -> usize {
+        self.width * self.maps
+    }
+
+    /// Columns that lie together at `x`, a multiple of [`LANES`].
+    fn columns(self, x: usize) -> usize {
+        LANES.min(self.width - x)
+    }
+
+    /// Where those of a map lie in a row.
+    #[inline(always)]
+    fn at(self, x: usize, map: usize) -> std::ops::Range<usize> {
+        let first = x * self.maps + map * self.columns(x);
+        first..first + self.columns(x)
     }
 }
 
-/// First pass: along rows, the window's means of what SSIM needs.
-pub(super) fn ssim_rows(call: &Call<'_>) {
+/// Where the rows begin that the window of a strip reaches; nothing outside the picture, where all is zero.
+type Reached = [Option<usize>; REACH];
+
+/// The rows that a strip reaches, where row `y` begins at `start(y)`.
+fn reached(size: Size, strip: usize, start: impl Fn(usize) -> usize) -> Reached {
+    let row = |j: usize| (strip * STRIP + j).checked_sub(SSIM_RADIUS).filter(|y| *y < size.height);
+    std::array::from_fn(|j| row(j).map(&start))
+}
+
+/// SSIM, and its derivatives blurred along rows: all passes but the last, each thread with a ring of its own.
+pub(super) fn ssim_back_rows(call: &Call<'_>) {
     let (size, memory) = (Size::of(call.frame), &call.memory);
-    let (image, target) = (memory.read::<[f32; 4]>("image"), memory.read::<[u32; 2]>("target"));
-    // SAFETY: the only section that this kernel writes.
-    let planes = Parts::of(unsafe { memory.write::<f32>("moments") });
-    call.pool.each(size.strips(), |strip| {
-        dispatch!(call.level, s => rows_of_strip(s, call.frame, (image, target), &planes, size, strip));
+    let pictures = (memory.read::<[f32; 4]>("image"), memory.read::<[u32; 2]>("target"));
+    // SAFETY: the three sections that this kernel writes, once each.
+    let (rings, derivatives, sums) = unsafe {
+        (
+            Parts::of(memory.write::<f32>("moments")),
+            Parts::of(memory.write::<f32>("adjoint")),
+            Parts::of(memory.write::<LossSums>("strip_sums")),
+        )
+    };
+    let (ring_rows, each) = (REACH.min(size.height), 3 * DERIVATIVES * size.width);
+    call.pool.each_with_slot(size.chunks(), |chunk, slot| {
+        let maps = Maps { width: size.width, maps: 3 * MOMENTS };
+        let numbers = ring_rows * maps.row();
+        // SAFETY: a slot is one thread's at a time. There is room: REACH rows of as many chunks as there are slots are no more than the
+        // picture has.
+        let mut ring = Ring { means: unsafe { rings.range(slot * numbers, numbers) }, maps, rows: ring_rows };
+        let strips = size.strips_of(chunk);
+        let mut next = (strips.start * STRIP).saturating_sub(SSIM_RADIUS);
+        for strip in strips {
+            let (rows, last) = (size.rows(strip), ((strip + 1) * STRIP + SSIM_RADIUS).min(size.height));
+            // SAFETY: rows of this strip, and its sums, which no other part has.
+            let (out, sums) = unsafe {
+                (derivatives.range(rows.start * each, rows.len() * each), sums.range(strip * size.width, size.width))
+            };
+            // The first is the strip's, the host adds them all.
+            sums.fill(LossSums::zeroed());
+            dispatch!(call.level, s => {
+                for y in std::mem::replace(&mut next, last)..last {
+                    ring.add_row(s, call.frame, pictures, y);
+                }
+                sums[0].ssim = ring.derive(s, size, strip, out);
+            });
+        }
     });
 }
 
-#[inline(always)]
-fn rows_of_strip<S: Simd>(
-    s: S,
-    frame: &Frame,
-    (image, target): (&[[f32; 4]], &[[u32; 2]]),
-    planes: &Parts<'_, f32>,
-    size: Size,
-    strip: usize,
-) {
-    let Size { width, .. } = size;
-    for y in size.rows(strip) {
+/// What lies between the passes: of the last rows, the window's means along the row, three channels of [`MOMENTS`] each.
+struct Ring<'a> {
+    means: &'a mut [f32],
+    maps: Maps,
+    rows: usize,
+}
+
+impl Ring<'_> {
+    /// Where a row begins.
+    fn start(&self, y: usize) -> usize {
+        y % self.rows * self.maps.row()
+    }
+
+    /// First pass: along a row, the window's means of what SSIM needs.
+    #[inline(always)]
+    fn add_row<S: Simd>(&mut self, s: S, frame: &Frame, (image, target): (&[[f32; 4]], &[[u32; 2]]), y: usize) {
+        let width = self.maps.width;
         let (image, target) = (&image[y * width..(y + 1) * width], &target[y * width..(y + 1) * width]);
+        let start = self.start(y);
+        let row = &mut self.means[start..start + self.maps.row()];
         for x0 in (0..width).step_by(BLOCK) {
             // Zero outside the picture: x and y of each channel, then the four maps of one.
             let mut shown = [[[0.0; BLOCK_REACH]; 2]; 3];
             let (first, last) = (x0.saturating_sub(LANES), (x0 + BLOCK + LANES).min(width));
-            let places = first + LANES - x0..last + LANES - x0;
-            for (at, (rendered, wanted)) in places.zip(image[first..last].iter().zip(&target[first..last])) {
-                for c in 0..3 {
-                    (shown[c][0][at], shown[c][1][at]) = compared_in(frame, c, rendered[c], wanted[0]);
-                }
-            }
-            let count = BLOCK.min(width - x0);
+            compare(frame, (&image[first..last], &target[first..last]), &mut shown, first + LANES - x0);
             for (c, [a, b]) in shown.iter().enumerate() {
                 let (mut squares, mut products) = ([0.0; BLOCK_REACH], [0.0; BLOCK_REACH]);
                 for x in (0..BLOCK_REACH).step_by(LANES) {
@@ -135,34 +207,128 @@ fn rows_of_strip<S: Simd>(
                     (a * b).store_slice(&mut products[x..x + LANES]);
                 }
                 for (k, values) in [a, b, &squares, &products].into_iter().enumerate() {
-                    let plane = MOMENTS * c + k;
-                    // SAFETY: rows of this strip, which no other part has.
-                    blur_block(s, values, unsafe { planes.range(plane * size.pixels() + y * width + x0, count) });
+                    for x in (x0..(x0 + BLOCK).min(width)).step_by(LANES) {
+                        store(blur_along(s, values, x - x0 + LANES), &mut row[self.maps.at(x, MOMENTS * c + k)]);
+                    }
                 }
+            }
+        }
+    }
+
+    /// Second and third pass: along columns, then a strip's SSIM and its derivatives, which are blurred along rows; returns the sum of
+    /// SSIM.
+    #[inline(always)]
+    fn derive<S: Simd>(&self, s: S, size: Size, strip: usize, out: &mut [f32]) -> f32 {
+        let (width, rows) = (size.width, reached(size, strip, |y| self.start(y)));
+        let maps = Maps { width, maps: 3 * DERIVATIVES };
+        let mut total = Total::new(s);
+        // Derivatives of a block, and of the columns before it; zero outside the picture.
+        let mut found = [[[0.0; BLOCK_REACH]; 3 * DERIVATIVES]; STRIP];
+        for x0 in (0..width + LANES).step_by(BLOCK) {
+            for x in (x0..x0 + BLOCK).step_by(LANES) {
+                if x < width {
+                    let columns = Columns { x, count: maps.columns(x) };
+                    for c in 0..3 {
+                        self.derive_columns(s, c, &rows, columns, (&mut found, x - x0), &mut total);
+                    }
+                } else {
+                    for row in found.iter_mut().flatten() {
+                        row[2 * LANES + x - x0..][..LANES].fill(0.0);
+                    }
+                }
+            }
+            for (out, found) in out.chunks_exact_mut(maps.row()).zip(&mut found) {
+                for x in (0..BLOCK).step_by(LANES) {
+                    let Some(at) = (x0 + x).checked_sub(LANES).filter(|at| *at < width) else { continue };
+                    for (map, found) in found.iter().enumerate() {
+                        store(blur_along(s, found, LANES + x), &mut out[maps.at(at, map)]);
+                    }
+                }
+                for found in found {
+                    found.copy_within(BLOCK.., 0);
+                }
+            }
+        }
+        total.sum()
+    }
+
+    /// The derivatives of a channel in some columns of a strip, kept from place `at` on behind those of the columns before the block.
+    #[inline(always)]
+    fn derive_columns<S: Simd>(
+        &self,
+        s: S,
+        c: usize,
+        rows: &Reached,
+        Columns { x, count }: Columns,
+        (found, at): (&mut [[[f32; BLOCK_REACH]; 3 * DERIVATIVES]; STRIP], usize),
+        total: &mut Total<S>,
+    ) {
+        let mut blurred = [[splat(s, 0.0); STRIP]; MOMENTS];
+        for (k, blurred) in blurred.iter_mut().enumerate() {
+            *blurred = blur_down(s, self.means, rows, self.maps.at(x, MOMENTS * c + k));
+        }
+        // As many as the strip has in the picture.
+        let inside = rows[SSIM_RADIUS..SSIM_RADIUS + STRIP].iter().flatten().count();
+        for (o, found) in found[..inside].iter_mut().enumerate() {
+            let (value, by) = ssim_of(s, [blurred[0][o], blurred[1][o], blurred[2][o], blurred[3][o]]);
+            total.add(value, count);
+            for (k, by) in by.into_iter().enumerate() {
+                let to = &mut found[DERIVATIVES * c + k][2 * LANES + at..3 * LANES + at];
+                by.store_slice(to);
+                to[count..].fill(0.0);
             }
         }
     }
 }
 
-/// Eight columns of a plane blurred down a strip.
+/// Columns that lie together.
+#[derive(Clone, Copy)]
+struct Columns {
+    x: usize,
+    count: usize,
+}
+
+/// What is compared of some pixels, channel by channel, from place `at` on.
 #[inline(always)]
-fn blur_down<S: Simd>(s: S, plane: &[f32], size: Size, strip: usize, x: usize) -> [F8<S>; STRIP] {
-    // Zero outside the picture.
-    let mut v = [splat(s, 0.0); REACH];
-    let count = LANES.min(size.width - x);
-    for (j, v) in v.iter_mut().enumerate() {
-        if let Some(y) = (strip * STRIP + j).checked_sub(SSIM_RADIUS).filter(|y| *y < size.height) {
-            let at = y * size.width + x;
-            *v = load(s, &plane[at..at + count]);
+fn compare<const N: usize>(
+    frame: &Frame,
+    (image, target): (&[[f32; 4]], &[[u32; 2]]),
+    out: &mut [[[f32; N]; 2]; 3],
+    at: usize,
+) {
+    for (c, [shown, wanted]) in out.iter_mut().enumerate() {
+        let pixels = shown[at..].iter_mut().zip(&mut wanted[at..]).zip(image.iter().zip(target));
+        for ((shown, wanted), (rendered, texel)) in pixels {
+            (*shown, *wanted) = compared_in(frame, c, rendered[c], texel[0]);
         }
     }
+}
+
+/// Eight columns blurred down a strip: `rows` tells where each row begins, and `at` where its columns are.
+#[inline(always)]
+fn blur_down<S: Simd>(s: S, all: &[f32], rows: &Reached, at: std::ops::Range<usize>) -> [F8<S>; STRIP] {
     let mut sums = [splat(s, 0.0); STRIP];
+    macro_rules! add_rows {
+        ($($j:literal)*) => { $(
+            if let Some(start) = rows[$j] {
+                let v = load(s, &all[start + at.start..start + at.end]);
+                add_row::<_, $j>(s, v, &mut sums);
+            }
+        )* };
+    }
+    add_rows!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17);
+    sums
+}
+
+/// Adds row `J` of those that a strip reaches to the rows of the strip that reach it.
+#[inline(always)]
+fn add_row<S: Simd, const J: usize>(s: S, v: F8<S>, sums: &mut [F8<S>; STRIP]) {
+    const { assert!(J < REACH && REACH == 18) };
     for (o, sum) in sums.iter_mut().enumerate() {
-        if let Some(v) = v[o..].first_chunk() {
-            *sum = weighted(s, v);
+        if let Some(tap) = SSIM_WINDOW.get((J + STRIP - o).abs_diff(SSIM_RADIUS + STRIP)) {
+            *sum = fma(splat(s, *tap), v, *sum);
         }
     }
-    sums
 }
 
 /// Adds what lanes hold to a strip's sum: of whole vectors lane by lane, of the last one those that lie in the picture.
@@ -194,46 +360,6 @@ impl<S: Simd> Total<S> {
     }
 }
 
-/// Second pass: along columns, then SSIM and its derivatives.
-pub(super) fn ssim_columns(call: &Call<'_>) {
-    let (size, memory) = (Size::of(call.frame), &call.memory);
-    let moments = memory.read::<f32>("moments");
-    // SAFETY: the two sections that this kernel writes, once each.
-    let (planes, sums) =
-        unsafe { (Parts::of(memory.write::<f32>("adjoint")), Parts::of(memory.write::<LossSums>("strip_sums"))) };
-    call.pool.each(size.strips(), |strip| {
-        let total = dispatch!(call.level, s => columns_of_strip(s, moments, &planes, size, strip));
-        // SAFETY: a strip's sums, which no other part has. The first is the strip's, the host adds them all.
-        let own = unsafe { sums.range(strip * size.width, size.width) };
-        own.fill(LossSums::zeroed());
-        own[0].ssim = total;
-    });
-}
-
-#[inline(always)]
-fn columns_of_strip<S: Simd>(s: S, moments: &[f32], planes: &Parts<'_, f32>, size: Size, strip: usize) -> f32 {
-    let (Size { width, .. }, pixels) = (size, size.pixels());
-    let mut total = Total::new(s);
-    for c in 0..3 {
-        for x in (0..width).step_by(LANES) {
-            let count = LANES.min(width - x);
-            let mut blurred = [[splat(s, 0.0); STRIP]; MOMENTS];
-            for (k, blurred) in blurred.iter_mut().enumerate() {
-                *blurred = blur_down(s, &moments[(MOMENTS * c + k) * pixels..], size, strip, x);
-            }
-            for (o, y) in size.rows(strip).enumerate() {
-                let (value, by) = ssim_of(s, [blurred[0][o], blurred[1][o], blurred[2][o], blurred[3][o]]);
-                total.add(value, count);
-                for k in 0..DERIVATIVES {
-                    // SAFETY: rows of this strip, which no other part has.
-                    store(by[k], unsafe { planes.range((DERIVATIVES * c + k) * pixels + y * width + x, count) });
-                }
-            }
-        }
-    }
-    total.sum()
-}
-
 /// SSIM at a pixel, and its derivatives by the means of x, of x² + y² and of xy (`reference::loss::ssim`).
 #[inline(always)]
 fn ssim_of<S: Simd>(s: S, [ma, mb, squares, product]: [F8<S>; MOMENTS]) -> (F8<S>, [F8<S>; DERIVATIVES]) {
@@ -252,124 +378,90 @@ fn ssim_of<S: Simd>(s: S, [ma, mb, squares, product]: [F8<S>; MOMENTS]) -> (F8<S
     (value, [by_mean, -(value * r2), two * a1 * both])
 }
 
-/// Third pass: the window over the derivatives, along rows.
-pub(super) fn ssim_back_rows(call: &Call<'_>) {
-    let (size, memory) = (Size::of(call.frame), &call.memory);
-    let adjoint = memory.read::<f32>("adjoint");
-    // SAFETY: the only section that this kernel writes.
-    let planes = Parts::of(unsafe { memory.write::<f32>("moments") });
-    call.pool.each(size.strips(), |strip| {
-        dispatch!(call.level, s => back_rows_of_strip(s, adjoint, &planes, size, strip));
-    });
-}
-
-#[inline(always)]
-fn back_rows_of_strip<S: Simd>(s: S, adjoint: &[f32], planes: &Parts<'_, f32>, size: Size, strip: usize) {
-    let Size { width, .. } = size;
-    for plane in 0..3 * DERIVATIVES {
-        for y in size.rows(strip) {
-            let row = plane * size.pixels() + y * width;
-            for x0 in (0..width).step_by(BLOCK) {
-                let mut values = [0.0; BLOCK_REACH];
-                let (first, last) = (x0.saturating_sub(LANES), (x0 + BLOCK + LANES).min(width));
-                values[first + LANES - x0..last + LANES - x0].copy_from_slice(&adjoint[row + first..row + last]);
-                // SAFETY: rows of this strip, which no other part has.
-                blur_block(s, &values, unsafe { planes.range(row + x0, BLOCK.min(width - x0)) });
-            }
-        }
-    }
-}
-
-/// Fourth pass: along columns, with what L1 and the depth add.
+/// Last pass: along columns, with what L1 and the depth add.
 pub(super) fn loss_gradient(call: &Call<'_>) {
     let (size, memory) = (Size::of(call.frame), &call.memory);
     let (image, target) = (memory.read::<[f32; 4]>("image"), memory.read::<[u32; 2]>("target"));
-    let (blurred, status) = (memory.read::<f32>("moments"), &memory.read::<Status>("status")[0]);
+    let (blurred, status) = (memory.read::<f32>("adjoint"), &memory.read::<Status>("status")[0]);
     // SAFETY: the two sections that this kernel writes, once each.
     let (gradients, sums) = unsafe {
         (Parts::of(memory.write::<[f32; 4]>("image_gradient")), Parts::of(memory.write::<LossSums>("strip_sums")))
     };
-    call.pool.each(size.strips(), |strip| {
+    call.pool.each(size.chunks(), |chunk| {
         let pictures = (image, target, blurred);
-        let l1 =
-            dispatch!(call.level, s => gradient_of_strip(s, call.frame, status, pictures, &gradients, size, strip));
-        // SAFETY: a strip's sums, which no other part has.
-        if let Some(own) = unsafe { sums.range(strip * size.width, 1) }.first_mut() {
-            own.l1 = l1;
-        }
+        let strips = size.strips_of(chunk);
+        dispatch!(call.level, s => {
+            let mut l1 = [const { None }; CHUNK_STRIPS];
+            for x0 in (0..size.width).step_by(BLOCK) {
+                for (strip, l1) in strips.clone().zip(&mut l1) {
+                    let l1 = l1.get_or_insert_with(|| Total::new(s));
+                    gradient_of_block(s, call.frame, status, pictures, &gradients, (size, strip, x0), l1);
+                }
+            }
+            for (strip, l1) in strips.zip(l1) {
+                // SAFETY: a strip's sums, which no other part has.
+                if let (Some(own), Some(l1)) = (unsafe { sums.range(strip * size.width, 1) }.first_mut(), l1) {
+                    own.l1 = l1.sum();
+                }
+            }
+        });
     });
 }
 
+/// The gradient in a block of a strip's pixels.
 #[inline(always)]
-fn gradient_of_strip<S: Simd>(
+fn gradient_of_block<S: Simd>(
     s: S,
     frame: &Frame,
     status: &Status,
     (image, target, blurred): (&[[f32; 4]], &[[u32; 2]], &[f32]),
     gradients: &Parts<'_, [f32; 4]>,
-    size: Size,
-    strip: usize,
-) -> f32 {
-    let (width, has_depth) = (size.width, frame.has(FLAG_DEPTH));
-    let mut l1 = Total::new(s);
-    for x0 in (0..width).step_by(BLOCK) {
-        let count = BLOCK.min(width - x0);
-        let mut found = [[[0.0; BLOCK]; STRIP]; 3];
-        for (c, found) in found.iter_mut().enumerate() {
-            gradient_of_block(s, frame, c, (image, target, blurred), (size, strip, x0), found, &mut l1);
-        }
-        for (o, y) in size.rows(strip).enumerate() {
-            let at = y * width + x0;
-            // SAFETY: pixels of this strip, which no other part has.
-            let out = unsafe { gradients.range(at, count) };
-            let pixels = out.iter_mut().zip(image[at..at + count].iter().zip(&target[at..at + count]));
-            for (i, (out, (shown, wanted))) in pixels.enumerate() {
-                *out = if wanted[0] >> 24 == LEFT_OUT {
-                    [0.0; 4]
-                } else {
-                    let depth = if has_depth { by_depth(frame, status, *wanted, shown[3]) } else { 0.0 };
-                    [found[0][o][i], found[1][o][i], found[2][o][i], depth]
-                };
+    (size, strip, x0): (Size, usize, usize),
+    l1: &mut Total<S>,
+) {
+    let (width, has_depth, count) = (size.width, frame.has(FLAG_DEPTH), BLOCK.min(size.width - x0));
+    // Of each row and channel: what is compared, then in place of the first the gradient.
+    let mut pixels = [[[[0.0; BLOCK]; 2]; 3]; STRIP];
+    for (y, pixels) in size.rows(strip).zip(&mut pixels) {
+        let at = y * width + x0;
+        compare(frame, (&image[at..at + count], &target[at..at + count]), pixels, 0);
+    }
+    let (zero, one, two) = (splat(s, 0.0), splat(s, 1.0), splat(s, 2.0));
+    let (by_l1, by_ssim) = (splat(s, frame.l1_weight), splat(s, -frame.ssim_weight));
+    let maps = Maps { width, maps: 3 * DERIVATIVES };
+    let rows = reached(size, strip, |y| y * maps.row());
+    for x in (0..count).step_by(LANES) {
+        let some = maps.columns(x0 + x);
+        for c in 0..3 {
+            let gain = splat(s, frame.exposure_gain[c]);
+            let mut sums = [[zero; STRIP]; DERIVATIVES];
+            for (k, sums) in sums.iter_mut().enumerate() {
+                *sums = blur_down(s, blurred, &rows, maps.at(x0 + x, DERIVATIVES * c + k));
+            }
+            for (o, pixels) in pixels[..size.rows(strip).len()].iter_mut().enumerate() {
+                let [shown_row, wanted_row] = &mut pixels[c];
+                let shown = F8::from_slice(s, &shown_row[x..x + LANES]);
+                let wanted = F8::from_slice(s, &wanted_row[x..x + LANES]);
+                let difference = shown - wanted;
+                l1.add(difference.abs(), some);
+                let sign = difference.simd_gt(zero).select(one, zero) - difference.simd_lt(zero).select(one, zero);
+                let similarity = fma(wanted, sums[2][o], fma(two * shown, sums[1][o], sums[0][o]));
+                (fma(by_l1, sign, by_ssim * similarity) * gain).store_slice(&mut shown_row[x..x + LANES]);
             }
         }
     }
-    l1.sum()
-}
-
-/// The gradient of one channel in a block of a strip's pixels, row by row.
-#[inline(always)]
-fn gradient_of_block<S: Simd>(
-    s: S,
-    frame: &Frame,
-    c: usize,
-    (image, target, blurred): (&[[f32; 4]], &[[u32; 2]], &[f32]),
-    (size, strip, x0): (Size, usize, usize),
-    found: &mut [[f32; BLOCK]; STRIP],
-    l1: &mut Total<S>,
-) {
-    let (zero, one, two) = (splat(s, 0.0), splat(s, 1.0), splat(s, 2.0));
-    let (by_l1, by_ssim, gain) =
-        (splat(s, frame.l1_weight), splat(s, -frame.ssim_weight), splat(s, frame.exposure_gain[c]));
-    for x in (x0..(x0 + BLOCK).min(size.width)).step_by(LANES) {
-        let count = LANES.min(size.width - x);
-        let mut sums = [[zero; STRIP]; DERIVATIVES];
-        for (k, sums) in sums.iter_mut().enumerate() {
-            *sums = blur_down(s, &blurred[(DERIVATIVES * c + k) * size.pixels()..], size, strip, x);
-        }
-        for (o, y) in size.rows(strip).enumerate() {
-            let at = y * size.width + x;
-            let (mut shown, mut wanted) = ([0.0; LANES], [0.0; LANES]);
-            let pixels = shown.iter_mut().zip(&mut wanted);
-            for ((shown, wanted), (rendered, texel)) in pixels.zip(image[at..at + count].iter().zip(&target[at..])) {
-                (*shown, *wanted) = compared_in(frame, c, rendered[c], texel[0]);
-            }
-            let (shown, wanted) = (F8::from_slice(s, &shown), F8::from_slice(s, &wanted));
-            let difference = shown - wanted;
-            l1.add(difference.abs(), count);
-            let sign = difference.simd_gt(zero).select(one, zero) - difference.simd_lt(zero).select(one, zero);
-            let similarity = fma(wanted, sums[2][o], fma(two * shown, sums[1][o], sums[0][o]));
-            let g = fma(by_l1, sign, by_ssim * similarity);
-            (g * gain).store_slice(&mut found[o][x - x0..x - x0 + LANES]);
+    for (y, found) in size.rows(strip).zip(&pixels) {
+        let at = y * width + x0;
+        // SAFETY: pixels of this strip, which no other part has.
+        let out = unsafe { gradients.range(at, count) };
+        let texels = out.iter_mut().zip(image[at..at + count].iter().zip(&target[at..at + count]));
+        for (i, (out, (shown, wanted))) in texels.enumerate() {
+            *out = if wanted[0] >> 24 == LEFT_OUT {
+                [0.0; 4]
+            } else {
+                let depth = if has_depth { by_depth(frame, status, *wanted, shown[3]) } else { 0.0 };
+                [found[0][0][i], found[1][0][i], found[2][0][i], depth]
+            };
         }
     }
 }
@@ -392,7 +484,7 @@ fn confident(frame: &Frame, [texel, depth]: [u32; 2]) -> Option<f32> {
 /// Count, means and centred second moments of rendered depth and prior over each lane's pixels; first the means, so that no large sums
 /// cancel.
 pub(super) fn depth_sums(call: &Call<'_>) {
-    let (frame, memory, pixels) = (call.frame, &call.memory, Size::of(call.frame).pixels());
+    let (frame, memory, pixels) = (call.frame, &call.memory, call.frame.pixels());
     let (image, target) = (memory.read::<[f32; 4]>("image"), memory.read::<[u32; 2]>("target"));
     // SAFETY: the only section that this kernel writes.
     let sums = Parts::of(unsafe { memory.write::<DepthMoments>("lane_sums") });

@@ -1,19 +1,22 @@
 //! Stages *reduce* and *optimise*: a Gaussian's summed gradient, projection's gradient, and Adam (`shaders/reduce.comp`, `optimise_sh.comp`,
 //! `project_backward.comp`, `pose_sums.comp`, `optimise.comp`; references: `crate::reference::{project_backward, adam}`).
 
-use super::gaussians::{Geometry, Harmonics, MOST, Numbers, State, Vec4, adam, finite, sigmoid, uniform_hash};
+use super::gaussians::{Adam, Geometry, Harmonics, MOST, Numbers, State, Vec4, adam, finite, sigmoid, uniform_hash};
+use super::lanes::{F8, LANES, load, ramp, splat, store};
 use super::pool::Parts;
-use super::project::{RANKS, UNSEEN, channels_of, rates_of};
+use super::project::{RANKS, channels_of, rates_of, seen};
 use super::projection::{Camera, Projection, four, length, three};
+use super::vectors::{V3, fetch, rows};
 use super::{Call, SHARE};
 use crate::constants::{COLOUR_MAX, SH_SMALL};
 use crate::layout::{FLAG_DEPTH, Frame, PoseSums, Status};
 use crate::reference::shade::{basis, basis_gradient};
-use fearless_simd::dispatch;
-use glam::{BVec3, Mat2, Vec2, Vec3};
+use fearless_simd::prelude::*;
+use fearless_simd::{Simd, dispatch, mask32x8};
+use glam::Vec3;
 
 /// A Gaussian's summed slots: q and its first moments and the total weight, second moments and depth, colour. Then, in the third, what its
-/// place gains by the colour.
+/// place gains by the colour. Sums and gradients lie as the Gaussians do.
 type Reduced = [Vec4; 3];
 
 /// Gradients in the camera's axes: point and logarithm of the opacity; log scales; turn.
@@ -24,44 +27,28 @@ fn visible(call: &Call<'_>) -> usize {
     call.memory.read::<Status>("status")[0].visible as usize
 }
 
-/// The visible ones of some Gaussians, as they lie, each with its place in depth order.
-fn seen(ranks: &[u32], those: std::ops::Range<usize>) -> impl Iterator<Item = (usize, usize)> {
-    ranks[those.clone()].iter().zip(those).filter(|(r, _)| **r != UNSEEN).map(|(r, g)| (g, *r as usize))
-}
-
-/// The Gaussians of a share.
-fn share_of(call: &Call<'_>, share: usize) -> std::ops::Range<usize> {
-    share * SHARE..((share + 1) * SHARE).min(call.frame.gaussians as usize)
-}
-
-/// Shares of all Gaussians.
-fn shares(call: &Call<'_>) -> usize {
-    (call.frame.gaussians as usize).div_ceil(SHARE)
-}
-
 /// Sums each visible Gaussian's gradient slots in tile order. Mode 1 adds to the sum of earlier bands: one running sum either way, so that
 /// the number of bands does not change a bit.
 pub(super) fn reduce(call: &Call<'_>) {
     let memory = &call.memory;
     let (ranges, slots) = (memory.read::<[u32; 2]>("slot_ranges"), memory.read::<Reduced>("slots"));
-    let shaded = memory.read::<[Vec4; 3]>("shaded");
+    let (shaded, order) = (memory.read::<[Vec4; 3]>("shaded"), memory.read::<u32>("order"));
     // SAFETY: the only section that this kernel writes.
     let reduced = Parts::of(unsafe { memory.write::<Reduced>("reduced") });
     let (n, has_depth, adds) = (visible(call), call.frame.has(FLAG_DEPTH), call.push.mode == 1);
     call.pool.each(n.div_ceil(SHARE), |share| {
-        let (first, count) = (share * SHARE, SHARE.min(n - share * SHARE));
-        // SAFETY: a share of the visible Gaussians for each part.
-        let out = unsafe { reduced.range(first, count) };
         dispatch!(call.level, _s => {
-            for (r, out) in (first..).zip(out) {
+            for r in share * SHARE..((share + 1) * SHARE).min(n) {
+                // SAFETY: every visible Gaussian has a place of its own.
+                let out = unsafe { &mut reduced.range(order[r] as usize, 1)[0] };
                 let [start, slot_count] = ranges[r].map(|n| n as usize);
-                let before = if adds { *out } else { [[0.0; 4]; 3] };
-                *out = sum_of(&slots[start..start + slot_count], before, has_depth);
+                let mut sum = sum_of(&slots[start..start + slot_count], if adds { *out } else { [[0.0; 4]; 3] }, has_depth);
                 // Where the colour was clamped there is no gradient.
                 for c in 0..3 {
                     let clamped = shaded[r][2][c] <= 0.0 || shaded[r][2][c] >= COLOUR_MAX;
-                    out[2][c] = if clamped { 0.0 } else { out[2][c] };
+                    sum[2][c] = if clamped { 0.0 } else { sum[2][c] };
                 }
+                *out = sum;
             }
         });
     });
@@ -93,12 +80,12 @@ pub(super) fn optimise_sh(call: &Call<'_>) {
     // SAFETY: the sections that this kernel writes, once each.
     let (reduced, harmonics) = unsafe { (Parts::of(memory.write::<Reduced>("reduced")), call.harmonics()) };
     let (camera, rates) = (Camera::of(call.frame), rates_of(call.frame, 1.0));
-    call.pool.each(shares(call), |share| {
-        dispatch!(call.level, _s => {
-            for (g, r) in seen(ranks, share_of(call, share)) {
-                // SAFETY: every Gaussian has a place of its own.
-                let own = unsafe { &mut reduced.range(r, 1)[0] };
-                own[2] = step_sh(call, (&harmonics, &rates), &camera, g, &geometry[g], own[2]);
+    call.pool.each(call.shares(), |share| {
+        dispatch!(call.level, s => {
+            for (g, _) in seen(ranks, call.share(share)) {
+                // SAFETY: a share of the Gaussians for each part.
+                let own = unsafe { &mut reduced.range(g, 1)[0] };
+                own[2] = step_sh(s, call, (&harmonics, &rates), &camera, g, &geometry[g], own[2]);
             }
         });
     });
@@ -106,7 +93,8 @@ pub(super) fn optimise_sh(call: &Call<'_>) {
 
 /// Steps a Gaussian's SH; returns the gradient by its place, and whether the colour's was finite.
 #[inline(always)]
-fn step_sh(
+fn step_sh<S: Simd>(
+    s: S,
     call: &Call<'_>,
     (harmonics, rates): (&Harmonics<'_>, &Numbers),
     camera: &Camera,
@@ -117,49 +105,49 @@ fn step_sh(
     let (frame, state) = (call.frame, State::of(geometry[1][3]));
     // The basis functions of a direction are finite and at most 1.5.
     let mut all_finite = true;
-    let by_color = finite([by_color[0], by_color[1], by_color[2], 0.0], &mut all_finite);
+    let [red, green, blue, _] = finite([by_color[0], by_color[1], by_color[2], 0.0], &mut all_finite);
     let away = three(geometry[0]) - camera.center;
     let distance = away.length().max(1.0e-12);
     let direction = away / distance;
     let degree = call.degree(state) as u8;
-    let mut gradient = channels_of(&basis(degree, direction.to_array()), [by_color[0], by_color[1], by_color[2]]);
+    let gradients = channels_of(&basis(degree, direction.to_array()), [red, green, blue]);
+    let channels = [red, green, blue, red, green, blue, red, green, blue, red];
     let (at, held) = (g * harmonics.stride, call.held(state));
-    let mut before = [0.0; MOST];
-    // SAFETY: numbers of this part's Gaussian.
-    let own = unsafe { harmonics.sh.range(at, held) };
-    before[..held].copy_from_slice(own);
-    // The derivative of what coefficients above degree 0 amount to. Where a picture has no gradient they count for nothing: it does not
-    // show the Gaussian, or not yet that degree.
-    for i in 3..MOST {
-        let more = frame.sh_weight * before[i] / (before[i].abs() + SH_SMALL);
-        gradient[i] += if gradient[i] == 0.0 { 0.0 } else { more };
-    }
-    // SAFETY: as above.
-    unsafe {
-        if call.push.mode == 1 {
-            harmonics.moments.store(frame, at, held, [gradient, gradient.map(|g| g * g)]);
-        } else {
-            let mut p = before;
-            let [mut m, mut v] = harmonics.moments.fetch(frame, at, held);
-            adam(frame, &mut p, &mut m, &mut v, &gradient, rates);
-            own.copy_from_slice(&p[..held]);
-            harmonics.moments.store(frame, at, held, [m, v]);
+    let (adam, zero) = (Adam::of(s, frame), splat(s, 0.0));
+    let (weight, small) = (splat(s, frame.sh_weight), splat(s, SH_SMALL));
+    // Each coefficient times the gradient of its channel's colour.
+    let mut products = [0.0; MOST];
+    for i in (0..held).step_by(LANES) {
+        let count = LANES.min(held - i);
+        // SAFETY: numbers of this part's Gaussian.
+        let own = unsafe { harmonics.sh.range(at + i, count) };
+        let (before, gradient) = (load(s, own), F8::from_slice(s, &gradients[i..i + LANES]));
+        let by_channel = F8::from_slice(s, &channels[i % 3..i % 3 + LANES]);
+        (before * by_channel).store_slice(&mut products[i..i + LANES]);
+        // The derivative of what coefficients above degree 0 amount to. Where a picture has no gradient they count for nothing: it does
+        // not show the Gaussian, or not yet that degree.
+        let more = weight * before / (before.abs() + small);
+        let counts = if i == 0 { ramp(s) } else { splat(s, 3.0) }.simd_ge(splat(s, 3.0)) & !gradient.simd_eq(zero);
+        let gradient = gradient + counts.select(more, zero);
+        // SAFETY: as above.
+        unsafe {
+            if call.push.mode == 1 {
+                harmonics.moments.store(frame, at + i, count, [gradient, gradient * gradient]);
+            } else {
+                let moments = harmonics.moments.fetch(s, frame, at + i, count);
+                let (p, moments) = adam.step(before, moments, gradient, F8::from_slice(s, &rates[i..i + LANES]));
+                store(p, own);
+                harmonics.moments.store(frame, at + i, count, moments);
+            }
         }
     }
     let mut weights = [0.0; 16];
-    for (weight, of_one) in weights.iter_mut().zip(before.chunks_exact(3)) {
-        *weight = by_color[0] * of_one[0] + by_color[1] * of_one[1] + by_color[2] * of_one[2];
+    for (weight, of_one) in weights.iter_mut().zip(products.chunks_exact(3)) {
+        *weight = of_one[0] + of_one[1] + of_one[2];
     }
     let by_direction = Vec3::from_array(basis_gradient(degree, direction.to_array(), &weights));
     let place = (by_direction - direction * direction.dot(by_direction)) / distance;
     four(place, if all_finite { 0.0 } else { 1.0 })
-}
-
-/// The gradient of one scaled axis in the camera's axes.
-#[inline(always)]
-fn axis_gradient(f: Vec2, ratio: Vec2, ga: f32, gb: f32) -> Vec3 {
-    let (x, y) = (f.x * ga, f.y * gb);
-    Vec3::new(x, y, -ratio.x * x - ratio.y * y)
 }
 
 /// The Gaussians of one of the lanes that leave partial sums.
@@ -170,7 +158,7 @@ fn lane_of(call: &Call<'_>, lane: usize) -> std::ops::Range<usize> {
 }
 
 /// From a Gaussian's summed gradient in the picture to that of its point, scales and turn in the camera's axes, through projection; it
-/// lies where the projections did, by place in depth order.
+/// lies where the projections did.
 pub(super) fn project_backward(call: &Call<'_>) {
     let memory = &call.memory;
     let (ranks, geometry) = (memory.read::<u32>(RANKS), memory.read::<Geometry>("geometry"));
@@ -184,56 +172,103 @@ pub(super) fn project_backward(call: &Call<'_>) {
         // SAFETY: a lane's own sum.
         let sums = unsafe { &mut sums.range(lane, 1)[0] };
         sums.non_finite = 0;
-        dispatch!(call.level, _s => {
-            for (g, r) in seen(ranks, lane_of(call, lane)) {
-                // SAFETY: every Gaussian has a place of its own.
-                let out = unsafe { &mut gradients.range(r, 1)[0] };
-                let all_finite = project_back(&camera, &geometry[g], &reduced[r], out);
-                sums.non_finite += u32::from(!all_finite);
+        dispatch!(call.level, s => {
+            let mut those = seen(ranks, lane_of(call, lane)).map(|(g, _)| g);
+            loop {
+                // What does not fill the lanes is the last one again.
+                let (mut some, mut count) = ([0; LANES], 0);
+                for g in those.by_ref().take(LANES) {
+                    some[count..].fill(g);
+                    count += 1;
+                }
+                if count == 0 {
+                    break;
+                }
+                let (out, is_finite) = project_back(s, &camera, |lane| (&geometry[some[lane]], &reduced[some[lane]]));
+                for lane in 0..count {
+                    // SAFETY: every Gaussian has a place of its own.
+                    unsafe { gradients.range(some[lane], 1)[0] = [out[0][lane], out[1][lane], out[2][lane]] };
+                    sums.non_finite += u32::from(is_finite >> lane & 1 == 0);
+                }
             }
         });
     });
 }
 
-/// Whether all was finite.
+/// Numbers that Adam can take: what is not finite, or too large to be squared, becomes zero and is told.
 #[inline(always)]
-fn project_back(camera: &Camera, geometry: &Geometry, reduced: &Reduced, out: &mut Gradients) -> bool {
-    let s = Projection::of(camera, geometry[0], geometry[1], geometry[2]);
-    let inverse_z = 1.0 / s.p.z;
-    let conic = s.conic();
-    let f = camera.focal * inverse_z;
-    let mut all_finite = true;
+fn bounded<S: Simd>(v: F8<S>, all_finite: &mut mask32x8<S>) -> F8<S> {
+    let s = v.token();
+    // Written so that what is not a number fails.
+    let good = v.abs().simd_lt(splat(s, 1.0e18));
+    *all_finite &= good;
+    good.select(v, splat(s, 0.0))
+}
+
+/// Gradients of eight Gaussians, row by row, and a bit for each whose were all finite.
+#[inline(always)]
+fn project_back<'a, S: Simd>(
+    s: S,
+    camera: &Camera,
+    of: impl Fn(usize) -> (&'a Geometry, &'a Reduced),
+) -> ([[Vec4; LANES]; 3], u64) {
+    let own = [fetch(s, |i| of(i).0[0]), fetch(s, |i| of(i).0[1]), fetch(s, |i| of(i).0[2])];
+    let [line, square, by_color] = [fetch(s, |i| of(i).1[0]), fetch(s, |i| of(i).1[1]), fetch(s, |i| of(i).1[2])];
+    let p = Projection::of(s, camera, own[0], own[1], own[2]);
+    let zero = splat(s, 0.0);
+    let inverse_z = splat(s, 1.0) / p.p.z;
+    let conic = p.conic(s);
+    let (fx, fy) = (inverse_z * camera.focal.x, inverse_z * camera.focal.y);
+    let mut all_finite = zero.simd_eq(zero);
 
     // Covariance: dL/dM = K S K M for the projected axes M = (a, b).
-    let [line, square, by_color] = reduced;
-    let symmetric = |xx: f32, xy: f32, yy: f32| Mat2::from_cols(Vec2::new(xx, xy), Vec2::new(xy, yy));
-    let k = symmetric(conic[0], conic[1], conic[2]);
-    let ksk = k * symmetric(square[0], square[1], square[2]) * k;
-    let (xx, xy, yy) = (ksk.x_axis.x, ksk.x_axis.y, ksk.y_axis.y);
-    let (ga, gb) = (xx * s.a + xy * s.b, xy * s.a + yy * s.b);
-    let az = Vec3::new(s.axes[0].z, s.axes[1].z, s.axes[2].z);
-    let ratio = Vec2::select(s.clamped, Vec2::ZERO, -f * Vec2::new(ga.dot(az), gb.dot(az)));
-    let place = Vec2::new(s.p.x, s.p.y);
-    let nearer = ratio.dot(place * inverse_z) + ga.dot(s.a) + gb.dot(s.b);
+    let (k_s_xx, k_s_xy) = (conic[0] * square[0] + conic[1] * square[1], conic[0] * square[1] + conic[1] * square[2]);
+    let (k_s_yx, k_s_yy) = (conic[1] * square[0] + conic[2] * square[1], conic[1] * square[1] + conic[2] * square[2]);
+    let (xx, xy) = (k_s_xx * conic[0] + k_s_xy * conic[1], k_s_xx * conic[1] + k_s_xy * conic[2]);
+    let yy = k_s_yx * conic[1] + k_s_yy * conic[2];
+    let ga = p.a.times(xx).plus(p.b.times(xy));
+    let gb = p.a.times(xy).plus(p.b.times(yy));
+    let az = V3 { x: p.axes[0].z, y: p.axes[1].z, z: p.axes[2].z };
+    let ratio_x = p.clamped[0].select(zero, -fx * ga.dot(az));
+    let ratio_y = p.clamped[1].select(zero, -fy * gb.dot(az));
+    let nearer = (ratio_x * p.p.x + ratio_y * p.p.y) * inverse_z + ga.dot(p.a) + gb.dot(p.b);
 
     // Place in the picture, then the point in the camera's axes.
-    let screen = Vec2::new(conic[0] * line[1] + conic[1] * line[2], conic[1] * line[1] + conic[2] * line[2]);
-    let across = screen * f + ratio * inverse_z;
-    let depth = square[3] - ((screen * f).dot(place) + nearer) * inverse_z;
-    out[0] = finite([across.x, across.y, depth, line[0]], &mut all_finite);
+    let screen_x = (conic[0] * line[1] + conic[1] * line[2]) * fx;
+    let screen_y = (conic[1] * line[1] + conic[2] * line[2]) * fy;
+    let depth = square[3] - (screen_x * p.p.x + screen_y * p.p.y + nearer) * inverse_z;
+    let place = [
+        bounded(screen_x + ratio_x * inverse_z, &mut all_finite),
+        bounded(screen_y + ratio_y * inverse_z, &mut all_finite),
+        bounded(depth, &mut all_finite),
+        bounded(line[0], &mut all_finite),
+    ];
 
     // The axes turned together and stretched each: no gradient of a rotation matrix is needed.
-    let by_axis = [0, 1, 2].map(|i| axis_gradient(f, s.ratio, ga[i], gb[i]));
-    let turn = s.axes[0].cross(by_axis[0]) + s.axes[1].cross(by_axis[1]) + s.axes[2].cross(by_axis[2]);
-    let stretch = Vec3::new(s.axes[0].dot(by_axis[0]), s.axes[1].dot(by_axis[1]), s.axes[2].dot(by_axis[2]));
-    let clamped: BVec3 = s.scale_clamped;
-    out[1] = finite(four(Vec3::select(clamped, Vec3::ZERO, stretch), 0.0), &mut all_finite);
+    let by_axis = |a: F8<S>, b: F8<S>| -> V3<S> {
+        let (x, y) = (fx * a, fy * b);
+        V3 { x, y, z: -p.ratio[0] * x - p.ratio[1] * y }
+    };
+    let by_axes = [by_axis(ga.x, gb.x), by_axis(ga.y, gb.y), by_axis(ga.z, gb.z)];
+    let turn = p.axes[0].cross(by_axes[0]).plus(p.axes[1].cross(by_axes[1])).plus(p.axes[2].cross(by_axes[2]));
+    let stretch = [
+        bounded(p.scale_clamped[0].select(zero, p.axes[0].dot(by_axes[0])), &mut all_finite),
+        bounded(p.scale_clamped[1].select(zero, p.axes[1].dot(by_axes[1])), &mut all_finite),
+        bounded(p.scale_clamped[2].select(zero, p.axes[2].dot(by_axes[2])), &mut all_finite),
+        zero,
+    ];
     // What `optimise` makes of it for a quaternion that is nearly nothing is as long as that is short.
-    finite(four(turn * (2.0 / s.q_length), 0.0), &mut all_finite);
-    out[2] = finite(four(turn, 0.0), &mut all_finite);
-
-    let by_color = finite(*by_color, &mut all_finite);
-    all_finite && by_color[3] == 0.0
+    let longer = splat(s, 2.0) / p.q_length;
+    for v in [turn.x, turn.y, turn.z] {
+        bounded(v * longer, &mut all_finite);
+    }
+    let turn =
+        [bounded(turn.x, &mut all_finite), bounded(turn.y, &mut all_finite), bounded(turn.z, &mut all_finite), zero];
+    for v in &by_color[..3] {
+        bounded(*v, &mut all_finite);
+    }
+    let all_finite = all_finite & by_color[3].simd_eq(zero);
+    ([rows(place), rows(stretch), rows(turn)], all_finite.to_bitmask())
 }
 
 /// The gradient of the camera's pose, p' = exp(turn) p + shift, one partial sum per lane.
@@ -246,12 +281,12 @@ pub(super) fn pose_sums(call: &Call<'_>) {
     let camera = Camera::of(call.frame);
     call.pool.each(call.loop_lanes(), |lane| {
         let (mut turn, mut shift) = (Vec3::ZERO, Vec3::ZERO);
-        for (g, r) in seen(ranks, lane_of(call, lane)) {
+        for (g, _) in seen(ranks, lane_of(call, lane)) {
             let p = camera.point(three(geometry[g][0]));
-            let point = three(gradients[r][0]);
-            turn += p.cross(point) + three(gradients[r][2]);
+            let point = three(gradients[g][0]);
+            turn += p.cross(point) + three(gradients[g][2]);
             // The camera sees the world move; with it moves the direction that SH are seen from.
-            shift += point + camera.turned(three(reduced[r][2]));
+            shift += point + camera.turned(three(reduced[g][2]));
         }
         // SAFETY: a lane's own sum.
         let own = unsafe { &mut sums.range(lane, 1)[0] };
@@ -269,12 +304,12 @@ pub(super) fn optimise(call: &Call<'_>) {
     let geometry = Parts::of(unsafe { memory.write::<Geometry>("geometry") });
     let (n, camera) = (visible(call), Camera::of(frame));
     let entropy_weight = frame.entropy_weight / n.max(1) as f32;
-    call.pool.each(shares(call), |share| {
+    call.pool.each(call.shares(), |share| {
         dispatch!(call.level, _s => {
-            for (g, r) in seen(ranks, share_of(call, share)) {
+            for (g, _) in seen(ranks, call.share(share)) {
                 // SAFETY: a share of the Gaussians for each part.
                 let own = unsafe { &mut geometry.range(g, 1)[0] };
-                let by = to_world(&camera, own, &gradients[r], &reduced[r], entropy_weight);
+                let by = to_world(&camera, own, &gradients[g], &reduced[g], entropy_weight);
                 if call.push.mode == 1 {
                     own[3..6].copy_from_slice(&by);
                 } else {

@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-/// What the parts of a task are done by.
-type Work = dyn Fn(usize) + Sync + 'static;
+/// What the parts of a task are done by: a function of the part and of the thread's number.
+type Work = dyn Fn(usize, usize) + Sync + 'static;
 
 /// A task that threads are told of.
 #[derive(Clone, Copy)]
@@ -45,18 +45,18 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn take_parts(&self, work: &(dyn Fn(usize) + Sync), parts: usize) {
+    fn take_parts(&self, work: &(dyn Fn(usize, usize) + Sync), parts: usize, thread: usize) {
         loop {
             let part = self.next.fetch_add(1, Ordering::Relaxed);
             if part >= parts {
                 return;
             }
-            work(part);
+            work(part, thread);
         }
     }
 
     /// What each thread does from its start to the pool's end.
-    fn serve(&self) {
+    fn serve(&self, thread: usize) {
         let mut seen = 0;
         loop {
             let mut state = self.state();
@@ -72,7 +72,7 @@ impl Shared {
             drop(state);
             // SAFETY: `Pool::each` waits until `busy` is zero before it lets go of the work.
             let work = unsafe { &*work };
-            if catch_unwind(AssertUnwindSafe(|| self.take_parts(work, parts))).is_err() {
+            if catch_unwind(AssertUnwindSafe(|| self.take_parts(work, parts, thread))).is_err() {
                 self.panicked.store(true, Ordering::Relaxed);
             }
             let mut state = self.state();
@@ -115,27 +115,36 @@ impl Pool {
         });
         let spawn = |i: usize| {
             let own = shared.clone();
-            std::thread::Builder::new().name(format!("kernels-{i}")).spawn(move || own.serve()).ok()
+            std::thread::Builder::new().name(format!("kernels-{i}")).spawn(move || own.serve(i)).ok()
         };
         Self { threads: (1..threads).map_while(spawn).collect(), shared }
     }
 
     /// Calls `work` once for every part below `parts`, from all threads at once, and returns when all are done.
     pub fn each(&self, parts: usize, work: impl Fn(usize) + Sync) {
+        self.share_out(parts, &|part, _| work(part));
+    }
+
+    /// Calls `work` with a part and a slot, that no other part has at the same time: one below both the parts and the threads.
+    pub fn each_with_slot(&self, parts: usize, work: impl Fn(usize, usize) + Sync) {
+        let by_part = parts <= self.threads.len();
+        self.share_out(parts, &|part, thread| work(part, if by_part { part } else { thread }));
+    }
+
+    fn share_out(&self, parts: usize, work: &(dyn Fn(usize, usize) + Sync)) {
         if self.threads.is_empty() || parts < 2 {
-            (0..parts).for_each(work);
+            (0..parts).for_each(|part| work(part, 0));
             return;
         }
-        let work: &(dyn Fn(usize) + Sync) = &work;
         // SAFETY: only the lifetime changes; the threads are waited for below, also where this thread's share panics.
-        let lasting = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), &'static Work>(work) };
+        let lasting = unsafe { std::mem::transmute::<&(dyn Fn(usize, usize) + Sync), &'static Work>(work) };
         self.shared.next.store(0, Ordering::Relaxed);
         let mut state = self.shared.state();
         state.task = Some(Task { work: lasting, parts });
         state.number += 1;
         drop(state);
         self.shared.started.notify_all();
-        let own = catch_unwind(AssertUnwindSafe(|| self.shared.take_parts(work, parts)));
+        let own = catch_unwind(AssertUnwindSafe(|| self.shared.take_parts(work, parts, 0)));
         // A thread that has not woken by now is not waited for: the parts are all taken.
         let mut state = self.shared.state();
         state.task = None;
@@ -194,6 +203,21 @@ mod tests {
                     done[i].fetch_add(1, Ordering::Relaxed);
                 });
                 assert!(done.iter().all(|n| n.load(Ordering::Relaxed) == 1), "{threads} threads, {parts} parts");
+            }
+        }
+    }
+
+    #[test]
+    fn no_two_parts_have_a_slot_at_the_same_time_and_slots_are_no_more_than_parts_or_threads() {
+        for threads in [1, 2, 3, 8] {
+            let pool = Pool::new(threads);
+            for parts in [1, 2, 3, 500] {
+                let taken: Vec<AtomicBool> = (0..threads.min(parts)).map(|_| AtomicBool::new(false)).collect();
+                pool.each_with_slot(parts, |_, slot| {
+                    assert!(!taken[slot].swap(true, Ordering::SeqCst), "{threads} threads, {parts} parts");
+                    std::thread::yield_now();
+                    taken[slot].store(false, Ordering::SeqCst);
+                });
             }
         }
     }

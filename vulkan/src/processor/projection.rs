@@ -1,10 +1,14 @@
-//! Projection of one Gaussian, shared by `project` and `project_backward`: gsplat's EWA splatting, with the determinant as a sum of squares
+//! Projection of eight Gaussians at a time, shared by `project` and `project_backward`: gsplat's EWA splatting, with the determinant as a sum of squares
 //! (Cauchy-Binet), which stays positive where a c - b b cancels (`shaders/projection.glsl`; reference: `crate::reference::project`).
 
 use super::gaussians::Vec4;
+use super::lanes::{F8, exp, splat};
+use super::vectors::V3;
 use crate::constants::{LOW_PASS, SCALE_LIMIT};
 use crate::layout::{FLAG_ORTHOGRAPHIC, Frame};
-use glam::{BVec2, BVec3, Mat3, Vec2, Vec3};
+use fearless_simd::prelude::*;
+use fearless_simd::{Simd, mask32x8};
+use glam::{Vec2, Vec3};
 
 /// The frame's camera.
 #[derive(Clone, Copy)]
@@ -77,36 +81,37 @@ pub(super) fn four(v: Vec3, w: f32) -> Vec4 {
     [v.x, v.y, v.z, w]
 }
 
-/// A Gaussian in the picture, and what its gradient needs again.
-pub(super) struct Projection {
+/// Eight Gaussians in the picture, and what their gradients need again.
+pub(super) struct Projection<S: Simd> {
     /// In the camera's axes.
-    pub p: Vec3,
+    pub p: V3<S>,
     /// Depth; 1 in an orthographic view.
-    pub divisor: f32,
+    pub divisor: F8<S>,
     /// x/z and y/z clamped for the Jacobian.
-    pub ratio: Vec2,
-    pub clamped: BVec2,
-    pub scale_clamped: BVec3,
+    pub ratio: [F8<S>; 2],
+    pub clamped: [mask32x8<S>; 2],
+    pub scale_clamped: [mask32x8<S>; 3],
     /// Scaled axes in the camera's.
-    pub axes: [Vec3; 3],
+    pub axes: [V3<S>; 3],
     /// Projected axes, x and y, pixels.
-    pub a: Vec3,
-    pub b: Vec3,
+    pub a: V3<S>,
+    pub b: V3<S>,
     /// xx, xy, yy with the low-pass.
-    pub cov: [f32; 3],
-    pub det: f32,
+    pub cov: [F8<S>; 3],
+    pub det: F8<S>,
     /// Length of the quaternion.
-    pub q_length: f32,
+    pub q_length: F8<S>,
 }
 
-/// Own axes to the world's, of a unit quaternion w x y z.
+/// Own axes in the world's, of unit quaternions w x y z.
 #[inline(always)]
-fn rotation_of([w, x, y, z]: Vec4) -> Mat3 {
-    Mat3::from_cols(
-        Vec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        Vec3::new(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        Vec3::new(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
+fn axes_of<S: Simd>(s: S, [w, x, y, z]: [F8<S>; 4]) -> [V3<S>; 3] {
+    let (one, two) = (splat(s, 1.0), splat(s, 2.0));
+    [
+        V3 { x: one - two * (y * y + z * z), y: two * (x * y + w * z), z: two * (x * z - w * y) },
+        V3 { x: two * (x * y - w * z), y: one - two * (x * x + z * z), z: two * (y * z + w * x) },
+        V3 { x: two * (x * z + w * y), y: two * (y * z - w * x), z: one - two * (x * x + y * y) },
+    ]
 }
 
 /// A quaternion's length, never zero.
@@ -115,50 +120,87 @@ pub(super) fn length(q: Vec4) -> f32 {
     (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]).sqrt().max(1.0e-20)
 }
 
-impl Projection {
-    /// Projects a Gaussian in front of the camera. In an orthographic view nothing is divided by depth: J = [[fx, 0, 0], [0, fy, 0]], f in
-    /// pixels per metre.
+impl<S: Simd> Projection<S> {
+    /// Projects Gaussians in front of the camera: rows of place, log scale and rotation. In an orthographic view nothing is divided by
+    /// depth: J = [[fx, 0, 0], [0, fy, 0]], f in pixels per metre.
     #[inline(always)]
-    pub fn of(camera: &Camera, place: Vec4, log_scale: Vec4, rotation: Vec4) -> Self {
-        let p = camera.point(three(place));
-        let divisor = if camera.orthographic { 1.0 } else { p.z };
-        let inverse_z = 1.0 / divisor;
-        let wanted = if camera.orthographic { Vec2::ZERO } else { Vec2::new(p.x, p.y) * inverse_z };
-        let ratio = wanted.max(camera.ratios[0]).min(camera.ratios[1]);
-        let q_length = length(rotation);
-        let own = rotation_of(rotation.map(|v| v / q_length));
-        let limit = SCALE_LIMIT * if camera.orthographic { camera.across } else { p.z };
-        let raw = three(log_scale).min(Vec3::splat(80.0));
-        let raw = Vec3::new(raw.x.exp(), raw.y.exp(), raw.z.exp());
-        let scale = raw.min(Vec3::splat(limit));
+    pub fn of(s: S, camera: &Camera, place: [F8<S>; 4], [lx, ly, lz, _]: [F8<S>; 4], q: [F8<S>; 4]) -> Self {
+        /// Log scales beyond this are cut to it: their exponential is far beyond every limit.
+        const MOST: f32 = 80.0;
+        let (zero, one, low_pass) = (splat(s, 0.0), splat(s, 1.0), splat(s, LOW_PASS));
+        let view = View::of(s, camera);
+        let p = view.point(V3::of(place));
+        let divisor = if camera.orthographic { one } else { p.z };
+        let inverse_z = one / divisor;
+        let (least, most) = (camera.ratios[0], camera.ratios[1]);
+        let wanted = if camera.orthographic { [zero; 2] } else { [p.x * inverse_z, p.y * inverse_z] };
+        let ratio_x = wanted[0].max(splat(s, least.x)).min(splat(s, most.x));
+        let ratio_y = wanted[1].max(splat(s, least.y)).min(splat(s, most.y));
+        let square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+        let q_length = square.sqrt().max(splat(s, 1.0e-20));
+        let unit = one / q_length;
+        let [own_x, own_y, own_z] = axes_of(s, [q[0] * unit, q[1] * unit, q[2] * unit, q[3] * unit]);
+        let limit = if camera.orthographic { splat(s, SCALE_LIMIT * camera.across) } else { p.z * SCALE_LIMIT };
+        let (rx, ry, rz) = (exp(lx.min(splat(s, MOST))), exp(ly.min(splat(s, MOST))), exp(lz.min(splat(s, MOST))));
         let axes = [
-            camera.turned(own.x_axis) * scale.x,
-            camera.turned(own.y_axis) * scale.y,
-            camera.turned(own.z_axis) * scale.z,
+            view.turned(own_x).times(rx.min(limit)),
+            view.turned(own_y).times(ry.min(limit)),
+            view.turned(own_z).times(rz.min(limit)),
         ];
-        let f = camera.focal * inverse_z;
-        let [ax, ay, az] = [0, 1, 2].map(|i| Vec3::new(axes[0][i], axes[1][i], axes[2][i]));
-        let (a, b) = (f.x * (ax - ratio.x * az), f.y * (ay - ratio.y * az));
+        let (fx, fy) = (inverse_z * camera.focal.x, inverse_z * camera.focal.y);
+        let ax = V3 { x: axes[0].x, y: axes[1].x, z: axes[2].x };
+        let ay = V3 { x: axes[0].y, y: axes[1].y, z: axes[2].y };
+        let az = V3 { x: axes[0].z, y: axes[1].z, z: axes[2].z };
+        let a = ax.plus(az.times(-ratio_x)).times(fx);
+        let b = ay.plus(az.times(-ratio_y)).times(fy);
         let (aa, bb, c) = (a.dot(a), b.dot(b), a.cross(b));
         Self {
             p,
             divisor,
-            ratio,
-            clamped: wanted.cmpne(ratio),
-            scale_clamped: raw.cmpgt(Vec3::splat(limit)),
+            ratio: [ratio_x, ratio_y],
+            clamped: [!wanted[0].simd_eq(ratio_x), !wanted[1].simd_eq(ratio_y)],
+            scale_clamped: [rx.simd_gt(limit), ry.simd_gt(limit), rz.simd_gt(limit)],
             axes,
             a,
             b,
-            cov: [aa + LOW_PASS, a.dot(b), bb + LOW_PASS],
-            det: c.dot(c) + LOW_PASS * (aa + bb) + LOW_PASS * LOW_PASS,
+            cov: [aa + low_pass, a.dot(b), bb + low_pass],
+            det: c.dot(c) + low_pass * (aa + bb) + low_pass * low_pass,
             q_length,
         }
     }
 
     /// The inverse covariance: xx, xy, yy.
     #[inline(always)]
-    pub fn conic(&self) -> [f32; 3] {
-        let inverse = 1.0 / self.det;
+    pub fn conic(&self, s: S) -> [F8<S>; 3] {
+        let inverse = splat(s, 1.0) / self.det;
         [self.cov[2] * inverse, -self.cov[1] * inverse, self.cov[0] * inverse]
+    }
+}
+
+/// The camera's pose for eight Gaussians.
+#[derive(Clone, Copy)]
+pub(super) struct View<S: Simd> {
+    rows: [V3<S>; 3],
+    translation: V3<S>,
+}
+
+impl<S: Simd> View<S> {
+    #[inline(always)]
+    pub fn of(s: S, camera: &Camera) -> Self {
+        let [x, y, z] = camera.rows;
+        let rows = [V3::splat(s, x), V3::splat(s, y), V3::splat(s, z)];
+        Self { rows, translation: V3::splat(s, camera.translation) }
+    }
+
+    /// Directions of the world in the camera's axes.
+    #[inline(always)]
+    pub fn turned(&self, v: V3<S>) -> V3<S> {
+        V3 { x: self.rows[0].dot(v), y: self.rows[1].dot(v), z: self.rows[2].dot(v) }
+    }
+
+    /// Points of the world in the camera's axes.
+    #[inline(always)]
+    pub fn point(&self, p: V3<S>) -> V3<S> {
+        self.turned(p).plus(self.translation)
     }
 }

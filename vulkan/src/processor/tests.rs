@@ -70,3 +70,22 @@ fn a_model_has_the_same_bits_with_any_number_of_threads_and_any_vectors() {
         }
     }
 }
+
+#[test]
+fn pictures_of_any_height_and_width_have_one_loss_with_any_number_of_threads() {
+    for (width, height) in [(1, 1), (3, 17), (70, 18), (5, 19), (9, 41), (2, 81), (65, 200)] {
+        let loss = |threads: usize| {
+            let gpu = open(threads, Level::new())?;
+            let v = view(width, height);
+            let request = PlanRequest { device_mib: 64, width, height, views: 1, ..Default::default() };
+            let mut trainer = Fixture::new(&gpu, &Plan::with_capacities(&request, 300, 9000), &plain()).unwrap();
+            trainer.load(&cloud(5, 300, 1)).unwrap();
+            trainer.add_view(&posed(&v, &photo(1, &v)), None).unwrap();
+            trainer.step().unwrap();
+            Some(trainer.step().unwrap().loss)
+        };
+        let Some(one) = loss(1) else { return needs::missing(needs::Need::Vulkan, "no processor to train on") };
+        assert!(one.is_finite() && one > 0.0, "{width} x {height}: {one}");
+        assert_eq!(loss(8), Some(one), "{width} x {height}");
+    }
+}

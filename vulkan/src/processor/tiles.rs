@@ -4,11 +4,13 @@
 //! The work is cut into as many shares as the plan has sorting lanes, whatever the number of threads: each has a histogram of its own.
 
 use super::Call;
+use super::lanes::{F8, LANES, ramp, splat};
 use super::pool::Parts;
 use super::project::{Projected, UNSEEN};
 use crate::constants::{TILE_HEIGHT, TILE_WIDTH};
 use crate::layout::{FLAG_WHOLE_BOXES, Frame, Status};
-use fearless_simd::dispatch;
+use fearless_simd::prelude::*;
+use fearless_simd::{Simd, dispatch, i32x8};
 
 /// Values of a digit.
 const DIGITS: usize = 256;
@@ -113,24 +115,76 @@ impl Spans {
         Self { center: [center[0], center[1]], slope, width, half_height, tip, rows }
     }
 
-    /// First and last touched tile of row `row`, as columns of the window, cut to the band; empty when the first is beyond the last.
+    /// Calls `touched` with every row that has touched tiles, and their first and last as columns of the window, cut to the band.
     #[inline(always)]
-    fn in_row(&self, frame: &Frame, row: i32, band: [u32; 2]) -> [i32; 2] {
-        let half = self.half_height;
-        let (wide, high) = (TILE_WIDTH as f32, TILE_HEIGHT as f32);
-        let y0 = (frame.region_origin[1] as i32 + row * TILE_HEIGHT as i32) as f32 + 0.5 - self.center[1];
-        let (y0, y1) = (y0.max(-half).min(half), (y0 + (high - 1.0)).max(-half).min(half));
+    fn each_row<S: Simd>(&self, s: S, frame: &Frame, band: [u32; 2], mut touched: impl FnMut(usize, [usize; 2])) {
+        let (first, last) = (*self.rows.start(), *self.rows.end());
+        for row in (first..=last).step_by(LANES) {
+            let [from, to] = self.in_rows(s, frame, row, band);
+            for (i, (from, to)) in from.into_iter().zip(to).enumerate().take((last - row + 1) as usize) {
+                if from <= to {
+                    touched(row as usize + i, [from as usize, to as usize]);
+                }
+            }
+        }
+    }
+
+    /// First and last touched tile of eight rows; none when the first is beyond the last, or where something is no number.
+    #[inline(always)]
+    fn in_rows<S: Simd>(&self, s: S, frame: &Frame, row: i32, band: [u32; 2]) -> [[i32; LANES]; 2] {
+        let (zero, half) = (splat(s, 0.0), splat(s, self.half_height));
+        let (wide, high) = (splat(s, 1.0 / TILE_WIDTH as f32), TILE_HEIGHT as f32);
+        let across = splat(s, frame.window[0] as f32);
+        let rows = ramp(s) + splat(s, row as f32);
+        let inside = |v: F8<S>| -> F8<S> { v.simd_gt(-half).select(v, -half).min(half) };
+        let y0 = rows * splat(s, high) + splat(s, frame.region_origin[1] as f32 + 0.5) - splat(s, self.center[1]);
+        let (y0, y1) = (inside(y0), inside(y0 + splat(s, high - 1.0)));
         let whole = frame.has(FLAG_WHOLE_BOXES);
-        let at = |tip: f32| if whole { tip } else { tip.max(y0).min(y1) };
-        let reach = |dy: f32| self.width * (half * half - dy * dy).max(0.0).sqrt() + 0.01;
+        let at = |tip: f32| if whole { splat(s, tip) } else { splat(s, tip).max(y0).min(y1) };
         let (right, left) = (at(self.tip), at(-self.tip));
-        let (right, left) = (self.slope * right + reach(right), self.slope * left - reach(left));
-        let x = self.center[0] - frame.region_origin[0] as f32 - 0.5;
-        let first = (((x + left - (wide - 1.0)) / wide).floor() + 1.0).max(0.0) as i32;
-        let last = (((x + right) / wide).floor() as i32).min(frame.window[0] as i32 - 1);
-        let start = i64::from(row) * i64::from(frame.window[0]);
-        let cut = |tile: u32| (i64::from(tile) - start).clamp(-1, i64::from(i32::MAX)) as i32;
-        [first.max(cut(band[0])), last.min(cut(band[1]) - 1)]
+        let reach = |dy: F8<S>| -> F8<S> {
+            let rest = half * half - dy * dy;
+            rest.simd_gt(zero).select(rest, zero).sqrt() * splat(s, self.width) + splat(s, 0.01)
+        };
+        let slope = splat(s, self.slope);
+        let (right, left) = (slope * right + reach(right), slope * left - reach(left));
+        let x = splat(s, self.center[0] - frame.region_origin[0] as f32 - 0.5);
+        let from = ((x + left - splat(s, TILE_WIDTH as f32 - 1.0)) * wide).floor() + splat(s, 1.0);
+        let to = ((x + right) * wide).floor();
+        let from = from.simd_gt(zero).select(from, zero);
+        let from = from.simd_lt(across).select(from, across);
+        let to = to.simd_ge(zero).select(to, splat(s, -1.0));
+        let to = to.simd_lt(across).select(to, across - splat(s, 1.0));
+        // Columns of the window that the band begins and ends with in each row.
+        let (from, to, rows): (i32x8<S>, i32x8<S>, i32x8<S>) = (from.to_int(), to.to_int(), rows.to_int());
+        let starts = rows * frame.window[0] as i32;
+        let (begin, end) = (i32x8::splat(s, band[0] as i32) - starts, i32x8::splat(s, band[1] as i32 - 1) - starts);
+        let mut all = [[0; LANES]; 2];
+        from.max(begin).store_slice(&mut all[0]);
+        to.min(end).store_slice(&mut all[1]);
+        all
+    }
+}
+
+/// Gaussians that are fetched at once: where each lies is left to chance, so that one alone would be waited for.
+const FETCHED: usize = 16;
+
+/// Calls `work` with some Gaussians in depth order and each one's place in it.
+#[inline(always)]
+fn each_in_order(
+    (projected, order): (&[Projected], &[u32]),
+    those: std::ops::Range<usize>,
+    mut work: impl FnMut(usize, &Projected),
+) {
+    let mut fetched = [[[0.0; 4]; 3]; FETCHED];
+    for first in those.clone().step_by(FETCHED) {
+        let order = &order[first..(first + FETCHED).min(those.end)];
+        for (to, g) in fetched.iter_mut().zip(order) {
+            *to = projected[*g as usize];
+        }
+        for (i, projected) in fetched[..order.len()].iter().enumerate() {
+            work(first + i, projected);
+        }
     }
 }
 
@@ -151,23 +205,18 @@ pub(super) fn count(call: &Call<'_>) {
         // SAFETY: a share's own histogram and total.
         let (own, total) = unsafe { (tiles.range(lane * tile_count, tile_count), &mut totals.range(lane, 1)[0]) };
         *total = 0;
-        dispatch!(call.level, _s => {
-            for g in &order[share_of(lane, visible, lanes)] {
-                let spans = Spans::of(frame, &projected[*g as usize]);
-                for row in spans.rows.clone() {
-                    let [first, last] = spans.in_row(frame, row, band);
-                    if first > last {
-                        continue;
-                    }
+        dispatch!(call.level, s => {
+            each_in_order((projected, order), share_of(lane, visible, lanes), |_, projected| {
+                Spans::of(frame, projected).each_row(s, frame, band, |row, [first, last]| {
                     *total = total.wrapping_add((last - first + 1) as u32);
                     if call.push.mode == 0 {
-                        let line = row as usize * frame.window[0] as usize;
-                        for n in &mut own[line + first as usize..=line + last as usize] {
+                        let line = row * frame.window[0] as usize;
+                        for n in &mut own[line + first..=line + last] {
                             *n += 1;
                         }
                     }
-                }
-            }
+                });
+            });
         });
     });
     status.lane_counted.fill(1);
@@ -236,16 +285,12 @@ pub(super) fn emit(call: &Call<'_>) {
         // SAFETY: a share's own histogram.
         let ranks = unsafe { tiles.range(lane * tile_count, tile_count) };
         let mut slot = status.lane_instances[..lane].iter().fold(0u32, |sum, n| sum.wrapping_add(*n));
-        dispatch!(call.level, _s => {
-            for r in share_of(lane, visible, lanes) {
-                let (begin, spans) = (slot, Spans::of(frame, &projected[order[r] as usize]));
-                for row in spans.rows.clone() {
-                    let [first, last] = spans.in_row(frame, row, band);
-                    if first > last {
-                        continue;
-                    }
-                    let line = row as usize * frame.window[0] as usize;
-                    let tiles = line + first as usize..=line + last as usize;
+        dispatch!(call.level, s => {
+            each_in_order((projected, order), share_of(lane, visible, lanes), |r, projected| {
+                let begin = slot;
+                Spans::of(frame, projected).each_row(s, frame, band, |row, [first, last]| {
+                    let line = row * frame.window[0] as usize;
+                    let tiles = line + first..=line + last;
                     for (start, rank) in starts[tiles.clone()].iter().zip(&mut ranks[tiles]) {
                         let at = start.wrapping_sub(origin).wrapping_add(*rank);
                         *rank += 1;
@@ -253,10 +298,10 @@ pub(super) fn emit(call: &Call<'_>) {
                         unsafe { instances.range(at as usize, 1) }.fill([r as u32, slot]);
                         slot = slot.wrapping_add(1);
                     }
-                }
+                });
                 // SAFETY: a Gaussian of this share.
                 unsafe { ranges.range(r, 1) }.fill([begin, slot.wrapping_sub(begin)]);
-            }
+            });
         });
     });
 }
