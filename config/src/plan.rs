@@ -163,7 +163,7 @@ impl Plan {
         }
         let fits = |per_pixel: &usize| made(low, *per_pixel).total_bytes <= budget;
         // What is left goes to instances, so that few frames need bands.
-        let per_pixel = [8, 6, 4, 3].into_iter().find(fits).unwrap_or(2);
+        let per_pixel = [6, 4, 3].into_iter().find(fits).unwrap_or(2);
         Ok(made(low, per_pixel))
     }
 

@@ -1,8 +1,7 @@
 //! The plan in the host's own memory, where the processor is the device.
 
 use crate::gpu::GpuError;
-use rustix::io::Errno;
-use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap_anonymous, munmap};
+use rustix::mm::{MapFlags, ProtFlags, mmap_anonymous, munmap};
 use std::ffi::c_void;
 
 /// One mapping of zeros, present from its first page to its last.
@@ -27,35 +26,11 @@ impl HostMemory {
     pub fn new(bytes: u64) -> Result<Self, GpuError> {
         let refused = || GpuError::OutOfMemory { bytes };
         let size = usize::try_from(bytes).map_err(|_| refused())?.max(1);
+        // Present now: pages that are only promised may not be there in the middle of a flight.
+        let flags = MapFlags::PRIVATE | MapFlags::POPULATE;
         // SAFETY: a new mapping at an address of the system's choice; nobody else has it.
-        let mapped = unsafe {
-            mmap_anonymous(std::ptr::null_mut(), size, ProtFlags::READ | ProtFlags::WRITE, MapFlags::PRIVATE)
-        };
-        let memory = Self { first: mapped.map_err(|_| refused())?, bytes: size };
-        memory.make_present().map_err(|_| refused())?;
-        Ok(memory)
-    }
-
-    /// Makes all pages present: those that are only promised may not be there in the middle of a flight. Large ones where the system has
-    /// them, since kernels go from one end of the plan to the other.
-    fn make_present(&self) -> Result<(), Errno> {
-        /// No page is smaller.
-        const PAGE: usize = 4096;
-        // SAFETY: the mapping of this object; neither advice changes what it holds.
-        unsafe {
-            // Without large pages it is slower, no more.
-            let _ = madvise(self.first, self.bytes, Advice::LinuxHugepage);
-            match madvise(self.first, self.bytes, Advice::LinuxPopulateWrite) {
-                // Linux before 5.14.
-                Err(Errno::INVAL) => {
-                    for at in (0..self.bytes).step_by(PAGE) {
-                        self.first.cast::<u8>().add(at).write_volatile(0);
-                    }
-                    Ok(())
-                }
-                other => other,
-            }
-        }
+        let mapped = unsafe { mmap_anonymous(std::ptr::null_mut(), size, ProtFlags::READ | ProtFlags::WRITE, flags) };
+        Ok(Self { first: mapped.map_err(|_| refused())?, bytes: size })
     }
 
     /// Its first byte, at a page's beginning.
