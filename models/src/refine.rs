@@ -15,6 +15,7 @@ mod calibration;
 mod certainty;
 mod control;
 mod covisible;
+mod decoys;
 mod discovery;
 mod fivepoint;
 mod gauge;

@@ -10,7 +10,7 @@ use super::linking::{Pair, Proposal, epipolar_lines, rays};
 use super::matching::{Guide, MatchLimits, match_frames};
 use super::tracks::Tracks;
 use super::twoview::{RelativePose, TwoViewLimits, verify};
-use super::{AddReport, Refiner, overview};
+use super::{AddReport, Refiner, decoys, overview};
 use crate::camera::{Pinhole, Pose};
 
 /// Points of a picture that say which others see the same.
@@ -121,10 +121,13 @@ fn propose_again(refiner: &Refiner, a: u32, b: u32, before: Option<&Pair>) -> (u
         cosine_margin: refiner.settings.cosine_margin,
         features: usize::MAX,
     };
-    let anywhere = vec![Some(ca.c); fb.keypoints().len()];
-    let lines = epipolar_lines(&relative, &ca, &cb, fb.keypoints());
-    let width = (!no_baseline).then_some((lines.as_slice(), 3.0 * refiner.settings.epipolar_px));
-    let matches = match_frames(fa, fb, &Guide { predicted: &anywhere, radius: f64::INFINITY, lines: width }, limits);
+    let matches = if no_baseline {
+        let anywhere = vec![Some(ca.c); fb.keypoints().len()];
+        match_frames(fa, fb, &Guide { predicted: &anywhere, radius: f64::INFINITY, lines: None }, limits)
+    } else {
+        let lines = epipolar_lines(&relative, &ca, &cb, fb.keypoints());
+        decoys::match_along(fa, fb, &lines, 3.0 * refiner.settings.epipolar_px, limits)
+    };
     let limits = TwoViewLimits {
         threshold: refiner.settings.epipolar_px / ca.f.min_element().min(cb.f.min_element()),
         min_inliers: refiner.settings.min_inliers,

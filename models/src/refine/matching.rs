@@ -105,6 +105,12 @@ pub(crate) fn match_frames(a: &KeyFrame, b: &KeyFrame, guide: &Guide, limits: Ma
     found
 }
 
+/// How much the key points of each match look alike.
+pub(crate) fn likenesses(a: &KeyFrame, b: &KeyFrame, matches: &[Match]) -> Vec<i32> {
+    let (of_a, of_b) = (a.descriptors(), b.descriptors());
+    matches.iter().map(|m| dot(of_a.of(m.a as usize), of_b.of(m.b as usize))).collect()
+}
+
 /// Sorts matches by how much their key points look alike, most first.
 pub(crate) fn likeliest_first(a: &KeyFrame, b: &KeyFrame, matches: &mut [Match]) {
     let (of_a, of_b) = (a.descriptors(), b.descriptors());

@@ -11,7 +11,7 @@ use super::matching::{Guide, Match, MatchLimits, likeliest_first, match_frames};
 use super::problem::INDEPENDENT;
 use super::tracks::Union;
 use super::twoview::{RayPair, TwoView, TwoViewLimits, adapted, verify};
-use super::{AddReport, RefineError, Refiner};
+use super::{AddReport, RefineError, Refiner, decoys};
 
 /// Up to so many pictures, each is compared with every other one.
 const ALL_PAIRS: usize = 64;
@@ -379,11 +379,13 @@ fn look_closely(refiner: &Refiner, look: &Look, threshold_px: f64) -> (Vec<Match
         cosine_margin: refiner.settings.cosine_margin,
         features: usize::MAX,
     };
-    let anywhere = vec![Some(ca.c); fb.keypoints().len()];
-    let lines = epipolar_lines(&coarse.pose, &ca, &cb, fb.keypoints());
-    let width = (!coarse.rotation_only).then_some((lines.as_slice(), 2.0 * threshold_px));
-    let guide = Guide { predicted: &anywhere, radius: f64::INFINITY, lines: width };
-    let matches = match_frames(fa, fb, &guide, limits);
+    let matches = if coarse.rotation_only {
+        let anywhere = vec![Some(ca.c); fb.keypoints().len()];
+        match_frames(fa, fb, &Guide { predicted: &anywhere, radius: f64::INFINITY, lines: None }, limits)
+    } else {
+        let lines = epipolar_lines(&coarse.pose, &ca, &cb, fb.keypoints());
+        decoys::match_along(fa, fb, &lines, 2.0 * threshold_px, limits)
+    };
     let limits = TwoViewLimits {
         threshold: threshold_px / focal(refiner, look.a, look.b),
         min_inliers: refiner.settings.min_inliers,

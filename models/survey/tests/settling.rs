@@ -31,6 +31,7 @@ fn settled(set: &Dataset) -> Option<Settlement> {
             control: &|_| Vec::new(),
             taken: &mut |_, _| {},
             cancelled: &|| false,
+            fits: &|_| true,
         },
     );
     match found {

@@ -91,6 +91,16 @@ pub fn available_bytes() -> Option<u64> {
     line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok().map(|k| k * 1024)
 }
 
+/// What this process may still write to, bytes: what is available, less where its own limit (RLIMIT_DATA) leaves less.
+pub fn writable_bytes() -> Option<u64> {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Data).current;
+    let left = limit.map(|limit| limit.saturating_sub(status_bytes("VmData").unwrap_or(0)));
+    match (available_bytes(), left) {
+        (Some(available), Some(left)) => Some(available.min(left)),
+        (available, left) => available.or(left),
+    }
+}
+
 /// What this user may still write to the file system of `path`, bytes; None while it is not there.
 pub fn free_disk_bytes(path: &Path) -> Option<u64> {
     let stat = rustix::fs::statvfs(path).ok()?;

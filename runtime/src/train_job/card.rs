@@ -10,6 +10,7 @@ use engine::host::settling_bytes;
 use engine::{matching_file_bytes, waiting_file};
 use geometry::geodesy::Geodetic;
 use job::console::Progress;
+use job::resources::writable_bytes;
 use models::camera::View;
 use models::formats::reconstruction::Shot;
 use models::formats::transforms;
@@ -270,6 +271,10 @@ fn refined(
             control: &|scale| surveyed::marked(set, &notes.control, scale),
             taken: &mut |done, name| progress.set(done as u64, || name.to_owned()),
             cancelled: &|| !go_on(),
+            fits: &|settings| {
+                let bytes = settling_bytes(settings, all as u64, false, (settings.threads as u64 + 1, pixels));
+                writable_bytes().is_some_and(|left| bytes <= left / 2)
+            },
         },
     )?;
     let Some(mut found) = found else { return Ok(None) };

@@ -97,6 +97,7 @@ pub fn measure(
             control: &|_| Vec::new(),
             taken: &mut |_, _| {},
             cancelled: &|| false,
+            fits: &|_| true,
         },
     )?;
     let seconds = clock.elapsed().as_secs_f64();
