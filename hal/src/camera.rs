@@ -107,17 +107,7 @@ mod tests {
 
     #[test]
     fn a_video_device_is_refused_by_a_build_without_them_with_the_remedy() {
-        let lens = CameraSettings {
-            width: 4,
-            height: 2,
-            fx: 4.0,
-            fy: 4.0,
-            cx: 2.0,
-            cy: 1.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 0.0,
-            index: None,
-        };
+        let lens = CameraSettings::pinhole(4, 2, 4.0);
         let error = AnyCamera::open(&CameraSource::V4l2("/dev/video0".into()), &lens, None).err().expect("refused");
         assert!(error.to_string().starts_with("camera /dev/video0: built without v4l2"), "{error}");
         assert_eq!(error.kind(), ErrorKind::Invalid);

@@ -82,21 +82,7 @@ fn settings(path: &Path) -> VehicleSettings {
     VehicleSettings {
         link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
-        ..VehicleSettings::new(
-            LinkAddress::File(path.into()),
-            CameraSettings {
-                width: 640,
-                height: 480,
-                fx: 400.0,
-                fy: 400.0,
-                cx: 320.0,
-                cy: 240.0,
-                distortion: [0.0; 4],
-                exposure_delay_ms: 0.0,
-                index: None,
-            },
-            ORIGIN,
-        )
+        ..VehicleSettings::new(LinkAddress::File(path.into()), CameraSettings::pinhole(640, 480, 400.0), ORIGIN)
     }
 }
 

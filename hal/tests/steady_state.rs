@@ -37,17 +37,7 @@ fn settings() -> VehicleSettings {
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },
         ..VehicleSettings::new(
             LinkAddress::Pty(None),
-            CameraSettings {
-                width: 640,
-                height: 480,
-                fx: 400.0,
-                fy: 400.0,
-                cx: 320.0,
-                cy: 240.0,
-                distortion: [0.0; 4],
-                exposure_delay_ms: 0.0,
-                index: None,
-            },
+            CameraSettings::pinhole(640, 480, 400.0),
             Geodetic { lat_deg: 46.84265, lon_deg: -91.9939, alt_m: 158.6 },
         )
     }

@@ -109,17 +109,7 @@ fn recorded() -> (Vec<Datagram>, VecDeque<u64>) {
 }
 
 fn settings() -> VehicleSettings {
-    let lens = CameraSettings {
-        width: 640,
-        height: 480,
-        fx: 400.0,
-        fy: 400.0,
-        cx: 320.0,
-        cy: 240.0,
-        distortion: [0.0; 4],
-        exposure_delay_ms: 0.0,
-        index: None,
-    };
+    let lens = CameraSettings::pinhole(640, 480, 400.0);
     VehicleSettings {
         link: LinkSettings { exif_pose: false, ..LinkSettings::default() },
         mount: MountSettings { attitude: MountAttitude::Fixed, ..MountSettings::default() },

@@ -30,17 +30,7 @@ use super::intake::{EndOfFlight, Ended, FlightCounters, FlightPlan, Intake};
 use super::record::Recorder;
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
-const LENS: CameraSettings = CameraSettings {
-    width: 64,
-    height: 48,
-    fx: 50.0,
-    fy: 50.0,
-    cx: 32.0,
-    cy: 24.0,
-    distortion: [0.0; 4],
-    exposure_delay_ms: 0.0,
-    index: None,
-};
+const LENS: CameraSettings = CameraSettings::pinhole(64, 48, 50.0);
 /// Ten turns a second.
 const TURN_MS: u64 = 100;
 

@@ -26,17 +26,7 @@ const KILLS: &str = "DGTR_KILLS";
 const FRAMES: usize = 24;
 /// Steps after each key frame.
 const STEPS: u64 = 20;
-const LENS: CameraSettings = CameraSettings {
-    width: 96,
-    height: 72,
-    fx: 80.0,
-    fy: 80.0,
-    cx: 48.0,
-    cy: 36.0,
-    distortion: [0.0; 4],
-    exposure_delay_ms: 0.0,
-    index: None,
-};
+const LENS: CameraSettings = CameraSettings::pinhole(96, 72, 80.0);
 
 fn frame(i: usize) -> KeyFrame {
     let mut pixels = vec![0; (3 * LENS.width * LENS.height) as usize];

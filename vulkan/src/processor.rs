@@ -1,8 +1,8 @@
 //! The kernels as functions of the processor.
 //!
-//! Where the device is the processor itself, its memory is the host's and no driver is needed. Each function has the name, the sections and the meaning of its kernel in `shaders/`;
-//! the references in `crate::reference` judge both. What a step leaves does not depend on the number of threads, on the vectors of the
-//! processor, or on how many bands a picture is done in.
+//! Where the device is the processor itself, its memory is the host's and no driver is needed. Each function has the name, the
+//! sections and the meaning of its kernel in `shaders/`; the references in `crate::reference` judge both. What a step leaves does not
+//! depend on the number of threads, on the vectors of the processor, or on how many bands a picture is done in.
 
 mod blend;
 mod gaussians;

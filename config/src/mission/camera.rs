@@ -37,6 +37,23 @@ record! {
     }
 }
 
+impl CameraSettings {
+    /// A camera without distortion whose optical axis is the middle of its picture; `focal` in pixels.
+    pub const fn pinhole(width: u32, height: u32, focal: f32) -> Self {
+        Self {
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx: width as f32 / 2.0,
+            cy: height as f32 / 2.0,
+            distortion: [0.0; 4],
+            exposure_delay_ms: 0.0,
+            index: None,
+        }
+    }
+}
+
 choice! {
     /// Where the camera's attitude comes from.
     pub enum MountAttitude {

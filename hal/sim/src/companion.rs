@@ -46,17 +46,7 @@ pub fn accompany<R: Send>(
             camera: Some(CameraSource::Folder(folder.into())),
             ..VehicleSettings::new(
                 LinkAddress::Serial { path, baud: 921_600 },
-                CameraSettings {
-                    width: 64,
-                    height: 48,
-                    fx: 50.0,
-                    fy: 50.0,
-                    cx: 32.0,
-                    cy: 24.0,
-                    distortion: [0.0; 4],
-                    exposure_delay_ms: 0.0,
-                    index: None,
-                },
+                CameraSettings::pinhole(64, 48, 50.0),
                 origin,
             )
         };

@@ -199,17 +199,7 @@ mod tests {
 
     #[test]
     fn a_picture_cut_in_its_head_is_refused_in_one_line() {
-        let lens = CameraSettings {
-            width: 16,
-            height: 8,
-            fx: 10.0,
-            fy: 10.0,
-            cx: 8.0,
-            cy: 4.0,
-            distortion: [0.0; 4],
-            exposure_delay_ms: 0.0,
-            index: None,
-        };
+        let lens = CameraSettings::pinhole(16, 8, 10.0);
         let mut jpeg = std::io::Cursor::new(Vec::new());
         RgbImage::new(16, 8).write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("encoded");
         let jpeg = jpeg.into_inner();

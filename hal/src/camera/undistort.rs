@@ -32,17 +32,7 @@ mod tests {
     #[test]
     fn the_coefficients_of_the_mission_are_opencvs_k1_k2_p1_p2() {
         let side = 101;
-        let lens = |distortion| CameraSettings {
-            width: side,
-            height: side,
-            fx: 80.0,
-            fy: 80.0,
-            cx: 50.5,
-            cy: 50.5,
-            distortion,
-            exposure_delay_ms: 0.0,
-            index: None,
-        };
+        let lens = |distortion| CameraSettings { distortion, ..CameraSettings::pinhole(side, side, 80.0) };
         // p1 moves what lies right of the centre down: y = p1 r² = 0.1 · 0.25, two pixels.
         let mut image = RgbImage::new(side, side);
         image.put_pixel(90, 52, image::Rgb([255; 3]));

@@ -27,7 +27,7 @@ const LATENCY_SCALE_NS: f32 = 2.0e9;
 const UNLIKELY_LATENCY: f32 = 8.0;
 /// What a latency costs that jumps to another one, and for each second of the jump.
 const JUMP_NS: f32 = 0.25e9;
-/// The same where it falls and the numbers go on: a computer has caught up.
+/// What a latency costs that falls while the numbers go on: a computer has caught up.
 const CAUGHT_UP_NS: f32 = 1e9;
 const JUMPED: f32 = 2.5;
 /// What a latency costs at most that is not the usual one, and how far from it is unusual, ns.

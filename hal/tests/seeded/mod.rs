@@ -1,5 +1,8 @@
 //! Vehicles, cameras and links by chance, the same ones for the same seed.
 
+mod chance;
+
+pub use chance::Chance;
 use glam::DVec3;
 use hal::mavlink::dialect::{CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, MavBool};
 use hal::traits::PictureClues;
@@ -13,44 +16,6 @@ const CAMERA_AHEAD_S: f64 = 7777.3;
 const BEGIN_S: f64 = 10.0;
 /// Every aircraft flies straight on, so that a place is a time.
 pub const SPEED_M_S: f64 = 10.0;
-
-/// Numbers by chance (an LCG with a mixed output).
-pub struct Chance(u64);
-
-impl Chance {
-    pub fn new(seed: u64) -> Self {
-        let mut chance = Self(seed * 7919 + 13);
-        (0..5).for_each(|_| {
-            chance.unit();
-        });
-        chance
-    }
-
-    /// 0 … 1.
-    fn unit(&mut self) -> f64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        let mixed = (self.0 ^ (self.0 >> 33)).wrapping_mul(0xff51_afd7_ed55_8ccd);
-        (mixed >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.unit()
-    }
-
-    fn yes(&mut self, share: f64) -> bool {
-        self.unit() < share
-    }
-
-    /// `low`, … `high`.
-    fn count(&mut self, low: usize, high: usize) -> usize {
-        (self.between(low as f64, high as f64 + 1.0) as usize).min(high)
-    }
-
-    /// Zero in `share` of all flights.
-    fn sometimes(&mut self, share: f64, high: f64) -> f64 {
-        if self.yes(share) { 0.0 } else { self.between(0.0, high) }
-    }
-}
 
 /// When the shutter of another camera opens.
 #[derive(Clone, Copy, Debug, PartialEq)]

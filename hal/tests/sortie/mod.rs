@@ -34,17 +34,7 @@ const AFTER_TENTHS: u64 = 20;
 
 /// An aircraft of a pinhole camera that is bolted to it.
 pub fn settings(system_id: u8) -> VehicleSettings {
-    let lens = CameraSettings {
-        width: 640,
-        height: 480,
-        fx: 400.0,
-        fy: 400.0,
-        cx: 320.0,
-        cy: 240.0,
-        distortion: [0.0; 4],
-        exposure_delay_ms: 0.0,
-        index: None,
-    };
+    let lens = CameraSettings::pinhole(640, 480, 400.0);
     VehicleSettings {
         system_id,
         link: LinkSettings { exif_pose: false, ..LinkSettings::default() },

@@ -48,7 +48,86 @@ fn believed(scores: &[i32], wrong: &[i32], searches: usize, share: f64) -> usize
 
 #[cfg(test)]
 mod tests {
+    use glam::DQuat;
+
     use super::*;
+    use crate::camera::{Intrinsics, Pose, PoseSigma, View};
+    use crate::frame_file::Kept;
+    use crate::refine::intake::arrived;
+    use crate::refine::keyframe::{DESCRIPTOR, Descriptors};
+
+    /// Side of the pictures, pixels, and key points in each.
+    const SIDE: u32 = 1000;
+    const POINTS: usize = 900;
+
+    /// Numbers by chance, 0 … 1, the same ones for the same seed.
+    struct Chance(u64);
+
+    impl Chance {
+        fn unit(&mut self) -> f64 {
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            ((self.0 ^ (self.0 >> 33)).wrapping_mul(0xff51_afd7_ed55_8ccd) >> 11) as f64 / (1u64 << 53) as f64
+        }
+
+        /// A unit vector times 127 that lies `off` from `from`, in units of its own length.
+        fn near(&mut self, from: &[f64], off: f64) -> Vec<f64> {
+            let noise: Vec<f64> = from.iter().map(|_| self.unit() - 0.5).collect();
+            let long = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let scale = off * 127.0 / long(&noise);
+            let moved: Vec<f64> = from.iter().zip(&noise).map(|(f, n)| f + scale * n).collect();
+            let length = long(&moved);
+            moved.iter().map(|v| v * 127.0 / length).collect()
+        }
+    }
+
+    fn frame(seen: Vec<[f32; 2]>, descriptors: &[Vec<f64>]) -> KeyFrame {
+        let intrinsics = Intrinsics { width: SIDE, height: SIDE, fx: 800.0, fy: 800.0, cx: 500.0, cy: 500.0 };
+        let pose = Pose { rotation: DQuat::IDENTITY, center: DVec3::ZERO };
+        let sigma = PoseSigma { position_m: [1.0; 3], rotation_rad: [0.01; 3] };
+        let mut frame = arrived("a.jpg", 0, &View { intrinsics, pose }, &sigma);
+        let values = descriptors.iter().flatten().map(|v| v.round() as i8).collect();
+        frame.descriptors = Kept::at_best(Descriptors(values), None);
+        frame.settled = vec![false; seen.len()];
+        frame.seen = seen;
+        frame
+    }
+
+    /// A picture and another one taken beside it, of a world that repeats itself: every key point is of one of 40 kinds. A third of
+    /// the second picture's points are the first one's, moved along the row; those have the same index in both.
+    fn repetitive_pair(chance: &mut Chance) -> (KeyFrame, KeyFrame) {
+        let kinds: Vec<Vec<f64>> = (0..40).map(|_| chance.near(&[0.0; DESCRIPTOR], 1.0)).collect();
+        let (mut in_a, mut in_b, mut of_a, mut of_b) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for i in 0..POINTS {
+            let mut place = || [(chance.unit() * 1000.0) as f32, (chance.unit() * 1000.0) as f32];
+            let (a, b) = (place(), place());
+            let mut thing = || {
+                let kind = (chance.unit() * 40.0) as usize;
+                chance.near(&kinds[kind], 0.7)
+            };
+            let (seen, other) = (thing(), thing());
+            let is_same = i < POINTS / 3;
+            in_a.push(a);
+            of_a.push(seen.clone());
+            in_b.push(if is_same { [b[0], a[1]] } else { b });
+            of_b.push(if is_same { chance.near(&seen, 0.3) } else { other });
+        }
+        (frame(in_a, &of_a), frame(in_b, &of_b))
+    }
+
+    #[test]
+    fn of_the_matches_along_lines_of_a_world_that_repeats_itself_at_most_the_stated_share_is_wrong() {
+        let limits = MatchLimits { min_cosine: 0.5, cosine_margin: 0.0, features: POINTS };
+        for seed in 0..5 {
+            let (a, b) = repetitive_pair(&mut Chance(seed));
+            // The second camera stands beside the first: every line is the point's own row.
+            let rows: Vec<DVec3> = b.keypoints().iter().map(|p| DVec3::new(0.0, 1.0, -f64::from(p[1]))).collect();
+            let found = match_along(&a, &b, &rows, 4.0, limits);
+            let wrong = found.iter().filter(|m| m.a != m.b).count() as f64;
+            let right = found.len() as f64 - wrong;
+            assert!(wrong <= 0.26 * found.len() as f64, "{wrong} of {}", found.len());
+            assert!(right >= 0.8 * (POINTS / 3) as f64, "{right} of {}", POINTS / 3);
+        }
+    }
 
     #[test]
     fn as_many_matches_are_believed_as_look_more_alike_than_wrong_ones_do() {

@@ -71,36 +71,12 @@ impl Refiner {
     }
 
     pub(super) fn insert(&mut self, name: &str, time_ns: u64, view: &View, sigma: &PoseSigma) {
-        let prior = Pose { rotation: view.pose.rotation.normalize(), ..view.pose };
-        let largest = |v: [f32; 3], cap: f64| f64::from(v.iter().fold(0.0f32, |a, b| a.max(*b))).min(cap);
         self.by_name.insert(name.to_owned(), self.frames.len() as u32);
         self.grounds.push(None);
-        self.frames.push(KeyFrame {
-            name: name.to_owned(),
-            intrinsics: view.intrinsics,
-            prior,
-            told: Told { time_ns, pose: prior, sigma: *sigma },
-            velocity: DVec3::ZERO,
-            sigma: *sigma,
-            pose: self.expect(&prior),
-            // Beyond these, guided search is no guide any more.
-            rotation_sigma: largest(sigma.rotation_rad, 0.5),
-            position_sigma: largest(sigma.position_m, 30.0),
-            rotation_refused: false,
-            unplaced: false,
-            adjusted: false,
-            tied: false,
-            turns: 0,
-            pairs: 0,
-            known: Known::default(),
-            straight: Vec::new(),
-            seen: Vec::new(),
-            colors: Vec::new(),
-            settled: Vec::new(),
-            grey: None,
-            descriptors: Kept::Memory(Descriptors::default()),
-            first_node: self.union.grow(0, 0),
-        });
+        let mut frame = arrived(name, time_ns, view, sigma);
+        frame.pose = self.expect(&frame.prior);
+        frame.first_node = self.union.grow(0, 0);
+        self.frames.push(frame);
     }
 
     /// Gives the newest frame its features (again, when a turn of the picture did not match).
@@ -163,6 +139,38 @@ impl Refiner {
     }
 }
 
+/// A key frame as it came, without key points; `view` as told, with one standard deviation.
+pub(super) fn arrived(name: &str, time_ns: u64, view: &View, sigma: &PoseSigma) -> KeyFrame {
+    let prior = Pose { rotation: view.pose.rotation.normalize(), ..view.pose };
+    let largest = |v: [f32; 3], cap: f64| f64::from(v.iter().fold(0.0f32, |a, b| a.max(*b))).min(cap);
+    KeyFrame {
+        name: name.to_owned(),
+        intrinsics: view.intrinsics,
+        prior,
+        told: Told { time_ns, pose: prior, sigma: *sigma },
+        velocity: DVec3::ZERO,
+        sigma: *sigma,
+        pose: prior,
+        // Beyond these, guided search is no guide any more.
+        rotation_sigma: largest(sigma.rotation_rad, 0.5),
+        position_sigma: largest(sigma.position_m, 30.0),
+        rotation_refused: false,
+        unplaced: false,
+        adjusted: false,
+        tied: false,
+        turns: 0,
+        pairs: 0,
+        known: Known::default(),
+        straight: Vec::new(),
+        seen: Vec::new(),
+        colors: Vec::new(),
+        settled: Vec::new(),
+        grey: None,
+        descriptors: Kept::Memory(Descriptors::default()),
+        first_node: 0,
+    }
+}
+
 pub(super) fn invalid(name: &str, what: &'static str) -> RefineError {
     RefineError::Invalid { name: name.to_owned(), what }
 }
@@ -171,7 +179,7 @@ pub(super) fn invalid(name: &str, what: &'static str) -> RefineError {
 #[allow(clippy::unwrap_used)] // a test may
 mod tests {
     use config::refine::RefineSettings;
-    use glam::{DQuat, DVec3};
+    use glam::DQuat;
 
     use super::*;
     use crate::camera::Intrinsics;

@@ -23,14 +23,15 @@ const ROLLING_SHUTTER: f64 = 0.005;
 /// A card's pictures are matched at this many times the size, and with as many more key points, than in flight, where the time is
 /// short: brighton_beach's card lies 0.80 m from its reference at 640 pixels and 0.07 m at 1,280.
 const USUAL: Detail = Detail { side: 2.0, features: 2 };
-/// The same where few pictures hold together at the usual size: what is seen from further apart looks more alike when it is small.
+/// Where few pictures hold together at the usual size: what is seen from further apart looks more alike when it is small.
 const COARSE: Detail = Detail { side: 1.0, features: 2 };
-/// The same where pictures were taken far apart or all around: of banana's 16, 8 hold together at the usual size and 14 at this.
+/// Where pictures were taken far apart or all around and few hold together at either size: more points and smaller ones.
 const FINE: Detail = Detail { side: 3.2, features: 6 };
-/// Most pictures that are compared so closely: each with each.
-const FEW: usize = 64;
+/// Most pictures that are compared at [`FINE`]: each with each, so that the time grows with the square.
+const MOST_FINE: usize = 64;
 /// What `[refine]` allows of either.
 const MOST_DETAIL: u32 = 8192;
+
 impl Start {
     /// Looks after the first. Of pictures that were all compared, the second makes matches exact, the third finds more of them; in the
     /// order of capture each finds some from the places of the others (brighton_beach's 18 without GPS: 15, 17, 17 and 18 tied).
@@ -173,7 +174,8 @@ pub fn settle<E: From<RefineError>>(
         true => [(known, USUAL), (Start::Pictures, USUAL), (Start::Pictures, COARSE), (Start::Pictures, FINE)],
         false => [(Start::Pictures, USUAL), (known, USUAL), (Start::Pictures, COARSE), (Start::Pictures, FINE)],
     };
-    let closely = set.frames.len() <= FEW && (needs.fits)(&of_card(set, notes, settings, (Start::Pictures, FINE)));
+    let closely =
+        set.frames.len() <= MOST_FINE && (needs.fits)(&of_card(set, notes, settings, (Start::Pictures, FINE)));
     let mut best: Option<Settlement> = None;
     for (start, detail) in ways.into_iter().take(if closely { 4 } else { 3 }) {
         let Some(found) = attempt(set, notes, settings, (start, detail), needs)? else { return Ok(None) };

@@ -23,17 +23,7 @@ use crate::driver::{Read, Reader, Shell, Verdict, line, memory_folder, survive};
 
 const ORIGIN: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
 const LENS: Intrinsics = Intrinsics { width: 8, height: 6, fx: 8.0, fy: 8.0, cx: 4.0, cy: 3.0 };
-const CAMERA: CameraSettings = CameraSettings {
-    width: 8,
-    height: 6,
-    fx: 8.0,
-    fy: 8.0,
-    cx: 4.0,
-    cy: 3.0,
-    distortion: [0.0; 4],
-    exposure_delay_ms: 0.0,
-    index: None,
-};
+const CAMERA: CameraSettings = CameraSettings::pinhole(8, 6, 8.0);
 
 /// The refusal of a file that was set aside, with the name it got; the next input finds the place empty.
 fn set_aside(folder: &Path, name: &str) -> Verdict {

@@ -137,7 +137,7 @@ pub enum Domain {
     /// The ground names its session.
     Session,
     /// An aircraft says how it is.
-    Word,
+    Heartbeat,
 }
 
 impl Domain {
@@ -148,7 +148,7 @@ impl Domain {
             Self::Acknowledgement => b"dgtr acknowledgement\0",
             Self::Request => b"dgtr request\0",
             Self::Session => b"dgtr session\0",
-            Self::Word => b"dgtr word\0",
+            Self::Heartbeat => b"dgtr heartbeat\0",
         };
         [domain, bytes].concat()
     }

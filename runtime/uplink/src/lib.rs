@@ -20,6 +20,7 @@ mod chaos;
 pub mod disk_error;
 pub mod flight_number;
 pub mod folder;
+pub mod heartbeat;
 pub mod keys;
 mod medium;
 pub mod memory;
@@ -45,7 +46,6 @@ mod territory;
 #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "bad links are the network's"))]
 mod testing;
 pub mod transport;
-pub mod word;
 
 use config::error::{Error, ErrorKind};
 

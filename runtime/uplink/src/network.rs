@@ -2,7 +2,7 @@
 //!
 //! Keys: `dgtr/<mission>/<aircraft>/offer`, `…/chunk/<blake3>`, `…/receipt`; all three are queries that the aircraft
 //! answers, so nothing is kept in between and a restart of either end costs at most one chunk. A new offer is announced
-//! by a publication as well, which only wakes the ground early; `…/word` is a publication that says how the aircraft is. No scouting, no gossip: both ends talk to the endpoints
+//! by a publication as well, which only wakes the ground early; `…/heartbeat` is a publication that says how the aircraft is. No scouting, no gossip: both ends talk to the endpoints
 //! of the mission file and to nobody else. The ground passes on nothing between those who connect to it, and
 //! over TLS an aircraft speaks only under the id that is its certificate's common name (zenoh's access control). What the
 //! ground asks is signed, so that an aircraft answers nobody else.

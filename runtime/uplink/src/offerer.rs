@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use config::upload::UploadSettings;
 
 use super::folder::FolderOutlet;
-use super::word::Condition;
+use super::heartbeat::Condition;
 use super::{Source, UploadError};
 use inbox::{Inbox, Kind, locked};
 use worker::{Connect, Worker};

@@ -20,9 +20,9 @@ use config::upload::UploadSettings;
 use super::UploadError;
 use super::admission::{Admission, Refusals};
 use super::folder::FolderInlet;
+use super::heartbeat::Condition;
 use super::offer::{Offer, OfferError, Order};
 use super::transport::Inlet;
-use super::word::Condition;
 use lookout::{Lookout, QUIET};
 use sight::Sight;
 use slot::{Advance, Link, Slot};
@@ -118,11 +118,11 @@ type Trace = (Option<Order>, (usize, usize), Option<(u64, bool)>);
 
 /// When an aircraft last gave a sign of life, and what it said of itself.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Sign {
+pub struct LastHeard {
     /// How long ago; `None` = not in this session.
     pub ago: Option<Duration>,
-    /// Its newest word; `None` where no network leads here.
-    pub word: Option<Condition>,
+    /// What its newest heartbeat says; `None` where no network leads here.
+    pub condition: Option<Condition>,
 }
 
 enum Place {
@@ -270,18 +270,18 @@ impl Receiver {
         self.seats.iter().map(|s| (s.id.clone(), s.progress.0, s.progress.1)).collect()
     }
 
-    /// Of every aircraft its last sign of life.
-    pub fn signs(&self) -> Vec<Sign> {
-        let sign = |seat: &Seat| {
+    /// When each aircraft was last heard, in the order of the mission.
+    pub fn last_heard(&self) -> Vec<LastHeard> {
+        let last_heard = |seat: &Seat| {
             let heard = self.link.inlets.iter().filter_map(|inlet| inlet.heard(&seat.id)).max_by_key(|heard| heard.at);
             let at = seat.heard.max(heard.map(|heard| heard.at));
-            Sign { ago: at.map(|at| at.elapsed()), word: heard.map(|heard| heard.word.condition) }
+            LastHeard { ago: at.map(|at| at.elapsed()), condition: heard.map(|heard| heard.heartbeat.condition) }
         };
-        self.seats.iter().map(sign).collect()
+        self.seats.iter().map(last_heard).collect()
     }
 
     /// Notes who has given a sign of life since the last time.
-    fn note_signs(&mut self) {
+    fn note_who_was_heard(&mut self) {
         for seat in &mut self.seats {
             let newest = self.sight.of(&seat.id).iter().map(|shown| shown.0.order).max();
             let trace = (newest, seat.progress, seat.received.as_ref().map(|r| (r.size, r.finished)));
@@ -331,7 +331,7 @@ impl Receiver {
             }
             std::thread::sleep(LOOK_UP);
         }
-        self.note_signs();
+        self.note_who_was_heard();
         Ok(self.lookout.is_waiting() || self.seats.iter().any(|s| s.is_at_work() || s.wants_work()))
     }
 

@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use config::error::{Error, ErrorKind};
 
+use super::heartbeat::{Heard, Heartbeat};
 use super::offer::{Hash, Offer, OfferedModel, hex};
 use super::receipt::Delivery;
-use super::word::{Heard, Word};
 
 /// Why a transport could not do what was asked. All of these are worth another attempt.
 #[derive(Debug, thiserror::Error)]
@@ -79,8 +79,8 @@ pub trait Outlet: Send {
     /// Bytes of offers and chunks that left the aircraft this way.
     fn sent(&self) -> u64;
 
-    /// Says how the aircraft is, where anybody can hear it now; of a word that does not arrive the next one says more.
-    fn say(&mut self, _word: &Word) {}
+    /// Says how the aircraft is, where anybody can hear it now; the next one follows one that does not arrive.
+    fn say(&mut self, _heartbeat: &Heartbeat) {}
 }
 
 /// How long the ground waits for one answer.
@@ -131,7 +131,7 @@ pub trait Inlet: Send + Sync {
     /// Forgets the session where aircraft would read of it after its end.
     fn end_session(&self) {}
 
-    /// The newest word of an aircraft, where words are heard.
+    /// Returns the newest heartbeat of an aircraft, where heartbeats are heard.
     fn heard(&self, _aircraft: &str) -> Option<Heard> {
         None
     }

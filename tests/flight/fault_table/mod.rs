@@ -55,17 +55,7 @@ fn script(row: &Row) -> Script {
         link: LinkSettings { battery_swap_s: 0.0, ..LinkSettings::default() },
         ..VehicleSettings::new(
             LinkAddress::Pty(None),
-            CameraSettings {
-                width: 64,
-                height: 48,
-                fx: 50.0,
-                fy: 50.0,
-                cx: 32.0,
-                cy: 24.0,
-                distortion: [0.0; 4],
-                exposure_delay_ms: 60.0,
-                index: None,
-            },
+            CameraSettings { exposure_delay_ms: 60.0, ..CameraSettings::pinhole(64, 48, 50.0) },
             ORIGIN,
         )
     };

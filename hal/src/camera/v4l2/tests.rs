@@ -97,17 +97,7 @@ fn a_driver_that_breaks_the_thread_is_an_error_and_no_crash() {
 }
 
 fn opened(device: &str) -> HalError {
-    let lens = CameraSettings {
-        width: 4,
-        height: 2,
-        fx: 4.0,
-        fy: 4.0,
-        cx: 2.0,
-        cy: 1.0,
-        distortion: [0.0; 4],
-        exposure_delay_ms: 0.0,
-        index: None,
-    };
+    let lens = CameraSettings::pinhole(4, 2, 4.0);
     AnyCamera::open(&CameraSource::V4l2(device.into()), &lens, None).err().expect("no camera")
 }
 

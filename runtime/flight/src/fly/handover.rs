@@ -16,7 +16,7 @@ use hal::mavlink_camera::Activity;
 use image::RgbImage;
 use models::camera::{Pose, PosedImage};
 use models::mask::Mask;
-use uplink::word::Condition;
+use uplink::heartbeat::Condition;
 
 use crate::keyframe_store::{KeyFrame, KeyframeStore, Relief, StoreError};
 

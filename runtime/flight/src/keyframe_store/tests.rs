@@ -11,17 +11,7 @@ use models::camera::PoseSigma;
 
 use super::*;
 
-const CAMERA: CameraSettings = CameraSettings {
-    width: 4,
-    height: 3,
-    fx: 3.0,
-    fy: 3.0,
-    cx: 2.0,
-    cy: 1.5,
-    distortion: [0.0; 4],
-    exposure_delay_ms: 0.0,
-    index: None,
-};
+const CAMERA: CameraSettings = CameraSettings::pinhole(4, 3, 3.0);
 const LENS: Intrinsics = Intrinsics { width: 4, height: 3, fx: 3.0, fy: 3.0, cx: 2.0, cy: 1.5 };
 
 fn open(disk: &Disk, folder: &Path) -> KeyframeStore {

@@ -15,7 +15,7 @@ use uplink::UploadError;
 use uplink::admission::{Admission, ModelRefusal, Refusals};
 use uplink::keys::{GROUND, Identity};
 use uplink::memory::Memory;
-use uplink::receive::{ReceiveCounters, Received, Receiver, Sign};
+use uplink::receive::{LastHeard, ReceiveCounters, Received, Receiver};
 
 use crate::AggregateError;
 use crate::jobs::aggregate::{self, Outcome};
@@ -24,11 +24,11 @@ use crate::member::Member;
 pub mod admit;
 mod board;
 mod joining;
-mod vigil;
+mod watchdog;
 
 pub use board::Board;
 pub use joining::{Joined, Joining};
-pub use vigil::COVERED_PCT;
+pub use watchdog::COVERED_PCT;
 
 /// After the last model is here, the aircraft have so long to take their receipts.
 const RECEIPTS: Duration = Duration::from_secs(10);
@@ -70,8 +70,8 @@ pub struct Progress {
     pub bytes: u64,
     /// The complete models.
     pub received: Vec<Received>,
-    /// Of every aircraft, in the mission's order, its last sign of life.
-    pub signs: Vec<Sign>,
+    /// Of every aircraft, in the mission's order, when it was last heard, and what it said of itself.
+    pub last_heard: Vec<LastHeard>,
 }
 
 /// What came in.
@@ -124,7 +124,7 @@ pub fn receive(
             transfers: receiver.progress().into_iter().filter(|p| p.2 > 0).collect(),
             bytes: receiver.counters.bytes,
             received,
-            signs: receiver.signs(),
+            last_heard: receiver.last_heard(),
         });
         if receiver.all_finished() {
             let since = complete.get_or_insert_with(Instant::now);

@@ -17,8 +17,8 @@ use super::super::transport::{Inlet, Patience, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
 use crate::admission::Admission;
 use crate::binding;
+use crate::heartbeat::{Heard, Heartbeat, MAX_SEALED};
 use crate::keys::{Domain, GROUND, Identity};
-use crate::word::{Heard, MAX_SEALED, Word};
 
 /// What zenoh lets pass on the ground: from each aircraft, known by its certificate's common name, what lies under its own
 /// key; to everybody, what the ground itself asks.
@@ -53,34 +53,41 @@ pub struct NetworkInlet {
     identity: Identity,
     session_number: Hash,
     max_offer: u64,
-    words: Words,
+    heartbeats: Heartbeats,
 }
 
-/// The newest word of each aircraft.
-type Words = Arc<Mutex<HashMap<String, Heard>>>;
+/// The newest heartbeat of each aircraft.
+type Heartbeats = Arc<Mutex<HashMap<String, Heard>>>;
 
 /// Listens to what the aircraft of the mission say of themselves.
-fn listen(session: &Session, admission: &Admission) -> Result<Words, TransportError> {
+fn listen(session: &Session, admission: &Admission) -> Result<Heartbeats, TransportError> {
     let Admission { mission, aircraft, identity, memory, .. } = admission;
-    let words = Words::default();
-    let (heard, ids, identity, number) = (words.clone(), aircraft.clone(), identity.clone(), *memory.session());
+    let heartbeats = Heartbeats::default();
+    let (heard, ids, identity, number) = (heartbeats.clone(), aircraft.clone(), identity.clone(), *memory.session());
     let prefix = format!("dgtr/{mission}/");
     let hear = move |sample: zenoh::sample::Sample| {
         let key = sample.key_expr().as_str();
-        let id = key.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix("/word"));
+        let id = key.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix("/heartbeat"));
         let Some(id) = id.filter(|id| ids.iter().any(|known| known == id)) else { return };
         if sample.payload().len() as u64 > MAX_SEALED {
             return;
         }
-        let Some(word) = Word::open(&sample.payload().to_bytes(), &number, key, id, &identity) else { return };
+        let Some(heartbeat) = Heartbeat::open(&sample.payload().to_bytes(), &number, key, id, &identity) else {
+            return;
+        };
         // Whatever panicked elsewhere, what is in here is whole.
         let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-        if heard.get(id).is_none_or(|before| before.word.order < word.order) {
-            heard.insert(id.to_owned(), Heard { at: Instant::now(), word });
+        if heard.get(id).is_none_or(|before| before.heartbeat.order < heartbeat.order) {
+            heard.insert(id.to_owned(), Heard { at: Instant::now(), heartbeat });
         }
     };
-    session.declare_subscriber(format!("dgtr/{mission}/*/word")).callback(hear).background().wait().map_err(network)?;
-    Ok(words)
+    session
+        .declare_subscriber(format!("dgtr/{mission}/*/heartbeat"))
+        .callback(hear)
+        .background()
+        .wait()
+        .map_err(network)?;
+    Ok(heartbeats)
 }
 
 impl NetworkInlet {
@@ -115,10 +122,10 @@ impl NetworkInlet {
             .background()
             .wait()
             .map_err(network)?;
-        let words = listen(&session, admission)?;
+        let heartbeats = listen(&session, admission)?;
         Ok(Self {
             session,
-            words,
+            heartbeats,
             mission: mission.clone(),
             endpoints: settings.listen.join(", "),
             identity: identity.clone(),
@@ -228,7 +235,7 @@ impl Inlet for NetworkInlet {
     }
 
     fn heard(&self, aircraft: &str) -> Option<Heard> {
-        self.words.lock().unwrap_or_else(PoisonError::into_inner).get(aircraft).copied()
+        self.heartbeats.lock().unwrap_or_else(PoisonError::into_inner).get(aircraft).copied()
     }
 }
 

@@ -18,8 +18,8 @@ use super::super::receipt::{Delivery, MAX_ENCODED, Receipt};
 use super::super::transport::{Outlet, TransportError};
 use super::{LOOK_UP, NOT_HELD, network, open};
 use crate::binding;
+use crate::heartbeat::Heartbeat;
 use crate::keys::Domain;
-use crate::word::Word;
 
 /// A model under way is let go when nobody has asked for it for so long: longer than the ground ever waits for a chunk.
 const KEPT_FOR: Duration = Duration::from_secs(900);
@@ -234,16 +234,16 @@ impl Outlet for NetworkOutlet {
         self.shared.sent.load(Ordering::Relaxed)
     }
 
-    fn say(&mut self, word: &Word) {
+    fn say(&mut self, heartbeat: &Heartbeat) {
         // The session that the mission names is known before the ground asks.
         let asked = *locked(&self.shared.session);
         let Some(session) = self.shared.source.session.or(asked) else { return };
-        let key = format!("{}/word", self.prefix);
-        let sealed = word.seal(&session, &key, &self.shared.source.identity);
+        let key = format!("{}/heartbeat", self.prefix);
+        let sealed = heartbeat.seal(&session, &key, &self.shared.source.identity);
         // Before chunks on a slow link, and dropped rather than waited for.
         let put = self.session.put(key, sealed).congestion_control(CongestionControl::Drop);
         if let Err(e) = put.priority(Priority::InteractiveHigh).wait() {
-            tracing::debug!("upload: a word was not sent: {e}");
+            tracing::debug!("upload: a heartbeat was not sent: {e}");
         }
     }
 }

@@ -8,6 +8,7 @@ use std::time::Instant;
 use super::*;
 use crate::admission::Admission;
 use crate::binding;
+use crate::heartbeat::{Condition, EVERY};
 use crate::keys::testing::identities;
 use crate::keys::{Domain, Identity};
 use crate::memory::Memory;
@@ -15,7 +16,6 @@ use crate::offer::{OfferedModel, Order};
 use crate::receipt::{Receipt, Verdict};
 use crate::receive::Receiver;
 use crate::testing::{certificates, free_port, knows_localhost, noise};
-use crate::word::{Condition, EVERY};
 use crate::{Offerer, Source};
 
 const LIMIT: Duration = Duration::from_secs(60);
@@ -109,10 +109,14 @@ fn the_ground_hears_how_an_aircraft_is_from_itself_alone_and_knows_for_how_long_
     let rogue = Offerer::start(&settings, source("a2", &ids[0])).expect("offerer");
     let low = Condition { battery_pct: Some(14), battery_low: true, ..Condition::default() };
     [&a1, &rogue].into_iter().for_each(|aircraft| aircraft.say(low));
-    assert!(receive(&mut r, LIMIT, |r| r.signs()[0].word == Some(low)), "{:?}", r.signs());
+    assert!(receive(&mut r, LIMIT, |r| r.last_heard()[0].condition == Some(low)), "{:?}", r.last_heard());
     drop(a1);
-    assert!(receive(&mut r, LIMIT, |r| r.signs()[0].ago.is_some_and(|ago| ago > 4 * EVERY)), "{:?}", r.signs());
-    assert!(r.signs()[1].ago.is_none() && r.signs()[1].word.is_none(), "{:?}", r.signs());
+    assert!(
+        receive(&mut r, LIMIT, |r| r.last_heard()[0].ago.is_some_and(|ago| ago > 4 * EVERY)),
+        "{:?}",
+        r.last_heard()
+    );
+    assert!(r.last_heard()[1].ago.is_none() && r.last_heard()[1].condition.is_none(), "{:?}", r.last_heard());
     drop(rogue);
 }
 

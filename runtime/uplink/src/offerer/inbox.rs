@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use crate::word::Condition;
+use crate::heartbeat::Condition;
 
 /// What has become of the offers so far.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

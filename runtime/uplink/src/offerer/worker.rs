@@ -10,10 +10,10 @@ use models::ground_cell::{CellKey, Grid};
 
 use super::inbox::{Inbox, Kind, locked};
 use crate::flight_number::FlightNumber;
+use crate::heartbeat::{EVERY, Heartbeat};
 use crate::offer::{OfferedModel, Order};
 use crate::receipt::Delivery;
 use crate::transport::{Outlet, TransportError};
-use crate::word::{EVERY, Word};
 use crate::{Source, territory};
 
 /// A model that took so long to deliver keeps the next checkpoint back for so many times as long.
@@ -45,9 +45,9 @@ pub(super) struct Worker {
     offered: Instant,
     /// Before this time no further checkpoint is offered.
     next_checkpoint: Instant,
-    /// Words so far, and when the next one is due.
-    words: u64,
-    next_word: Instant,
+    /// Heartbeats so far, and when the next one is due.
+    heartbeats: u64,
+    next_heartbeat: Instant,
 }
 
 impl Worker {
@@ -70,8 +70,8 @@ impl Worker {
             is_fetched: false,
             offered: Instant::now(),
             next_checkpoint: Instant::now(),
-            words: 0,
-            next_word: Instant::now(),
+            heartbeats: 0,
+            next_heartbeat: Instant::now(),
         }
     }
 
@@ -99,14 +99,14 @@ impl Worker {
 
     /// Says how the aircraft is, when that is due.
     fn say(&mut self) {
-        if Instant::now() < self.next_word {
+        if Instant::now() < self.next_heartbeat {
             return;
         }
-        self.next_word = Instant::now() + EVERY;
-        self.words += 1;
-        let order = Order { flight: self.flight.get(), counter: self.words };
-        let word = Word::new(order, locked(&self.shared.0).condition);
-        self.ways.iter_mut().filter_map(|way| way.outlet.as_mut()).for_each(|outlet| outlet.say(&word));
+        self.next_heartbeat = Instant::now() + EVERY;
+        self.heartbeats += 1;
+        let order = Order { flight: self.flight.get(), counter: self.heartbeats };
+        let heartbeat = Heartbeat::new(order, locked(&self.shared.0).condition);
+        self.ways.iter_mut().filter_map(|way| way.outlet.as_mut()).for_each(|outlet| outlet.say(&heartbeat));
     }
 
     /// Waits until there is something to do; None = stop.

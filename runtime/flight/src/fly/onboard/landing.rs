@@ -7,7 +7,7 @@ use engine::{Reconstruct, model_path};
 use hal::failsafe::{Cause, Flags};
 use hal::traits::Clock;
 use job::interrupt::Interrupt;
-use uplink::word::Condition;
+use uplink::heartbeat::Condition;
 use vulkan::trainer::{RunBudget, StepReport, StopReason};
 
 use super::{CHECKPOINT_EVERY_NS, Handover, Job, JobEnd};

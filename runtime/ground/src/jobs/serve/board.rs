@@ -11,7 +11,7 @@ use pages::report::ground::Shot;
 use pages::watch::Watch;
 use survey::coverage::{CoverageMap, CoverageRegion};
 
-use super::vigil::{COVERED_PCT, Vigil};
+use super::watchdog::{COVERED_PCT, Watchdog};
 use super::{Progress, Received};
 
 /// What is said of an aircraft that nobody has heard of.
@@ -32,7 +32,7 @@ pub struct Board<'a> {
     under_way: Vec<Option<(Instant, usize)>>,
     started: Instant,
     told: Option<(usize, usize)>,
-    vigil: Vigil,
+    watchdog: Watchdog,
     /// Percent of each region that the newest model covers.
     covered: Vec<Option<u32>>,
 }
@@ -59,7 +59,7 @@ impl<'a> Board<'a> {
             under_way: vec![None; ids.len()],
             started: Instant::now(),
             told: None,
-            vigil: Vigil::new(mission, out),
+            watchdog: Watchdog::new(mission, out),
             covered: vec![None; ids.len()],
         }
     }
@@ -90,15 +90,15 @@ impl<'a> Board<'a> {
             if let Some(received) = here {
                 self.look(i, received);
             }
-            let sign = progress.signs.get(i).copied().unwrap_or_default();
+            let heard = progress.last_heard.get(i).copied().unwrap_or_default();
             let finished = here.is_some_and(|r| r.finished);
-            for line in self.vigil.look(i, &sign, finished, self.covered[i], Instant::now()) {
+            for line in self.watchdog.look(i, &heard, finished, self.covered[i], Instant::now()) {
                 // The log's warnings stand on the page and in the report, too.
                 tracing::warn!("{line}");
             }
-            let (short, trouble) = (self.short[i], self.vigil.state(i));
+            let (short, trouble) = (self.short[i], self.watchdog.state(i));
             self.watch.craft(i, |craft| {
-                craft.battery = sign.word.and_then(|word| word.battery_pct).or(craft.battery);
+                craft.battery = heard.condition.and_then(|condition| condition.battery_pct).or(craft.battery);
                 (craft.chunks, craft.schedule.left_s) = (under_way, left_s);
                 craft.bytes = here.map(|r| r.size);
                 craft.schedule.progress = under_way.map(|(n, of)| n as f32 / of.max(1) as f32);
@@ -108,7 +108,7 @@ impl<'a> Board<'a> {
                     (Some(r), None) if r.finished => "final model is here",
                     (_, Some(_)) => "sending a model",
                     (Some(_), None) => "checkpoint is here, still flying or training",
-                    (None, None) if sign.ago.is_some() => "no model is here yet",
+                    (None, None) if heard.ago.is_some() => "no model is here yet",
                     (None, None) => NOTHING,
                 };
                 craft.state = trouble.unwrap_or(craft.state);
@@ -192,8 +192,8 @@ impl<'a> Board<'a> {
 mod tests {
     use std::time::Duration;
 
-    use uplink::receive::Sign;
-    use uplink::word::Condition;
+    use uplink::heartbeat::Condition;
+    use uplink::receive::LastHeard;
 
     use super::super::tests::mission;
     use super::*;
@@ -224,7 +224,7 @@ mod tests {
                 transfers: Vec::new(),
                 bytes: 0,
                 received: models,
-                signs: Vec::new(),
+                last_heard: Vec::new(),
             });
             board.watch().freeze().aircraft.iter().map(|craft| craft.state).collect::<Vec<_>>()
         };
@@ -246,10 +246,11 @@ mod tests {
         let mut board = Board::new(&mission, &folder.path().join("out"));
         let half = received(folder.path(), "west", [[-40, -20], [-32, 20]], false);
         let mut state = |ago_s: u64| {
-            let heard = |ago_s| Sign { ago: Some(Duration::from_secs(ago_s)), word: Some(Condition::default()) };
-            let signs = vec![heard(ago_s), heard(1)];
+            let heard =
+                |ago_s| LastHeard { ago: Some(Duration::from_secs(ago_s)), condition: Some(Condition::default()) };
+            let last_heard = vec![heard(ago_s), heard(1)];
             let (transfers, received) = (Vec::new(), vec![half.clone()]);
-            board.round(&Progress { finished: 0, aircraft: 2, transfers, bytes: 0, received, signs });
+            board.round(&Progress { finished: 0, aircraft: 2, transfers, bytes: 0, received, last_heard });
             board.watch().freeze().aircraft.iter().map(|craft| craft.state).collect::<Vec<_>>()
         };
         let flying = ["checkpoint is here, still flying or training", "no model is here yet"];

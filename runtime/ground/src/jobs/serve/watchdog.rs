@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use config::mission::Mission;
-use uplink::receive::Sign;
-use uplink::word::Condition;
+use uplink::heartbeat::Condition;
+use uplink::receive::LastHeard;
 
 /// An aircraft that covered less of its region than this did not do what it was to do, percent.
 pub const COVERED_PCT: u32 = 75;
@@ -47,8 +47,8 @@ struct Standing {
     over: Option<Instant>,
 }
 
-/// Watches over the aircraft of a mission.
-pub(super) struct Vigil {
+/// Watches the aircraft of a mission.
+pub(super) struct Watchdog {
     ids: Vec<String>,
     out: PathBuf,
     silence: Duration,
@@ -62,7 +62,7 @@ pub(super) struct Vigil {
     state: Vec<Option<&'static str>>,
 }
 
-impl Vigil {
+impl Watchdog {
     pub(super) fn new(mission: &Mission, out: &Path) -> Self {
         let ids: Vec<String> = mission.aircraft.iter().map(|a| a.id.clone()).collect();
         let (silence_s, checkpoint_s) = (mission.ground.silence_s, mission.upload.checkpoint_s);
@@ -88,22 +88,22 @@ impl Vigil {
     pub(super) fn look(
         &mut self,
         i: usize,
-        sign: &Sign,
+        heard: &LastHeard,
         finished: bool,
         covered_pct: Option<u32>,
         now: Instant,
     ) -> Vec<String> {
-        if let Some(ago) = sign.ago {
+        if let Some(ago) = heard.ago {
             let at = now.checked_sub(ago).unwrap_or(now);
             self.first = Some(self.first.map_or(at, |first| first.min(at)));
         }
-        let word = sign.word.unwrap_or_default();
-        let covered = covered_pct.max(word.covered_pct.map(u32::from));
+        let condition = heard.condition.unwrap_or_default();
+        let covered = covered_pct.max(condition.covered_pct.map(u32::from));
         let mut said = Vec::new();
         self.state[i] = None;
         for (k, trouble) in Trouble::ALL.into_iter().enumerate().rev() {
             // Of an aircraft whose last model is here the model tells.
-            let stands = !finished && self.stands(trouble, sign, &word, covered, now);
+            let stands = !finished && self.stands(trouble, heard, &condition, covered, now);
             if stands {
                 self.state[i] = Some(trouble.state());
             }
@@ -111,7 +111,7 @@ impl Vigil {
             if stands {
                 standing.over = None;
                 if !std::mem::replace(&mut standing.told, true) {
-                    said.push(self.line(i, trouble, sign, covered));
+                    said.push(self.line(i, trouble, heard, covered));
                 }
             } else if standing.told && (finished || now.duration_since(*standing.over.get_or_insert(now)) >= CALM) {
                 *standing = Standing::default();
@@ -121,24 +121,34 @@ impl Vigil {
         said
     }
 
-    fn stands(&self, trouble: Trouble, sign: &Sign, word: &Condition, covered: Option<u32>, now: Instant) -> bool {
-        match (trouble, sign.ago) {
+    fn stands(
+        &self,
+        trouble: Trouble,
+        heard: &LastHeard,
+        condition: &Condition,
+        covered: Option<u32>,
+        now: Instant,
+    ) -> bool {
+        match (trouble, heard.ago) {
             // It never took off, or its link never came up.
             (Trouble::Silent, None) => {
                 self.has_network && self.first.is_some_and(|first| now.duration_since(first) > self.silence)
             }
-            (Trouble::Silent, Some(ago)) if sign.word.is_some() => ago > self.silence,
+            (Trouble::Silent, Some(ago)) if heard.condition.is_some() => ago > self.silence,
             (Trouble::Silent, Some(ago)) => self.rare.is_some_and(|rare| ago > rare),
-            (Trouble::BatteryLow, _) => word.battery_low,
-            (Trouble::LinkLost, _) => word.link_lost,
-            (Trouble::LandedShort, _) => word.landed && covered.is_some_and(|percent| percent < COVERED_PCT),
+            (Trouble::BatteryLow, _) => condition.battery_low,
+            (Trouble::LinkLost, _) => condition.link_lost,
+            (Trouble::LandedShort, _) => condition.landed && covered.is_some_and(|percent| percent < COVERED_PCT),
         }
     }
 
-    fn line(&self, i: usize, trouble: Trouble, sign: &Sign, covered: Option<u32>) -> String {
+    fn line(&self, i: usize, trouble: Trouble, heard: &LastHeard, covered: Option<u32>) -> String {
         let id = &self.ids[i];
-        let charge = sign.word.and_then(|word| word.battery_pct).map_or(String::new(), |pct| format!(" ({pct} %)"));
-        let what = match (trouble, sign.ago) {
+        let charge = heard
+            .condition
+            .and_then(|condition| condition.battery_pct)
+            .map_or(String::new(), |pct| format!(" ({pct} %)"));
+        let what = match (trouble, heard.ago) {
             (Trouble::Silent, None) => {
                 format!("nothing is heard of {id}, {:.0} s after another one was", self.silence.as_secs_f64())
             }
@@ -177,46 +187,50 @@ mod tests {
 
     const OUT: &str = "ground";
 
-    fn vigil(network: bool) -> Vigil {
+    fn watchdog(network: bool) -> Watchdog {
         let folder = tempfile::tempdir().expect("temp dir");
         let mut mission = mission(folder.path());
         if network {
             mission.upload.listen = vec!["tcp/127.0.0.1:7447".into()];
         }
-        Vigil::new(&mission, Path::new(OUT))
+        Watchdog::new(&mission, Path::new(OUT))
     }
 
-    fn heard(ago_s: f64, condition: Condition) -> Sign {
-        Sign { ago: Some(Duration::from_secs_f64(ago_s)), word: Some(condition) }
+    fn heard(ago_s: f64, condition: Condition) -> LastHeard {
+        LastHeard { ago: Some(Duration::from_secs_f64(ago_s)), condition: Some(condition) }
     }
 
     #[test]
     fn who_falls_silent_is_named_once_with_what_to_do_and_once_more_when_it_is_heard_again() {
-        let (mut vigil, start) = (vigil(true), Instant::now());
+        let (mut watchdog, start) = (watchdog(true), Instant::now());
         let at = |s: u64| start + Duration::from_secs(s);
-        assert!(vigil.look(0, &heard(2.0, Condition::default()), false, Some(48), at(5)).is_empty());
-        assert!(vigil.look(0, &heard(59.0, Condition::default()), false, Some(48), at(62)).is_empty());
-        let said = vigil.look(0, &heard(61.0, Condition::default()), false, Some(48), at(64));
+        assert!(watchdog.look(0, &heard(2.0, Condition::default()), false, Some(48), at(5)).is_empty());
+        assert!(watchdog.look(0, &heard(59.0, Condition::default()), false, Some(48), at(62)).is_empty());
+        let said = watchdog.look(0, &heard(61.0, Condition::default()), false, Some(48), at(64));
         let wanted = "west has not been heard of for 61 s; 48 % of its region is covered; if it does not go on, \
                       `dgtr survey --after ground --without west` deals the rest to the others";
-        assert_eq!((said, vigil.state(0)), (vec![wanted.to_owned()], Some("silent")));
-        assert!(vigil.look(0, &heard(300.0, Condition::default()), false, Some(48), at(303)).is_empty(), "once");
+        assert_eq!((said, watchdog.state(0)), (vec![wanted.to_owned()], Some("silent")));
+        assert!(watchdog.look(0, &heard(300.0, Condition::default()), false, Some(48), at(303)).is_empty(), "once");
         // It flaps for less than ten seconds, then it is back.
-        assert!(vigil.look(0, &heard(1.0, Condition::default()), false, Some(48), at(310)).is_empty());
-        assert!(vigil.look(0, &heard(61.0, Condition::default()), false, Some(48), at(312)).is_empty());
-        assert!(vigil.look(0, &heard(1.0, Condition::default()), false, Some(48), at(320)).is_empty());
-        let said = vigil.look(0, &heard(1.0, Condition::default()), false, Some(48), at(330));
-        assert_eq!((said, vigil.state(0)), (vec!["west is heard of again".to_owned()], None));
-        assert_eq!(vigil.look(0, &heard(70.0, Condition::default()), false, None, at(400)).len(), 1, "a second time");
+        assert!(watchdog.look(0, &heard(1.0, Condition::default()), false, Some(48), at(310)).is_empty());
+        assert!(watchdog.look(0, &heard(61.0, Condition::default()), false, Some(48), at(312)).is_empty());
+        assert!(watchdog.look(0, &heard(1.0, Condition::default()), false, Some(48), at(320)).is_empty());
+        let said = watchdog.look(0, &heard(1.0, Condition::default()), false, Some(48), at(330));
+        assert_eq!((said, watchdog.state(0)), (vec!["west is heard of again".to_owned()], None));
+        assert_eq!(
+            watchdog.look(0, &heard(70.0, Condition::default()), false, None, at(400)).len(),
+            1,
+            "a second time"
+        );
     }
 
     #[test]
     fn who_is_never_heard_is_named_where_a_network_leads_and_not_where_models_come_on_a_stick() {
         for (network, named) in [(true, 1), (false, 0)] {
-            let (mut vigil, start) = (vigil(network), Instant::now());
-            vigil.look(1, &heard(0.0, Condition::default()), false, None, start);
-            assert!(vigil.look(0, &Sign::default(), false, None, start + Duration::from_secs(50)).is_empty());
-            let said = vigil.look(0, &Sign::default(), false, None, start + Duration::from_secs(61));
+            let (mut watchdog, start) = (watchdog(network), Instant::now());
+            watchdog.look(1, &heard(0.0, Condition::default()), false, None, start);
+            assert!(watchdog.look(0, &LastHeard::default(), false, None, start + Duration::from_secs(50)).is_empty());
+            let said = watchdog.look(0, &LastHeard::default(), false, None, start + Duration::from_secs(61));
             assert_eq!(said.len(), named, "{said:?}");
             assert!(said.iter().all(|line| line.starts_with("nothing is heard of west, 60 s after another one")));
         }
@@ -224,20 +238,20 @@ mod tests {
 
     #[test]
     fn a_low_battery_a_lost_autopilot_and_a_landing_short_of_the_region_are_named_each_once() {
-        let (mut vigil, now) = (vigil(true), Instant::now());
+        let (mut watchdog, now) = (watchdog(true), Instant::now());
         let low = Condition { battery_pct: Some(14), battery_low: true, covered_pct: Some(40), ..Condition::default() };
-        let said = vigil.look(0, &heard(1.0, low), false, None, now);
+        let said = watchdog.look(0, &heard(1.0, low), false, None, now);
         assert!(said[0].starts_with("the battery of west is low (14 %); 40 % of its region is covered"), "{said:?}");
         let lost = Condition { link_lost: true, ..low };
-        let said = vigil.look(0, &heard(1.0, lost), false, None, now);
+        let said = watchdog.look(0, &heard(1.0, lost), false, None, now);
         assert!(said.len() == 1 && said[0].starts_with("the computer of west does not hear"), "{said:?}");
         let landed = Condition { landed: true, battery_low: true, covered_pct: Some(52), ..Condition::default() };
-        let said = vigil.look(0, &heard(1.0, landed), false, Some(30), now);
+        let said = watchdog.look(0, &heard(1.0, landed), false, Some(30), now);
         assert!(said.len() == 1 && said[0].starts_with("west has landed and left ground; 52 %"), "{said:?}");
         let whole = Condition { covered_pct: Some(99), ..landed };
-        assert!(vigil.look(1, &heard(1.0, Condition { battery_low: false, ..whole }), false, None, now).is_empty());
+        assert!(watchdog.look(1, &heard(1.0, Condition { battery_low: false, ..whole }), false, None, now).is_empty());
         // The last model is here: that tells.
-        assert!(vigil.look(0, &heard(500.0, landed), true, Some(52), now).is_empty());
-        assert_eq!(vigil.state(0), None);
+        assert!(watchdog.look(0, &heard(500.0, landed), true, Some(52), now).is_empty());
+        assert_eq!(watchdog.state(0), None);
     }
 }
