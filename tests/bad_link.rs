@@ -199,6 +199,8 @@ pub fn certificates(dir: &Path, name: &str) -> config::upload::TlsSettings {
     let (certificate, key_path) = (dir.join(format!("{name}.pem")), dir.join(format!("{name}.key")));
     std::fs::write(&certificate, signed.pem()).expect("write");
     std::fs::write(&key_path, key.serialize_pem()).expect("write");
+    // As it is to be kept.
+    std::fs::set_permissions(&key_path, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its own");
     config::upload::TlsSettings { authority: ca_path, certificate, key: key_path }
 }
 

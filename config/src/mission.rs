@@ -340,6 +340,18 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
         assert!(refused("id = \"a1\"", "id = \"a1\"\nsystem_id = 0").contains("system_id"));
     }
 
+    #[test]
+    fn aircraft_whose_names_differ_in_capitals_alone_would_share_a_folder_of_a_stick_and_are_refused() {
+        let (head, aircraft) = GOOD.split_once("[[aircraft]]").expect("an aircraft");
+        for (id, wanted) in [("A1", false), ("a1", false), ("b1", true)] {
+            let other = aircraft.replace("\"a1\"", &format!("\"{id}\""));
+            let both = format!("{head}[[aircraft]]{aircraft}[[aircraft]]{other}");
+            let read = Mission::parse(&both, Path::new("/m")).map_err(|e| e.to_string());
+            let told = read.as_ref().err().is_some_and(|e| e.contains("aircraft[1].id") && e.contains("capitals"));
+            assert_eq!((read.is_ok(), told), (wanted, !wanted), "{id}: {read:?}");
+        }
+    }
+
     /// `[link]` was read but never checked: with NaN, and with 0, the link counted as lost for ever.
     #[test]
     fn every_table_is_checked_and_the_setting_is_named_by_its_path() {
@@ -416,7 +428,9 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
         let key = |n: u8| format!("public_key = \"{}\"", PublicKey([n; 32]));
         let twice = format!("ground = {{ {} }}\n[[aircraft]]\n{}", key(3), key(3));
         assert!(refused("[[aircraft]]", &twice).contains("nobody else's"));
-        assert!(refused("id = \"a1\"", &format!("id = \"ground\"\n{}", key(4))).contains("ground.key"));
+        for id in ["ground", "Ground"] {
+            assert!(refused("id = \"a1\"", &format!("id = \"{id}\"\n{}", key(4))).contains("ground.key"));
+        }
         assert!(refused("id = \"a1\"", "id = \"a1\"\npublic_key = \"abc\"").contains("64 hexadecimal digits"));
     }
 

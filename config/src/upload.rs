@@ -78,7 +78,7 @@ record! {
         pub authority: PathBuf;
         /// This end's certificate.
         pub certificate: PathBuf;
-        /// This end's private key.
+        /// This end's private key; a file that others may read is refused.
         pub key: PathBuf;
     }
 }

@@ -69,7 +69,7 @@ pub enum FormatError {
         path: PathBuf,
     },
     /// The content makes no sense.
-    #[error("{}: {}", shown(path), escaped(what))]
+    #[error("{}: {}", shown(path), disk::escaped(what))]
     Invalid {
         /// The file.
         path: PathBuf,
@@ -172,18 +172,12 @@ pub fn without_mark(bytes: &[u8]) -> &[u8] {
 
 /// What another library says, on one line: decoders' and ONNX Runtime's messages span several.
 pub fn one_line(error: impl std::fmt::Display) -> String {
-    escaped(&error.to_string().split_whitespace().collect::<Vec<_>>().join(" "))
+    disk::escaped(&error.to_string().split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
 /// A path within an error's line: a line end in a name, which a file may have chosen, begins no line of its own.
 pub(crate) fn shown(path: &Path) -> String {
-    escaped(&path.to_string_lossy())
-}
-
-/// What a file chose of an error's line, or a parser quotes of it: no line ends in it, and nothing that a terminal obeys.
-pub fn escaped(text: &str) -> String {
-    let escaped = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
-    text.chars().map(escaped).collect()
+    disk::escaped(&path.to_string_lossy())
 }
 
 /// Writes a file whole or not at all, see [`Disk::replace`].

@@ -231,9 +231,24 @@ fn decode_stored(path: &Path) -> Result<DynamicImage, PictureError> {
     if let Some(mut decoder) = webp::open(path)? {
         return webp::decode(path, &mut decoder);
     }
+    stored(path)?.decode().map_err(|e| undecoded(path, e))
+}
+
+/// What decodes a picture that is neither a JPEG nor a WebP, once the JPEGs within it are known to be whole.
+fn stored(path: &Path) -> Result<ImageReader<BufReader<File>>, PictureError> {
     let mut reader = open(path)?;
+    let unread = |e: std::io::Error| bad(path, format!("cannot be read ({e}); copy it again"));
+    if reader.format() == Some(ImageFormat::Tiff)
+        && let Some(flaw) = tiff::flaw(path).map_err(unread)?
+    {
+        return Err(cut(path, flaw));
+    }
     reader.limits(limits());
-    reader.decode().map_err(|e| undecoded(path, e))
+    Ok(reader)
+}
+
+fn cut(path: &Path, flaw: &str) -> PictureError {
+    bad(path, format!("is cut off or damaged ({flaw}); copy it again"))
 }
 
 /// The picture at another size, each pixel the mean of those it covers; one of that size already is returned as it is.
@@ -262,7 +277,7 @@ fn jpeg(path: &Path) -> Result<Option<Vec<u8>>, PictureError> {
     file.take(MAX_FILE).read_to_end(&mut bytes).map_err(io)?;
     match jpeg::flaw(&bytes) {
         None => Ok(Some(bytes)),
-        Some(flaw) => Err(bad(path, format!("is cut off or damaged ({flaw}); copy it again"))),
+        Some(flaw) => Err(cut(path, flaw)),
     }
 }
 

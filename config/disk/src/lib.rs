@@ -19,12 +19,14 @@ mod operations;
 pub mod plan;
 pub mod regular;
 mod remedy;
+mod shown;
 pub mod table;
 
 pub use lines::Lines;
 pub use lock::FolderLock;
 pub use operations::{Operations, Output, System};
 pub use remedy::{Told, told};
+pub use shown::{Escaping, escaped};
 
 /// What every temporary file's name begins with.
 const TEMPORARY: &str = ".dgtr-";

@@ -40,14 +40,15 @@ impl Mission {
         }
         for (i, a) in self.aircraft.iter().enumerate() {
             let at = |e: SettingError| e.at(&format!("aircraft[{i}]"));
-            if self.aircraft[..i].iter().any(|b| b.id == a.id) {
-                return Err(at(SettingError::new("id", &a.id, "the only one of its name")));
+            // A stick with FAT has one folder for both.
+            if self.aircraft[..i].iter().any(|b| b.id.eq_ignore_ascii_case(&a.id)) {
+                return Err(at(SettingError::new("id", &a.id, "the only one of its name, in capitals or not")));
             }
             let mut others = self.aircraft[..i].iter().map(|b| b.public_key).chain([self.ground.public_key]);
             if a.public_key.is_some() && others.any(|key| key == a.public_key) {
                 return Err(at(SettingError::new("public_key", &a.public_key, "nobody else's")));
             }
-            if a.public_key.is_some() && a.id == "ground" {
+            if a.public_key.is_some() && a.id.eq_ignore_ascii_case("ground") {
                 return Err(at(SettingError::new(
                     "id",
                     &a.id,

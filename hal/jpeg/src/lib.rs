@@ -12,8 +12,8 @@ const NO_END: &str = "its end marker is missing";
 const CUT: &str = "its scan ends before the picture does";
 const DAMAGED: &str = "its scan holds what no picture has";
 
-/// What is missing or wrong: the end marker, or blocks of the picture. The scans of progressive pictures and of those with arithmetic
-/// coding are not looked into; what lies behind the end marker does not matter, nor do end markers of previews within a segment.
+/// What is missing or wrong: the end marker, or blocks of the picture. The scans of pictures with arithmetic coding are not looked into,
+/// which the decoders in use refuse; what lies behind the end marker does not matter, nor do end markers of previews within a segment.
 pub fn flaw(jpeg: &[u8]) -> Option<&'static str> {
     Walk::default().through(jpeg).err()
 }
@@ -51,7 +51,7 @@ impl Walk {
             let content = jpeg.get(at + 2..at + length).unwrap_or_default();
             at += length;
             match marker {
-                0xC0 | 0xC1 => self.frame = Frame::read(content),
+                0xC0..=0xC2 => self.frame = Frame::read(content, marker == 0xC2),
                 0xC4 => self.tables(content),
                 0xDD => self.restart = content.first_chunk().map_or(0, |n| u16::from_be_bytes(*n).into()),
                 0xDA => at = self.scan(content, jpeg, at)?,
@@ -73,14 +73,13 @@ impl Walk {
     /// Where the next marker is behind a scan.
     fn scan(&mut self, header: &[u8], jpeg: &[u8], from: usize) -> Result<usize, &'static str> {
         let data = jpeg.get(from..).ok_or(NO_END)?;
-        let walked = match &mut self.frame {
-            Some(frame) => frame.walk(header, &self.dc, &self.ac, self.restart, data)?,
-            None => 0,
-        };
-        if walked == 0 {
+        let frame = self.frame.as_mut();
+        let walked = frame.map_or(Ok(None), |f| f.walk(header, &self.dc, &self.ac, self.restart, data))?;
+        if walked.is_none() {
             // Its tables are known to the decoder alone, as those of a film's pictures.
             self.frame = None;
         }
+        let walked = walked.unwrap_or(0);
         let end = scan::end(&data[walked..]).ok_or(NO_END)?;
         if walked > 0 && scan::is_damaged(&data[walked..walked + end], walked) {
             return Err(DAMAGED);

@@ -50,22 +50,62 @@ fn a_picture_cut_anywhere_is_found_out_whatever_ends_it() {
     }
 }
 
+/// 61 x 45 pixels in ten scans, colours at half the size, by libjpeg-turbo.
+const PROGRESSIVE: &[u8] = include_bytes!("../data/progressive.jpg");
+
+#[test]
+fn a_progressive_picture_cut_anywhere_is_found_out_whatever_ends_it() {
+    assert_eq!(flaw(PROGRESSIVE), None);
+    let scans: Vec<usize> = (0..PROGRESSIVE.len()).filter(|at| PROGRESSIVE[*at..].starts_with(&[0xFF, 0xDA])).collect();
+    assert_eq!(scans.len(), 10);
+    for keep in scans[0] + 14..PROGRESSIVE.len() - 32 {
+        let ended = [&PROGRESSIVE[..keep], &[0xFF, 0xD9]].concat();
+        // Within a header the end marker is none.
+        if PROGRESSIVE[keep - 1] != 0xFF {
+            assert!(flaw(&ended).is_some(), "{keep}");
+        }
+    }
+    // Between two scans everything is whole that is there.
+    for scan in &scans[1..] {
+        assert_eq!(flaw(&[&PROGRESSIVE[..*scan], &[0xFF, 0xD9]].concat()), Some(CUT), "{scan}");
+    }
+    let decoded = image::load_from_memory(&[&PROGRESSIVE[..scans[1]], &[0xFF, 0xD9]].concat());
+    assert!(decoded.is_ok_and(|d| d.width() == 61), "a decoder notices nothing");
+}
+
+/// Each could take the time of a whole picture.
+#[test]
+fn a_picture_of_more_scans_than_encoders_write_is_refused() {
+    let at = |from: usize| from + PROGRESSIVE[from..].windows(2).position(|w| w == [0xFF, 0xDA]).expect("a scan");
+    let first = at(0);
+    let second = at(first + 2);
+    let repeated = |times: usize| {
+        let all = vec![&PROGRESSIVE[first..second]; times].concat();
+        [&PROGRESSIVE[..first], &all, &PROGRESSIVE[second..]].concat()
+    };
+    assert_eq!((flaw(&repeated(100)), flaw(&repeated(300))), (None, Some(DAMAGED)));
+}
+
 #[test]
 fn a_hole_in_a_scan_is_found_out() {
     let jpeg = encoded(&picture(320, 240), 90);
     let (from, to) = (jpeg.len() / 2, 3 * jpeg.len() / 4);
     assert!(flaw(&[&jpeg[..from], &jpeg[to..]].concat()).is_some());
+    // As a disk leaves it that lost a part: zeros are short codes, so that the picture is complete before its scan is.
+    let zeros = vec![0; to - from];
+    assert_eq!(flaw(&[&jpeg[..from], &zeros, &jpeg[to..]].concat()), Some(DAMAGED));
 }
 
 #[test]
 fn tables_and_headers_that_are_none_end_in_time_and_find_no_fault_of_their_own() {
-    let jpeg = encoded(&picture(64, 48), 90);
-    for at in 2..jpeg.len().min(700) {
-        for value in [0, 1, 0x7F, 0xFF] {
-            let mut other = jpeg.clone();
-            other[at] = value;
-            // Whatever it says, it says it.
-            let _ = flaw(&other);
+    for jpeg in [encoded(&picture(64, 48), 90), PROGRESSIVE.to_vec()] {
+        for at in 2..jpeg.len() {
+            for value in [0, 1, 0x7F, 0xFF] {
+                let mut other = jpeg.clone();
+                other[at] = value;
+                // Whatever it says, it says it.
+                let _ = flaw(&other);
+            }
         }
     }
     assert_eq!((flaw(&[]), flaw(&[0xFF, 0xD8])), (Some(NO_END), Some(NO_END)));

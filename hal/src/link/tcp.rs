@@ -281,6 +281,59 @@ mod tests {
         drop(silent);
     }
 
+    /// So many connections to `here`, all of them taken.
+    fn connected(here: &mut TcpLink, count: usize) -> std::vec::Vec<TcpStream> {
+        let port = here.local().expect("its port");
+        let all = (0..count).map(|_| TcpStream::connect(port).expect("listening")).collect();
+        let until = Instant::now() + Duration::from_secs(10);
+        while here.connections.len() < count && Instant::now() < until {
+            let _ = here.read(&mut [0; 64], Duration::from_millis(10)).expect("open");
+        }
+        assert_eq!(here.connections.len(), count);
+        all
+    }
+
+    fn age(here: &mut TcpLink, by: Duration) {
+        here.connections.iter_mut().for_each(|c| c.since = c.since.checked_sub(by).expect("up for longer"));
+    }
+
+    #[test]
+    fn who_has_not_proven_himself_in_time_is_sent_away_and_the_pinned_one_stays() {
+        let mut here = TcpLink::listen("127.0.0.1:0").expect("a port");
+        let others = connected(&mut here, 3);
+        let autopilot = here.connections[1].peer;
+        here.pin(autopilot);
+        age(&mut here, PROOF_TIME - GRACE);
+        let _ = here.read(&mut [0; 64], Duration::from_millis(10)).expect("open");
+        assert_eq!(here.connections.len(), 3, "there is time left");
+        age(&mut here, GRACE);
+        let _ = here.read(&mut [0; 64], Duration::from_millis(10)).expect("a stranger's end is no end");
+        assert!(matches!(&here.connections[..], [one] if one.peer == autopilot));
+        drop(others);
+    }
+
+    #[test]
+    fn of_too_many_the_oldest_who_said_nothing_makes_room_and_never_the_pinned_one() {
+        let mut here = TcpLink::listen("127.0.0.1:0").expect("a port");
+        let mut all = connected(&mut here, CONNECTIONS);
+        let peers: std::vec::Vec<_> = here.connections.iter().map(|c| c.peer).collect();
+        // The two that have been here for longest: one is pinned, the other speaks as an autopilot does.
+        here.pin(peers[0]);
+        here.vouch(peers[1]);
+        age(&mut here, GRACE);
+        let port = here.local().expect("its port");
+        all.push(TcpStream::connect(port).expect("listening"));
+        let newest = all[CONNECTIONS].local_addr().expect("connected");
+        let until = Instant::now() + Duration::from_secs(10);
+        while !here.connections.iter().any(|c| c.peer == newest) && Instant::now() < until {
+            let _ = here.read(&mut [0; 64], Duration::from_millis(10)).expect("open");
+        }
+        let kept: std::vec::Vec<_> = here.connections.iter().map(|c| c.peer).collect();
+        let expected: std::vec::Vec<_> =
+            peers.iter().copied().filter(|peer| *peer != peers[2]).chain([newest]).collect();
+        assert_eq!(kept, expected);
+    }
+
     #[test]
     fn once_pinned_a_peer_is_answered_and_kept_whoever_else_connects() {
         let mut here = TcpLink::listen("127.0.0.1:0").expect("a port");

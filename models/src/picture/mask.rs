@@ -1,10 +1,11 @@
 //! Mask files: a second picture of the same view, black where nothing is to be learnt.
 
+use std::io::Cursor;
 use std::path::Path;
 
-use image::{DynamicImage, ImageFormat, Limits};
+use image::{DynamicImage, ImageFormat, ImageReader};
 
-use super::{MAX_EDGE, PictureError, bad, open};
+use super::{PictureError, bad, jpeg, limits, stored};
 use crate::formats::one_line;
 use crate::mask::Mask;
 
@@ -20,14 +21,15 @@ impl Mask {
     pub fn read(path: &Path) -> Result<Self, PictureError> {
         let damaged =
             |e: image::ImageError| bad(path, format!("cannot be decoded ({}); mend or remove this mask", one_line(e)));
-        let mut reader = open(path)?;
-        let mut limits = Limits::default();
-        limits.max_image_width = Some(MAX_EDGE);
-        limits.max_image_height = Some(MAX_EDGE);
-        limits.max_alloc = Some(u64::from(MAX_EDGE) * u64::from(MAX_EDGE) * 3);
-        reader.limits(limits);
-        let least = if reader.format() == Some(ImageFormat::Jpeg) { BLACK } else { 1 };
-        let grey = match reader.decode().map_err(damaged)? {
+        let (decoded, least) = match jpeg(path)? {
+            Some(bytes) => {
+                let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg);
+                reader.limits(limits());
+                (reader.decode(), BLACK)
+            }
+            None => (stored(path)?.decode(), 1),
+        };
+        let grey = match decoded.map_err(damaged)? {
             // A 16-bit value below 128 would be rounded to black.
             DynamicImage::ImageLuma16(image) => {
                 return Ok(Self::from_fn(image.width(), image.height(), |x, y| image.get_pixel(x, y).0[0] > 0));
@@ -61,5 +63,18 @@ mod tests {
         let deep = ImageBuffer::<Luma<u16>, _>::from_fn(32, 16, |x, _| Luma([if left(x) { 0u16 } else { 9 }]));
         deep.save(dir.path().join("deep.png")).unwrap();
         read("deep.png");
+    }
+
+    /// What is missing would be grey: white, and learnt from.
+    #[test]
+    fn a_mask_that_is_cut_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.jpg");
+        GrayImage::from_fn(96, 64, |x, y| Luma([(x * y * 7 + 31 * x) as u8])).save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        assert!(Mask::read(&path).is_ok());
+        std::fs::write(&path, [&whole[..2 * whole.len() / 3], &[0xFF, 0xD9]].concat()).unwrap();
+        assert!(image::open(&path).is_ok(), "a decoder notices nothing");
+        assert!(Mask::read(&path).is_err_and(|e| e.to_string().contains("is cut off or damaged")));
     }
 }

@@ -1,6 +1,5 @@
 //! XML of other people's files, parsed without following elements nested by the thousand: the parser calls itself for each.
 
-use models::formats::escaped;
 use roxmltree::Document;
 
 /// Elements within elements that are followed; the XMP of cameras has five.
@@ -14,7 +13,7 @@ pub fn parse(text: &str) -> Result<Document<'_>, String> {
     if !is_shallow(text) {
         return Err(format!("its elements are nested more than {MOST_NESTED} deep, or one does not end"));
     }
-    Document::parse(text).map_err(|e| escaped(&e.to_string()))
+    Document::parse(text).map_err(|e| disk::escaped(&e.to_string()))
 }
 
 /// Whether no element of `xml` lies deeper than the parser may follow; false for markup that does not end.

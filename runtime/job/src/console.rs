@@ -80,6 +80,7 @@ pub fn install(verbose: u8, quiet: bool, format: Format, trace: Option<Trace>) {
 
 /// One error line on standard error, above any bar.
 pub fn error(line: &str) {
+    let line = &said(line);
     let line = match FORMAT.get() {
         Some(Format::Json) => {
             let mut time = String::new();
@@ -93,6 +94,21 @@ pub fn error(line: &str) {
     // A log line that cannot be written has nowhere to be reported.
     drop(Line(line.into_bytes()));
 }
+
+/// An error as a line that people can read: what names within it would make a terminal do is written out, and what is longer than a
+/// screen is left out of its middle, as the remedy ends it.
+fn said(line: &str) -> String {
+    let line = disk::escaped(line);
+    let (all, end) = (line.chars().count(), LONGEST / 4);
+    if all <= LONGEST {
+        return line;
+    }
+    let part = |from: usize, count: usize| line.chars().skip(from).take(count).collect::<String>();
+    format!("{} … {}", part(0, LONGEST - end), part(all - end, end))
+}
+
+/// Characters of an error's line.
+const LONGEST: usize = 4096;
 
 /// Warnings that are kept for the page, and characters of each.
 const KEPT: usize = 24;
@@ -253,6 +269,14 @@ mod tests {
     fn a_line_end_in_a_name_forges_no_log_line() {
         assert_eq!(one_line(b" INFO key frame 1: a\nINFO forged\r\n\n"), b" INFO key frame 1: a\\nINFO forged\\r\\n\n");
         assert_eq!(one_line(b" INFO plain\n"), b" INFO plain\n");
+    }
+
+    #[test]
+    fn an_error_is_one_line_of_a_screens_length_with_nothing_that_a_terminal_obeys() {
+        assert_eq!(said("a\u{1b}[2J\nINFO b.toml: check the path"), "a\\u{1b}[2J\\nINFO b.toml: check the path");
+        let long = said(&format!("name = \"{}\": must be short", "\u{e9}".repeat(1 << 20)));
+        assert_eq!(long.chars().count(), LONGEST + 3);
+        assert!(long.starts_with("name = \"\u{e9}") && long.ends_with("\": must be short"), "{long}");
     }
 
     #[test]

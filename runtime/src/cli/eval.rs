@@ -117,7 +117,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
             (Some(m), Some(d)) => format!("  {} {d:.4}", m.name()),
             _ => String::new(),
         };
-        outln!("{:<28} {}{distance}", v.name, figures(v.psnr, v.psnr_colors_fitted, v.ssim));
+        outln!("{:<28} {}{distance}", disk::escaped(&v.name), figures(v.psnr, v.psnr_colors_fitted, v.ssim));
     }
     let row = |what: &str, s: &Scores| outln!("{what:<28} {}", figures(s.psnr, s.psnr_colors_fitted, s.ssim));
     row(&format!("mean of {} views", scores.views.len()), &scores);

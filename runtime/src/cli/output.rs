@@ -1,8 +1,8 @@
 //! Results on standard output. Whoever reads them may have enough (`dgtr plan | head`): the rest is then for nobody, and no error. What
 //! cannot be written for another reason is one, once the command has done its work.
 
-use std::fmt::Arguments;
-use std::io::{Error, ErrorKind, Write};
+use std::fmt::{Arguments, Write as _};
+use std::io::{Error, ErrorKind, Write as _};
 use std::sync::OnceLock;
 
 use super::CliError;
@@ -24,10 +24,14 @@ macro_rules! outln {
 
 pub use {out, outln};
 
-/// Writes `text` to standard output, unless that failed before.
+/// Writes `text` to standard output, unless that failed before. Names within it are other people's: what they would make a terminal do is
+/// written out, but for line ends, of which a name on a line of its own is rid by [`disk::escaped`].
 pub fn write(text: Arguments<'_>) {
+    let mut safe = String::new();
+    // Writing into a String cannot fail.
+    let _ = disk::Escaping::new(&mut safe, |c| c.is_control() && !matches!(c, '\n' | '\t')).write_fmt(text);
     if FAILED.get().is_none()
-        && let Err(e) = std::io::stdout().lock().write_fmt(text)
+        && let Err(e) = std::io::stdout().lock().write_all(safe.as_bytes())
     {
         _ = FAILED.set(e);
     }

@@ -186,7 +186,7 @@ fn print(answer: &Answer<'_>) {
     outln!("{:<24} {:>12} {:>20} {:>20} {:>20}", "name", "area m²", "cut m³", "fill m³", "net m³");
     for v in answer.volumes {
         let [cut, fill, net] = [v.cut_m3, v.fill_m3, v.net_m3].map(|m| format!("{:.2} ± {:.2}", m.value, m.sigma));
-        outln!("{:<24} {:>12.2} {cut:>20} {fill:>20} {net:>20}", v.name, v.area_m2);
+        outln!("{:<24} {:>12.2} {cut:>20} {fill:>20} {net:>20}", disk::escaped(&v.name), v.area_m2);
         if v.unseen_m2 > 0.01 * v.area_m2 {
             tracing::warn!(
                 "{}: the map holds no height on {:.0} % of it; the volumes are of the rest",

@@ -14,6 +14,8 @@ use crate::keys::Identity;
 
 /// Distinct refusals that are remembered; beyond it they are only counted by kind.
 const MAX_REMEMBERED: usize = 256;
+/// Those of them whose words somebody without a key may have chosen: he leaves room for what is said of the mission's own aircraft.
+const MAX_OF_STRANGERS: usize = 128;
 
 /// Why a model that arrived whole does not count.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -78,6 +80,13 @@ impl Refusals {
         self.add(why, 1);
     }
 
+    /// As [`Refusals::count`], for what nobody has signed.
+    pub fn count_of_a_stranger(&mut self, why: String) {
+        if self.0.len() < MAX_OF_STRANGERS || self.0.contains_key(&why) {
+            self.count(why);
+        }
+    }
+
     fn add(&mut self, why: String, times: u64) {
         if self.0.len() < MAX_REMEMBERED || self.0.contains_key(&why) {
             *self.0.entry(why).or_default() += times;
@@ -91,5 +100,22 @@ impl Refusals {
 
     pub(super) fn absorb(&mut self, other: Self) {
         other.0.into_iter().for_each(|(why, n)| self.add(why, n));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whatever_strangers_show_there_is_room_for_why_an_aircrafts_model_does_not_count() {
+        let mut refusals = Refusals::default();
+        (0..10_000).for_each(|size| refusals.count_of_a_stranger(format!("model of {size} bytes")));
+        for _ in 0..3 {
+            refusals.count("west's final model is not of this session".into());
+        }
+        let ours = refusals.iter().find(|(why, _)| why.starts_with("west"));
+        assert_eq!(ours.map(|(_, times)| times), Some(3));
+        assert!(refusals.iter().count() <= MAX_REMEMBERED);
     }
 }

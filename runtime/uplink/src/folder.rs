@@ -112,6 +112,15 @@ impl FolderOutlet {
         Ok(())
     }
 
+    /// Whether a chunk lies there whole. What was there before this start may be what a power cut left of it, or somebody else's: it is
+    /// read once.
+    fn has(&self, path: &Path, hash: &Hash, bytes: u64) -> bool {
+        match self.current {
+            Some(_) => std::fs::symlink_metadata(path).is_ok_and(|m| m.is_file() && m.len() == bytes),
+            None => read_bounded(path, bytes).is_ok_and(|found| blake3::hash(&found) == *hash),
+        }
+    }
+
     fn drop_stale_chunks(&self, offer: &Offer) {
         let Ok(entries) = std::fs::read_dir(self.dir.join("chunk")) else { return };
         let keep: std::collections::HashSet<String> = offer.chunks.iter().chain(&self.previous).map(hex).collect();
@@ -145,8 +154,7 @@ impl Outlet for FolderOutlet {
         std::fs::create_dir_all(&chunks).map_err(TransportError::io(&chunks))?;
         for (index, hash) in model.offer.chunks.iter().enumerate() {
             let path = chunks.join(hex(hash));
-            let whole = std::fs::metadata(&path).is_ok_and(|m| m.len() == model.offer.chunk_len(index));
-            if !whole {
+            if !self.has(&path, hash, model.offer.chunk_len(index)) {
                 let bytes = model.chunk(index).map_err(TransportError::io(&path))?;
                 write_whole(&path, &bytes).map_err(TransportError::io(&path))?;
                 self.sent += bytes.len() as u64;
@@ -308,7 +316,8 @@ mod tests {
         let path = dir.join("model");
         std::fs::write(&path, noise(40_000, 1)).expect("written");
         let order = Order { flight: 1, counter: 1 };
-        Arc::new(OfferedModel::open(&path, &Default::default(), source, order, true).expect("a model"))
+        let settings = config::upload::UploadSettings { chunk_kib: 16, ..Default::default() };
+        Arc::new(OfferedModel::open(&path, &settings, source, order, true).expect("a model"))
     }
 
     #[test]
@@ -355,6 +364,28 @@ mod tests {
             let written = ["receipt", "a1/receipt", SESSION].map(|name| elsewhere.join(name).exists());
             assert_eq!(written, [false; 3], "{linked}");
         }
+    }
+
+    /// For the aircraft what lies on the stick is delivered; the ground refuses a chunk with other bytes.
+    #[test]
+    fn a_chunk_of_the_right_length_with_other_bytes_or_behind_a_link_is_written_anew() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (stick, source) = (dir.path().join("stick"), Source::unsigned("m", "a1"));
+        let model = offered(dir.path(), &source);
+        let chunks = stick.join("m/a1/chunk");
+        let at = |index: usize| chunks.join(hex(&model.offer.chunks[index]));
+        let whole = |index: usize| model.chunk(index).expect("a chunk");
+        std::fs::create_dir_all(&chunks).expect("made");
+        // As a power cut leaves a file: its length is there, its content is not.
+        std::fs::write(at(0), vec![0; whole(0).len()]).expect("written");
+        let away = dir.path().join("away");
+        std::fs::write(&away, whole(1)).expect("written");
+        symlink(&away, at(1)).expect("linked");
+        FolderOutlet::new(&stick, source).offer(&model).expect("offered");
+        for index in 0..model.offer.chunks.len() {
+            assert!(!at(index).is_symlink() && std::fs::read(at(index)).is_ok_and(|b| b == whole(index)), "{index}");
+        }
+        assert_eq!(std::fs::read(&away).expect("read"), whole(1));
     }
 
     #[test]

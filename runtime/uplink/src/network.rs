@@ -76,14 +76,7 @@ fn open(
         },
     });
     let tls = match &settings.tls {
-        Some(tls) => Some(serde_json::json!({
-            "root_ca_certificate": tls.authority,
-            "enable_mtls": true,
-            "listen_certificate": tls.certificate,
-            "listen_private_key": tls.key,
-            "connect_certificate": tls.certificate,
-            "connect_private_key": tls.key,
-        })),
+        Some(own) => Some(certificates::of_files(own)?),
         None if settings.has_tls() => certificates::settings(identity, id)?,
         None => None,
     };

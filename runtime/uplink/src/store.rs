@@ -265,7 +265,11 @@ impl Store {
         // There may be none.
         let _ = self.disk.remove(&self.preview_path());
         let keep: std::collections::HashSet<String> = offer.iter().flat_map(|o| &o.chunks).map(hex).collect();
-        let Ok(entries) = std::fs::read_dir(self.dir.join("chunk")) else { return };
+        let chunks = self.dir.join("chunk");
+        if !std::fs::symlink_metadata(&chunks).is_ok_and(|m| m.is_dir()) {
+            return;
+        }
+        let Ok(entries) = std::fs::read_dir(chunks) else { return };
         for entry in entries.flatten() {
             if entry.file_name().to_str().is_some_and(|name| is_hash(name) && !keep.contains(name)) {
                 // Left-overs cost room, nothing else.

@@ -1,5 +1,6 @@
 //! A folder that all workers reach: a disk, NFS.
 
+use std::fs::DirEntry;
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -75,11 +76,17 @@ impl Folder {
         self.disk.remove(&self.path.join(name)).map_err(|e| self.failed(name, "removing", e))
     }
 
-    /// Removes what `is_kept` does not hold of a folder of it. Only for a folder that nobody else works in.
+    /// What lies in a folder of it. Nothing behind a link: whoever reaches the store would choose what is removed elsewhere.
+    fn within(&self, folder: &str) -> impl Iterator<Item = DirEntry> + use<> {
+        let path = self.path.join(folder);
+        let is_its_own = std::fs::symlink_metadata(&path).is_ok_and(|m| m.is_dir());
+        is_its_own.then(|| std::fs::read_dir(path).ok()).flatten().into_iter().flatten().flatten()
+    }
+
+    /// Removes what is named by a hash in a folder of it and `is_kept` does not hold of. Only for a folder that nobody else works in.
     pub fn keep_only(&self, folder: &str, is_kept: &dyn Fn(&str) -> bool) {
-        let Ok(entries) = std::fs::read_dir(self.path.join(folder)) else { return };
-        for entry in entries.flatten() {
-            if !entry.file_name().to_str().is_some_and(is_kept) {
+        for entry in self.within(folder) {
+            if entry.file_name().to_str().is_some_and(|name| is_digits(name, 64) && !is_kept(name)) {
                 // Left over it costs room, nothing else.
                 let _ = self.disk.remove(&entry.path());
             }
@@ -88,11 +95,11 @@ impl Folder {
 
     /// Removes what was left half written so long ago.
     pub fn sweep(&self, left: Duration) {
-        let Ok(entries) = std::fs::read_dir(self.path.join(WRITING)) else { return };
         let is_old = |at: SystemTime| at.elapsed().is_ok_and(|age| age >= left);
-        for entry in entries.flatten() {
+        for entry in self.within(WRITING) {
             let changed = entry.metadata().and_then(|m| m.modified());
-            if entry.path() != self.aside && changed.is_ok_and(is_old) {
+            let is_a_workers = entry.file_name().to_str().is_some_and(|name| is_digits(name, 16));
+            if is_a_workers && entry.path() != self.aside && changed.is_ok_and(is_old) {
                 let _ = std::fs::remove_dir_all(entry.path());
             }
         }
@@ -104,6 +111,11 @@ impl Drop for Folder {
         // Only when it is empty; the one above it may be wanted by others this very moment.
         let _ = std::fs::remove_dir(&self.aside);
     }
+}
+
+/// Whether a name has so many hexadecimal digits and nothing else: 16 that of a worker's folder, 64 what is named by a hash.
+fn is_digits(name: &str, count: usize) -> bool {
+    name.len() == count && name.bytes().all(|b| b.is_ascii_hexdigit())
 }
 
 /// A number that no other worker has.

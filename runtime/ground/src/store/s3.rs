@@ -266,18 +266,23 @@ mod tests {
 
     #[test]
     fn a_server_that_stalls_before_or_in_its_answer_or_drips_is_given_up_after_few_tries() {
+        // Servers that had held on for as long as they do.
+        let waited_out = Arc::new(AtomicUsize::new(0));
         let hold = |bytes: &'static [u8], drips: bool| {
+            let waited_out = waited_out.clone();
             server(move |mut stream| {
+                let waited_out = waited_out.clone();
                 std::thread::spawn(move || {
                     let _ = stream.read(&mut [0; 4096]);
                     let _ = stream.write_all(bytes);
                     // Longer than anybody waits.
-                    for _ in 0..100 {
+                    for _ in 0..600 {
                         std::thread::sleep(Duration::from_millis(50));
                         if drips && stream.write_all(b"x").is_err() {
                             return;
                         }
                     }
+                    waited_out.fetch_add(1, Ordering::SeqCst);
                 });
             })
         };
@@ -288,6 +293,7 @@ mod tests {
                 bucket(at, Duration::from_millis(200)).range("cells/a", 0, 5000).expect_err("it stalls").to_string();
             assert!(line.contains("cells/a: reading failed") && !line.contains('\n'), "{line}");
             assert_eq!(met.load(Ordering::SeqCst), SILENT_TRIES as usize);
+            assert_eq!(waited_out.load(Ordering::SeqCst), 0, "somebody waited for the server's end");
         }
     }
 }

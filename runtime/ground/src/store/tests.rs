@@ -47,6 +47,35 @@ fn a_write_that_fails_leaves_what_was_there() {
 }
 
 #[test]
+fn nothing_is_removed_behind_a_link_or_of_a_name_that_no_worker_has() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let [store, away] = ["store", "away"].map(|name| dir.path().join(name));
+    let (worker, cell) = ("7".repeat(16), "c".repeat(64));
+    for folder in [store.clone(), away.join(&worker)] {
+        std::fs::create_dir_all(folder).expect("made");
+    }
+    std::fs::write(away.join(&cell), b"mine").expect("written");
+    let swept = Store::folder(&store);
+    for name in ["cells", "writing"] {
+        std::os::unix::fs::symlink(&away, store.join(name)).expect("linked");
+    }
+    swept.keep_only("cells", &|_| false);
+    assert!(away.join(&cell).exists() && away.join(&worker).exists());
+    // In folders of its own it removes what a worker left and cells that are not kept, and nothing else.
+    for (folder, ours) in [("cells", &cell), ("writing", &worker)] {
+        std::fs::remove_file(store.join(folder)).expect("removed");
+        std::fs::create_dir_all(store.join(folder).join("photos")).expect("made");
+        let place = store.join(folder).join(ours);
+        if folder == "writing" { std::fs::create_dir(place) } else { std::fs::write(place, b"") }.expect("made");
+    }
+    std::fs::write(store.join("cells/notes"), b"").expect("written");
+    swept.keep_only("cells", &|_| false);
+    for (folder, theirs, ours) in [("cells", "notes", &cell), ("writing", "photos", &worker)] {
+        assert!(store.join(folder).join(theirs).exists() && !store.join(folder).join(ours).exists(), "{folder}");
+    }
+}
+
+#[test]
 fn a_place_that_is_none_is_named() {
     for place in ["s3://", "s3:///prefix"] {
         let refused = Store::open(place).err().expect("refused");

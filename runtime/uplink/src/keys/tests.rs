@@ -51,8 +51,15 @@ fn an_identity_is_refused_with_the_wrong_the_missing_or_a_garbled_key() {
     assert!(!Identity::of(&mission(dir.path(), [None, None]), "a1").expect("unsigned").is_signed());
     let swapped = mission(dir.path(), [Some(a1), Some(ground)]);
     assert!(Identity::of(&swapped, "a1").is_err_and(|e| matches!(e, KeyError::Mismatch { .. })));
-    std::fs::write(private_path(&folder, "a1"), "not a key").expect("write");
-    assert!(Identity::of(&good, "a1").is_err_and(|e| matches!(e, KeyError::Format(_))));
+    // Zeros are what a disk leaves that lost the key, and a key that anybody has.
+    let zeros = format!("{PRIVATE} {}\n", "0".repeat(64));
+    for garbled in ["not a key", &zeros] {
+        std::fs::write(private_path(&folder, "a1"), garbled).expect("write");
+        let all_have = mission(dir.path(), [Some(ground), Some(public(&SigningKey::from_bytes(&[0; 32])))]);
+        for mission in [&good, &all_have] {
+            assert!(Identity::of(mission, "a1").is_err_and(|e| matches!(e, KeyError::Format(_))), "{garbled}");
+        }
+    }
     std::fs::remove_file(private_path(&folder, "a1")).expect("remove");
     assert!(Identity::of(&good, "a1").is_err_and(|e| e.to_string().contains("dgtr keys")));
 }

@@ -1,8 +1,13 @@
 //! TLS without certificates to hand out: each end makes its own certificate from the key that it signs with, and believes
 //! those of the keys in the mission file. Nothing but what `dgtr keys` made has to be copied.
 
+use std::fs::File;
+use std::io::{Error, ErrorKind, Read};
+use std::path::Path;
+
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
+use config::upload::TlsSettings;
 use rcgen::{
     CertificateParams, DistinguishedName, DnType, Issuer, KeyPair, PKCS_ED25519, PublicKeyData, SignatureAlgorithm,
     date_time_ymd,
@@ -37,6 +42,35 @@ fn contents(id: &str) -> Result<CertificateParams, rcgen::Error> {
     Ok(contents)
 }
 
+/// Bound on a file of certificates: some hundred of them.
+const MOST_BYTES: u64 = 1 << 20;
+const TOO_LONG: &str = "is longer than any file of certificates; name another one in [upload.tls]";
+
+/// zenoh's TLS settings with the certificates of the user's own authority.
+///
+/// # Errors
+/// A file is not there, is no regular one, is too long, or is a private key that others may read.
+pub(super) fn of_files(tls: &TlsSettings) -> Result<serde_json::Value, TransportError> {
+    let read = |path: &Path, file: std::io::Result<File>| {
+        let mut bytes = Vec::new();
+        let read = file.and_then(|file| file.take(MOST_BYTES + 1).read_to_end(&mut bytes));
+        match read.map_err(TransportError::io(path))? as u64 <= MOST_BYTES {
+            true => Ok(STANDARD.encode(bytes)),
+            false => Err(TransportError::io(path)(Error::new(ErrorKind::InvalidInput, TOO_LONG))),
+        }
+    };
+    let public = |path: &Path| read(path, disk::regular::open(path));
+    let (certificate, key) = (public(&tls.certificate)?, read(&tls.key, disk::regular::open_secret(&tls.key))?);
+    Ok(serde_json::json!({
+        "root_ca_certificate_base64": public(&tls.authority)?,
+        "enable_mtls": true,
+        "listen_certificate_base64": certificate,
+        "listen_private_key_base64": key,
+        "connect_certificate_base64": certificate,
+        "connect_private_key_base64": key,
+    }))
+}
+
 /// zenoh's TLS settings for the end called `id`: an aircraft believes the ground, the ground every aircraft. `None` in a mission
 /// without keys.
 ///
@@ -63,4 +97,43 @@ pub(super) fn settings(identity: &Identity, id: &str) -> Result<Option<serde_jso
         "connect_certificate_base64": certificate,
         "connect_private_key_base64": private,
     })))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn a_certificates_key_that_others_may_read_and_a_pipe_in_the_place_of_a_file_are_refused_in_one_line() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| dir.path().join(name);
+        let tls = TlsSettings { authority: at("ca.pem"), certificate: at("own.pem"), key: at("own.key") };
+        let files = [&tls.authority, &tls.certificate, &tls.key];
+        let refused = |what: &str, file: &Path| {
+            let line = of_files(&tls).expect_err(what).to_string();
+            let named = line.contains(&*file.to_string_lossy()) && line.contains(what);
+            assert!(named && !line.contains('\n'), "{line}");
+        };
+        files.iter().for_each(|file| std::fs::write(file, b"x").expect("written"));
+        let mode = |mode| std::fs::set_permissions(&tls.key, Permissions::from_mode(mode)).expect("its own");
+        mode(0o644);
+        refused("chmod 600", &tls.key);
+        mode(0o600);
+        assert_eq!(of_files(&tls).expect("settings")["connect_private_key_base64"], STANDARD.encode(b"x"));
+        for file in files {
+            let whole = std::fs::read(file).expect("read");
+            std::fs::remove_file(file).expect("removed");
+            refused("No such file", file);
+            rustix::fs::mknodat(rustix::fs::CWD, file, rustix::fs::FileType::Fifo, 0o600.into(), 0).expect("a pipe");
+            refused("no regular file", file);
+            std::fs::remove_file(file).expect("removed");
+            std::fs::write(file, vec![b'x'; MOST_BYTES as usize + 1]).expect("written");
+            mode(0o600);
+            refused("is longer", file);
+            std::fs::write(file, whole).expect("written");
+        }
+    }
 }

@@ -1,6 +1,6 @@
 //! Strangers on the network: whoever speaks in another's name, and whoever answers faster than the one who was asked.
 
-use std::io::Write;
+use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -203,14 +203,33 @@ fn connections_that_say_nothing_keep_no_aircraft_out() {
     let port = free_port();
     let settings = settings(&format!("tcp/127.0.0.1:{port}"));
     let mut r = ground(&settings, &["a1"], &Identity::unsigned(), &dir.path().join("g"));
-    let idle: Vec<_> =
-        (0..200).map(|_| std::net::TcpStream::connect(("127.0.0.1", port)).expect("listening")).collect();
+    let idle = || {
+        let stream = std::net::TcpStream::connect(("127.0.0.1", port)).expect("listening");
+        stream.set_nonblocking(true).expect("its own");
+        stream
+    };
+    let mut all: Vec<_> = (0..200).map(|_| idle()).collect();
     let path = dir.path().join("m.dgtr");
     std::fs::write(&path, noise(100_000, 4)).expect("write");
-    let a1 = Offerer::start(&settings, source("a1", &Identity::unsigned())).expect("offerer");
-    a1.offer_final(&path);
-    assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?}", r.counters);
-    drop(idle);
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            // Whoever is sent away comes again.
+            while !is_over.load(Ordering::Relaxed) {
+                for stream in &mut all {
+                    if !matches!(stream.read(&mut [0]), Err(e) if e.kind() == std::io::ErrorKind::WouldBlock) {
+                        *stream = idle();
+                    }
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        });
+        let a1 = Offerer::start(&settings, source("a1", &Identity::unsigned())).expect("offerer");
+        a1.offer_final(&path);
+        let is_here = receive(&mut r, LIMIT, |r| r.all_finished());
+        is_over.store(true, Ordering::Relaxed);
+        assert!(is_here, "{:?}", r.counters);
+    });
 }
 
 /// Every handshake that failed held up all others for a tenth of a second: whoever begins ten a second kept everybody out.

@@ -149,7 +149,7 @@ impl Look {
                         Ok(()) => (self.heard, self.is_fresh) = (Instant::now(), true),
                         Err(e) => {
                             counters.count_refusal(&e);
-                            refusals.count(e.to_string());
+                            refusals.count_of_a_stranger(e.to_string());
                         }
                     }
                 }
