@@ -95,8 +95,8 @@ pub fn error(line: &str) {
     drop(Line(line.into_bytes()));
 }
 
-/// An error as a line that people can read: what names within it would make a terminal do is written out, and what is longer than a
-/// screen is left out of its middle, as the remedy ends it.
+/// An error as a line that people can read. What names within it would make a terminal do is written out. Of a line that is longer than
+/// a screen the middle is left out: its end is the remedy.
 fn said(line: &str) -> String {
     let line = disk::escaped(line);
     let (all, end) = (line.chars().count(), LONGEST / 4);

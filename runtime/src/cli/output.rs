@@ -24,8 +24,8 @@ macro_rules! outln {
 
 pub use {out, outln};
 
-/// Writes `text` to standard output, unless that failed before. Names within it are other people's: what they would make a terminal do is
-/// written out, but for line ends, of which a name on a line of its own is rid by [`disk::escaped`].
+/// Writes `text` to standard output, unless that failed before. What names within it would make a terminal do is written out. Line ends
+/// are left: who prints a name that may hold one calls [`disk::escaped`].
 pub fn write(text: Arguments<'_>) {
     let mut safe = String::new();
     // Writing into a String cannot fail.

@@ -94,6 +94,28 @@ fn cameras_whose_names_lead_out_of_the_folder_of_results_are_drawn_in_it() {
     }
 }
 
+#[test]
+fn what_a_name_would_make_a_terminal_do_reaches_neither_output_nor_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut cloud = GaussianCloud::with_capacity(0, 1);
+    cloud.push([0.0; 3], [-1.0; 3], [1.0, 0.0, 0.0, 0.0], 3.0, &[0.5; 3]);
+    model::write(&dir.path().join("m.dgtr"), &ModelHeader::default(), &cloud).unwrap();
+    let name = "a\u{1b}[2J\u{9b}31m\u{7}.ply";
+    let written = ended(dir.path(), &["export", "m.dgtr", "--to", "ply", "--out", name, "-q"]);
+    assert!(written.status.success() && dir.path().join(name).exists());
+    // The file is called so; it is shown as this.
+    let shown = "a\\u{1b}[2J\\u{9b}31m\\u{7}";
+    let told = String::from_utf8(written.stdout).unwrap();
+    assert!(told.starts_with(&format!("{shown}.ply: 1 Gaussians")) && told.ends_with('\n'), "{told:?}");
+    let missing = "a\u{1b}[2J\u{9b}31m\u{7}\nINFO all is well.toml";
+    let refused = ended(dir.path(), &["plan", "--mission", missing]);
+    let line = error_line(&refused);
+    assert!(line.contains(shown) && line.contains("INFO all is well.toml"), "{line:?}");
+    for told in [told.trim_end(), &line] {
+        assert!(!told.contains(|c: char| c.is_control()), "{told:?}");
+    }
+}
+
 fn names_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).unwrap();
     let mut names: Vec<String> = entries.map(|e| e.unwrap().file_name().to_string_lossy().into_owned()).collect();

@@ -112,8 +112,8 @@ impl FolderOutlet {
         Ok(())
     }
 
-    /// Whether a chunk lies there whole. What was there before this start may be what a power cut left of it, or somebody else's: it is
-    /// read once.
+    /// Whether a chunk lies there whole. What was there before this start is read once: a power cut may have left half of it, or somebody
+    /// something else.
     fn has(&self, path: &Path, hash: &Hash, bytes: u64) -> bool {
         match self.current {
             Some(_) => std::fs::symlink_metadata(path).is_ok_and(|m| m.is_file() && m.len() == bytes),
