@@ -92,7 +92,7 @@ pub enum ProcessorKernels {
     /// Functions of this program.
     #[default]
     Native,
-    /// Those of the software driver, as on any other device.
+    /// Kernels of the software driver, as on any other device.
     Driver,
 }
 

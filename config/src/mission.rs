@@ -177,7 +177,7 @@ impl Mission {
     /// As [`Mission::read`], with the text that was read.
     ///
     /// # Errors
-    /// Those of [`Mission::read`].
+    /// Errors of [`Mission::read`].
     pub fn read_with_text(path: &Path) -> Result<(Self, String), MissionError> {
         let at = |source| MissionError::Unreadable { path: path.into(), source };
         let mut text = String::new();

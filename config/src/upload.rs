@@ -20,7 +20,7 @@ choice! {
         /// Rounded and entropy-coded, about a thirtieth of that (`models/FORMATS.md`); 1.1 kB of `memory.host_mib` per
         /// Gaussian are planned for the encoding.
         Delivery = "delivery",
-        /// The same, rounded more finely, for what is seen from near: a third more bytes than `delivery`.
+        /// Quantised more finely than `delivery`, for what is seen from near: a third more bytes than `delivery`.
         Fine = "fine",
     }
 }

@@ -224,7 +224,7 @@ impl Autopilot {
     /// As [`PoseSource::pose_at`], but takes what there is when nothing better will come.
     ///
     /// # Errors
-    /// Those of [`PoseSource::pose_at`].
+    /// Errors of [`PoseSource::pose_at`].
     pub fn pose_near(&self, boot_ns: u64) -> Result<BodyPose, PoseError> {
         self.track.pose_near(boot_ns)
     }

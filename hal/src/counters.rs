@@ -64,7 +64,7 @@ pub struct TelemetryCounters {
 pub struct ExposureCounters {
     /// Exposures announced.
     pub triggers: u64,
-    /// The same exposure announced again, or by a second message.
+    /// An exposure announced again, or by a second message.
     pub trigger_duplicates: u64,
     /// Announcements missing by their counter.
     pub trigger_gaps: u64,
@@ -94,7 +94,7 @@ pub struct PictureCounters {
     pub pictures_overexposed: u64,
     /// Pictures left out because they were of one colour.
     pub pictures_constant: u64,
-    /// The same picture again.
+    /// A picture that was there before.
     pub picture_duplicates: u64,
     /// Pictures without an exposure.
     pub pictures_unmatched: u64,
@@ -108,16 +108,16 @@ pub struct PictureCounters {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "std", derive(serde::Serialize))]
 pub struct HalCounters {
-    /// Those of the link.
+    /// Counters of the link.
     #[cfg_attr(feature = "std", serde(flatten))]
     pub link: LinkCounters,
-    /// Those of the telemetry.
+    /// Counters of the telemetry.
     #[cfg_attr(feature = "std", serde(flatten))]
     pub telemetry: TelemetryCounters,
-    /// Those of the exposures.
+    /// Counters of the exposures.
     #[cfg_attr(feature = "std", serde(flatten))]
     pub exposures: ExposureCounters,
-    /// Those of the pictures.
+    /// Counters of the pictures.
     #[cfg_attr(feature = "std", serde(flatten))]
     pub pictures: PictureCounters,
     /// Frames given to the runtime.

@@ -70,7 +70,7 @@ pub enum Reason {
     NoTrigger,
     /// No picture came for this exposure.
     NoPicture,
-    /// The same picture again.
+    /// A picture that was there before.
     Duplicate,
     /// Its number says one exposure, its time another, and no later picture settled it.
     Contradictory,

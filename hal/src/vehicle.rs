@@ -150,7 +150,7 @@ where
     /// The next event, waiting `timeout` at most for one.
     ///
     /// # Errors
-    /// Those of a link that does not reconnect by itself.
+    /// Errors of a link that does not reconnect by itself.
     pub fn poll(&mut self, timeout: Duration) -> Result<Option<Event>, HalError> {
         let deadline = Instant::now() + timeout;
         loop {

@@ -190,7 +190,7 @@ impl GaussianCloud {
         keep
     }
 
-    /// Those of `rows` that cover least, until `budget` of them are left; of equals the first.
+    /// Rows that cover least, until `budget` of them are left; of equals the first.
     pub fn least_covering(&self, rows: Vec<u32>, budget: usize) -> Vec<u32> {
         let over = rows.len().saturating_sub(budget);
         if over == 0 {

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::camera::Intrinsics;
 
-/// The same picture seen through a pinhole with the same intrinsics.
+/// Returns the picture as a pinhole of these intrinsics sees it.
 pub fn undistort(image: &RgbImage, k: &Intrinsics, distortion: &Distortion) -> RgbImage {
     let mut out = RgbImage::new(image.width(), image.height());
     if image.width() == 0 || image.height() == 0 {

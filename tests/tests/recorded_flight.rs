@@ -31,7 +31,7 @@ fn recording() -> PathBuf {
     shared("data/sitl/run8/survey.tlog").unwrap_or_else(piece)
 }
 
-/// The same exposures without the ways there and back.
+/// Exposures without the ways there and back.
 fn piece() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("data/run8_trimmed.tlog")
 }

@@ -198,7 +198,7 @@ impl Recording<'_> {
     /// As [`Self::submit`]; the host looks at the sections of these names next, which a mirror then has at once.
     ///
     /// # Errors
-    /// Those of [`Self::submit`].
+    /// Errors of [`Self::submit`].
     pub fn submit_and_read(self, sections: &[&str]) -> Result<(), GpuError> {
         match self {
             Self::Driver(r) => r.submit_and_read(sections),

@@ -46,7 +46,7 @@ impl Fixture {
     /// Opens both with the device's standard configuration.
     ///
     /// # Errors
-    /// Those of [`Trainer::new`].
+    /// Errors of [`Trainer::new`].
     pub fn new(gpu: &Gpu, plan: &Plan, settings: &TrainSettings) -> Result<Self, TrainError> {
         Trainer::new(gpu, plan, settings).map(Self::from)
     }
@@ -54,7 +54,7 @@ impl Fixture {
     /// Opens both with kernels of `config`.
     ///
     /// # Errors
-    /// Those of [`Trainer::with_config`].
+    /// Errors of [`Trainer::with_config`].
     pub fn with_config(
         gpu: &Gpu,
         plan: &Plan,
@@ -67,7 +67,7 @@ impl Fixture {
     /// Takes a picture in.
     ///
     /// # Errors
-    /// Those of [`PictureStore::add`].
+    /// Errors of [`PictureStore::add`].
     pub fn add_view(&mut self, picture: &PosedImage, prior: Option<&DepthPrior>) -> Result<usize, TrainError> {
         self.pictures.add(self.trainer.device_mut(), picture, prior)
     }
@@ -75,7 +75,7 @@ impl Fixture {
     /// Takes a crop in.
     ///
     /// # Errors
-    /// Those of [`PictureStore::add_crop`].
+    /// Errors of [`PictureStore::add_crop`].
     pub fn add_crop(
         &mut self,
         view: usize,
@@ -89,7 +89,7 @@ impl Fixture {
     /// Replaces a view's depth prior.
     ///
     /// # Errors
-    /// Those of [`PictureStore::set_prior`].
+    /// Errors of [`PictureStore::set_prior`].
     pub fn set_prior(&mut self, index: usize, prior: Option<&DepthPrior>) -> Result<(), TrainError> {
         self.pictures.set_prior(self.trainer.device_mut(), index, prior)
     }
@@ -97,7 +97,7 @@ impl Fixture {
     /// The picture of a view.
     ///
     /// # Errors
-    /// Those of [`PictureStore::image`].
+    /// Errors of [`PictureStore::image`].
     pub fn view_image(&mut self, index: usize) -> Result<RgbImage, TrainError> {
         self.pictures.image(self.trainer.device_mut(), index)
     }
@@ -105,7 +105,7 @@ impl Fixture {
     /// Which of its pixels count.
     ///
     /// # Errors
-    /// Those of [`PictureStore::mask`].
+    /// Errors of [`PictureStore::mask`].
     pub fn view_mask(&mut self, index: usize) -> Result<Option<Mask>, TrainError> {
         self.pictures.mask(self.trainer.device_mut(), index)
     }
@@ -113,7 +113,7 @@ impl Fixture {
     /// Takes a step.
     ///
     /// # Errors
-    /// Those of [`Trainer::step`].
+    /// Errors of [`Trainer::step`].
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         self.trainer.step(&mut self.pictures)
     }
@@ -121,7 +121,7 @@ impl Fixture {
     /// Trains.
     ///
     /// # Errors
-    /// Those of [`Trainer::run`].
+    /// Errors of [`Trainer::run`].
     pub fn run(
         &mut self,
         budget: &RunBudget,
@@ -133,7 +133,7 @@ impl Fixture {
     /// Computes the gradient of a view's loss.
     ///
     /// # Errors
-    /// Those of [`Trainer::gradient`].
+    /// Errors of [`Trainer::gradient`].
     pub fn gradient(&mut self, index: usize, into: &mut GaussianCloud) -> Result<ViewGradients, TrainError> {
         self.trainer.gradient(&mut self.pictures, index, into)
     }

@@ -202,7 +202,7 @@ impl Gpu {
         self.vulkan().map_or(1.0, Vulkan::timestamp_ns)
     }
 
-    /// The same device, were its limits these.
+    /// This device, were its limits these.
     #[cfg(test)]
     pub(crate) fn limited(mut self, limits: DeviceLimits) -> Self {
         let inner = Arc::get_mut(&mut self.inner).expect("nobody else holds this device");
@@ -211,7 +211,7 @@ impl Gpu {
         self
     }
 
-    /// The same device, odd in these ways.
+    /// This device, odd in these ways.
     #[cfg(test)]
     pub(crate) fn forced(mut self, forced: Forced) -> Self {
         let inner = Arc::get_mut(&mut self.inner).expect("nobody else holds this device");

@@ -59,7 +59,7 @@ impl Trainer {
     /// Opens a trainer with the device's standard configuration; else as [`Trainer::with_config`].
     ///
     /// # Errors
-    /// Those of [`Trainer::with_config`].
+    /// Errors of [`Trainer::with_config`].
     pub fn new(gpu: &Gpu, plan: &Plan, settings: &TrainSettings) -> Result<Self, TrainError> {
         Self::with_config(gpu, plan, settings, KernelConfig::standard(gpu.info()))
     }
@@ -122,7 +122,7 @@ impl Trainer {
     /// Loads all pieces in one, of which the host holds one at a time; else as [`Trainer::load`].
     ///
     /// # Errors
-    /// Those of [`Trainer::load`], and those of `pieces`: no Gaussians are there then, where it had begun to replace them.
+    /// Errors of [`Trainer::load`] and of `pieces`: no Gaussians are there then, where it had begun to replace them.
     pub fn load_pieces<E: From<TrainError>>(&mut self, pieces: Pieces<'_, E>) -> Result<LoadReport, E> {
         let report = self.model.load_pieces(&mut self.device, &self.settings, pieces)?;
         self.schedule.restart();
@@ -306,7 +306,7 @@ impl Trainer {
     /// one. Allocates nothing.
     ///
     /// # Errors
-    /// Those of [`Trainer::snapshot`]; the cloud is of no use then.
+    /// Errors of [`Trainer::snapshot`]; the cloud is of no use then.
     pub fn blend_into(&mut self, cloud: &mut GaussianCloud, share: f32) -> Result<(), TrainError> {
         self.model.blend_into(&mut self.device, cloud, share)
     }
@@ -315,7 +315,7 @@ impl Trainer {
     /// does first, so that it gives the same Gaussians until the next step.
     ///
     /// # Errors
-    /// Those of [`Trainer::snapshot`], and those of `take`.
+    /// Errors of [`Trainer::snapshot`] and of `take`.
     pub fn each_piece<E: From<TrainError>>(
         &mut self,
         take: &mut dyn FnMut(&mut GaussianCloud) -> Result<(), E>,
@@ -336,7 +336,7 @@ impl Trainer {
     /// gone (the median, not the mean; 0 where less than half goes): what floats thinly above the ground does not raise it.
     ///
     /// # Errors
-    /// Those of [`Trainer::render`].
+    /// Errors of [`Trainer::render`].
     pub fn render_orthographic(&mut self, view: &OrthographicView, into: &mut Rendering) -> Result<(), TrainError> {
         render::check_orthographic(view)?;
         self.draw((view.width, view.height), into, |frame| frame.look_orthographic(view))

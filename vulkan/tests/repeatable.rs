@@ -1,4 +1,4 @@
-//! The same seed gives the same bytes whatever number of threads the driver uses and whenever a checkpoint is taken, and a long run needs no more memory
+//! One seed gives the same bytes whatever number of threads the driver uses and whenever a checkpoint is taken, and a long run needs no more memory
 //! than a short one. Both are questions to a whole process, so the test starts itself again as a child.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 

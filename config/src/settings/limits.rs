@@ -42,7 +42,7 @@ impl Limits {
         value.is_finite() && std::ops::RangeBounds::contains(&(self.low, self.high), &value)
     }
 
-    /// The same limits for numbers of 32 bits: 0.1 is not the same number there.
+    /// Limits for numbers of 32 bits: 0.1 is another number there.
     pub(super) fn single(&self) -> Self {
         let round = |limit: Bound<f64>| limit.map(|l| f64::from(l as f32));
         Self { low: round(self.low), high: round(self.high) }

@@ -155,7 +155,7 @@ pub fn camera_trigger(boot_us: u64, sequence: u16) -> CAMERA_TRIGGER_DATA {
     CAMERA_TRIGGER_DATA { time_usec: boot_us, seq: sequence.into() }
 }
 
-/// The same exposure as a command to the camera of the system; PX4 sends both this and [`digicam_control`].
+/// An exposure as a command to the camera of the system; PX4 sends both this and [`digicam_control`].
 pub fn image_start_capture(system: u8) -> COMMAND_LONG_DATA {
     COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_IMAGE_START_CAPTURE,
@@ -170,7 +170,7 @@ pub fn image_start_capture(system: u8) -> COMMAND_LONG_DATA {
     }
 }
 
-/// The same exposure in the older way, to every system.
+/// An exposure in the older way, to every system.
 pub fn digicam_control() -> COMMAND_LONG_DATA {
     COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_DO_DIGICAM_CONTROL,

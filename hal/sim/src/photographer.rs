@@ -270,7 +270,7 @@ pub fn to_jpeg(picture: &RgbImage) -> Result<Vec<u8>, SimError> {
     Ok(bytes)
 }
 
-/// The same picture with its light multiplied.
+/// Multiplies the light of a picture.
 fn expose(bytes: &[u8], gain: f32, name: &str) -> Result<Vec<u8>, SimError> {
     let mut picture = image::load_from_memory(bytes)
         .map_err(|e| SimError::Picture { name: name.into(), why: e.to_string() })?

@@ -101,7 +101,7 @@ impl FolderCamera {
     /// As [`FolderCamera::open`], but files written after `since` belong to this flight: it was interrupted then.
     ///
     /// # Errors
-    /// Those of [`FolderCamera::open`].
+    /// Errors of [`FolderCamera::open`].
     pub fn open_since(folder: &Path, since: Option<SystemTime>) -> Result<Self, HalError> {
         let mut camera = Self {
             folder: folder.into(),

@@ -83,7 +83,7 @@ fn walk(file: &mut BufReader<File>) -> std::io::Result<bool> {
     }
 }
 
-/// The same picture with the marker of motion JPEG. Many cameras leave the Huffman tables out of the pictures of a stream,
+/// Gives a picture the marker of motion JPEG. Many cameras leave the Huffman tables out of the pictures of a stream,
 /// because they are always the standard's (ITU-T T.81, annex K.3); a decoder that sees the marker puts them where they are
 /// missing. What is not a JPEG is returned as it is.
 pub(super) fn marked_as_mjpeg(jpeg: &[u8]) -> Vec<u8> {

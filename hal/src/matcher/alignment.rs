@@ -145,13 +145,13 @@ impl Chain<'_> {
         (from..to).map(|p| self.alone(p)).sum()
     }
 
-    /// The same for pictures before the first one that has an exposure.
+    /// For pictures before the first one that has an exposure.
     fn alone_before(&self, from: usize, to: usize) -> f32 {
         let dearest = (from..to).map(|p| self.alone(p)).fold(0.0, f32::max);
         self.alone_between(from, to) - (dearest - AT_THE_END).max(0.0)
     }
 
-    /// The same for pictures behind the last one. In flight none is the last.
+    /// For pictures behind the last one. In flight none is the last.
     fn alone_behind(&self, from: usize, to: usize) -> f32 {
         if self.is_over() { self.alone_before(from, to) } else { self.alone_between(from, to) }
     }

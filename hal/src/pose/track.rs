@@ -151,7 +151,7 @@ impl Track {
     /// and attitude, the uncertainty grown accordingly.
     ///
     /// # Errors
-    /// Those of [`PoseSource::pose_at`].
+    /// Errors of [`PoseSource::pose_at`].
     pub fn pose_near(&self, boot_ns: u64) -> Result<BodyPose, PoseError> {
         self.pose(boot_ns, MAX_EXTRAPOLATION_NS)
     }

@@ -25,7 +25,7 @@ const MARGIN_SHARE: f64 = 0.2;
 /// Exposures of two cameras this close together are one for the pose: at 20 m/s a metre.
 const SAME_NS: u64 = 50_000_000;
 const SAME_SHARE: f64 = 0.8;
-/// The same for two of one rhythm, of both of which a fifth may be lost.
+/// For two cameras of one rhythm, of both of which a fifth may be lost.
 const ECHO_SHARE: f64 = 0.6;
 /// Of fewer exposures nobody can say whether two cameras have one rhythm.
 const TELLING: usize = 8;

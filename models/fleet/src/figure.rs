@@ -41,7 +41,7 @@ impl Paper {
 /// Writes regions, lines and take-off places.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write(out: &mut dyn Write, craft: &[Craft], shares: &[Share]) -> io::Result<()> {
     let flown = craft.iter().zip(shares);
     let ways = flown.flat_map(|(craft, share)| share.sorties.iter().flat_map(|sortie| sortie.path(craft.home)));

@@ -70,7 +70,7 @@ impl Obstacles {
         Ok(this)
     }
 
-    /// The same ones, with ways that stay on the ground inside `outside` and `beyond_m` around it, where there is such a way.
+    /// Obstacles with ways that stay on the ground inside `outside` and `beyond_m` around it, where there is such a way.
     pub fn inside(mut self, outside: &Ring, beyond_m: f64) -> Self {
         if self.sides.is_empty() {
             return self;

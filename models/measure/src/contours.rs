@@ -158,7 +158,7 @@ fn joined(segments: &[[(usize, DVec2); 2]]) -> Vec<(Vec<DVec2>, bool)> {
 /// Writes lines as GeoJSON (RFC 7946): in degrees with `reference`, else in the map's own metres, which a member `axes` says.
 ///
 /// # Errors
-/// Those of `out`, or a place outside of the reference system.
+/// Errors of `out`, or a place outside of the reference system.
 pub fn write_geojson(out: &mut dyn Write, contours: &[Contour], reference: Option<&Reference>) -> io::Result<()> {
     write!(out, "{}", collection(reference))?;
     for (k, contour) in contours.iter().enumerate() {
@@ -178,7 +178,7 @@ pub fn write_geojson(out: &mut dyn Write, contours: &[Contour], reference: Optio
 /// lines on a layer of their own.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_dxf(out: &mut dyn Write, contours: &[Contour]) -> io::Result<()> {
     write!(out, "0\nSECTION\n2\nENTITIES\n")?;
     for contour in contours {

@@ -134,7 +134,7 @@ pub fn measure(area: &Area, heights: &Heights, noise: &Noise, below: &Below<'_>)
 /// Writes `volumes` as a table with commas between its cells (RFC 4180), its first line the names of its columns.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_table(out: &mut dyn Write, volumes: &[Volume]) -> io::Result<()> {
     writeln!(
         out,

@@ -11,7 +11,7 @@ use nalgebra::{SMatrix, SVector};
 use super::similarity::Similarity;
 use crate::camera::Pose;
 
-/// The same detail in two models, seen from one place.
+/// A detail that two models have, seen from one place.
 #[derive(Clone, Copy, Debug)]
 pub struct Sighting {
     /// Where both were drawn from, in the frame of `to`.

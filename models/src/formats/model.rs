@@ -99,7 +99,7 @@ pub fn write(path: &Path, header: &ModelHeader, cloud: &GaussianCloud) -> Result
 /// As [`write()`], through `disk`, and the checkpoint before stays as the older of two generations.
 ///
 /// # Errors
-/// Those of [`write()`].
+/// Errors of [`write()`].
 pub fn write_checkpoint(
     disk: &Disk,
     path: &Path,
@@ -125,7 +125,7 @@ pub fn read_checkpoint(disk: &Disk, path: &Path) -> Result<Option<(ModelHeader, 
 /// number of Gaussians it holds.
 ///
 /// # Errors
-/// Those of [`write()`].
+/// Errors of [`write()`].
 pub fn write_rounded(
     disk: &Disk,
     path: &Path,
@@ -216,7 +216,7 @@ pub fn read(path: &Path) -> Result<(ModelHeader, GaussianCloud), FormatError> {
 /// As [`read`], with the BLAKE3 of the content, by which the same model is known again.
 ///
 /// # Errors
-/// Those of [`read`].
+/// Errors of [`read`].
 pub fn read_with_hash(path: &Path) -> Result<(ModelHeader, GaussianCloud, [u8; 32]), FormatError> {
     let mut opened = open(path)?;
     let header = read_header_of(path, &mut opened)?;

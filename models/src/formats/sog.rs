@@ -97,7 +97,7 @@ struct Harmonics<'a> {
 /// Writes `cloud`, atomically; what is to be added to the file's coordinates.
 ///
 /// # Errors
-/// Those of [`encode`], else the operating system's.
+/// Errors of [`encode`], else the operating system's.
 pub fn write(path: &Path, cloud: &GaussianCloud) -> Result<Sog, FormatError> {
     let sog = encode(path, cloud)?;
     write_atomic(path, |out| out.write_all(&sog.bytes))?;

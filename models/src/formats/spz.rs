@@ -51,7 +51,7 @@ pub enum Axes {
     /// Right, up, back, as the format wants them: half a turn about x from the model's.
     #[default]
     Rub,
-    /// Those of the model, as a PLY has them.
+    /// The model's axes, as a PLY has them.
     Own,
 }
 

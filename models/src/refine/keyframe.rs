@@ -101,7 +101,7 @@ pub(crate) struct KeyFrame {
     pub known: Known,
     /// Key points, in pixels of the picture as it is: what the lens is estimated from.
     pub seen: Vec<[f32; 2]>,
-    /// The same as a pinhole would have seen them; none while the lens bends nothing.
+    /// Key points as a pinhole would have seen them; none while the lens bends nothing.
     pub straight: Vec<[f32; 2]>,
     pub colors: Vec<[u8; 3]>,
     /// Key points whose place photometric alignment has settled.

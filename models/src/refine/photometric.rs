@@ -56,7 +56,7 @@ pub(crate) fn align_patch(a: &Side, b: &Side, ground: Ground) -> Option<[f32; 2]
     align_warped(a, b, &|pixel| predict(a.camera, b.camera, ground, pixel)).map(|(place, _)| place)
 }
 
-/// The same for what lies at `world`, be it level or facing the two cameras.
+/// Aligns a patch of what lies at `world`, be it level or facing the two cameras.
 pub(crate) fn align_patch_at(a: &Side, b: &Side, world: DVec3) -> Option<[f32; 2]> {
     let facing = (a.camera.pose.center - world).normalize() + (b.camera.pose.center - world).normalize();
     let on_plane = |normal: DVec3| {
@@ -70,7 +70,7 @@ pub(crate) fn align_patch_at(a: &Side, b: &Side, world: DVec3) -> Option<[f32; 2
     tried.max_by(|x, y| x.1.total_cmp(&y.1)).map(|(place, _)| place)
 }
 
-/// The same with `to_b`, which says where a pixel of `a` lies in `b`; and how well the two patches correlate there.
+/// Aligns a patch by `to_b`, which says where a pixel of `a` lies in `b`; and how well the two patches correlate there.
 fn align_warped(a: &Side, b: &Side, to_b: &dyn Fn([f32; 2]) -> Option<DVec2>) -> Option<([f32; 2], f64)> {
     let place = |s: &Side| DVec2::new(s.at[0].into(), s.at[1].into());
     // How a step in a's picture looks in b's: the plane's derivative, good enough for a patch of 11 pixels.

@@ -54,7 +54,7 @@ impl Refiner {
         Ok(report)
     }
 
-    /// The same where the pictures alone say where they were taken.
+    /// Links all anew where the pictures alone say where they were taken.
     fn look_again(&mut self, report: &mut AddReport) {
         self.forget_counts();
         let clock = std::time::Instant::now();

@@ -115,7 +115,7 @@ impl Refiner {
         self.problem_of(&Part::whole(self.frames.len()), tracks, chosen, max_px)
     }
 
-    /// The same of some key frames, of which some stand still.
+    /// The problem of some key frames, of which some stand still.
     pub(super) fn problem_of(&self, part: &Part, tracks: &Tracks, chosen: &[u32], max_px: f64) -> Problem {
         let s = &self.settings;
         let weight = |sigma: f64| if sigma > 0.0 { 1.0 / sigma } else { 0.0 };
@@ -179,7 +179,7 @@ impl Refiner {
         }
     }
 
-    /// Those of the frames `of` a part that hold few of the sightings they should have had are placed from the points around them.
+    /// Frames `of` a part that hold few of the sightings they should have had are placed from the points around them.
     pub(super) fn replace_strays(
         &mut self,
         (part, of): (&Part, &[u32]),

@@ -143,7 +143,7 @@ impl CoverageMap {
         Ok(Self { rules, grid, cells, ground, base_m: ground_m, extremes, inside, pictures: 0, dropped: 0 })
     }
 
-    /// The same over ground of this height at (east, north), metres; what is not finite stays as it was. Pictures seen before
+    /// Puts the ground at this height at (east, north), metres; what is not finite stays as it was. Pictures seen before
     /// are forgotten.
     #[must_use]
     pub fn over(mut self, height_m: impl Fn(DVec2) -> f64) -> Self {

@@ -73,7 +73,7 @@ fn parts(name: &str) -> Vec<&str> {
     name.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".").collect()
 }
 
-/// The same without the extension.
+/// Returns the name without its extension.
 fn bare(name: &str) -> Vec<String> {
     let mut bare: Vec<String> = parts(name).into_iter().map(str::to_owned).collect();
     if let Some(last) = bare.last_mut()

@@ -50,7 +50,7 @@ fn entry(file: &[u8], name: &str) -> Vec<u8> {
     bytes
 }
 
-/// The same with another pickle.
+/// A file with another pickle.
 fn with_pickle(pickle: &[u8]) -> Vec<u8> {
     let file = saved_by_torch();
     let (names, mut zip) =

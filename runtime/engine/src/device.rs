@@ -153,7 +153,7 @@ pub fn renderer(device: Option<&str>, cloud: &GaussianCloud, width: u32, height:
 /// that is cut short it shows what is there.
 ///
 /// # Errors
-/// Those of [`renderer`], and of [`model::read_what_is_there`].
+/// Errors of [`renderer`], and of [`model::read_what_is_there`].
 pub fn file_renderer(
     device: Option<&str>,
     path: &Path,
@@ -176,7 +176,7 @@ pub fn file_renderer(
 /// A renderer of the blocks of a map, in less memory: where more Gaussians meet, a block is drawn in bands.
 ///
 /// # Errors
-/// Those of [`renderer`]; the model cannot be read any more.
+/// Errors of [`renderer`]; the model cannot be read any more.
 pub fn map_renderer(device: Option<&str>, model: &Chunks) -> Result<Trainer, EngineError> {
     renderer_of_pieces(device, model, (BLOCK, BLOCK), INSTANCES_PER_MAP_PIXEL)
 }

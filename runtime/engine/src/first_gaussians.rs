@@ -35,7 +35,7 @@ pub enum InitKind {
     SparsePoints,
     /// Points at random in what the cameras see.
     Random,
-    /// Those of a model ([`crate::Reconstruction::begin_with`]).
+    /// The Gaussians of a model ([`crate::Reconstruction::begin_with`]).
     Model,
 }
 

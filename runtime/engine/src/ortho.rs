@@ -88,7 +88,7 @@ impl Map {
     /// The map of a model's file, of which a piece is in memory at a time.
     ///
     /// # Errors
-    /// Those of [`Map::of`]; the file cannot be read any more.
+    /// Errors of [`Map::of`]; the file cannot be read any more.
     pub fn of_file(model: &Chunks, request: &MapRequest) -> Result<Self, EngineError> {
         Self::of(&model.header, &model.sample(SAMPLE)?, request)
     }

@@ -39,7 +39,7 @@ pub(crate) fn told(mended: usize) {
 /// Means of the trainer's Gaussians: every so many, at most `most`.
 ///
 /// # Errors
-/// Those of [`Trainer::each_piece`].
+/// Errors of [`Trainer::each_piece`].
 pub(crate) fn means(trainer: &mut Trainer, most: usize) -> Result<Vec<[f32; 3]>, TrainError> {
     let (every, mut at, mut means) = (trainer.gaussians().div_ceil(most).max(1), 0, Vec::new());
     trainer.each_piece::<TrainError>(&mut |piece| {

@@ -184,7 +184,7 @@ impl KeyframeSelector {
     }
 }
 
-/// Those of `frames` of a data set that `rule` makes key frames, and what became of all.
+/// Returns which frames of a data set `rule` makes key frames, and what became of all.
 ///
 /// # Errors
 /// A picture without the pose that was asked for.

@@ -65,7 +65,7 @@ pub struct Learnt {
     pub views: usize,
     /// Those that see a seam and took part.
     pub used: usize,
-    /// Those of them that were kept back from training.
+    /// Views that were kept back from training.
     pub kept_back: usize,
     /// Cells of ground where regions meet.
     pub cells: usize,

@@ -223,7 +223,7 @@ impl Member {
     /// The file as it is, in its own frame.
     ///
     /// # Errors
-    /// Those of [`Member::cloud`].
+    /// Errors of [`Member::cloud`].
     pub fn as_written(&self) -> Result<(ModelHeader, GaussianCloud), AggregateError> {
         let (header, cloud, content) = model::read_with_hash(&self.path)?;
         match content == self.content {

@@ -113,7 +113,7 @@ pub struct Placed {
     pub gain: [f32; 3],
     /// Gaussians of its file.
     pub gaussians: u64,
-    /// Those of them that lie so far from all others that they are in no piece.
+    /// Gaussians that lie so far from all others that they are in no piece.
     pub strays: u64,
     /// SH degree of the pieces.
     pub sh_degree: u8,
@@ -193,7 +193,7 @@ impl Plan {
     /// As [`Plan::read`], where there must be one.
     ///
     /// # Errors
-    /// Those of it; there is none.
+    /// There is no plan, or it cannot be read.
     pub fn of(store: &Store) -> Result<Self, StoreError> {
         Self::read(store)?.ok_or_else(|| StoreError::Missing(NAME.into()))
     }

@@ -180,7 +180,7 @@ fn square_of(p: DVec2, side: f64) -> (i64, i64) {
     ((p.x / side).floor() as i64, (p.y / side).floor() as i64)
 }
 
-/// Those of `among` that may own a point of the square of this side around `middle`, in their order: the nearest, and those no farther
+/// Regions that may own a point of the square of this side around `middle`, in their order: the nearest, and those no farther
 /// than `border_m` beyond it.
 pub fn nearest<'a>(
     among: impl Iterator<Item = (usize, &'a Region)>,

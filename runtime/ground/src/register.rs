@@ -63,7 +63,7 @@ pub struct Registered {
     pub models: Vec<Registration>,
     /// Pairs whose ground overlaps.
     pub pairs: usize,
-    /// Those of them fitted now; the others were known.
+    /// Pairs fitted now; the others were known.
     pub fitted: usize,
     /// Pairs whose fit contradicts the others', and what was known of a pair and could not be used.
     pub warnings: Vec<String>,
@@ -139,7 +139,7 @@ impl<F: Fitter> Registrar<F> {
     /// near enough. Models that overlap no other stay where their GPS put them. Pairs that are in use no more are forgotten.
     ///
     /// # Errors
-    /// Those of [`Registrar::fit`]; the models are then as they were.
+    /// Errors of [`Registrar::fit`]; the models are then as they were.
     pub fn register(
         &mut self,
         members: &mut [Member],

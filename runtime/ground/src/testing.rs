@@ -45,7 +45,7 @@ pub fn united(models: &[LocalModel], budget: usize) -> Merged {
     merged(&mut members, budget)
 }
 
-/// The same, in one square.
+/// Merges models that lie in one square.
 pub fn merged(members: &mut [Member], budget: usize) -> Merged {
     let dir = tempfile::tempdir().expect("temp dir");
     let store = Store::folder(dir.path());

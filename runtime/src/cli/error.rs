@@ -109,7 +109,7 @@ mod tests {
         FormatError::Io { path: "x".into(), action: "writing", source: IoError::from(kind) }
     }
 
-    /// The same cause has the same code, whichever job met it.
+    /// One cause has one code, whichever job met it.
     #[test]
     fn an_error_keeps_its_kind_through_every_job() {
         use ErrorKind::{Device, Failed, Input, Interrupted};

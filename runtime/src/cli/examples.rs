@@ -5,7 +5,7 @@ use clap::Command;
 /// A command's path below the program and its examples.
 pub type Examples = [(&'static str, &'static [&'static str])];
 
-/// Those of `dgtr`.
+/// Examples of `dgtr`.
 pub(super) const EXAMPLES: &Examples = &[
     (
         "train",

@@ -45,7 +45,7 @@ pub(super) fn largest(set: &Dataset, frames: &[usize], scale: f64) -> Result<(u3
     Ok(sizes.iter().max_by_key(|k| k.pixels()).map_or((1, 1), |k| (k.width, k.height)))
 }
 
-/// Those of `frames` that have something to learn from at `scale`; the others are named.
+/// Returns the frames that have something to learn from at `scale`; the others are named.
 ///
 /// # Errors
 /// There is none.

@@ -31,7 +31,7 @@ use crate::keys::{Domain, Identity, SignatureBytes, SignatureError};
 const EVEN: u8 = 2;
 /// With chunks of different lengths.
 const PIECES: u8 = 3;
-/// The same, bound to a session of the ground.
+/// An offer bound to a session of the ground.
 const EVEN_BOUND: u8 = 4;
 const PIECES_BOUND: u8 = 5;
 /// A chunk's length takes so many bytes at most.
@@ -142,7 +142,7 @@ impl Offer {
         bytes
     }
 
-    /// The same offer for a session of the ground, signed anew.
+    /// Returns this offer for a session of the ground, signed anew.
     pub fn bound_to(&self, session: &Hash, identity: &Identity) -> Self {
         let version = if self.is_in_pieces() { PIECES_BOUND } else { EVEN_BOUND };
         let mut bound = Self { version, session: Some(*session), ..self.clone() };
@@ -323,7 +323,7 @@ impl OfferedModel {
         self
     }
 
-    /// The same model under another number.
+    /// Numbers this model anew.
     ///
     /// # Errors
     /// The open file cannot be shared.

@@ -56,7 +56,7 @@ pub struct ReceiveCounters {
     pub corrupt: u64,
     /// Failed attempts that were or will be repeated.
     pub retries: u64,
-    /// Those of them that the ground's own disk failed.
+    /// Attempts that the ground's own disk failed.
     pub disk: u64,
     /// Offers of other missions.
     pub foreign: u64,

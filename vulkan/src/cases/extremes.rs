@@ -19,7 +19,7 @@ use std::ops::ControlFlow;
 /// One grey level and a bit: a contribution at the cut-off may fall on the other side.
 const GREY_LEVEL: f32 = 1.1 / 255.0;
 
-/// The same scene with every length multiplied.
+/// Multiplies every length of a scene.
 fn scaled(base: &GaussianCloud, scale: f32) -> GaussianCloud {
     let mut c = base.clone();
     c.means.iter_mut().for_each(|m| *m = m.map(|x| x * scale));
@@ -30,7 +30,7 @@ fn scaled(base: &GaussianCloud, scale: f32) -> GaussianCloud {
 /// Scenes of other sizes than metres.
 const SIZES: [(&str, f32); 2] = [("a centimetre", 0.0052), ("a hundred kilometres", 1.25e4)];
 
-/// The same scene and its camera with the camera at `center`, both in f32 as far as they are given so.
+/// A scene and its camera with the camera at `center`, both in f32 as far as they are given so.
 fn moved(base: &GaussianCloud, at_origin: &View, metres: f64) -> (GaussianCloud, View) {
     let (mut c, mut v) = (base.clone(), *at_origin);
     v.pose.center = DVec3::new(metres, -metres, 0.1 * metres);

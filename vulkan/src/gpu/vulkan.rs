@@ -105,14 +105,14 @@ impl Vulkan {
         &self.inner.info
     }
 
-    /// The same device, were its limits these.
+    /// This device, were its limits these.
     #[cfg(test)]
     pub fn limited(mut self, limits: DeviceLimits) -> Self {
         Arc::get_mut(&mut self.inner).expect("nobody else holds this device").info.limits = limits;
         self
     }
 
-    /// The same device, with a driver that is odd in these ways.
+    /// This device, with a driver that is odd in these ways.
     #[cfg(test)]
     pub fn forced(mut self, forced: super::Forced) -> Self {
         Arc::get_mut(&mut self.inner).expect("nobody else holds this device").forced = forced;

@@ -167,7 +167,7 @@ pub(super) fn rasterise(call: &Call<'_>) {
     rasterise_as::<false>(call);
 }
 
-/// The same with the depth of the Gaussian that takes the second half of the light.
+/// Blends with the depth of the Gaussian that takes the second half of the light.
 pub(super) fn rasterise_median(call: &Call<'_>) {
     rasterise_as::<true>(call);
 }

@@ -10,7 +10,7 @@ pub(super) const LANES: usize = 8;
 /// Eight numbers.
 pub(super) type F8<S> = f32x8<S>;
 
-/// The same number in all lanes.
+/// One number in all lanes.
 #[inline(always)]
 pub(super) fn splat<S: Simd>(s: S, v: f32) -> F8<S> {
     F8::splat(s, v)

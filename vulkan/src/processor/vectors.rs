@@ -15,7 +15,7 @@ pub(super) struct V3<S: Simd> {
 }
 
 impl<S: Simd> V3<S> {
-    /// The same vector in all lanes.
+    /// One vector in all lanes.
     #[inline(always)]
     pub fn splat(s: S, v: Vec3) -> Self {
         Self { x: splat(s, v.x), y: splat(s, v.y), z: splat(s, v.z) }

@@ -87,7 +87,7 @@ impl<R: Real> Camera<R> {
         }
     }
 
-    /// The same camera in another number type.
+    /// This camera in another number type.
     pub fn cast<S: Real>(&self) -> Camera<S> {
         let v = |a: Vec3<R>| a.map(|x| S::of(x.f64()));
         Camera {

@@ -1,4 +1,4 @@
-//! The same scenes on the device; `None` (and a line saying so) where there is none.
+//! Scenes on the device; `None` (and a line saying so) where there is none.
 #![allow(dead_code, unused_imports, reason = "each test binary uses its own part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test fails by panicking")]
 

@@ -19,7 +19,7 @@ const PROCESSOR_HANDICAP: f64 = 1.25;
 /// seen for the first time are measured, where there are several, which takes seconds (a software renderer compiles).
 ///
 /// # Errors
-/// Those of [`Gpu::open`].
+/// Errors of [`Gpu::open`].
 pub fn open(name: Option<&str>) -> Result<Gpu, GpuError> {
     open_by(name, &measured)
 }
@@ -27,7 +27,7 @@ pub fn open(name: Option<&str>) -> Result<Gpu, GpuError> {
 /// Opens a device without measuring: the first hardware device until they were.
 ///
 /// # Errors
-/// Those of [`Gpu::open`].
+/// Errors of [`Gpu::open`].
 pub fn open_known(name: Option<&str>) -> Result<Gpu, GpuError> {
     open_by(name, &known)
 }

@@ -55,7 +55,7 @@ fn rings(spot: &Spot, reference: Option<&Reference>) -> io::Result<Vec<Vec<[f64;
 /// Writes the spots as a FeatureCollection.
 ///
 /// # Errors
-/// Those of `out`, or a place outside of the reference system.
+/// Errors of `out`, or a place outside of the reference system.
 pub fn geojson(out: &mut dyn Write, spots: &[Spot], reference: Option<&Reference>) -> io::Result<()> {
     write!(out, "{}", collection(reference))?;
     for (k, spot) in spots.iter().enumerate() {
@@ -80,7 +80,7 @@ pub fn geojson(out: &mut dyn Write, spots: &[Spot], reference: Option<&Reference
 /// Writes the spots as KML; it has degrees alone.
 ///
 /// # Errors
-/// Those of `out`, or a place outside of the reference system.
+/// Errors of `out`, or a place outside of the reference system.
 pub fn kml(out: &mut dyn Write, spots: &[Spot], reference: &Reference) -> io::Result<()> {
     writeln!(
         out,
@@ -115,7 +115,7 @@ pub fn kml(out: &mut dyn Write, spots: &[Spot], reference: &Reference) -> io::Re
 /// Writes the spots as a table with commas between its cells.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn table(out: &mut dyn Write, spots: &[Spot]) -> io::Result<()> {
     writeln!(out, "name,east_m,north_m,area_m2,height_m,height_sigma_m,most_m,volume_m3,volume_sigma_m3")?;
     for (k, s) in spots.iter().enumerate() {

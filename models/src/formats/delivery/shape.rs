@@ -166,7 +166,7 @@ pub fn opacities(
     Ok(out)
 }
 
-/// The same Gaussian with its axes named so that its rotation is the smallest: its log scales and Rodrigues vector.
+/// Names the axes of a Gaussian so that its rotation is the smallest: its log scales and Rodrigues vector.
 pub fn smallest_rotation(log_scales: [f32; 3], rotation: [f32; 4]) -> ([f32; 3], [f64; 3]) {
     let [w, x, y, z] = rotation.map(f64::from);
     let q = glam::DQuat::from_xyzw(x, y, z, w).normalize();

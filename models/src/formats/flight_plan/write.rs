@@ -38,7 +38,7 @@ impl FlightPlan {
     /// Writes the plan.
     ///
     /// # Errors
-    /// Those of `out`.
+    /// Errors of `out`.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         let mut items = Vec::with_capacity(3 * self.waypoints.len() + 4);
         let zeros = [Some(0.0); 7];

@@ -46,7 +46,7 @@ pub(super) struct Cells(Vec<Entry>);
 /// As [`super::write_rounded`], of the cells that `wanted` asks for.
 ///
 /// # Errors
-/// Those of [`super::write()`].
+/// Errors of [`super::write()`].
 pub fn write_cells(
     disk: &Disk,
     path: &Path,

@@ -233,7 +233,7 @@ pub fn write_checkpoint_pieces(
 /// As [`super::read_checkpoint`], to be read piece by piece.
 ///
 /// # Errors
-/// Those of [`super::read_checkpoint`].
+/// Errors of [`super::read_checkpoint`].
 pub fn open_checkpoint(disk: &Disk, path: &Path) -> Result<Option<Chunks>, FormatError> {
     let newest = disk.newest(path, Chunks::open).map_err(|e| FormatError::io(path, "setting aside", e))?;
     newest.damaged.iter().for_each(|d| tracing::warn!("{d}"));

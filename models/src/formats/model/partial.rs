@@ -23,7 +23,7 @@ pub struct Partial {
 /// layers. For who looks at a model, not for who goes on with it.
 ///
 /// # Errors
-/// Those of [`read`], which anything is that is not cut short behind its index.
+/// Errors of [`read`], which anything is that is not cut short behind its index.
 pub fn read_what_is_there(path: &Path) -> Result<(ModelHeader, GaussianCloud, Option<Partial>), FormatError> {
     match read(path) {
         Ok((header, cloud)) => Ok((header, cloud, None)),

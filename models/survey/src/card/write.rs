@@ -115,7 +115,7 @@ impl Tags {
         )
     }
 
-    /// The same JPEG with these tags.
+    /// Returns this JPEG with these tags.
     ///
     /// # Errors
     /// A value cannot be written, or `jpeg` is no JPEG.

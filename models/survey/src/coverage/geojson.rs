@@ -19,7 +19,7 @@ const METRE: f64 = 1e3;
 /// standard wants them; without one they are metres east and north, which a member `axes` of the file says.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write(out: &mut dyn Write, map: &CoverageMap, gaps: &[Gap], origin: Option<Geodetic>) -> io::Result<()> {
     let frame = origin.map(EnuFrame::new);
     let place = |p: &DVec2| match &frame {

@@ -75,7 +75,7 @@ fn segment(jpeg: &[u8], name: &[u8]) -> (usize, usize) {
     (at, at + usize::from(u16::from_be_bytes([jpeg[at], jpeg[at + 1]])))
 }
 
-/// The same JPEG with another segment of the same name.
+/// A JPEG with another segment of the same name.
 fn with_segment(jpeg: &[u8], name: &[u8], content: &[u8]) -> Vec<u8> {
     let (from, to) = segment(jpeg, name);
     let content = &content[..content.len().min(65_000)];

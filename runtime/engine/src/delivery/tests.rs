@@ -21,7 +21,7 @@ fn settings_for(delivers: Option<Rounding>, incremental: bool) -> EngineSettings
     EngineSettings { delivers, incremental, ..settings() }
 }
 
-/// The same; with `incremental`, as a flight does it after its landing.
+/// A reconstruction; with `incremental`, as a flight does it after its landing.
 fn built_as(delivers: Option<Rounding>, incremental: bool) -> Option<Reconstruction> {
     if Gpu::list().is_err() {
         needs::missing(needs::Need::Vulkan, "no Vulkan device (install mesa-vulkan-drivers)");

@@ -31,7 +31,7 @@ pub struct Joined {
 /// The header of the global model; `of` gives those of the models, where they go.
 ///
 /// # Errors
-/// Those of `of`.
+/// Errors of `of`.
 pub fn header(
     plan: &Plan,
     of: &dyn Fn(usize) -> Result<ModelHeader, AggregateError>,

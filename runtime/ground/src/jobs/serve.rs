@@ -81,7 +81,7 @@ pub struct Reception {
     pub received: Vec<Received>,
     /// Aircraft without a final model.
     pub missing: Vec<String>,
-    /// Those of them whose final model of an earlier session was shown instead, and what it is.
+    /// Aircraft whose final model of an earlier session was shown instead, and what it is.
     pub stale: Vec<(String, String)>,
     /// What happened on the way.
     pub counters: ReceiveCounters,

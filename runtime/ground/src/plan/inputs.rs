@@ -109,7 +109,7 @@ impl Plan {
     }
 }
 
-/// Those of `regions` that may own a point of the square of this side around `middle`, in their order: looked at more closely than a
+/// Regions among `regions` that may own a point of the square of this side around `middle`, in their order: looked at more closely than a
 /// square of ground as a whole, so that whoever joins changes few.
 fn owners(regions: &[(usize, &Region)], middle: DVec2, side: f64, border_m: f64) -> BTreeSet<usize> {
     let all: BTreeMap<usize, &Region> = regions.iter().copied().collect();
@@ -123,7 +123,7 @@ fn owners(regions: &[(usize, &Region)], middle: DVec2, side: f64, border_m: f64)
 }
 
 impl Inputs {
-    /// The same cell merged and not distilled.
+    /// This cell merged and not distilled.
     pub fn merged_only(mut self) -> Self {
         (self.recipe.epochs, self.recipe.seconds) = (0, None);
         self

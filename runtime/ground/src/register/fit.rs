@@ -254,7 +254,7 @@ fn fitted(pairs: &[Sighting], has_free_scale: bool) -> Option<Fitted> {
     })
 }
 
-/// Those of `pairs` whose error is no more than three times the median of `kept`, and that median; None when they are too few to
+/// Pairs whose error is no more than three times the median of `kept`, and that median; None when they are too few to
 /// prove anything.
 fn agreeing(pairs: &[Sighting], kept: &[Sighting], error: impl Fn(&Sighting) -> f64) -> Option<(Vec<Sighting>, f64)> {
     let mut errors: Vec<f64> = kept.iter().map(&error).collect();

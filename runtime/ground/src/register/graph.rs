@@ -53,7 +53,7 @@ pub struct Link {
     pub a: usize,
     /// The second.
     pub b: usize,
-    /// The same six places in both.
+    /// Six places, as each of both has them.
     pub places: [(DVec3, DVec3); 6],
     /// What their common place is known to, metres.
     pub sigma_m: f64,

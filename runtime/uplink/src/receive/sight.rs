@@ -43,7 +43,7 @@ impl Sight {
     /// Takes in what `inlet` shows; `let_in` is asked where neither this nor the look before has these bytes.
     ///
     /// # Errors
-    /// Those of `let_in`.
+    /// Errors of `let_in`.
     pub fn see(
         &mut self,
         before: &Self,
