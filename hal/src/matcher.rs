@@ -36,6 +36,9 @@ const GAP: u32 = 8;
 const LEAST_IN_FLIGHT: f32 = 0.49;
 /// What is less sure than this at the landing has no exposure.
 pub const LEAST_CONFIDENCE: f32 = 0.465;
+/// A confidence above this is sure.
+#[cfg(feature = "std")]
+pub const SURE: f32 = 0.9;
 /// While something waits and nothing comes, it is aligned again after this.
 const AGAIN_NS: u64 = 100_000_000;
 /// Announcements that came late by some time may come this much later.

@@ -171,6 +171,11 @@ impl Conditions {
         !self.regular && (self.named || !shifted)
     }
 
+    /// Both ends are cut, so that as many pictures as announcements are left: one exposure off, they fit without a gap.
+    pub fn looks_whole(&self) -> bool {
+        matches!(self.cut, Some(Cut::FirstAnnouncementAndLastPicture | Cut::FirstPictureAndLastAnnouncement))
+    }
+
     /// Nothing waits until it is known which camera is ours.
     pub fn knows_its_camera(&self) -> bool {
         self.named || self.others.is_empty()

@@ -20,8 +20,6 @@ pub(super) const PUT_ASIDE: usize = 4096;
 const BY_VOTE: f32 = 0.85;
 /// In flight votes count beside so many pictures that were matched.
 const LEAST_KNOWN: usize = 8;
-/// A confidence above this is sure.
-const SURE: f32 = 0.9;
 
 /// What an exposure waits for.
 #[derive(Clone, Copy, PartialEq)]
@@ -57,25 +55,31 @@ pub(super) struct Landing {
     pub(super) pairs: Vec<(Trigger, PutAside, f32)>,
     /// Pictures found in flight that it says another exposure of.
     revised: usize,
+    /// Pictures that have an exposure, those of them that fit another one nearly as well, and whether that is the flight as a whole.
+    posed: usize,
+    doubtful: usize,
+    is_ambiguous: bool,
 }
 
 impl Landing {
     /// One line for the pilot where the flight is ambiguous; the log says more.
     pub(super) fn doubt(&self) -> Option<String> {
-        let doubtful = self.pairs.iter().filter(|(_, _, confidence)| *confidence <= SURE).count();
-        if self.revised > 0 {
-            tracing::warn!(
-                "the whole flight says another exposure of {} pictures that were posed in flight",
-                self.revised
-            );
+        let Self { revised, posed, doubtful, .. } = *self;
+        if revised > 0 {
+            tracing::warn!("the whole flight says another exposure of {revised} pictures that were posed in flight");
         }
-        if doubtful > 0 {
+        let many = format!("{doubtful} of {posed} pictures fit other exposures nearly as well");
+        if self.is_ambiguous {
             tracing::warn!(
-                "the flight is ambiguous: {doubtful} pictures fit other exposures nearly as well; geotags.csv holds their confidence \
+                "the flight is ambiguous: {many}; geotags.csv holds their confidence \
                  (link.picture_latency_ms, numbers in file names or EXIF times tell them apart)"
             );
+            return Some(format!("dgtr: ambiguous flight, {doubtful} of {posed} unsure"));
         }
-        (self.revised > 0).then(|| format!("dgtr: {} pictures may have another exposure's pose", self.revised))
+        if doubtful > 0 {
+            tracing::info!("{many}; geotags.csv holds their confidence");
+        }
+        (revised > 0).then(|| format!("dgtr: {revised} pictures may have another exposure's pose"))
     }
 }
 
@@ -211,8 +215,10 @@ impl Exposures {
         let clues: Vec<PictureClues> = self.aside.iter().map(|a| a.clues).collect();
         let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
         let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
-        let (pairs, revised) = landing::settle(&triggers, &clues, &known, settings);
-        Landing { pairs: self.take(&triggers, pairs), revised: revised.len() }
+        let settled = landing::settle(&triggers, &clues, &known, settings);
+        let (revised, posed, doubtful) = (settled.revised.len(), settled.posed, settled.doubtful);
+        let is_ambiguous = settled.is_ambiguous();
+        Landing { pairs: self.take(&triggers, settled.pairs), revised, posed, doubtful, is_ambiguous }
     }
 
     fn take(&mut self, triggers: &[Trigger], mut pairs: Vec<Pairing>) -> Vec<(Trigger, PutAside, f32)> {
