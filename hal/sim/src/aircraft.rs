@@ -230,6 +230,11 @@ pub struct Manner {
     pub gimbal_pitch_deg: f64,
 }
 
+/// Name of a camera's picture by its number.
+pub fn picture_name(prefix: &str, number: u64) -> String {
+    format!("{prefix}{number:04}.jpg")
+}
+
 /// Flies `legs`, metres around `origin`; `None` when there are none.
 ///
 /// Pictures are called `{prefix}0001.jpg` and so on.
@@ -308,7 +313,7 @@ pub fn fly(
         while turned && shot < shots.len() && (position - from).dot(direction) >= shots[shot] {
             let middle_s =
                 time_s + (wrong.shutter_delay_ms + wrong.shutter_jitter_ms * normal(random)).max(0.0) / 1000.0;
-            let name = format!("{prefix}{:04}.jpg", exposures.len() + 1);
+            let name = picture_name(prefix, exposures.len() as u64 + 1);
             exposures.push(Exposure {
                 trigger_s: time_s,
                 middle_s,

@@ -15,7 +15,7 @@ use geometry::geodesy::{EnuFrame, Geodetic};
 use glam::DQuat;
 
 use super::SimError;
-use super::aircraft::Exposure;
+use super::aircraft::{Exposure, picture_name};
 use super::messages;
 use super::photographer::{Photographer, PictureCounters, to_jpeg};
 use super::reference::Lens;
@@ -285,7 +285,7 @@ impl Attached {
             match self.views.try_send(view) {
                 Ok(()) => {
                     let number = self.numbered + u64::from(trigger.sequence);
-                    let name = format!("{}{number:04}.jpg", self.settings.prefix);
+                    let name = picture_name(&self.settings.prefix, number);
                     let ready_s = wall_s + TRANSFER_S;
                     self.photographer.expose(Exposure { trigger_s: wall_s, middle_s: wall_s, ready_s, name });
                 }
@@ -337,7 +337,7 @@ impl Attached {
 }
 
 /// Highest number of the pictures in `folder` whose names begin with `prefix`; a camera goes on counting from there.
-fn highest_number(folder: &Path, prefix: &str) -> u64 {
+pub(crate) fn highest_number(folder: &Path, prefix: &str) -> u64 {
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name());
     let number = |name: std::ffi::OsString| name.to_str()?.strip_prefix(prefix)?.strip_suffix(".jpg")?.parse().ok();
     names.filter_map(number).max().unwrap_or(0)

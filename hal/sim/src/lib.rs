@@ -29,6 +29,7 @@ pub use error::SimError;
 pub use session::{SessionReport, SessionSettings};
 
 use aircraft::{Flight, Imperfections, Leg, Manner};
+use attached::highest_number;
 use autopilot::{Autopilot, AutopilotSettings};
 use hal::link::LinkAddress;
 use photographer::{Photographer, to_jpeg, write_whole};
@@ -152,7 +153,15 @@ pub fn run(
     on_ready: &mut dyn FnMut(Option<&Path>),
 ) -> Result<SessionReport, SimError> {
     settings.session.check()?;
-    let flight = settings.flight()?;
+    let mut flight = settings.flight()?;
+    // A camera goes on counting where the folder's pictures end.
+    let earlier = highest_number(camera_dir, &settings.prefix);
+    if earlier > 0 {
+        for (exposure, number) in flight.exposures.iter_mut().zip(earlier + 1..) {
+            exposure.name = aircraft::picture_name(&settings.prefix, number);
+        }
+    }
+    let flight = flight;
     let link = session::open(address, settings.seed, on_ready)?;
     let world = Arc::new(World::new(settings.world_seed, &settings.world));
     let camera = camera_over(world, &flight, &settings.lens, camera_dir, reference_dir, settings.seed)?;
