@@ -1,4 +1,4 @@
-//! What is not flown over: holes of the area with room around them, and the ways round them.
+//! What is not flown over: holes of the area with room around them, what lies beyond its fence, and the ways round both.
 
 use geometry::polygon;
 use glam::DVec2;
@@ -7,6 +7,8 @@ use crate::FleetError;
 use crate::ground::{Ground, Ring};
 use crate::lines::Line;
 
+/// Lines and ways keep this far inside a fence, metres: ArduPilot's FENCE_MARGIN.
+const FENCE_M: f64 = 2.0;
 /// Ways bend so much further out than they need to, metres: rounding is no collision.
 const SLACK_M: f64 = 0.5;
 /// A ring is drawn with fewer corners, none of the old further off than this share of the clearance.
@@ -33,13 +35,17 @@ pub struct Obstacles {
     limit: Option<Limit>,
 }
 
-/// Ground that ways round holes do not leave where they need not.
+/// Ground that ways do not leave.
 #[derive(Clone, Debug)]
 struct Limit {
     ground: Ground,
     sides: Vec<[DVec2; 2]>,
-    /// Metres between the corners of the holes that see each other and this ground only.
+    /// Where ways bend: corners of the holes, and those of this ground that point inwards.
+    corners: Vec<DVec2>,
+    /// Metres between those that see each other and this ground only.
     apart: Vec<f64>,
+    /// A fence: nothing ever leaves it, and lines end inside of this, which is a little less. Else ways leave it where they have to.
+    fence: Option<Ground>,
 }
 
 impl Obstacles {
@@ -66,31 +72,60 @@ impl Obstacles {
         }
         let sides = sides(&closed);
         let mut this = Self { sides, closed, wide, apart: Vec::new(), corners, clearance_m, limit: None };
-        this.apart = this.between(|a, b| this.seen_m(a, b));
+        this.apart = between(&this.corners, |a, b| this.seen_m(a, b));
         Ok(this)
     }
 
-    /// Obstacles with ways that stay on the ground inside `outside` and `beyond_m` around it, where there is such a way.
+    /// With ways round the holes that stay on the ground inside `outside` and `beyond_m` around it, where there is such a way.
     pub fn inside(mut self, outside: &Ring, beyond_m: f64) -> Self {
         if self.sides.is_empty() {
             return self;
         }
-        let mut coarse_m = COARSE * beyond_m;
-        let mut ring = simplified(outside, coarse_m);
-        while ring.len() > MOST_CORNERS {
-            coarse_m *= 2.0;
-            ring = simplified(outside, coarse_m);
-        }
-        let ground = with_room(&[ring], beyond_m + coarse_m);
-        let mut limit = Limit { sides: sides(&ground), ground, apart: Vec::new() };
-        limit.apart = self.between(|a, b| limit.seen_m(&self, a, b));
-        self.limit = Some(limit);
+        let (ring, coarse_m) = drawn_coarsely(outside, COARSE * beyond_m);
+        let [ground, inner] = [0.0, SLACK_M].map(|less| with_room(&[ring.clone()], beyond_m + coarse_m - less));
+        self.limit = Some(self.limited(ground, inward(&inner), None));
         self
     }
 
-    /// Metres between all corners.
-    fn between(&self, metres: impl Fn(DVec2, DVec2) -> f64) -> Vec<f64> {
-        self.corners.iter().flat_map(|a| self.corners.iter().map(|b| metres(*a, *b))).collect()
+    /// With lines and ways that never leave `fence`.
+    ///
+    /// # Errors
+    /// A fence that is too narrow to fly in.
+    pub fn fenced(mut self, fence: &Ring) -> Result<Self, FleetError> {
+        let whole = Ground::of(vec![fence.clone()]);
+        let [ground, lines] = [FENCE_M, FENCE_M + SLACK_M].map(|metres| whole.without(&beside(fence, metres)));
+        if lines.parts.is_empty() {
+            return Err(FleetError::Area(format!(
+                "is a fence with no room inside; lines keep {} m from its sides",
+                FENCE_M + SLACK_M
+            )));
+        }
+        // Ways bend where a coarser fence inside of this one has its corners.
+        let (mut bends, mut coarse_m) = (inward(&lines), SLACK_M);
+        while bends.len() > MOST_CORNERS {
+            let ring = simplified(fence, coarse_m);
+            let inner = Ground::of(vec![ring.clone()]).without(&beside(&ring, FENCE_M + SLACK_M + coarse_m));
+            (bends, coarse_m) = (inward(&inner), 2.0 * coarse_m);
+        }
+        self.limit = Some(self.limited(ground, bends, Some(lines)));
+        Ok(self)
+    }
+
+    fn limited(&self, ground: Ground, bends: Vec<DVec2>, fence: Option<Ground>) -> Limit {
+        let corners = [&self.corners[..], &bends].concat();
+        let mut limit = Limit { sides: sides(&ground), ground, corners, apart: Vec::new(), fence };
+        limit.apart = between(&limit.corners, |a, b| limit.seen_m(self, a, b));
+        limit
+    }
+
+    /// The ground inside the fence on which lines lie.
+    pub fn fence(&self) -> Option<&Ground> {
+        self.limit.as_ref()?.fence.as_ref()
+    }
+
+    /// Whether a place lies beyond the fence, or nearer to it than may be flown.
+    pub fn shut_out(&self, p: DVec2) -> bool {
+        self.limit.as_ref().is_some_and(|limit| limit.fence.is_some() && !limit.ground.contains(p))
     }
 
     /// Metres that are kept from every ring.
@@ -98,15 +133,17 @@ impl Obstacles {
         self.clearance_m
     }
 
-    /// Whether a place lies on a ring or nearer to it than the clearance.
+    /// Whether a place lies on a ring or nearer to it than the clearance, or beyond the fence.
     pub fn hold(&self, p: DVec2) -> bool {
-        self.closed.contains(p)
+        self.closed.contains(p) || self.shut_out(p)
     }
 
     /// What of a line may be flown, in its direction.
     pub fn clear(&self, line: &Line) -> Vec<Line> {
         let way = line.to - line.from;
-        let sides = self.wide.rings().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)));
+        let fence = self.fence();
+        let rings = self.wide.rings().chain(fence.into_iter().flat_map(Ground::rings));
+        let sides = rings.flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)));
         let crossed = sides.filter_map(|(a, b)| {
             let (side, across) = (*b - *a, way.perp_dot(*b - *a));
             let [along, at] = [side, way].map(|v| (*a - line.from).perp_dot(v) / across);
@@ -116,7 +153,8 @@ impl Obstacles {
         shares.sort_by(f64::total_cmp);
         let mut open: Vec<[f64; 2]> = Vec::new();
         for pair in shares.windows(2) {
-            if self.wide.contains(line.from.lerp(line.to, 0.5 * (pair[0] + pair[1]))) {
+            let middle = line.from.lerp(line.to, 0.5 * (pair[0] + pair[1]));
+            if self.wide.contains(middle) || fence.is_some_and(|fence| !fence.contains(middle)) {
                 continue;
             }
             match open.last_mut() {
@@ -132,62 +170,71 @@ impl Obstacles {
 
     /// Where the shortest way between two places bends, in flying order; `None` where there is none.
     pub fn way(&self, from: DVec2, to: DVec2) -> Option<Vec<DVec2>> {
-        if self.sides.is_empty() {
-            return Some(Vec::new());
-        }
         if self.hold(from) || self.hold(to) {
             return None;
         }
-        if self.seen_m(from, to).is_finite() {
+        let limit = self.limit.as_ref();
+        let is_straight = match limit.filter(|limit| limit.fence.is_some()) {
+            Some(fence) => fence.seen_m(self, from, to).is_finite(),
+            None => self.seen_m(from, to).is_finite(),
+        };
+        if is_straight {
             return Some(Vec::new());
         }
-        let inside = self.limit.as_ref();
-        let inside = inside.and_then(|limit| self.bends((from, to), &limit.apart, |a, b| limit.seen_m(self, a, b)));
-        inside.or_else(|| self.bends((from, to), &self.apart, |a, b| self.seen_m(a, b)))
-    }
-
-    /// Where the shortest way bends, by the metres between corners and from place to place (Dijkstra 1959).
-    fn bends(
-        &self,
-        (from, to): (DVec2, DVec2),
-        apart: &[f64],
-        seen_m: impl Fn(DVec2, DVec2) -> f64,
-    ) -> Option<Vec<DVec2>> {
-        let count = self.corners.len();
-        let mut metres: Vec<f64> = self.corners.iter().map(|c| seen_m(from, *c)).collect();
-        let mut before = vec![count; count];
-        let mut done = vec![false; count];
-        let mut best = (f64::INFINITY, count);
-        while let Some(k) = (0..count).filter(|k| !done[*k]).min_by(|i, j| metres[*i].total_cmp(&metres[*j])) {
-            if metres[k] >= best.0 {
-                break;
-            }
-            done[k] = true;
-            let end = metres[k] + seen_m(self.corners[k], to);
-            if end < best.0 {
-                best = (end, k);
-            }
-            for next in (0..count).filter(|next| !done[*next]) {
-                let longer = metres[k] + apart[k * count + next];
-                if longer < metres[next] {
-                    (metres[next], before[next]) = (longer, k);
-                }
-            }
+        let inside =
+            limit.and_then(|limit| bends((from, to), (&limit.corners, &limit.apart), |a, b| limit.seen_m(self, a, b)));
+        match limit.is_some_and(|limit| limit.fence.is_some()) {
+            true => inside,
+            false => inside.or_else(|| bends((from, to), (&self.corners, &self.apart), |a, b| self.seen_m(a, b))),
         }
-        let mut at = best.1;
-        let mut bends = Vec::new();
-        while at < count {
-            bends.push(self.corners[at]);
-            at = before[at];
-        }
-        bends.reverse();
-        (!bends.is_empty()).then_some(bends)
     }
 
     /// Metres between two places with nothing in between, else infinite.
     fn seen_m(&self, from: DVec2, to: DVec2) -> f64 {
         if meets(&self.sides, from, to) { f64::INFINITY } else { from.distance(to) }
     }
+}
+
+/// Where the shortest way bends, by the metres between corners and from place to place (Dijkstra 1959).
+fn bends(
+    (from, to): (DVec2, DVec2),
+    (corners, apart): (&[DVec2], &[f64]),
+    seen_m: impl Fn(DVec2, DVec2) -> f64,
+) -> Option<Vec<DVec2>> {
+    let count = corners.len();
+    let mut metres: Vec<f64> = corners.iter().map(|c| seen_m(from, *c)).collect();
+    let mut before = vec![count; count];
+    let mut done = vec![false; count];
+    let mut best = (f64::INFINITY, count);
+    while let Some(k) = (0..count).filter(|k| !done[*k]).min_by(|i, j| metres[*i].total_cmp(&metres[*j])) {
+        if metres[k] >= best.0 {
+            break;
+        }
+        done[k] = true;
+        let end = metres[k] + seen_m(corners[k], to);
+        if end < best.0 {
+            best = (end, k);
+        }
+        for next in (0..count).filter(|next| !done[*next]) {
+            let longer = metres[k] + apart[k * count + next];
+            if longer < metres[next] {
+                (metres[next], before[next]) = (longer, k);
+            }
+        }
+    }
+    let mut at = best.1;
+    let mut bends = Vec::new();
+    while at < count {
+        bends.push(corners[at]);
+        at = before[at];
+    }
+    bends.reverse();
+    (!bends.is_empty()).then_some(bends)
+}
+
+/// Metres between all corners.
+fn between(corners: &[DVec2], metres: impl Fn(DVec2, DVec2) -> f64) -> Vec<f64> {
+    corners.iter().flat_map(|a| corners.iter().map(|b| metres(*a, *b))).collect()
 }
 
 impl Limit {
@@ -216,12 +263,45 @@ fn meets(sides: &[[DVec2; 2]], from: DVec2, to: DVec2) -> bool {
 
 /// Rings and all places within `metres` of them, and a little more at corners.
 fn with_room(rings: &[Ring], metres: f64) -> Ground {
+    let beside = rings.iter().flat_map(|ring| corridors(ring, metres));
+    Ground::covered_by(rings.iter().cloned().chain(beside).collect())
+}
+
+/// All places within `metres` of a ring's sides, and a little more at corners.
+fn beside(ring: &Ring, metres: f64) -> Ground {
+    Ground::covered_by(corridors(ring, metres))
+}
+
+fn corridors(ring: &Ring, metres: f64) -> Vec<Ring> {
     let step = std::f64::consts::TAU / f64::from(AROUND);
     let octagon: Vec<DVec2> =
         (0..AROUND).map(|k| DVec2::from_angle(step * (f64::from(k) + 0.5)) * (metres / (0.5 * step).cos())).collect();
     let around = |(a, b): (&DVec2, &DVec2)| polygon::hull(octagon.iter().flat_map(|o| [*a + *o, *b + *o]).collect());
-    let sides = rings.iter().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1))).map(around);
-    Ground::covered_by(rings.iter().cloned().chain(sides).collect())
+    ring.iter().zip(ring.iter().cycle().skip(1)).map(around).collect()
+}
+
+/// Corners of `ground` at which its sides turn away from it: the shortest ways on it bend there.
+fn inward(ground: &Ground) -> Vec<DVec2> {
+    let of = |ring: &Ring| {
+        let count = ring.len();
+        let turns = |k: &usize| {
+            let [a, b, c] = [*k + count - 1, *k, *k + 1].map(|k| ring[k % count]);
+            (b - a).perp_dot(c - b) < 0.0
+        };
+        (0..count).filter(turns).map(|k| ring[k]).collect::<Vec<_>>()
+    };
+    ground.rings().flat_map(of).collect()
+}
+
+/// A ring with no more than [`MOST_CORNERS`], and how far the old ones are off at most: `off` or more.
+fn drawn_coarsely(ring: &Ring, mut off: f64) -> (Ring, f64) {
+    loop {
+        let drawn = simplified(ring, off);
+        if drawn.len() <= MOST_CORNERS {
+            return (drawn, off);
+        }
+        off *= 2.0;
+    }
 }
 
 /// A ring with as few corners as leave none of the old further off than `off` (Douglas and Peucker 1973).
@@ -391,5 +471,69 @@ mod tests {
             }
         }
         assert!(bent > 100, "{bent}");
+    }
+
+    /// A star: any of its corners may point inwards.
+    fn star(rng: &mut Pcg64Mcg, middle: DVec2, corners: std::ops::Range<u32>, radii: std::ops::Range<f64>) -> Ring {
+        let corners = rng.random_range(corners);
+        let step = std::f64::consts::TAU / f64::from(corners);
+        (0..corners)
+            .map(|k| middle + DVec2::from_angle(step * f64::from(k)) * rng.random_range(radii.clone()))
+            .collect()
+    }
+
+    #[test]
+    fn lines_and_ways_inside_fences_by_seed_never_leave_them() {
+        let mut rng = Pcg64Mcg::seed_from_u64(60);
+        let (mut bent, mut cut, mut none) = (0, 0, 0);
+        for _ in 0..60 {
+            let fence = star(&mut rng, DVec2::ZERO, 5..16, 40.0..300.0);
+            let holes: Vec<Ring> = (0..rng.random_range(0..4))
+                .map(|_| {
+                    let middle = DVec2::new(rng.random_range(-150.0..150.0), rng.random_range(-150.0..150.0));
+                    star(&mut rng, middle, 3..9, 5.0..30.0)
+                })
+                .collect();
+            let clearance = rng.random_range(1.0..10.0);
+            let obstacles = Obstacles::new(&holes, clearance).and_then(|free| free.fenced(&fence)).expect("room");
+            let keeps = |path: &[DVec2]| {
+                let inside = path.iter().all(|p| polygon::contains(&fence, *p));
+                let sides = fence.iter().zip(fence.iter().cycle().skip(1)).map(|(a, b)| vec![*a, *b]);
+                let off = sides.map(|side| nearest_m(path, &side)).fold(f64::MAX, f64::min);
+                assert!(inside && off >= FENCE_M - 1e-6, "{off} m from {fence:?}: {path:?}");
+                holes.iter().for_each(|hole| assert!(nearest_m(path, hole) > clearance - 1e-6, "{path:?} {hole:?}"));
+            };
+            for _ in 0..20 {
+                let [from, to] =
+                    [0, 1].map(|_| DVec2::new(rng.random_range(-300.0..300.0), rng.random_range(-300.0..300.0)));
+                let pieces = obstacles.clear(&Line { from, to });
+                cut += pieces.len();
+                pieces.iter().for_each(|piece| keeps(&[piece.from, piece.to]));
+                let Some(first) = pieces.first() else { continue };
+                let Some(p) = pieces.last().map(|piece| piece.to) else { continue };
+                match obstacles.way(first.from, p) {
+                    Some(bends) => {
+                        bent += usize::from(!bends.is_empty());
+                        let path: Vec<DVec2> = std::iter::once(first.from).chain(bends).chain([p]).collect();
+                        keeps(&path);
+                    }
+                    // A neck too narrow, or holes from side to side.
+                    None => {
+                        none += 1;
+                        let ground = obstacles.fence().expect("a fence").without(&obstacles.wide);
+                        let of = |p: DVec2| ground.parts.iter().position(|part| nearest_m(&[p, p], &part[0]) < 0.01);
+                        assert!(
+                            ground.parts.len() > 1 && of(first.from) != of(p),
+                            "{} {p} {fence:?} {holes:?}",
+                            first.from
+                        );
+                    }
+                }
+                assert!(polygon::contains(&fence, from) || obstacles.way(from, p).is_none(), "it begins outside");
+            }
+        }
+        assert!(bent > 60 && cut > 300 && none < 100, "{bent} {cut} {none}");
+        let slit = rectangle(0.0, 0.0, 500.0, 4.0);
+        assert!(Obstacles::default().fenced(&slit).expect_err("no room").to_string().contains("no room inside"));
     }
 }

@@ -77,10 +77,12 @@ impl Flying<'_> {
     fn way(&self, from: DVec2, to: DVec2) -> Result<Way, FleetError> {
         let bends = self.obstacles.way(from, to).ok_or_else(|| {
             FleetError::Reach(format!(
-                "{}: no way leads round the holes of the area to all of its lines with {} m of room; move --take-off, give less \
-                 --clearance, or draw the holes otherwise",
+                "{}: no way leads {}round the holes of the area to all of its lines with {} m of room; move --take-off, give less \
+                 --clearance, or draw {} otherwise",
                 self.craft.id,
-                self.obstacles.clearance_m()
+                if self.obstacles.fence().is_some() { "inside the fence and " } else { "" },
+                self.obstacles.clearance_m(),
+                if self.obstacles.fence().is_some() { "the fence" } else { "the holes" },
             ))
         })?;
         let path: Vec<DVec2> = std::iter::once(from).chain(bends.iter().copied()).chain([to]).collect();

@@ -81,6 +81,8 @@ pub struct Areas {
     pub areas: Vec<Area>,
     /// Features that are no polygons.
     pub others: usize,
+    /// They are the fence of a plan: nobody may leave them.
+    pub fence: bool,
 }
 
 /// Reads the polygons of a file for a map in `epsg`. Of a map that names no reference system, corners are in its own metres.
@@ -147,7 +149,7 @@ fn placed(path: &Path, drawn: Drawn, place: &Placing) -> Result<Areas, MeasureEr
         let holes: Result<Vec<_>, String> = rings.map(|r| ring(r?)).collect();
         areas.push(Area { holes: holes.map_err(wrong)?, outside, name: name.clone() });
     }
-    Ok(Areas { areas, others: drawn.others })
+    Ok(Areas { areas, others: drawn.others, fence: drawn.fence })
 }
 
 /// A name as one short line.
@@ -219,6 +221,7 @@ struct Drawn {
     polygons: Vec<(String, Vec<Vec<DVec2>>)>,
     /// Features that are no polygons.
     others: usize,
+    fence: bool,
 }
 
 fn from_json(text: &str) -> Result<Drawn, String> {
@@ -263,7 +266,7 @@ fn from_fence(fence: &Value) -> Result<Drawn, String> {
     }
     let polygon = |outside| (String::new(), std::iter::once(outside).chain(cut.iter().cloned()).collect());
     let polygons: Vec<(String, Vec<Vec<DVec2>>)> = inside.into_iter().map(polygon).collect();
-    Ok(Drawn { system: Some(DEGREES.into()), polygons, others: 0 })
+    Ok(Drawn { system: Some(DEGREES.into()), polygons, others: 0, fence: true })
 }
 
 fn from_geojson(file: &Value) -> Result<Drawn, String> {
