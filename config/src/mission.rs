@@ -222,6 +222,11 @@ impl Mission {
         }
     }
 
+    /// Aircraft that do not fly any more, since their ground was dealt to the others.
+    pub fn lost(&self) -> &[String] {
+        self.survey.as_ref().map_or(&[], |survey| &survey.lost)
+    }
+
     /// The region of an aircraft in metres east and north of the mission's origin.
     pub fn region(&self, aircraft: &Aircraft) -> Vec<[f64; 2]> {
         if !aircraft.region_enu.is_empty() {

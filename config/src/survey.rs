@@ -36,6 +36,15 @@ record! {
         pub terrain: Option<PathBuf> = None;
         /// Holes that are flown round: corners east and north of the origin.
         pub holes_enu: Vec<Vec<[f64; 2]>>, unit "metres";
+        /// Outside of the area: corners east and north of the origin. Absent = around all regions.
+        #[serde(default)]
+        pub outside_enu: Vec<[f64; 2]> = Vec::new(), unit "metres";
+        /// The area is an inclusion fence: no way leads out of it.
+        #[serde(default)]
+        pub fence: bool = false;
+        /// Aircraft that do not fly any more: what the ground has of them is their last.
+        #[serde(default)]
+        pub lost: Vec<String> = Vec::new();
     } where Self::of_one_fleet
 }
 
@@ -57,6 +66,9 @@ impl SurveySettings {
             clearance_m: 10.0,
             terrain: None,
             holes_enu: Vec::new(),
+            outside_enu: Vec::new(),
+            fence: false,
+            lost: Vec::new(),
         }
     }
 
@@ -92,6 +104,9 @@ mod tests {
             endurance_min: vec![25.0, 20.0],
             take_off: vec![[47.4, 8.5]; 2],
             holes_enu: vec![vec![[0.0, 0.0], [9.5, 0.0], [0.0, 9.0]]],
+            outside_enu: vec![[-9.0, -9.0], [99.0, -9.0], [0.0, 99.5]],
+            fence: true,
+            lost: vec!["a1".into()],
             ..SurveySettings::usual(2.0)
         }
     }

@@ -26,7 +26,7 @@ mod regions;
 mod terrain;
 
 pub use after::Rest;
-use place::{area, homes, moved, outside, placed};
+use place::{area, homes, outside, placed};
 use terrain::Terrain;
 
 /// Names in the folder.
@@ -184,12 +184,23 @@ pub struct Planned {
     pub hectares: f64,
     /// Where aircraft take off when nobody said it.
     pub take_off: Option<Geodetic>,
-    /// Lines reach so far beyond the area, metres.
-    pub beyond_m: f64,
+    /// Lines reach so far beyond the area, metres; `None`: it is a fence, and they end inside.
+    pub beyond_m: Option<f64>,
     /// Rings that are cut out of the area and flown round.
     pub holes: usize,
     /// Ways to, from and between lines that lead round them.
     pub detours: usize,
+}
+
+/// Where it is flown, in metres of one frame.
+struct Site {
+    ground: Ground,
+    /// What is cut out of the area.
+    holes: Vec<Ring>,
+    /// Around the area, and whether nobody may leave that.
+    outside: Ring,
+    fence: bool,
+    obstacles: Obstacles,
 }
 
 /// Plans `request` and writes it into `out`.
@@ -210,19 +221,33 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
     let count = request.aircraft.len();
     let (base_m, manner) = manner(&request.camera, &request.pictures, &request.flying)?;
     let (place, area) = match &request.source {
-        Source::File(path) => area(path).map(|(area, middle)| (middle, Some((path, area))))?,
+        Source::File(path) => area(path).map(|(area, middle, fence)| (middle, Some((path, area, fence))))?,
         Source::Rest(rest) => (rest.origin(), None),
     };
-    let ground_in = |frame: &EnuFrame| match (&area, &request.source) {
-        (Some((path, area)), _) => placed(path, area, frame),
-        (None, Source::Rest(rest)) => Ok((rest.left.clone(), rest.holes.clone())),
-        (None, Source::File(_)) => Ok((Ground::default(), Vec::new())),
+    let site_in = |frame: &EnuFrame| -> Result<Site, SurveyError> {
+        let (ground, holes, outside, fence) = match (&area, &request.source) {
+            (Some((path, area, fence)), _) => {
+                let (ground, holes) = placed(path, area, frame)?;
+                (ground, holes, outside(area, frame), *fence)
+            }
+            (None, Source::Rest(rest)) => (rest.left.clone(), rest.holes.clone(), rest.outside.clone(), rest.fence),
+            (None, Source::File(_)) => Default::default(),
+        };
+        let free = obstacles(&holes, request.flying.clearance_m);
+        // What a fence encloses is never left, and other areas only where no way round their holes lies inside.
+        let obstacles = match fence {
+            true => free.and_then(|free| free.fenced(&outside)),
+            false => free.map(|free| free.inside(&outside, manner.beyond_m)),
+        };
+        Ok(Site { obstacles: obstacles.map_err(|e| request.in_source(e))?, ground, holes, outside, fence })
     };
     let frame = EnuFrame::new(place);
-    let (ground, holes) = ground_in(&frame)?;
-    let obstacles = obstacles(&holes, request.flying.clearance_m).map_err(|e| request.in_source(e))?;
-    let homes = homes(&request.flying, &frame, (&ground, &obstacles), count)?;
-    let terrain = request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &ground, &homes)).transpose()?;
+    let site = site_in(&frame)?;
+    let homes_of =
+        |frame: &EnuFrame, site: &Site| homes(&request.flying, frame, (&site.ground, &site.obstacles), count);
+    let homes = homes_of(&frame, &site)?;
+    let terrain =
+        request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &site.ground, &homes)).transpose()?;
     let height = |p: DVec2| terrain.as_ref().and_then(|t| t.height(p));
     let home_m = match (&terrain, homes.first()) {
         (Some(_), Some(home)) => height(*home).ok_or_else(|| {
@@ -237,19 +262,13 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         Source::File(_) => Geodetic { alt_m: (home_m * 100.0).round() / 100.0, ..place },
         Source::Rest(_) => place,
     };
-    let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
-    let (ground, holes) = ground_in(&frame)?;
-    let mut obstacles = self::obstacles(&holes, request.flying.clearance_m).map_err(|e| request.in_source(e))?;
-    if let Some((_, area)) = &area {
-        // What a fence encloses is not left by ways round its holes.
-        obstacles = obstacles.inside(&outside(area, &frame), manner.beyond_m);
-    }
-    if let Source::Rest(rest) = &request.source {
-        obstacles = obstacles.inside(&rest.outside, manner.beyond_m);
-    }
+    let frame = EnuFrame::new(origin);
+    let site = site_in(&frame)?;
+    let homes = homes_of(&frame, &site)?;
+    let Site { obstacles, ground, holes, .. } = &site;
     let craft = craft(request, &homes, &manner)?;
-    let shares = deal(&ground, &obstacles, &craft, &manner).map_err(|e| request.in_source(e))?;
-    let settings = settings(request, &frame, &homes, &holes);
+    let shares = deal(ground, obstacles, &craft, &manner).map_err(|e| request.in_source(e))?;
+    let settings = settings(request, &frame, &homes, &site);
     let text = match &request.source {
         Source::File(_) => mission(request, origin, &shares, settings)?,
         Source::Rest(rest) => rest.mission(&shares, settings)?,
@@ -297,7 +316,7 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         height_m: manner.height_m,
         speed_m_s: manner.pace.speed_m_s,
         hectares: ground.area_m2() / 1e4,
-        beyond_m: manner.beyond_m,
+        beyond_m: (!site.fence).then_some(manner.beyond_m),
         holes: holes.len(),
         detours: shares.iter().flat_map(|share| &share.sorties).map(Sortie::detours).sum(),
         take_off: (request.flying.take_off.is_empty()).then(|| frame.to_geodetic(homes[0].extend(0.0))),
@@ -426,7 +445,7 @@ fn obstacles(holes: &[Ring], clearance_m: f64) -> Result<Obstacles, FleetError> 
 }
 
 /// What is asked for, as the mission keeps it.
-fn settings(request: &Request, frame: &EnuFrame, homes: &[DVec2], holes: &[Ring]) -> SurveySettings {
+fn settings(request: &Request, frame: &EnuFrame, homes: &[DVec2], site: &Site) -> SurveySettings {
     let Request { pictures, flying, .. } = request;
     let place = |home: &DVec2| {
         let at = frame.to_geodetic(home.extend(0.0));
@@ -449,7 +468,10 @@ fn settings(request: &Request, frame: &EnuFrame, homes: &[DVec2], holes: &[Ring]
         clearance_m: flying.clearance_m,
         // Whoever reads the mission stands in another folder.
         terrain: request.terrain.as_deref().map(|path| std::path::absolute(path).unwrap_or_else(|_| path.into())),
-        holes_enu: holes.iter().map(|ring| ring.iter().map(|p| millimetres(*p)).collect()).collect(),
+        holes_enu: site.holes.iter().map(|ring| ring.iter().map(|p| millimetres(*p)).collect()).collect(),
+        outside_enu: site.outside.iter().map(|p| millimetres(*p)).collect(),
+        fence: site.fence,
+        lost: Vec::new(),
     }
 }
 

@@ -24,7 +24,6 @@ use super::CliError;
 use super::aggregate::{Settings, finish};
 use super::ending::within_bounds;
 use super::http::HttpArgs;
-use crate::survey_job::MISSION;
 
 /// Arguments of `dgtr serve`.
 #[derive(Debug, clap::Args)]
@@ -79,9 +78,16 @@ pub fn run(args: Args) -> Result<(), CliError> {
         origin: [mission.origin.lat_deg, mission.origin.lon_deg, mission.origin.alt_m],
         picture: [0; 2],
     };
-    let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    let session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    let carried = match &session.put_aside {
+        Some(earlier) => serve::carry(&mission, earlier, &args.out)?,
+        None => Vec::new(),
+    };
+    if !carried.is_empty() {
+        tracing::info!("the models of {} go on from the session before", carried.join(", "));
+    }
     // With the models that belong to it: what is left is dealt by both.
-    let kept = args.out.join(MISSION);
+    let kept = args.out.join(serve::MISSION);
     if !Mission::read_with_text(&kept).is_ok_and(|(_, before)| before == text) {
         let written = Disk::default().replace(&kept, |to| to.write_all(text.as_bytes()));
         written.map_err(|e| FormatError::disk(&kept, e))?;

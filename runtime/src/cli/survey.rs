@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use config::survey::SurveySettings;
-use job::run_json::RunReport;
 
 use super::CliError;
 use crate::cli::init::{field_of_view, numbers, size};
@@ -233,16 +232,13 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let mission = out.join(MISSION);
     outln!("next: load each plan into its aircraft; dgtr doctor --mission {}", mission.display());
     if let (Source::Rest(rest), Some(ground)) = (&request.source, &args.rest.after) {
-        // A session that has merged everything is over, and its models are put aside.
-        let over = RunReport::read(ground).is_ok_and(|run| run.outcome == "done");
-        let again = if over { "--again " } else { "" };
-        outln!("the ground goes on: dgtr serve {again}--mission {} --out {}", mission.display(), ground.display());
-        if over {
-            let lost = rest.lost.join(", ");
-            outln!(
-                "what {lost} covered counts when its model comes once more: start its job again, or plug in its stick"
-            );
-        }
+        let flown = args.rest.mission.as_ref().map_or("MISSION".into(), |path| path.display().to_string());
+        outln!(
+            "put it in the place of the mission that was flown, on every aircraft and the ground: its paths are relative to that folder"
+        );
+        outln!("aircraft go on with the --out of their first flight: their models become those of both flights");
+        outln!("the ground goes on: dgtr serve --mission {flown} --out {}", ground.display());
+        outln!("what it has of {} counts; nothing more is awaited from there", rest.lost.join(", "));
     }
     Ok(())
 }
@@ -266,7 +262,10 @@ fn print(request: &Request, planned: &Planned) {
     if let Some(at) = planned.take_off {
         outln!("take-off and landing at {:.6},{:.6}, the area's corner nearest to its middle", at.lat_deg, at.lon_deg);
     }
-    outln!("lines reach {:.0} m beyond the area", planned.beyond_m);
+    match planned.beyond_m {
+        Some(metres) => outln!("lines reach {metres:.0} m beyond the area"),
+        None => outln!("no flight leaves the fence; its border is seen in fewer pictures than its middle"),
+    }
     if planned.holes > 0 {
         outln!(
             "holes of the area are flown round, {} m off, by {} detours; lines end there",

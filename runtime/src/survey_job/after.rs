@@ -9,6 +9,7 @@ use fleet::ground::{Ground, Ring};
 use geometry::geodesy::{EnuFrame, Geodetic};
 use geometry::polygon;
 use glam::DVec2;
+use ground::jobs::serve::{self, RECEIVED};
 use models::camera::View;
 use models::formats::{FormatError, model};
 use survey::coverage::gaps::{self, Gap};
@@ -17,8 +18,6 @@ use survey::coverage::{CoverageMap, CoverageRegion};
 use super::regions::{with_regions, with_survey};
 use super::{Camera, SurveyError, region};
 
-/// Where `dgtr serve` keeps what it receives, below its folder.
-const RECEIVED: &str = "received";
 /// Less ground than this is no region, square metres.
 const LEAST_M2: f64 = 100.0;
 /// Origins nearer to each other are one, metres.
@@ -35,8 +34,9 @@ pub struct Rest {
     pub left: Ground,
     /// What no aircraft's region holds, between the regions.
     pub(super) holes: Vec<Ring>,
-    /// Around all regions: no way leads out of here.
+    /// Around the area, or all regions, and whether that is a fence that nobody leaves.
     pub(super) outside: Ring,
+    pub(super) fence: bool,
     /// Aircraft that do not fly it.
     pub lost: Vec<String>,
 }
@@ -62,7 +62,9 @@ impl Rest {
         for aircraft in &mission.aircraft {
             let path = received.join(&aircraft.id).join("model.dgtr");
             if !path.is_file() {
-                open.push(aircraft.id.clone());
+                if !mission.lost().contains(&aircraft.id) {
+                    open.push(aircraft.id.clone());
+                }
                 continue;
             }
             let (header, _) = model::read_header(&path)?;
@@ -76,16 +78,19 @@ impl Rest {
                 let why = format!("has its origin {apart:.1} m from the mission's; give the mission that was flown");
                 return Err(FormatError::invalid(&path, why).into());
             }
-            if !header.finished {
+            if !header.finished && !mission.lost().contains(&aircraft.id) {
                 open.push(aircraft.id.clone());
             }
             views.extend(header.views.iter().map(|(_, view)| *view));
         }
         let mut lost = if lost.is_empty() { open } else { lost.to_vec() };
+        let is_news = !lost.is_empty();
+        // Who was lost before does not fly either.
+        lost.extend(mission.lost().iter().filter(|id| mission.aircraft(Some(id)).is_ok()).cloned());
         lost.sort();
         lost.dedup();
         let asked = |what: &str| Err(SurveyError::Request(format!("{}: {what}", ground.display())));
-        if lost.is_empty() {
+        if !is_news {
             return asked(
                 "the final models of all aircraft are here; name those that do not fly any more with --without",
             );
@@ -103,10 +108,13 @@ impl Rest {
             Ok(all.with(&self::ground(&mission, &a.id)?))
         })?;
         let outer = || all.parts.iter().filter_map(|part| part.first());
-        let outside = match outer().count() {
-            1 => outer().flatten().copied().collect(),
-            _ => polygon::hull(outer().flatten().copied().collect()),
+        let drawn = mission.survey.as_ref().map(|survey| &survey.outside_enu).filter(|ring| !ring.is_empty());
+        let outside = match (drawn, outer().count()) {
+            (Some(ring), _) => ring.iter().copied().map(DVec2::from).collect(),
+            (None, 1) => outer().flatten().copied().collect(),
+            (None, _) => polygon::hull(outer().flatten().copied().collect()),
         };
+        let fence = mission.survey.as_ref().is_some_and(|survey| survey.fence);
         let holes = match &mission.survey {
             Some(survey) => {
                 survey.holes_enu.iter().map(|ring| ring.iter().copied().map(DVec2::from).collect()).collect()
@@ -121,7 +129,7 @@ impl Rest {
             let why = format!("its [survey] is of {count} aircraft and [[aircraft]] of {wanted}; make them agree");
             return Err(FormatError::invalid(file, why).into());
         }
-        Ok(Self { text, mission, left, holes, outside, lost })
+        Ok(Self { text, mission, left, holes, outside, fence, lost })
     }
 
     /// Ids and links of those that fly it.
@@ -170,7 +178,9 @@ impl Rest {
                 take_off.push(place);
             }
         }
-        SurveySettings { endurance_min, take_off, ..settings }
+        let stays = |id: &String| self.mission.aircraft.iter().zip(stays).any(|(a, stays)| *stays && a.id == *id);
+        let lost = self.lost.iter().filter(|id| stays(id)).cloned().collect();
+        SurveySettings { endurance_min, take_off, lost, ..settings }
     }
 
     /// The mission's camera.
@@ -219,7 +229,7 @@ impl Rest {
 
 /// Refuses a folder in which the ground received another mission.
 fn is_of(mission: &Mission, ground: &Path) -> Result<(), SurveyError> {
-    let kept = ground.join(super::MISSION);
+    let kept = ground.join(serve::MISSION);
     if !kept.is_file() {
         return Ok(());
     }

@@ -5,7 +5,7 @@ use std::path::Path;
 use fleet::ground::{Ground, Ring};
 use fleet::obstacles::Obstacles;
 use geometry::geodesy::{EnuFrame, Geodetic};
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use measure::areas::{self, Area};
 
 use super::{Flying, SurveyError, in_file, setting};
@@ -13,8 +13,8 @@ use super::{Flying, SurveyError, in_file, setting};
 /// Take-off places are no further from the area's middle, metres.
 const FARTHEST_M: f64 = 50_000.0;
 
-/// The area in degrees, and its middle.
-pub fn area(path: &Path) -> Result<(Area, Geodetic), SurveyError> {
+/// The area in degrees, its middle, and whether it is a fence that nobody may leave.
+pub fn area(path: &Path) -> Result<(Area, Geodetic, bool), SurveyError> {
     let mut drawn = areas::read_degrees(path)?;
     if drawn.others > 0 {
         tracing::warn!("{}: {} features are no polygons and are left out", path.display(), drawn.others);
@@ -29,7 +29,7 @@ pub fn area(path: &Path) -> Result<(Area, Geodetic), SurveyError> {
         )));
     };
     let middle = middle(area);
-    Ok((drawn.areas.swap_remove(0), middle))
+    Ok((drawn.areas.swap_remove(0), middle, drawn.fence))
 }
 
 /// The middle of the box around an area, also where it lies on both sides of the antimeridian.
@@ -74,15 +74,6 @@ fn flat(frame: &EnuFrame, lat_deg: f64, lon_deg: f64) -> DVec2 {
     }
 }
 
-/// Places of one frame in another.
-pub fn moved(from: &EnuFrame, to: &EnuFrame, places: Vec<DVec2>) -> Vec<DVec2> {
-    let place = |p: DVec2| {
-        let at = from.to_geodetic(DVec3::new(p.x, p.y, 0.0));
-        flat(to, at.lat_deg, at.lon_deg)
-    };
-    places.into_iter().map(place).collect()
-}
-
 /// Where each aircraft takes off.
 pub fn homes(
     flying: &Flying,
@@ -93,6 +84,11 @@ pub fn homes(
     let place = |[lat_deg, lon_deg]: &[f64; 2]| {
         let valid = Geodetic { lat_deg: *lat_deg, lon_deg: *lon_deg, alt_m: 0.0 }.is_valid();
         match valid.then(|| flat(frame, *lat_deg, *lon_deg)).filter(|p| p.length() < FARTHEST_M) {
+            Some(p) if obstacles.shut_out(p) => Err(setting(
+                "--take-off",
+                format!("{lat_deg},{lon_deg}"),
+                "inside the fence, a few metres from its sides, as no flight leaves it",
+            )),
             Some(p) if obstacles.hold(p) => Err(setting(
                 "--take-off",
                 format!("{lat_deg},{lon_deg}"),
@@ -110,7 +106,8 @@ pub fn homes(
         [] => {
             // The corner with the shortest way to all of the area.
             let middle = ground.middle();
-            let corners = ground.parts.first().and_then(|part| part.first()).into_iter().flatten();
+            let inside = obstacles.fence().unwrap_or(ground);
+            let corners = inside.parts.iter().filter_map(|part| part.first()).flatten();
             let corners = corners.filter(|p| !obstacles.hold(**p));
             let nearest = corners.min_by(|a, b| a.distance(middle).total_cmp(&b.distance(middle)));
             Ok(vec![nearest.copied().unwrap_or(middle); count])

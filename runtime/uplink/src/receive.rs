@@ -246,7 +246,12 @@ impl Receiver {
 
     /// Whether the last word of every aircraft is here: its last model, or one that may not count.
     pub fn all_finished(&self) -> bool {
-        self.seats.iter().all(|s| !s.is_at_work() && s.is_over)
+        self.over().into_iter().all(|over| over)
+    }
+
+    /// Of every aircraft whether its last word is here.
+    pub fn over(&self) -> Vec<bool> {
+        self.seats.iter().map(|s| !s.is_at_work() && s.is_over).collect()
     }
 
     /// What of an aircraft is shown in the place of this session's last model, in words.
@@ -262,7 +267,12 @@ impl Receiver {
 
     /// Whether every aircraft whose model is here has signed for the receipt.
     pub fn all_told(&self) -> bool {
-        self.seats.iter().all(|s| !s.is_at_work() && s.is_told)
+        self.told().into_iter().all(|told| told)
+    }
+
+    /// Of every aircraft whether it has signed for the receipt of what is here.
+    pub fn told(&self) -> Vec<bool> {
+        self.seats.iter().map(|s| !s.is_at_work() && s.is_told).collect()
     }
 
     /// Per aircraft: chunks here and chunks wanted of what is being fetched now; (0, 0) when nothing is.

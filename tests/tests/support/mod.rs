@@ -3,6 +3,7 @@
 
 pub mod hub;
 pub mod plane;
+pub mod radio;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};

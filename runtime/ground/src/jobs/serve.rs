@@ -20,15 +20,23 @@ use uplink::receive::{LastHeard, ReceiveCounters, Received, Receiver};
 use crate::AggregateError;
 use crate::jobs::aggregate::{self, Outcome};
 use crate::member::Member;
+use redealt::Redealt;
 
 pub mod admit;
 mod board;
 mod joining;
+mod redealt;
 mod watchdog;
 
 pub use board::Board;
 pub use joining::{Joined, Joining};
+pub use redealt::carry;
 pub use watchdog::COVERED_PCT;
+
+/// Where received models lie in the folder of a ground.
+pub const RECEIVED: &str = "received";
+/// The mission that a ground received them for, beside them.
+pub const MISSION: &str = "mission.toml";
 
 /// After the last model is here, the aircraft have so long to take their receipts.
 const RECEIPTS: Duration = Duration::from_secs(10);
@@ -111,13 +119,21 @@ pub fn receive(
 ) -> Result<Reception, UploadError> {
     let start = Instant::now();
     let ids: Vec<String> = mission.aircraft.iter().map(|a| a.id.clone()).collect();
-    let mut receiver =
-        Receiver::open(&mission.upload, admission(mission, &out.join("received"))?, &out.join("received"))?;
+    let folder = out.join(RECEIVED);
+    let mut receiver = Receiver::open(&mission.upload, admission(mission, &folder)?, &folder)?;
+    let mut redealt = Redealt::new(mission);
     let mut complete: Option<Instant> = None;
+    let mut is_over;
     let over = || stop.load(std::sync::atomic::Ordering::Relaxed) || timeout.is_some_and(|t| start.elapsed() >= t);
     loop {
         let more = receiver.round(stop)?;
-        let received = receiver.received();
+        let received = redealt.judged(receiver.received());
+        // Whoever does not fly any more is here with what it has sent, and hears no receipt.
+        let is_last = |id: &String| received.iter().find(|r| r.aircraft == *id).map(|r| r.finished);
+        let lost = |id: &String| redealt.is_lost(id) && is_last(id) == Some(true);
+        let each = || ids.iter().zip(receiver.over().into_iter().zip(receiver.told()));
+        is_over = each().all(|(id, (over, _))| lost(id) || over && is_last(id) != Some(false));
+        let is_told = each().all(|(id, (_, told))| lost(id) || told);
         tell(&Progress {
             finished: received.iter().filter(|r| r.finished).count(),
             aircraft: ids.len(),
@@ -126,9 +142,9 @@ pub fn receive(
             received,
             last_heard: receiver.last_heard(),
         });
-        if receiver.all_finished() {
+        if is_over {
             let since = complete.get_or_insert_with(Instant::now);
-            if receiver.all_told() || since.elapsed() > RECEIPTS {
+            if is_told || since.elapsed() > RECEIPTS {
                 break;
             }
         }
@@ -139,10 +155,10 @@ pub fn receive(
             receiver.wait();
         }
     }
-    if receiver.all_finished() {
+    if is_over {
         receiver.end_session();
     }
-    let received = receiver.received();
+    let received = redealt.judged(receiver.received());
     let is_here = |id: &String| received.iter().any(|r| r.finished && r.aircraft == *id);
     Ok(Reception {
         missing: ids.iter().filter(|id| !is_here(id)).cloned().collect(),
