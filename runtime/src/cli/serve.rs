@@ -157,6 +157,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
         run.stage("map", from);
     }
     let seen = board.watch().freeze();
+    // What was said while it received stands in the report, too.
+    let said: Vec<String> = seen.warnings.iter().filter(|line| !data.warnings.contains(*line)).cloned().collect();
+    data.warnings.extend(said);
     data.warnings.extend(left_short(&args.out, &seen.aircraft, &reception.missing));
     (data.aircraft, data.ground) = (seen.aircraft, seen.ground);
     if !reception.missing.is_empty() {
