@@ -207,7 +207,7 @@ impl Dealer<'_> {
         let seconds = |lines: &Vec<Line>| path_s(lines, craft.home, &manner.pace);
         let best = tried.into_iter().min_by(|a, b| seconds(&a.1).total_cmp(&seconds(&b.1)));
         let (spacing_m, lines) = best.unwrap_or_default();
-        let lines: Vec<Line> = lines.iter().flat_map(|line| self.obstacles.clear(line)).collect();
+        let lines: Vec<Line> = lines.iter().flat_map(|line| self.obstacles.along_strip(line, spacing_m)).collect();
         if lines.is_empty() {
             return Err(FleetError::Deal(format!("the area is too small for {} aircraft", self.craft.len())));
         }

@@ -9,6 +9,8 @@ use crate::lines::Line;
 
 /// Lines and ways keep this far inside a fence, metres: ArduPilot's FENCE_MARGIN.
 const FENCE_M: f64 = 2.0;
+/// Where a line lies whose strip has its middle beyond the fence, in widths of the strip from there.
+const ASIDE: [f64; 4] = [0.25, -0.25, 0.45, -0.45];
 /// Ways bend so much further out than they need to, metres: rounding is no collision.
 const SLACK_M: f64 = 0.5;
 /// A ring is drawn with fewer corners, none of the old further off than this share of the clearance.
@@ -166,6 +168,29 @@ impl Obstacles {
             |[from, to]: [f64; 2]| Line { from: line.from.lerp(line.to, from), to: line.from.lerp(line.to, to) };
         let whole = open.len() == 1 && open[0] == [0.0, 1.0];
         open.into_iter().map(piece).filter(|piece| whole || piece.length() >= SHORTEST_M).collect()
+    }
+
+    /// What of the line along a strip of ground `width` metres wide may be flown, in its direction. Where a fence has the strip's middle
+    /// beyond it and a side of the strip inside, the line lies on that side.
+    pub fn along_strip(&self, line: &Line, width: f64) -> Vec<Line> {
+        let mut open = self.clear(line);
+        let Some(along) = (line.to - line.from).try_normalize().filter(|_| self.fence().is_some()) else { return open };
+        let metres = |p: DVec2| (p - line.from).dot(along);
+        let ends = open.iter().flat_map(|piece| [metres(piece.from), metres(piece.to)]);
+        let ends: Vec<f64> = std::iter::once(0.0).chain(ends).chain([line.length()]).collect();
+        // At sides that cross the strip steeply no piece is as long as that.
+        let is_long = |length: f64| length >= width;
+        for gap in ends.chunks_exact(2).filter(|gap| is_long(gap[1] - gap[0])) {
+            let beside = ASIDE.iter().map(|share| {
+                let place = |metres: f64| line.from + along * metres + along.perp() * share * width;
+                let mut pieces = self.clear(&Line { from: place(gap[0]), to: place(gap[1]) });
+                pieces.retain(|piece| is_long(piece.length()));
+                pieces
+            });
+            open.extend(beside.into_iter().find(|pieces| !pieces.is_empty()).unwrap_or_default());
+        }
+        open.sort_by(|a, b| metres(a.from).total_cmp(&metres(b.from)));
+        open
     }
 
     /// Where the shortest way between two places bends, in flying order; `None` where there is none.
@@ -480,6 +505,18 @@ mod tests {
         (0..corners)
             .map(|k| middle + DVec2::from_angle(step * f64::from(k)) * rng.random_range(radii.clone()))
             .collect()
+    }
+
+    #[test]
+    fn a_strip_whose_middle_is_beyond_the_fence_has_a_line_on_its_side_inside() {
+        let fenced = Obstacles::default().fenced(&rectangle(0.0, 0.0, 200.0, 100.0)).expect("room");
+        let strip = |north: f64| Line { from: DVec2::new(-5.0, north), to: DVec2::new(205.0, north) };
+        let inside = fenced.along_strip(&strip(50.0), 20.0);
+        assert_eq!((inside.len(), inside[0].from.y), (1, 50.0));
+        let aside = fenced.along_strip(&strip(102.0), 20.0);
+        assert_eq!((aside.len(), aside[0].from.y), (1, 97.0), "a quarter of its width inwards");
+        assert!(fenced.along_strip(&strip(115.0), 20.0).is_empty(), "no side of it is inside");
+        assert!(Obstacles::default().along_strip(&strip(102.0), 20.0).len() == 1, "without a fence the middle");
     }
 
     #[test]
