@@ -77,7 +77,7 @@ impl Landing {
             return Some(format!("dgtr: ambiguous flight, {doubtful} of {posed} unsure"));
         }
         if doubtful > 0 {
-            tracing::info!("{many}; geotags.csv holds their confidence");
+            tracing::warn!("ambiguous: {many}; geotags.csv holds their confidence");
         }
         (revised > 0).then(|| format!("dgtr: {revised} pictures may have another exposure's pose"))
     }
