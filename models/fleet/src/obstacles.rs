@@ -84,7 +84,8 @@ impl Obstacles {
             return self;
         }
         let (ring, coarse_m) = drawn_coarsely(outside, COARSE * beyond_m);
-        let [ground, inner] = [0.0, SLACK_M].map(|less| with_room(&[ring.clone()], beyond_m + coarse_m - less));
+        let [ground, inner] =
+            [0.0, SLACK_M].map(|less| with_room(std::slice::from_ref(&ring), beyond_m + coarse_m - less));
         self.limit = Some(self.limited(ground, inward(&inner), None));
         self
     }
