@@ -14,16 +14,18 @@ pub fn reference() -> String {
         &mut out,
         "Every setting of a mission file with its default. Tables that are not given have these defaults.",
     );
-    tables(&mut out, "", &Mission::settings());
+    tables(&mut out, "", &Mission::settings(), false);
     out
 }
 
-/// First what lies directly in the table, then its tables: TOML wants them in this order.
-fn tables(out: &mut String, path: &str, settings: &[Setting]) {
+/// First what lies directly in the table, then its tables: TOML wants them in this order. What lies in a table that may be absent is
+/// commented out with it.
+fn tables(out: &mut String, path: &str, settings: &[Setting], is_absent: bool) {
+    let mark = if is_absent { "#" } else { "" };
     for s in settings.iter().filter(|s| s.settings.is_empty()) {
         comment(out, &explain(s));
         match &s.default {
-            Some(default) => *out += &format!("{} = {default}\n", s.name),
+            Some(default) => *out += &format!("{mark}{} = {default}\n", s.name),
             None => *out += &format!("#{} =\n", s.name),
         }
     }
@@ -33,9 +35,9 @@ fn tables(out: &mut String, path: &str, settings: &[Setting]) {
         comment(out, s.about);
         let header = if s.repeated { format!("[[{path}]]") } else { format!("[{path}]") };
         // A table that may be absent must not appear by being described.
-        let absent = if s.default.is_none() && !s.required { "#" } else { "" };
-        *out += &format!("{absent}{header}\n");
-        tables(out, &path, &s.settings);
+        let is_absent = is_absent || (s.default.is_none() && !s.required);
+        *out += &format!("{}{header}\n", if is_absent { "#" } else { "" });
+        tables(out, &path, &s.settings, is_absent);
     }
 }
 
