@@ -95,10 +95,10 @@ fi
 
 if [ "${1:-}" = --tests ]; then
     command -v c++ >/dev/null || apt g++
-    # The reader of models in Python.
-    python3 -c "import numpy" 2>/dev/null || apt python3 python3-numpy
-    # A Python that is not Debian's does not see Debian's packages.
-    python3 -c "import numpy" 2>/dev/null || python3 -m pip install -q numpy >&2 || give_up "python3 has no numpy; install it"
+    # The reader of models in Python. A Python that is not Debian's does not see Debian's packages.
+    numpy() { python3 -c "import numpy" 2>/dev/null || /usr/bin/python3 -c "import numpy" 2>/dev/null; }
+    numpy || apt python3 python3-numpy
+    numpy || give_up "python3 has no numpy; install it"
     # Without it the validation test says that it is skipped.
     [ -e /usr/share/vulkan/explicit_layer.d/VkLayer_khronos_validation.json ] || (apt vulkan-validationlayers) || true
 fi
