@@ -10,7 +10,8 @@ pub fn escaped(text: &str) -> String {
     line
 }
 
-/// Passes on what is written to it, and writes out the characters that a terminal would obey.
+/// Passes on what is written to it, and writes out the characters that a terminal would obey as JSON and TOML do: text in one of these
+/// stays what it is.
 pub struct Escaping<W, F> {
     out: W,
     is_obeyed: F,
@@ -29,7 +30,12 @@ impl<W: Write, F: Fn(char) -> bool> Write for Escaping<W, F> {
             match part.chars().next_back().filter(|c| (self.is_obeyed)(*c)) {
                 Some(obeyed) => {
                     self.out.write_str(&part[..part.len() - obeyed.len_utf8()])?;
-                    write!(self.out, "{}", obeyed.escape_default())?;
+                    match obeyed {
+                        '\n' => self.out.write_str("\\n")?,
+                        '\r' => self.out.write_str("\\r")?,
+                        '\t' => self.out.write_str("\\t")?,
+                        other => write!(self.out, "\\u{:04x}", u32::from(other))?,
+                    }
                 }
                 None => self.out.write_str(part)?,
             }
@@ -46,7 +52,7 @@ mod tests {
     fn nothing_that_a_terminal_obeys_and_no_line_end_is_in_a_line() {
         assert_eq!(
             escaped("a\u{1b}[2J\nINFO b\r\u{9b}31m\u{7f}\0 \u{e9}"),
-            "a\\u{1b}[2J\\nINFO b\\r\\u{9b}31m\\u{7f}\\u{0} \u{e9}"
+            "a\\u001b[2J\\nINFO b\\r\\u009b31m\\u007f\\u0000 \u{e9}"
         );
         assert_eq!(escaped(""), "");
     }

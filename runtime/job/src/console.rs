@@ -273,7 +273,7 @@ mod tests {
 
     #[test]
     fn an_error_is_one_line_of_a_screens_length_with_nothing_that_a_terminal_obeys() {
-        assert_eq!(said("a\u{1b}[2J\nINFO b.toml: check the path"), "a\\u{1b}[2J\\nINFO b.toml: check the path");
+        assert_eq!(said("a\u{1b}[2J\nINFO b.toml: check the path"), "a\\u001b[2J\\nINFO b.toml: check the path");
         let long = said(&format!("name = \"{}\": must be short", "\u{e9}".repeat(1 << 20)));
         assert_eq!(long.chars().count(), LONGEST + 3);
         assert!(long.starts_with("name = \"\u{e9}") && long.ends_with("\": must be short"), "{long}");

@@ -104,7 +104,7 @@ fn what_a_name_would_make_a_terminal_do_reaches_neither_output_nor_error() {
     let written = ended(dir.path(), &["export", "m.dgtr", "--to", "ply", "--out", name, "-q"]);
     assert!(written.status.success() && dir.path().join(name).exists());
     // The file is called so; it is shown as this.
-    let shown = "a\\u{1b}[2J\\u{9b}31m\\u{7}";
+    let shown = "a\\u001b[2J\\u009b31m\\u0007";
     let told = String::from_utf8(written.stdout).unwrap();
     assert!(told.starts_with(&format!("{shown}.ply: 1 Gaussians")) && told.ends_with('\n'), "{told:?}");
     let missing = "a\u{1b}[2J\u{9b}31m\u{7}\nINFO all is well.toml";
