@@ -114,10 +114,14 @@ impl Frame {
         }
         for part in &parts {
             let component = &mut self.components[part.component];
-            component.lowest[pass.coefficients()].fill(lowest);
             if matches!(pass, Pass::Band(..) | Pass::BandBit(..)) {
+                // The means come first (T.81, G.1.1.1.1): no memory is taken for blocks of which nothing was there yet.
+                if component.lowest[0] == u8::MAX {
+                    return Err(DAMAGED);
+                }
                 component.sent.resize(units, 0);
             }
+            component.lowest[pass.coefficients()].fill(lowest);
         }
         let mut bits = Bits { data, at: 0, buffer: 0, count: 0, zeros: 0, run: 0 };
         for unit in 0..units {

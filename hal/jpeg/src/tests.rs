@@ -86,6 +86,15 @@ fn a_picture_of_more_scans_than_encoders_write_is_refused() {
     assert_eq!((flaw(&repeated(100)), flaw(&repeated(300))), (None, Some(DAMAGED)));
 }
 
+/// A header alone could claim a picture of any size.
+#[test]
+fn a_band_of_a_progressive_picture_before_its_means_is_refused() {
+    let at = |from: usize| from + PROGRESSIVE[from..].windows(2).position(|w| w == [0xFF, 0xDA]).expect("a scan");
+    let (first, second) = (at(0), at(at(0) + 2));
+    // The first scan is of the means of all components; what is left are bands.
+    assert_eq!(flaw(&[&PROGRESSIVE[..first], &PROGRESSIVE[second..]].concat()), Some(DAMAGED));
+}
+
 #[test]
 fn a_hole_in_a_scan_is_found_out() {
     let jpeg = encoded(&picture(320, 240), 90);
