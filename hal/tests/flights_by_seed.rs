@@ -36,6 +36,8 @@ struct Tally {
     in_flight: usize,
     /// Flights that are called ambiguous at the landing.
     ambiguous: usize,
+    /// Lowest and highest median confidence of a flight.
+    medians: Option<(f32, f32)>,
 }
 
 impl Tally {
@@ -44,10 +46,11 @@ impl Tally {
         let possible = taken.iter().filter(|at| told.contains(at)).count();
         let flown = sortie.fly(&conditions.settings());
         let mut tally = Self { flights: 1, possible, ..Self::default() };
-        let mut wrong = Vec::new();
+        let (mut wrong, mut confidences) = (Vec::new(), Vec::new());
         for (name, place, confidence) in flown.places() {
             let off_s = place.x / SPEED_M_S - taken[name.parse::<usize>().unwrap()];
             let sure = usize::from(confidence > SURE);
+            confidences.push(confidence);
             if off_s.abs() < SAME_S {
                 (tally.right, tally.surely_right) = (tally.right + 1, tally.surely_right + sure);
             } else {
@@ -56,6 +59,8 @@ impl Tally {
             }
         }
         tally.in_flight = tally.right - (flown.counters.pictures.pictures_reconciled as usize).min(tally.right);
+        confidences.sort_by(f32::total_cmp);
+        tally.medians = confidences.get(confidences.len() / 2).map(|median| (*median, *median));
         tally.ambiguous = usize::from(flown.said.iter().any(|said| said.contains("ambiguous flight")));
         if tally.surely_wrong > 0 || (conditions.tells() && tally.right * 100 < 97 * possible) {
             println!("seed {seed}: {tally:?} {conditions:?}: wrong {wrong:.2?}");
@@ -72,6 +77,10 @@ impl Tally {
         self.surely_wrong += o.surely_wrong;
         self.in_flight += o.in_flight;
         self.ambiguous += o.ambiguous;
+        self.medians = match (self.medians, o.medians) {
+            (Some(a), Some(b)) => Some((a.0.min(b.0), a.1.max(b.1))),
+            (a, b) => a.or(b),
+        };
     }
 }
 

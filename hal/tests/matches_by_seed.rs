@@ -11,7 +11,7 @@ mod chance;
 
 use std::collections::HashSet;
 
-use chance::Chance;
+use chance::{Chance, Rhythm};
 use hal::matcher::{Matcher, MatcherSettings, Outcome, Reason, landing};
 use hal::traits::PictureClues;
 use hal::trigger::{Source, Trigger, TriggerKind};
@@ -64,19 +64,7 @@ impl Conditions {
 
     /// When the shutter opened.
     fn times(&self, chance: &mut Chance) -> Vec<f64> {
-        let mut at = 20.0;
-        let mut times = Vec::with_capacity(self.exposures);
-        for k in 0..self.exposures {
-            times.push(at);
-            at += self.interval;
-            if !self.regular {
-                at += self.interval * chance.between(-0.15, 0.15);
-                if k % self.line == self.line - 1 {
-                    at += self.interval * chance.between(0.5, 3.0);
-                }
-            }
-        }
-        times
+        Rhythm { interval: self.interval, regular: self.regular, line: self.line }.times(chance, 20.0, self.exposures)
     }
 
     fn late(&self, chance: &mut Chance, share: f64) -> f64 {

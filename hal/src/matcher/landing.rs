@@ -13,9 +13,8 @@ use crate::trigger::Trigger;
 /// Exposures that come into question for one picture.
 const WIDTH: usize = 96;
 
-/// Middle confidence up to which the second assignment of a flight is nearly as likely as the best. Of flights by seed
-/// (tests/flights_by_seed.rs) those whose rhythm tells lie above (0.63 at least); those of an even rhythm that lack something at one end
-/// lie below (0.45 at most).
+/// Middle confidence up to which the second assignment of a flight is nearly as likely as the best: flights whose rhythm tells lie above,
+/// those of an even rhythm that lack something at one end lie below (`tests/flights_by_seed.rs` prints how far).
 const NEARLY_AS_LIKELY: f32 = 0.6;
 /// A camera may be this many times later than in flight: pictures were copied at the landing.
 const REACH: u64 = 4;
@@ -109,13 +108,13 @@ fn with_gaps(exposures: &[Trigger]) -> Vec<Slot> {
 pub struct Settled {
     /// Pictures that found no exposure in flight, with the one that is theirs.
     pub pairs: Vec<Pairing>,
-    /// Those of the known ones that it says something else of.
+    /// Which of the known ones it says another exposure of.
     pub revised: Vec<usize>,
     /// Pictures that have an exposure.
     pub posed: usize,
-    /// Those of them that fit another one nearly as well.
+    /// How many of these fit another one nearly as well.
     pub doubtful: usize,
-    /// The middle one of their confidences: by how much this assignment of the flight is likelier than the second.
+    /// The median of their confidences: by how much this assignment of the flight is likelier than the second.
     pub confidence: f32,
 }
 
@@ -140,12 +139,10 @@ pub fn settle(
     in_order(&mut all);
     let clues: Vec<PictureClues> = all.iter().map(|a| a.0).collect();
     let answers = align_shutters(exposures, &clues, settings);
-    let posed = answers.iter().filter(|a| a.exposure.is_some());
-    let doubtful = posed.clone().filter(|a| a.confidence <= SURE).count();
-    let posed = posed.count();
     let mut sorted: Vec<f32> = answers.iter().filter(|a| a.exposure.is_some()).map(|a| a.confidence).collect();
     sorted.sort_by(f32::total_cmp);
-    let confidence = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0);
+    let (posed, doubtful) = (sorted.len(), sorted.partition_point(|confidence| *confidence <= SURE));
+    let confidence = sorted.get(posed / 2).copied().unwrap_or(1.0);
     let (mut taken, mut revised) = (HashSet::new(), Vec::new());
     for (answer, (_, place)) in answers.iter().zip(&all) {
         let Ok(k) = *place else { continue };

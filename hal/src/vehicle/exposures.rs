@@ -169,7 +169,7 @@ where
         }
         // The whole flight once more, with both ends; then by votes what is still alone.
         let landing = self.exposures.align(self.matcher.settings());
-        if let Some(doubt) = landing.doubt() {
+        for doubt in landing.doubts() {
             self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &doubt);
         }
         self.take_pairs(landing.pairs);

@@ -1,4 +1,4 @@
-//! Numbers by chance, the same ones for the same seed.
+//! Numbers by chance, the same ones for the same seed, and a shutter's rhythm made of them.
 
 /// Numbers by chance (an LCG with a mixed output).
 pub struct Chance(u64);
@@ -35,5 +35,34 @@ impl Chance {
     /// Zero in `share` of all flights.
     pub fn sometimes(&mut self, share: f64, high: f64) -> f64 {
         if self.yes(share) { 0.0 } else { self.between(0.0, high) }
+    }
+}
+
+/// When a shutter opens.
+pub struct Rhythm {
+    /// Seconds between two exposures.
+    pub interval: f64,
+    /// It is always the same; else turns lie between survey lines, and no interval is quite like the next.
+    pub regular: bool,
+    /// Exposures of one survey line.
+    pub line: usize,
+}
+
+impl Rhythm {
+    /// Times of so many exposures from `begin` on, s.
+    pub fn times(&self, chance: &mut Chance, begin: f64, exposures: usize) -> Vec<f64> {
+        let mut at = begin;
+        let mut times = Vec::with_capacity(exposures);
+        for k in 0..exposures {
+            times.push(at);
+            at += self.interval;
+            if !self.regular {
+                at += self.interval * chance.between(-0.15, 0.15);
+                if k % self.line == self.line - 1 {
+                    at += self.interval * chance.between(0.5, 3.0);
+                }
+            }
+        }
+        times
     }
 }

@@ -3,6 +3,7 @@
 mod chance;
 
 pub use chance::Chance;
+use chance::Rhythm;
 use glam::DVec3;
 use hal::mavlink::dialect::{CAMERA_FEEDBACK_DATA, CAMERA_IMAGE_CAPTURED_DATA, MavBool};
 use hal::traits::PictureClues;
@@ -189,19 +190,11 @@ impl Conditions {
 
     /// When the shutter opened.
     fn times(&self, chance: &mut Chance) -> Vec<f64> {
-        let mut at = BEGIN_S;
-        let mut times = Vec::with_capacity(self.exposures);
-        for k in 0..self.exposures {
-            times.push(at);
-            at += self.interval;
-            if !self.regular {
-                at += self.interval * chance.between(-0.15, 0.15);
-                if k % self.line == self.line - 1 {
-                    at += self.interval * chance.between(0.5, 3.0);
-                }
-            }
-        }
-        times
+        Rhythm { interval: self.interval, regular: self.regular, line: self.line }.times(
+            chance,
+            BEGIN_S,
+            self.exposures,
+        )
     }
 
     fn late(&self, chance: &mut Chance, share: f64) -> f64 {

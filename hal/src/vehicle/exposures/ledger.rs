@@ -62,8 +62,8 @@ pub(super) struct Landing {
 }
 
 impl Landing {
-    /// One line for the pilot where the flight is ambiguous; the log says more.
-    pub(super) fn doubt(&self) -> Option<String> {
+    /// What the pilot is told where poses are in doubt; the log says more.
+    pub(super) fn doubts(&self) -> impl Iterator<Item = String> + use<> {
         let Self { revised, posed, doubtful, .. } = *self;
         if revised > 0 {
             tracing::warn!("the whole flight says another exposure of {revised} pictures that were posed in flight");
@@ -74,12 +74,12 @@ impl Landing {
                 "the flight is ambiguous: {many}; geotags.csv holds their confidence \
                  (link.picture_latency_ms, numbers in file names or EXIF times tell them apart)"
             );
-            return Some(format!("dgtr: ambiguous flight, {doubtful} of {posed} unsure"));
-        }
-        if doubtful > 0 {
+        } else if doubtful > 0 {
             tracing::warn!("ambiguous: {many}; geotags.csv holds their confidence");
         }
-        (revised > 0).then(|| format!("dgtr: {revised} pictures may have another exposure's pose"))
+        let ambiguous = self.is_ambiguous.then(|| format!("dgtr: ambiguous flight, {doubtful} of {posed} unsure"));
+        let other = (revised > 0).then(|| format!("dgtr: {revised} pictures may have another exposure's pose"));
+        ambiguous.into_iter().chain(other)
     }
 }
 
