@@ -1,9 +1,11 @@
-//! What a TIFF declares, against what it can hold, and whether the JPEGs in it are whole. Decoders allocate for a tag before they read it, 32 bytes for each of its
-//! numbers, so that a file of some hundred bytes could take hundreds of MiB.
+//! What a TIFF declares, against what it can hold, and whether the JPEGs in it are whole. Decoders allocate for a tag before they read it,
+//! 32 bytes for each of its numbers, so that a file of some hundred bytes could take hundreds of MiB.
 
-use std::fs::File;
 use std::io::{BufReader, Read, Result, Seek, SeekFrom};
 use std::path::Path;
+
+use tiff::decoder::Decoder;
+use tiff::tags::{CompressionMethod, Tag};
 
 /// Directories read; the first is the picture, others are previews and pyramids.
 const DIRECTORIES: usize = 16;
@@ -37,10 +39,15 @@ pub fn fits_its_tags(path: &Path) -> Result<bool> {
         for _ in 0..u16_of(entries) {
             let mut entry = [0; 12];
             file.read_exact(&mut entry)?;
-            if size_of(u16_of([entry[2], entry[3]]).into())
-                * u64::from(u32_of([entry[4], entry[5], entry[6], entry[7]]))
-                > length
-            {
+            // TIFF 6.0, section 2: bytes of the types 1 to 12; 13 is an offset to another directory, 16 to 18 are BigTIFF's, which
+            // decoders take here, too.
+            let size = match u16_of([entry[2], entry[3]]) {
+                3 | 8 => 2,
+                4 | 9 | 11 | 13 => 4,
+                5 | 10 | 12 | 16..=18 => 8,
+                _ => 1,
+            };
+            if size * u64::from(u32_of([entry[4], entry[5], entry[6], entry[7]])) > length {
                 return Ok(false);
             }
         }
@@ -51,129 +58,52 @@ pub fn fits_its_tags(path: &Path) -> Result<bool> {
     Ok(true)
 }
 
-/// Tags of the picture (TIFF 6.0, and its supplement of 2002 on JPEG).
-const COMPRESSION: u64 = 259;
-const STRIPS: [u64; 2] = [273, 279];
-const TILES: [u64; 2] = [324, 325];
-const TABLES: u64 = 347;
-/// The compression that is JPEG.
-const JPEG: [u64; 1] = [7];
-
 /// Bytes of the tables that all of its JPEGs have in common: eight of codes and four of steps take 3 kB.
 const MOST_TABLES: usize = 1 << 14;
 
 const BEYOND: &str = "its strips are larger than the file";
 const NO_TABLES: &str = "its tables are larger than any";
 
-/// What is missing of the JPEGs that a TIFF's picture is stored in, of which decoders make grey; `None` where they are whole, and for other
-/// files.
+/// What is missing of the JPEGs that a TIFF's picture is stored in (its supplement of 2002), of which decoders make grey; `None` where they
+/// are whole, and for other files. What cannot be read here is refused when it is decoded.
 ///
 /// # Errors
-/// The file cannot be read, or ends within its directory.
+/// The file cannot be read.
 pub fn flaw(path: &Path) -> Result<Option<&'static str>> {
-    let mut file = BufReader::new(disk::regular::open(path)?);
-    let length = file.get_ref().metadata()?.len();
-    let Some(directory) = Directory::first(&mut file, length)? else { return Ok(None) };
-    if directory.numbers(&mut file, COMPRESSION)? != JPEG {
+    let mut file = disk::regular::open(path)?;
+    let length = file.metadata()?.len();
+    let Ok(mut tags) = Decoder::new(BufReader::new(file.try_clone()?)) else { return Ok(None) };
+    let compression = tags.find_tag_unsigned(Tag::Compression).ok().flatten();
+    if compression != Some(CompressionMethod::ModernJPEG.to_u16()) {
         return Ok(None);
     }
-    let tables = directory.bytes(&mut file, TABLES)?;
+    let tables = tags.find_tag(Tag::JPEGTables).ok().flatten().and_then(|value| value.into_u8_vec().ok());
+    let tables = tables.unwrap_or_default();
     if tables.len() > MOST_TABLES {
         return Ok(Some(NO_TABLES));
     }
     let tables = tables.strip_suffix(&[0xFF, 0xD9]).unwrap_or(&tables);
+    let mut numbers = |tag: Tag| tags.find_tag_unsigned_vec::<u64>(tag).ok().flatten().unwrap_or_default();
+    let strips = numbers(Tag::StripOffsets).into_iter().zip(numbers(Tag::StripByteCounts));
+    let tiles = numbers(Tag::TileOffsets).into_iter().zip(numbers(Tag::TileByteCounts));
     let mut left = length;
-    for [offsets, counts] in [STRIPS, TILES] {
-        let (offsets, counts) = (directory.numbers(&mut file, offsets)?, directory.numbers(&mut file, counts)?);
-        for (offset, count) in offsets.into_iter().zip(counts) {
-            // None of them is read twice, however many there are.
-            let Some(rest) = left.checked_sub(count).filter(|_| offset <= length - count) else {
-                return Ok(Some(BEYOND));
-            };
-            left = rest;
-            let mut jpeg = vec![0; count as usize];
-            file.seek(SeekFrom::Start(offset))?;
-            file.read_exact(&mut jpeg)?;
-            if !tables.is_empty() {
-                jpeg = [tables, jpeg.get(2..).unwrap_or_default()].concat();
-            }
-            if let Some(flaw) = jpeg::flaw(&jpeg) {
-                return Ok(Some(flaw));
-            }
+    for (offset, count) in strips.chain(tiles) {
+        // None of them is read twice, however many there are.
+        let Some(rest) = left.checked_sub(count).filter(|_| offset <= length - count) else {
+            return Ok(Some(BEYOND));
+        };
+        left = rest;
+        let mut jpeg = vec![0; count as usize];
+        file.seek(SeekFrom::Start(offset))?;
+        file.read_exact(&mut jpeg)?;
+        if !tables.is_empty() {
+            jpeg = [tables, jpeg.get(2..).unwrap_or_default()].concat();
+        }
+        if let Some(flaw) = jpeg::flaw(&jpeg) {
+            return Ok(Some(flaw));
         }
     }
     Ok(None)
-}
-
-/// The tags of a picture. BigTIFF is no picture to the decoders in use.
-struct Directory {
-    little: bool,
-    /// Tag, type, count, and the value or where it lies.
-    entries: Vec<(u64, u64, u64, [u8; 4])>,
-    length: u64,
-}
-
-impl Directory {
-    /// The first one; `None` for what is no TIFF.
-    fn first(file: &mut BufReader<File>, length: u64) -> Result<Option<Self>> {
-        let mut head = [0; 8];
-        if file.read_exact(&mut head).is_err() {
-            return Ok(None);
-        }
-        let little = match &head[..4] {
-            b"II*\0" => true,
-            b"MM\0*" => false,
-            _ => return Ok(None),
-        };
-        file.seek(SeekFrom::Start(number(little, &head[4..])))?;
-        let mut count = [0; 2];
-        file.read_exact(&mut count)?;
-        let mut entries = Vec::new();
-        for _ in 0..number(little, &count) {
-            let mut entry = [0; 12];
-            file.read_exact(&mut entry)?;
-            let of = |from: usize, to: usize| number(little, &entry[from..to]);
-            entries.push((of(0, 2), of(2, 4), of(4, 8), [entry[8], entry[9], entry[10], entry[11]]));
-        }
-        Ok(Some(Self { little, entries, length }))
-    }
-
-    /// The bytes of a tag's values; none where there is no such tag, or where it is larger than the file.
-    fn bytes(&self, file: &mut BufReader<File>, tag: u64) -> Result<Vec<u8>> {
-        let Some((_, kind, count, value)) = self.entries.iter().find(|e| e.0 == tag) else { return Ok(Vec::new()) };
-        let Some(bytes) = count.checked_mul(size_of(*kind)).filter(|b| *b <= self.length) else {
-            return Ok(Vec::new());
-        };
-        if bytes <= value.len() as u64 {
-            return Ok(value[..bytes as usize].to_vec());
-        }
-        file.seek(SeekFrom::Start(number(self.little, value)))?;
-        let mut there = vec![0; bytes as usize];
-        file.read_exact(&mut there)?;
-        Ok(there)
-    }
-
-    fn numbers(&self, file: &mut BufReader<File>, tag: u64) -> Result<Vec<u64>> {
-        let kind = self.entries.iter().find(|e| e.0 == tag).map_or(1, |e| e.1);
-        let bytes = self.bytes(file, tag)?;
-        Ok(bytes.chunks_exact(size_of(kind) as usize).map(|one| number(self.little, one)).collect())
-    }
-}
-
-fn number(little: bool, bytes: &[u8]) -> u64 {
-    let join = |all: u64, byte: &u8| all << 8 | u64::from(*byte);
-    if little { bytes.iter().rev().fold(0, join) } else { bytes.iter().fold(0, join) }
-}
-
-/// Bytes of the types 1 to 12 of TIFF 6.0, section 2; 13 is an offset to another directory, 16 to 18 are BigTIFF's, which decoders take in
-/// others, too.
-fn size_of(kind: u64) -> u64 {
-    match kind {
-        3 | 8 => 2,
-        4 | 9 | 11 | 13 => 4,
-        5 | 10 | 12 | 16..=18 => 8,
-        _ => 1,
-    }
 }
 
 #[cfg(test)]
