@@ -26,7 +26,7 @@ mod regions;
 mod terrain;
 
 pub use after::Rest;
-use place::{area, homes, outside, placed};
+use place::{area, homes, moved, outside, placed};
 use terrain::Terrain;
 
 /// Names in the folder.
@@ -243,9 +243,7 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
     };
     let frame = EnuFrame::new(place);
     let site = site_in(&frame)?;
-    let homes_of =
-        |frame: &EnuFrame, site: &Site| homes(&request.flying, frame, (&site.ground, &site.obstacles), count);
-    let homes = homes_of(&frame, &site)?;
+    let homes = homes(&request.flying, &frame, (&site.ground, &site.obstacles), count)?;
     let terrain =
         request.terrain.as_deref().map(|path| Terrain::open(path, &frame, &site.ground, &homes)).transpose()?;
     let height = |p: DVec2| terrain.as_ref().and_then(|t| t.height(p));
@@ -262,9 +260,8 @@ pub fn run(request: &Request, out: &Path) -> Result<Planned, SurveyError> {
         Source::File(_) => Geodetic { alt_m: (home_m * 100.0).round() / 100.0, ..place },
         Source::Rest(_) => place,
     };
-    let frame = EnuFrame::new(origin);
+    let (frame, homes) = (EnuFrame::new(origin), moved(&frame, &EnuFrame::new(origin), homes));
     let site = site_in(&frame)?;
-    let homes = homes_of(&frame, &site)?;
     let Site { obstacles, ground, holes, .. } = &site;
     let craft = craft(request, &homes, &manner)?;
     let shares = deal(ground, obstacles, &craft, &manner).map_err(|e| request.in_source(e))?;

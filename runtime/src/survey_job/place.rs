@@ -5,7 +5,7 @@ use std::path::Path;
 use fleet::ground::{Ground, Ring};
 use fleet::obstacles::Obstacles;
 use geometry::geodesy::{EnuFrame, Geodetic};
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use measure::areas::{self, Area};
 
 use super::{Flying, SurveyError, in_file, setting};
@@ -72,6 +72,15 @@ fn flat(frame: &EnuFrame, lat_deg: f64, lon_deg: f64) -> DVec2 {
         true => at.truncate(),
         false => at.truncate().normalize_or(DVec2::X) * at.length(),
     }
+}
+
+/// Places of one frame in another.
+pub fn moved(from: &EnuFrame, to: &EnuFrame, places: Vec<DVec2>) -> Vec<DVec2> {
+    let place = |p: DVec2| {
+        let at = from.to_geodetic(DVec3::new(p.x, p.y, 0.0));
+        flat(to, at.lat_deg, at.lon_deg)
+    };
+    places.into_iter().map(place).collect()
 }
 
 /// Where each aircraft takes off.
