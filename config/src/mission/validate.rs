@@ -57,7 +57,10 @@ impl Mission {
             }
             self.check_region(a).map_err(at)?;
         }
-        Ok(())
+        match self.lost().iter().find(|id| self.aircraft.iter().all(|a| a.id != **id)) {
+            Some(id) => Err(SettingError::new("survey.lost", id, "the id of an aircraft")),
+            None => Ok(()),
+        }
     }
 
     fn check_region(&self, aircraft: &Aircraft) -> Result<(), SettingError> {

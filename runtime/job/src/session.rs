@@ -110,6 +110,11 @@ impl Session {
     }
 }
 
+/// Where the files of the newest session before this one in `out` lie.
+pub fn newest_earlier(out: &Path) -> Option<PathBuf> {
+    (1..=MAX_EARLIER).map(|n| out.join(format!("earlier-{n}"))).take_while(|p| p.join(FILE).exists()).last()
+}
+
 /// Whose `out` was, as far as it says.
 pub fn owner(out: &Path) -> Option<Owner> {
     read_owner(&out.join(FILE)).ok()
@@ -195,6 +200,8 @@ mod tests {
             assert_eq!(begin(), over);
         }
         assert!(!begin() && out.join("earlier-1/run.json").is_file());
+        assert_eq!(newest_earlier(out), Some(out.join("earlier-1")));
+        assert_eq!(newest_earlier(&out.join("earlier-1")), None);
     }
 
     #[test]

@@ -16,7 +16,7 @@ use job::interrupt::Interrupt;
 use job::resources;
 use job::run_json::RunReport;
 use job::service::Supervisor;
-use job::session::{Owner, Session};
+use job::session::{self, Owner, Session};
 use models::formats::FormatError;
 use pages::report::{Craft, REPORT, ReportData, Timing, bytes};
 
@@ -78,9 +78,9 @@ pub fn run(args: Args) -> Result<(), CliError> {
         origin: [mission.origin.lat_deg, mission.origin.lon_deg, mission.origin.alt_m],
         picture: [0; 2],
     };
-    let session = Session::begin(&Disk::default(), &args.out, &owner)?;
-    let carried = match &session.put_aside {
-        Some(earlier) => serve::carry(&mission, earlier, &args.out)?,
+    let _session = Session::begin(&Disk::default(), &args.out, &owner)?;
+    let carried = match session::newest_earlier(&args.out) {
+        Some(earlier) => serve::carry(&mission, &earlier, &args.out)?,
         None => Vec::new(),
     };
     if !carried.is_empty() {

@@ -128,6 +128,7 @@ pub fn receive(
     loop {
         let more = receiver.round(stop)?;
         let received = redealt.judged(receiver.received());
+        redealt.awaited(&received).iter().for_each(|line| tracing::warn!("{line}"));
         // Whoever does not fly any more is here with what it has sent, and hears no receipt.
         let is_last = |id: &String| received.iter().find(|r| r.aircraft == *id).map(|r| r.finished);
         let lost = |id: &String| redealt.is_lost(id) && is_last(id) == Some(true);

@@ -109,7 +109,7 @@ impl Plan {
     }
 }
 
-/// Regions among `regions` that may own a point of the square of this side around `middle`, in their order: looked at more closely than a
+/// Regions among `regions` that may own a point of the square of this side around `middle`, in their order: examined more closely than a
 /// square of ground as a whole, so that whoever joins changes few.
 fn owners(regions: &[(usize, &Region)], middle: DVec2, side: f64, border_m: f64) -> BTreeSet<usize> {
     let all: BTreeMap<usize, &Region> = regions.iter().copied().collect();

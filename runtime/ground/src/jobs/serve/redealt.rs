@@ -26,12 +26,13 @@ pub(super) struct Redealt<'a> {
     lost: &'a [String],
     /// Whether the final model of this file, written then, is of the region that its aircraft has now.
     known: HashMap<PathBuf, (SystemTime, bool)>,
+    has_told: bool,
 }
 
 impl<'a> Redealt<'a> {
     /// Of `mission`; one that was dealt once leaves everything as its aircraft say.
     pub(super) fn new(mission: &'a Mission) -> Self {
-        Self { mission, lost: mission.lost(), known: HashMap::new() }
+        Self { mission, lost: mission.lost(), known: HashMap::new(), has_told: false }
     }
 
     /// Whether this aircraft does not fly any more.
@@ -48,6 +49,21 @@ impl<'a> Redealt<'a> {
             model.finished = self.is_lost(&model.aircraft) || model.finished && self.is_of_this_dealing(model);
         }
         received
+    }
+
+    /// Who does not fly any more and is awaited all the same, since nothing of it is here: what is to be said of each, once.
+    pub(super) fn awaited(&mut self, received: &[Received]) -> Vec<String> {
+        if std::mem::replace(&mut self.has_told, true) {
+            return Vec::new();
+        }
+        let is_missing = |id: &&String| received.iter().all(|r| r.aircraft != **id);
+        let line = |id: &String| {
+            format!(
+                "{id} does not fly any more ([survey] lost), and no model of it is here; give the --out of its flight's ground, bring its \
+                 stick, or take it out of the mission"
+            )
+        };
+        self.lost.iter().filter(is_missing).map(line).collect()
     }
 
     fn is_of_this_dealing(&mut self, received: &Received) -> bool {
@@ -71,24 +87,20 @@ fn is_same(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
     a.len() == b.len() && a.iter().zip(b).all(near)
 }
 
-/// Brings the models of the session that was put aside in `earlier` back into `out`, where `mission` deals anew what that one flew:
-/// those who do not fly any more bring nothing again. Returns whose they are.
+/// Brings the models of an earlier session, whose files lie in `earlier`, into `out`, where `mission` deals anew what that one flew: those
+/// who do not fly any more bring nothing again. What is in `out` already stays. Returns whose models were brought.
 ///
 /// # Errors
 /// The disk.
 pub fn carry(mission: &Mission, earlier: &Path, out: &Path) -> Result<Vec<String>, FormatError> {
-    let flown = Mission::read(&earlier.join(super::MISSION)).ok();
-    let goes_on = |flown: Mission| {
-        let regions = |m: &Mission| m.aircraft.iter().map(|a| (a.id.clone(), m.region(a))).collect::<Vec<_>>();
-        flown.name == mission.name && regions(&flown) != regions(mission)
-    };
-    if mission.lost().is_empty() || !flown.is_some_and(goes_on) {
+    if mission.lost().is_empty() || !Mission::read(&earlier.join(super::MISSION)).is_ok_and(|m| deals(mission, &m)) {
         return Ok(Vec::new());
     }
     let (disk, mut carried) = (Disk::default(), Vec::new());
     for aircraft in &mission.aircraft {
         let [from, to] = [earlier, out].map(|folder| folder.join(RECEIVED).join(&aircraft.id));
-        if OF_AN_AIRCRAFT.iter().any(|name| !from.join(name).is_file()) {
+        let lacks = |folder: &Path| OF_AN_AIRCRAFT.iter().any(|name| !folder.join(name).is_file());
+        if lacks(&from) || !lacks(&to) {
             continue;
         }
         disk.make_folders(&to).map_err(|e| FormatError::io(&to, "making the folder", e))?;
@@ -103,9 +115,17 @@ pub fn carry(mission: &Mission, earlier: &Path, out: &Path) -> Result<Vec<String
     Ok(carried)
 }
 
+/// Whether `now` deals anew what `flown` dealt: one mission of one day in one frame, with other regions.
+fn deals(now: &Mission, flown: &Mission) -> bool {
+    let place = |m: &Mission| [m.origin.lat_deg, m.origin.lon_deg, m.origin.alt_m];
+    let regions = |m: &Mission| m.aircraft.iter().map(|a| (a.id.clone(), m.region(a))).collect::<Vec<_>>();
+    let is_one = flown.name == now.name && flown.upload.session == now.upload.session && place(flown) == place(now);
+    is_one && regions(flown) != regions(now)
+}
+
 #[cfg(test)]
 mod tests {
-    use super::super::tests::mission;
+    use super::super::tests::{MISSION_TEXT, mission};
     use super::*;
     use crate::testing::{carpet, model as made};
 
@@ -145,11 +165,60 @@ mod tests {
         assert_eq!(finished(&before, &before), [false, true], "dealt once");
         assert_eq!(finished(&now, &before), [true, false]);
         assert_eq!(finished(&now, &now), [true, true]);
+        // Of whom nothing is here, one is told once.
+        let mut redealt = Redealt::new(&now);
+        assert!(redealt.awaited(&[]).iter().all(|line| line.starts_with("west does not fly any more")));
+        assert!(redealt.awaited(&[]).is_empty());
+        assert_eq!(Redealt::new(&now).awaited(&[]).len(), 1);
+        let of_west = [received(folder.path(), &before, "west", false)];
+        assert!(Redealt::new(&now).awaited(&of_west).is_empty());
         // It is written anew while we look.
         let mut redealt = Redealt::new(&now);
         let mut last = |of: &Mission| redealt.judged(vec![received(folder.path(), of, "east", true)])[0].finished;
         assert!(!last(&before));
         std::thread::sleep(std::time::Duration::from_millis(20));
         assert!(last(&now));
+    }
+
+    #[test]
+    fn models_of_the_session_before_go_on_where_its_ground_is_dealt_anew_and_never_into_another_days_or_frames() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (earlier, now) = (folder.path().join("earlier-1"), dealt_anew(folder.path()));
+        let was_flown = |text: &str| std::fs::write(earlier.join(super::super::MISSION), text).expect("written");
+        for id in ["west", "east"] {
+            let own = earlier.join(RECEIVED).join(id);
+            std::fs::create_dir_all(&own).expect("made");
+            OF_AN_AIRCRAFT.iter().for_each(|name| std::fs::write(own.join(name), id).expect("written"));
+        }
+        let carried =
+            |mission: &Mission, out: &str| carry(mission, &earlier, &folder.path().join(out)).expect("carried");
+        let nobody = Vec::<String>::new();
+        assert_eq!(carried(&now, "a"), nobody, "nobody knows what was flown");
+        was_flown(MISSION_TEXT);
+        assert_eq!(carried(&now, "a"), ["west", "east"]);
+        assert_eq!(std::fs::read(folder.path().join("a/received/west/model.dgtr")).expect("there"), b"west");
+        // Nothing that is here is written over, and what a kill left half is made whole.
+        std::fs::write(folder.path().join("a/received/east/model.dgtr"), b"newer").expect("written");
+        std::fs::remove_file(folder.path().join("a/received/west/offer")).expect("removed");
+        assert_eq!(carried(&now, "a"), ["west"]);
+        assert_eq!(std::fs::read(folder.path().join("a/received/east/model.dgtr")).expect("there"), b"newer");
+        let once = mission(folder.path());
+        assert_eq!(carried(&once, "b"), nobody, "dealt once");
+        let regions = once.aircraft.clone();
+        assert_eq!(carried(&Mission { aircraft: regions, ..now.clone() }, "b"), nobody, "flown already");
+        for (from, to) in [
+            ("name = \"park\"", "name = \"lake\""),
+            ("folder = \"stick\"", "folder = \"stick\", session = \"monday\""),
+            ("alt_m = 0.0", "alt_m = 1.0"),
+        ] {
+            was_flown(&MISSION_TEXT.replacen(from, to, 1));
+            assert_eq!(carried(&now, "b"), nobody, "{to}");
+        }
+        was_flown(MISSION_TEXT);
+        let file = earlier.join("received/west/model.dgtr");
+        std::fs::remove_file(&file).expect("removed");
+        std::os::unix::fs::symlink("/etc/hostname", &file).expect("linked");
+        let refused = carry(&now, &earlier, &folder.path().join("b")).expect_err("a link").to_string();
+        assert!(refused.contains("received/west/model.dgtr"), "{refused}");
     }
 }

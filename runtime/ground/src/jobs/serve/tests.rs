@@ -19,8 +19,7 @@ pub(super) fn unsigned(mission: &str, aircraft: &str) -> Source {
     }
 }
 
-pub(super) fn mission(dir: &Path) -> Mission {
-    let text = r#"
+pub(super) const MISSION_TEXT: &str = r#"
 name = "park"
 origin = { lat_deg = 28.0, lon_deg = -82.0, alt_m = 0.0 }
 camera = { width = 64, height = 48, fx = 50.0, fy = 50.0, cx = 32.0, cy = 24.0 }
@@ -37,7 +36,9 @@ link = "udpin:127.0.0.1:14551"
 camera = { folder = "e" }
 region_enu = [[0.0, -20.0], [40.0, -20.0], [40.0, 20.0], [0.0, 20.0]]
 "#;
-    Mission::parse(text, dir).expect("mission")
+
+pub(super) fn mission(dir: &Path) -> Mission {
+    Mission::parse(MISSION_TEXT, dir).expect("mission")
 }
 
 fn fly(mission: &Mission, dir: &Path, id: &str) {
