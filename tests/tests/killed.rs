@@ -7,7 +7,6 @@
 
 mod support;
 
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -16,7 +15,7 @@ use job::run_json::RunReport;
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use models::formats::transforms;
-use support::{Running, change_mission, small_mission, wait_until};
+use support::{Running, change_mission, free_port, small_mission, wait_until};
 use uplink::keys::Identity;
 use uplink::{Offerer, Source};
 
@@ -206,7 +205,7 @@ const BORDERS: [f64; 4] = [-60.0, -20.0, 20.0, 60.0];
 
 /// A mission of three aircraft on this machine. What each may send is bounded, so that there is something to interrupt.
 fn ground_mission(at: &Path) -> Mission {
-    let port = TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a port").port();
+    let port = free_port();
     let mut text = format!(
         r#"
 name = "park"

@@ -1,11 +1,10 @@
-//! One of three aircraft stops half-way: what it left is dealt to the others, who fly again, and the ground merges what all of them
+//! One of three aircraft stops on the way: what it left is dealt to the others, who fly again, and the ground merges what all of them
 //! brought, the failed one's checkpoint too. Everything is the real program, training included; only vehicles and cameras are simulated.
 #![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
 
 mod support;
 
 use std::collections::HashSet;
-use std::net::TcpListener;
 use std::path::Path;
 use std::time::Duration;
 
@@ -13,7 +12,7 @@ use config::mission::Mission;
 use glam::DVec2;
 use job::run_json::RunReport;
 use models::formats::model;
-use support::{Running, run, wait_until};
+use support::{Running, free_port, run, wait_until};
 use survey::coverage::{CoverageMap, CoverageRegion};
 
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -28,7 +27,7 @@ const SIDE_M: f64 = 4.0;
 /// The survey's mission with the least training, and a network on this machine.
 fn small(at: &Path) {
     let planned = std::fs::read_to_string(at.join("plan/mission.toml")).expect("a mission");
-    let port = TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a port").port();
+    let port = free_port();
     let mut text = planned;
     for (table, more) in [
         ("[memory]", "device_mib = 96\nhost_mib = 1024\nmax_gaussians = 20000\nview_slots = 4"),
@@ -137,9 +136,9 @@ fn what_one_of_three_left_is_flown_by_the_others_and_the_merged_model_is_complet
 
     let mut ground = serve(at, "ground-1.log");
     let [a1, mut a2, a3] = ["a1", "a2", "a3"].map(|id| Craft::start(at, id, "plan", 1));
-    // Half-way, when the ground has something of it, its battery falls out.
+    // On the way, when the ground has something of it, its battery falls out.
     let here = at.join("ground/received/a2/model.dgtr");
-    wait_until("half of the second flight", &a2.log, PATIENCE, || a2.says("key frame 12:") && here.is_file());
+    wait_until("part of the second flight", &a2.log, PATIENCE, || a2.says("key frame 6:") && here.is_file());
     a2.job.0.kill().expect("killed");
     drop(a2);
     a1.lands();

@@ -5,11 +5,11 @@
 mod support;
 
 use std::io::{BufRead, BufReader, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpStream;
 use std::time::Duration;
 
 use support::radio::Radio;
-use support::{Running, change_mission, small_mission, wait_until};
+use support::{Running, change_mission, free_port, small_mission, wait_until};
 
 const PATIENCE: Duration = Duration::from_secs(120);
 
@@ -28,7 +28,7 @@ fn a_silent_aircraft_is_named_in_flight_on_the_page_in_the_log_and_in_the_report
     let dir = tempfile::tempdir().expect("tempdir");
     let at = dir.path();
     small_mission(at);
-    let port = TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a port").port();
+    let port = free_port();
     let radio = Radio::to(port);
     let upload = format!(
         "upload = {{ listen = [\"tcp/127.0.0.1:{port}\"], connect = [\"tcp/127.0.0.1:{}\"], poll_s = 0.3, retry_min_s = 0.1, \

@@ -234,11 +234,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
     if let (Source::Rest(rest), Some(ground)) = (&request.source, &args.rest.after) {
         let flown = args.rest.mission.as_ref().map_or("MISSION".into(), |path| path.display().to_string());
         outln!(
-            "put it in the place of the mission that was flown, on every aircraft and the ground: its paths are relative to that folder"
+            "on every aircraft and the ground, replace the mission file that was flown by this one: its paths are relative to that \
+             file's folder"
         );
-        outln!("aircraft go on with the --out of their first flight: their models become those of both flights");
+        outln!("aircraft fly with the --out of their first flight: their models become those of both flights");
         outln!("the ground goes on: dgtr serve --mission {flown} --out {}", ground.display());
-        outln!("what it has of {} counts; nothing more is awaited from there", rest.lost.join(", "));
+        outln!("what the ground has of {} counts as final; no more is awaited", rest.lost.join(", "));
     }
     Ok(())
 }

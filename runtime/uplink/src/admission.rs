@@ -14,7 +14,7 @@ use crate::keys::Identity;
 
 /// Distinct refusals that are remembered; beyond it they are only counted by kind.
 const MAX_REMEMBERED: usize = 256;
-/// Those of them whose words somebody without a key may have chosen: he leaves room for what is said of the mission's own aircraft.
+/// Of these at most so many whose words somebody without a key may have chosen: room is left for the mission's own aircraft.
 const MAX_OF_STRANGERS: usize = 128;
 
 /// Why a model that arrived whole does not count.

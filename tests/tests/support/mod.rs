@@ -5,9 +5,15 @@ pub mod hub;
 pub mod plane;
 pub mod radio;
 
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
+
+/// A port of this machine that nobody listens on.
+pub fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a port").port()
+}
 
 /// `dgtr ARGUMENTS` in `folder`.
 pub fn dgtr(folder: &Path, arguments: &[&str]) -> Command {
