@@ -18,14 +18,22 @@ pub fn open(path: &Path) -> io::Result<File> {
     opened(path, OpenOptions::new().read(true), OFlags::empty())
 }
 
+/// Opens the file at `path` for reading, in a folder that is only written by its owner.
+///
+/// # Errors
+/// As [`open`]; `InvalidInput` for a link, too.
+pub fn open_not_linked(path: &Path) -> io::Result<File> {
+    not_linked(path, OpenOptions::new().read(true))
+}
+
 /// Opens the file at `path` to write it anew, made where there is none, for what is of use while it is written: a log, a trace.
 /// Everything else is written by [`crate::Disk`].
 ///
 /// # Errors
-/// As [`open`]; `InvalidInput` for a link, too.
+/// As [`open_not_linked`].
 pub fn create(path: &Path) -> io::Result<File> {
     // Emptied only once it is known to be a file.
-    let file = written(path, OpenOptions::new().write(true).create(true).truncate(false))?;
+    let file = not_linked(path, OpenOptions::new().write(true).create(true).truncate(false))?;
     file.set_len(0)?;
     Ok(file)
 }
@@ -35,10 +43,10 @@ pub fn create(path: &Path) -> io::Result<File> {
 /// # Errors
 /// As [`create`].
 pub(crate) fn append(path: &Path) -> io::Result<File> {
-    written(path, OpenOptions::new().append(true).create(true))
+    not_linked(path, OpenOptions::new().append(true).create(true))
 }
 
-fn written(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+fn not_linked(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
     opened(path, options, OFlags::NOFOLLOW).map_err(|e| match e.raw_os_error() {
         Some(code) if code == Errno::LOOP.raw_os_error() => {
             invalid("is a link; name the file it leads to, or remove it")
@@ -87,7 +95,7 @@ mod tests {
         let linked = [("link", at("mine")), ("dangling", at("none")), ("device", "/dev/null".into())];
         for (name, to) in linked {
             std::os::unix::fs::symlink(to, at(name)).expect("linked");
-            for open in [create, append] {
+            for open in [create, append, open_not_linked] {
                 let said = open(&at(name)).expect_err(name).to_string();
                 assert_eq!(said, "is a link; name the file it leads to, or remove it", "{name}");
             }

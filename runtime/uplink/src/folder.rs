@@ -4,9 +4,7 @@
 //! network. The ground's `<folder>/<mission>/ground.session` says what offers are to be bound to. Every file is written aside, synced and renamed; chunks come before the offer that names them, so a reader
 //! never sees an offer whose chunks were not yet complete when it was written.
 
-use std::fs::File;
 use std::io::Read;
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -34,12 +32,7 @@ pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
 
 /// Reads a file of at most `limit` bytes.
 pub(super) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, TransportError> {
-    // A pipe without a writer would block for ever.
-    let flags = (rustix::fs::OFlags::NONBLOCK | rustix::fs::OFlags::NOFOLLOW).bits() as i32;
-    let file = File::options().read(true).custom_flags(flags).open(path).map_err(TransportError::io(path))?;
-    if !file.metadata().map_err(TransportError::io(path))?.is_file() {
-        return Err(TransportError::io(path)(std::io::Error::other("not a regular file")));
-    }
+    let file = disk::regular::open_not_linked(path).map_err(TransportError::io(path))?;
     let mut bytes = Vec::new();
     file.take(limit + 1).read_to_end(&mut bytes).map_err(TransportError::io(path))?;
     if bytes.len() as u64 > limit {

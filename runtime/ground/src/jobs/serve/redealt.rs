@@ -106,7 +106,7 @@ pub fn carry(mission: &Mission, earlier: &Path, out: &Path) -> Result<Vec<String
         disk.make_folders(&to).map_err(|e| FormatError::io(&to, "making the folder", e))?;
         for name in OF_AN_AIRCRAFT {
             let (from, to) = (from.join(name), to.join(name));
-            let mut file = disk::regular::open(&from).map_err(|e| FormatError::io(&from, "opening", e))?;
+            let mut file = disk::regular::open_not_linked(&from).map_err(|e| FormatError::io(&from, "opening", e))?;
             let copied = disk.replace(&to, |into| std::io::copy(&mut file, into).map(drop));
             copied.map_err(|e| FormatError::disk(&to, e))?;
         }
