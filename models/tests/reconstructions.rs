@@ -182,6 +182,17 @@ fn what_is_written_for_colmap_nerfstudio_and_opensfm_is_read_back() {
     assert_same(&opensfm::read(&opensfm::find(dir.path()).unwrap()).unwrap(), &survey, 1e-9);
 }
 
+/// In `images.bin` it would end the name, and the next view would be read out of the rest.
+#[test]
+fn a_name_with_a_zero_character_is_not_written_for_colmap() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut survey = survey();
+    survey.shots[1].path = "a\0b.jpg".into();
+    let refused = colmap::write(&dir.path().join("c"), &survey, &[]).unwrap_err().to_string();
+    assert!(refused.contains("a\\u0000b.jpg: a name for COLMAP holds no zero character"), "{refused}");
+    assert!(!dir.path().join("c/images.bin").exists());
+}
+
 #[test]
 fn every_camera_model_of_colmap_is_read_and_the_smallest_that_holds_a_lens_is_written() {
     for model in CAMERA_MODELS {

@@ -19,12 +19,15 @@ pub struct Point {
 /// Every distinct lens becomes one camera; there are no keypoints.
 ///
 /// # Errors
-/// The folder cannot be written to, a lens has no size, or COLMAP has no camera model for it.
+/// The folder cannot be written to, a lens has no size, COLMAP has no camera model for it, or a name holds the character that ends one.
 pub fn write(folder: &Path, reconstruction: &Reconstruction, points: &[Point]) -> Result<(), FormatError> {
     let mut cameras: Vec<((u32, u32), &'static CameraModel, Vec<f64>)> = Vec::new();
     let mut camera_of = Vec::with_capacity(reconstruction.shots.len());
     for shot in &reconstruction.shots {
         let bad = |what: String| FormatError::invalid(folder, format!("{}: {what}", shot.path));
+        if shot.path.contains('\0') {
+            return Err(bad("a name for COLMAP holds no zero character".to_owned()));
+        }
         let size = shot.lens.size.ok_or_else(|| bad("its size is not known".to_owned()))?;
         let (model, values) = CameraModel::holding(&shot.lens.lens(size)).map_err(bad)?;
         let same = |c: &((u32, u32), &CameraModel, Vec<f64>)| c.0 == size && c.1.id == model.id && c.2 == values;
