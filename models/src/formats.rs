@@ -203,11 +203,11 @@ mod tests {
         ] {
             let said = error.to_string();
             assert!(
-                said.starts_with("a/b\\n INFO forged\\u{1b}[2J.json: ") && !said.contains(char::is_control),
+                said.starts_with("a/b\\n INFO forged\\u001b[2J.json: ") && !said.contains(char::is_control),
                 "{said}"
             );
         }
-        assert_eq!(one_line("at line 6\n| a = \"\u{1}\""), "at line 6 | a = \"\\u{1}\"");
+        assert_eq!(one_line("at line 6\n| a = \"\u{1}\""), "at line 6 | a = \"\\u0001\"");
         let said = crate::picture::decode(path).unwrap_err().to_string();
         assert!(said.starts_with("a/b\\n INFO") && !said.contains(char::is_control), "{said}");
     }

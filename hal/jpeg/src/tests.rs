@@ -89,10 +89,12 @@ fn a_picture_of_more_scans_than_encoders_write_is_refused() {
 /// A header alone could claim a picture of any size.
 #[test]
 fn a_band_of_a_progressive_picture_before_its_means_is_refused() {
-    let at = |from: usize| from + PROGRESSIVE[from..].windows(2).position(|w| w == [0xFF, 0xDA]).expect("a scan");
-    let (first, second) = (at(0), at(at(0) + 2));
-    // The first scan is of the means of all components; what is left are bands.
-    assert_eq!(flaw(&[&PROGRESSIVE[..first], &PROGRESSIVE[second..]].concat()), Some(DAMAGED));
+    let at =
+        |marker: u8, from: usize| from + PROGRESSIVE[from..].windows(2).position(|w| w == [0xFF, marker]).expect("it");
+    // The first scan is of the means of all components; behind it the tables of the next one begin.
+    let first = at(0xDA, 0);
+    let bands = [&PROGRESSIVE[..first], &PROGRESSIVE[at(0xC4, first)..]].concat();
+    assert_eq!(flaw(&bands), Some(DAMAGED));
 }
 
 #[test]
