@@ -357,6 +357,18 @@ region_enu = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
         }
     }
 
+    #[test]
+    fn whoever_does_not_fly_any_more_is_an_aircraft_of_the_mission() {
+        let survey =
+            SurveySettings { endurance_min: vec![25.0], take_off: vec![[28.0, -82.0]], ..SurveySettings::usual(2.0) };
+        for (id, wanted) in [("a1", true), ("a2", false)] {
+            let text = SurveySettings { lost: vec![id.into()], ..survey.clone() }.text();
+            let read = Mission::parse(&format!("{GOOD}\n{text}"), Path::new("/m")).map_err(|e| e.to_string());
+            let told = read.as_ref().err().is_some_and(|e| e.contains("survey.lost") && e.contains("\"a2\""));
+            assert_eq!((read.is_ok(), told), (wanted, !wanted), "{id}: {read:?}");
+        }
+    }
+
     /// `[link]` was read but never checked: with NaN, and with 0, the link counted as lost for ever.
     #[test]
     fn every_table_is_checked_and_the_setting_is_named_by_its_path() {

@@ -340,6 +340,7 @@ fn pictures_that_nobody_announces_are_named_and_announced_ones_that_never_come_a
     let (announced_only, _) = announced_only.fly();
     let missed = |u: &&hal::vehicle::Unmatched| u.reason == UnmatchedReason::Matching(Reason::NoPicture);
     assert_eq!(announced_only.unmatched.iter().filter(missed).count(), SHOTS);
+    assert_eq!(announced_only.counters.exposures.triggers_unmatched, SHOTS as u64);
     assert!(announced_only.camera_was_silent, "the failsafe hears of it in flight");
     assert!(announced_only.posed.is_empty() && announced_only.exposures == SHOTS);
 }

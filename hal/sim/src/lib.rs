@@ -153,19 +153,22 @@ pub fn run(
     on_ready: &mut dyn FnMut(Option<&Path>),
 ) -> Result<SessionReport, SimError> {
     settings.session.check()?;
-    let mut flight = settings.flight()?;
-    // A camera goes on counting where the folder's pictures end.
-    let earlier = highest_number(camera_dir, &settings.prefix);
-    if earlier > 0 {
-        for (exposure, number) in flight.exposures.iter_mut().zip(earlier + 1..) {
-            exposure.name = aircraft::picture_name(&settings.prefix, number);
-        }
-    }
-    let flight = flight;
+    let flight = counted_on(settings.flight()?, camera_dir, &settings.prefix);
     let link = session::open(address, settings.seed, on_ready)?;
     let world = Arc::new(World::new(settings.world_seed, &settings.world));
     let camera = camera_over(world, &flight, &settings.lens, camera_dir, reference_dir, settings.seed)?;
     session::fly(Autopilot::new(link, flight, settings.autopilot()), Some(camera), &settings.session, stop)
+}
+
+/// The flight with the pictures' numbers going on where those of the camera's folder end, as a camera counts.
+fn counted_on(mut flight: Flight, camera_dir: &Path, prefix: &str) -> Flight {
+    let earlier = highest_number(camera_dir, prefix);
+    if earlier > 0 {
+        for (exposure, number) in flight.exposures.iter_mut().zip(earlier + 1..) {
+            exposure.name = aircraft::picture_name(prefix, number);
+        }
+    }
+    flight
 }
 
 /// A camera that renders a flight's true views of `world`.

@@ -252,3 +252,19 @@ fn stopping_early_ends_cleanly_and_impossible_settings_say_why() {
     assert!(refused(&|s| s.lens.fx = 0.0).contains("fx"));
     assert!(refused(&|s| s.survey.side_overlap = 1.0).contains("overlap"));
 }
+
+#[test]
+fn a_second_flight_into_the_same_folder_writes_over_no_picture_of_the_first() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (settings, prefix) = (quick(), &quick().prefix);
+    let names = || -> Vec<String> {
+        let flight = counted_on(settings.flight().expect("a flight"), folder.path(), prefix);
+        flight.exposures.into_iter().map(|exposure| exposure.name).collect()
+    };
+    let first = names();
+    assert_eq!(first.first(), Some(&aircraft::picture_name(prefix, 1)));
+    first.iter().for_each(|name| std::fs::write(folder.path().join(name), b"").expect("written"));
+    let second = names();
+    assert_eq!(second.first(), Some(&aircraft::picture_name(prefix, first.len() as u64 + 1)));
+    assert!(second.len() == first.len() && second.iter().all(|name| !first.contains(name)));
+}

@@ -416,6 +416,15 @@ mod tests {
     }
 
     #[test]
+    fn no_way_leaves_a_fence_where_a_hole_lies_across_it() {
+        let (fence, across) = (rectangle(0.0, 0.0, 200.0, 100.0), rectangle(90.0, -5.0, 20.0, 110.0));
+        let free = Obstacles::new(&[across], 10.0).expect("one");
+        let [from, to] = [[20.0, 20.0], [180.0, 20.0]].map(DVec2::from);
+        assert!(free.way(from, to).is_some());
+        assert_eq!(free.fenced(&fence).expect("room").way(from, to), None);
+    }
+
+    #[test]
     fn lines_end_before_a_hole_and_go_on_behind_it() {
         let hole = rectangle(40.0, 40.0, 20.0, 20.0);
         let obstacles = Obstacles::new(std::slice::from_ref(&hole), 10.0).expect("one");

@@ -59,6 +59,8 @@ mod tests {
     /// Side of the pictures, pixels, and key points in each.
     const SIDE: u32 = 1000;
     const POINTS: usize = 900;
+    /// Points of the second picture that are the first one's.
+    const SAME: usize = POINTS / 8;
 
     /// Numbers by chance, 0 … 1, the same ones for the same seed.
     struct Chance(u64);
@@ -92,8 +94,8 @@ mod tests {
         frame
     }
 
-    /// A picture and another one taken beside it, of a world that repeats itself: every key point is of one of 40 kinds. A third of
-    /// the second picture's points are the first one's, moved along the row; those have the same index in both.
+    /// A picture and another one taken beside it, of a world that repeats itself: every key point is of one of 15 kinds. The
+    /// first of the second picture's points are the first one's, moved along the row; those have the same index in both.
     fn repetitive_pair(chance: &mut Chance) -> (KeyFrame, KeyFrame) {
         let kinds: Vec<Vec<f64>> = (0..40).map(|_| chance.near(&[0.0; DESCRIPTOR], 1.0)).collect();
         let (mut in_a, mut in_b, mut of_a, mut of_b) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
@@ -101,11 +103,11 @@ mod tests {
             let mut place = || [(chance.unit() * 1000.0) as f32, (chance.unit() * 1000.0) as f32];
             let (a, b) = (place(), place());
             let mut thing = || {
-                let kind = (chance.unit() * 40.0) as usize;
-                chance.near(&kinds[kind], 0.7)
+                let kind = (chance.unit() * 15.0) as usize;
+                chance.near(&kinds[kind], 0.4)
             };
             let (seen, other) = (thing(), thing());
-            let is_same = i < POINTS / 3;
+            let is_same = i < SAME;
             in_a.push(a);
             of_a.push(seen.clone());
             in_b.push(if is_same { [b[0], a[1]] } else { b });
@@ -121,11 +123,21 @@ mod tests {
             let (a, b) = repetitive_pair(&mut Chance(seed));
             // The second camera stands beside the first: every line is the point's own row.
             let rows: Vec<DVec3> = b.keypoints().iter().map(|p| DVec3::new(0.0, 1.0, -f64::from(p[1]))).collect();
+            let wrong_of = |found: &[Match]| found.iter().filter(|m| m.a != m.b).count() as f64;
+            let anywhere = vec![Some(DVec2::splat(500.0)); b.keypoints().len()];
+            let guide = Guide { predicted: &anywhere, radius: f64::INFINITY, lines: Some((&rows, 4.0)) };
+            let all = match_frames(&a, &b, &guide, limits);
+            assert!(
+                wrong_of(&all) > 0.5 * all.len() as f64,
+                "hardly any are wrong: {} of {}",
+                wrong_of(&all),
+                all.len()
+            );
             let found = match_along(&a, &b, &rows, 4.0, limits);
-            let wrong = found.iter().filter(|m| m.a != m.b).count() as f64;
+            let wrong = wrong_of(&found);
             let right = found.len() as f64 - wrong;
             assert!(wrong <= 0.26 * found.len() as f64, "{wrong} of {}", found.len());
-            assert!(right >= 0.8 * (POINTS / 3) as f64, "{right} of {}", POINTS / 3);
+            assert!(right >= 0.8 * SAME as f64, "{right} of {SAME}");
         }
     }
 

@@ -15,15 +15,20 @@ fn trigger(camera: u8, at_ms: u64) -> Trigger {
     }
 }
 
-/// Exposures of each camera, and the one whose pictures come 0.3 to 0.4 s later; which camera was decided for.
+/// Exposures of each camera, and the one whose pictures come, without those `skipped`; which camera was decided for.
 fn decide(exposures: &[&[u64]], of: usize, skipped: &[usize]) -> Option<Decision> {
+    let taken = exposures[of].iter().enumerate().filter(|(k, _)| !skipped.contains(k));
+    decide_by(exposures, &taken.map(|(k, t)| t + k as u64 % 3 * 50).collect::<std::vec::Vec<_>>())
+}
+
+/// Announced exposures of each camera, and when the shutter opened whose pictures come 0.3 s later.
+fn decide_by(exposures: &[&[u64]], opened: &[u64]) -> Option<Decision> {
     let mut cameras = Cameras::new(None, 15_000 * MS);
     let mut events: std::vec::Vec<(u64, Option<u8>)> = std::vec::Vec::new();
     for (camera, times) in exposures.iter().enumerate() {
         events.extend(times.iter().map(|t| (*t, Some(camera as u8))));
     }
-    let taken = exposures[of].iter().enumerate().filter(|(k, _)| !skipped.contains(k));
-    events.extend(taken.map(|(k, t)| (t + 300 + k as u64 % 3 * 50, None)));
+    events.extend(opened.iter().map(|t| (t + 300, None)));
     events.sort_unstable();
     for (at_ms, camera) in events {
         match camera {
@@ -74,6 +79,15 @@ fn two_that_expose_together_give_the_same_poses_and_the_first_is_taken() {
 fn two_of_the_same_rhythm_at_different_times_are_no_certain_choice() {
     let (a, b) = (every(2000, 8_000, 30), every(2000, 8_900, 30));
     let decision = decide(&[&a, &b], 1, &[]).expect("decided");
+    assert!(decision.confidence <= 0.5, "{decision:?}");
+}
+
+/// Our own announcements are lost now and then, and the other camera's fit every picture but the first.
+#[test]
+fn of_two_of_the_same_rhythm_what_is_lost_says_nothing_of_whose_the_pictures_are() {
+    let (a, b) = (every(2000, 8_000, 24), every(2000, 8_900, 24));
+    let heard: std::vec::Vec<u64> = a.iter().enumerate().filter(|(k, _)| k % 4 != 2).map(|(_, t)| *t).collect();
+    let decision = decide_by(&[&heard, &b], &a).expect("decided");
     assert!(decision.confidence <= 0.5, "{decision:?}");
 }
 

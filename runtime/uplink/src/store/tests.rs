@@ -89,3 +89,17 @@ fn a_power_cut_after_any_operation_of_a_reception_loses_no_model_that_was_comple
     assert!(wrong.is_empty(), "{} of {states}: {:#?}", wrong.len(), &wrong[..wrong.len().min(5)]);
     assert!(states >= 100, "{states} states");
 }
+
+#[test]
+fn nothing_is_removed_behind_a_link_in_the_place_of_the_chunks() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let [elsewhere, own] = ["elsewhere", "own"].map(|name| folder.path().join(name));
+    let name = "a".repeat(64);
+    for made in [&elsewhere, &own] {
+        std::fs::create_dir(made).expect("made");
+    }
+    std::fs::write(elsewhere.join(&name), b"another's").expect("written");
+    std::os::unix::fs::symlink(&elsewhere, own.join("chunk")).expect("linked");
+    Store::open(&Disk::default(), &own, &settings(), &admission()).keep_only(None);
+    assert!(elsewhere.join(&name).is_file());
+}
