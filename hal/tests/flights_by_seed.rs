@@ -107,7 +107,8 @@ fn no_picture_of_any_flight_is_surely_another_exposures_and_where_the_rhythm_tel
 #[test]
 fn of_a_flight_that_two_assignments_explain_equally_no_picture_is_sure() {
     let [mut told, mut shifted] = [Tally::default(); 2];
-    for seed in 0..flights() / 4 {
+    // Of the last five the first announcement is lost, and the picture that is alone comes when no exposure is awaited.
+    for seed in (0..flights() / 4).chain([17, 27, 32, 45, 84]) {
         let mut chance = Chance::new(1_000_000 + seed);
         let conditions = Conditions::ambiguous(&mut chance);
         let flight = Tally::of(seed, &conditions, &mut chance);

@@ -209,7 +209,10 @@ where
             {
                 self.exposures.aside.push(PutAside { clues, picture, reason });
             }
-            Outcome::Picture { picture, reason, .. } => self.picture_alone(&picture, reason),
+            Outcome::Picture { picture, clues, reason } => {
+                self.exposures.stays_alone(clues);
+                self.picture_alone(&picture, reason);
+            }
             // Its picture may still come: it counts as missing at the end of the flight.
             Outcome::Trigger { .. } => self.trouble.pictureless = self.trouble.pictureless.saturating_add(1),
         }

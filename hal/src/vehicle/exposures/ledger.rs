@@ -87,6 +87,8 @@ impl Landing {
 pub(in crate::vehicle) struct Exposures {
     pub(super) all: VecDeque<Exposure>,
     pub(super) aside: Vec<PutAside>,
+    /// Pictures that were told of without an exposure.
+    alone: Vec<PictureClues>,
     pub(super) next_reconcile_ns: u64,
     /// Matched pictures that wait for their pose.
     pub(in crate::vehicle) pending: VecDeque<PendingPicture>,
@@ -103,6 +105,7 @@ impl Exposures {
             cameras,
             all: VecDeque::with_capacity(EXPOSURES),
             aside: Vec::with_capacity(PUT_ASIDE),
+            alone: Vec::with_capacity(PUT_ASIDE),
             next_reconcile_ns: 0,
             pending: VecDeque::with_capacity(PENDING),
             closing: VecDeque::new(),
@@ -175,6 +178,13 @@ impl Exposures {
         self.all.iter().filter(|e| e.partner == Partner::Awaited)
     }
 
+    /// Remembers a picture that found no exposure and was told of: it shows, at the landing, where the flight's pictures begin and end.
+    pub(super) fn stays_alone(&mut self, clues: PictureClues) {
+        if self.alone.len() < PUT_ASIDE {
+            self.alone.push(clues);
+        }
+    }
+
     /// Whether pictures are still to come.
     pub(in crate::vehicle) fn await_pictures(&self) -> bool {
         self.awaited().next().is_some()
@@ -212,10 +222,12 @@ impl Exposures {
         let paired = self.all.iter().filter(|e| e.partner != Partner::Unneeded);
         let mut triggers: Vec<Trigger> = paired.map(|e| e.trigger).collect();
         triggers.sort_by_key(|t| t.time_ns);
-        let clues: Vec<PictureClues> = self.aside.iter().map(|a| a.clues).collect();
+        let aside = self.aside.iter().map(|a| a.clues);
+        let clues: Vec<PictureClues> = aside.chain(self.alone.iter().copied()).collect();
         let found = |e: &Exposure| if let Partner::Found(clues) = e.partner { Some((e.trigger, clues)) } else { None };
         let known: Vec<(Trigger, PictureClues)> = self.all.iter().filter_map(found).collect();
-        let settled = landing::settle(&triggers, &clues, &known, settings);
+        let mut settled = landing::settle(&triggers, &clues, &known, settings);
+        settled.pairs.retain(|pair| pair.picture < self.aside.len());
         let (revised, posed, doubtful) = (settled.revised.len(), settled.posed, settled.doubtful);
         let is_ambiguous = settled.is_ambiguous();
         Landing { pairs: self.take(&triggers, settled.pairs), revised, posed, doubtful, is_ambiguous }
