@@ -36,7 +36,7 @@ struct Tally {
     in_flight: usize,
     /// Flights that are called ambiguous at the landing.
     ambiguous: usize,
-    /// Lowest and highest median confidence of a flight.
+    /// Lowest and highest median of a flight's pictures, by the confidence that each has in the end.
     medians: Option<(f32, f32)>,
 }
 

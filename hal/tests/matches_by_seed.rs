@@ -237,7 +237,7 @@ impl Tally {
 
 #[test]
 fn no_match_is_surely_another_exposures_and_where_the_rhythm_tells_most_need_not_wait_for_the_landing() {
-    let flights = std::env::var("DGTR_FLIGHTS").ok().and_then(|n| n.parse().ok()).unwrap_or(60);
+    let flights = std::env::var("DGTR_FLIGHTS").ok().and_then(|n| n.parse().ok()).unwrap_or(150);
     let [mut irregular, mut regular] = [Tally::default(), Tally::default()];
     for seed in 0..flights {
         let mut flight = Tally::default();

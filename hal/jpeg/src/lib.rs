@@ -12,7 +12,7 @@ const NO_END: &str = "its end marker is missing";
 const CUT: &str = "its scan ends before the picture does";
 const DAMAGED: &str = "its scan holds what no picture has";
 
-/// What is missing or wrong: the end marker, or blocks of the picture. The scans of pictures with arithmetic coding are not looked into,
+/// What is missing or wrong: the end marker, or blocks of the picture. The scans of pictures with arithmetic coding are not checked,
 /// which the decoders in use refuse, nor those of progressive pictures of more than 16,384 pixels a side. What lies behind the end marker
 /// does not matter, nor do end markers of previews within a segment.
 pub fn flaw(jpeg: &[u8]) -> Option<&'static str> {

@@ -13,8 +13,8 @@ use crate::trigger::Trigger;
 /// Exposures that come into question for one picture.
 const WIDTH: usize = 96;
 
-/// Middle confidence up to which the second assignment of a flight is nearly as likely as the best: flights whose rhythm tells lie above,
-/// those of an even rhythm that lack something at one end lie below (`tests/flights_by_seed.rs` prints how far).
+/// Median confidence up to which the second assignment of a flight is nearly as likely as the best. Nearly all flights whose rhythm tells
+/// lie above it, nearly all of an even rhythm that lack something at one end below (`tests/flights_by_seed.rs` counts both).
 const NEARLY_AS_LIKELY: f32 = 0.6;
 /// A camera may be this many times later than in flight: pictures were copied at the landing.
 const REACH: u64 = 4;

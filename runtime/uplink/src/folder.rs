@@ -1,8 +1,8 @@
 //! The folder transport: a USB stick carried over after landing, or a directory both ends mount.
 //!
 //! `<folder>/<mission>/<aircraft>/offer`, `…/chunk/<blake3>` and the ground's `…/receipt`: the same names and bytes as on the
-//! network. The ground's `<folder>/<mission>/ground.session` says what offers are to be bound to. Every file is written aside, synced and renamed; chunks come before the offer that names them, so a reader
-//! never sees an offer whose chunks were not yet complete when it was written.
+//! network. The ground's `<folder>/<mission>/ground.session` says what offers are to be bound to. Every file is written aside, synced and
+//! renamed; chunks come before the offer that names them, so a reader never sees an offer whose chunks were not yet complete.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};

@@ -87,7 +87,7 @@ impl Landing {
 pub(in crate::vehicle) struct Exposures {
     pub(super) all: VecDeque<Exposure>,
     pub(super) aside: Vec<PutAside>,
-    /// Pictures that were told of without an exposure.
+    /// Clues of pictures that were reported as having no exposure, the first [`PUT_ASIDE`].
     alone: Vec<PictureClues>,
     pub(super) next_reconcile_ns: u64,
     /// Matched pictures that wait for their pose.
@@ -178,7 +178,7 @@ impl Exposures {
         self.all.iter().filter(|e| e.partner == Partner::Awaited)
     }
 
-    /// Remembers a picture that found no exposure and was told of: it shows, at the landing, where the flight's pictures begin and end.
+    /// Remembers a picture that is reported as having no exposure: at the landing it shows where the flight's pictures begin and end.
     pub(super) fn stays_alone(&mut self, clues: PictureClues) {
         if self.alone.len() < PUT_ASIDE {
             self.alone.push(clues);

@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn models_of_the_session_before_go_on_where_its_ground_is_dealt_anew_and_never_into_another_days_or_frames() {
+    fn models_of_the_session_before_are_brought_where_its_ground_is_dealt_anew_and_never_into_another_days_or_frames() {
         let folder = tempfile::tempdir().expect("a folder");
         let (earlier, now) = (folder.path().join("earlier-1"), dealt_anew(folder.path()));
         let was_flown = |text: &str| std::fs::write(earlier.join(super::super::MISSION), text).expect("written");
