@@ -114,6 +114,8 @@ pub struct Settled {
     pub posed: usize,
     /// How many of these fit another one nearly as well.
     pub doubtful: usize,
+    /// How many of them fit the exposure next that is as many exposures away, in the same direction, as that of most others.
+    pub shifted: usize,
     /// The median of their confidences: by how much this assignment of the flight is likelier than the second.
     pub confidence: f32,
 }
@@ -122,6 +124,11 @@ impl Settled {
     /// The second assignment of the flight is nearly as likely as the best: it says otherwise of most pictures.
     pub fn is_ambiguous(&self) -> bool {
         self.posed > 0 && self.confidence <= NEARLY_AS_LIKELY
+    }
+
+    /// One exposure earlier or later, all pictures fit as well if both ends of the flight lack something.
+    pub fn may_be_shifted(&self) -> bool {
+        self.posed > 0 && self.doubtful == self.posed && self.shifted * 10 >= self.posed * 9
     }
 }
 
@@ -143,6 +150,10 @@ pub fn settle(
     sorted.sort_by(f32::total_cmp);
     let (posed, doubtful) = (sorted.len(), sorted.partition_point(|confidence| *confidence <= SURE));
     let confidence = sorted.get(posed / 2).copied().unwrap_or(1.0);
+    let mut away: Vec<i64> =
+        answers.iter().filter_map(|a| Some(a.other? as i64 - a.exposure? as i64)).filter(|n| *n != 0).collect();
+    away.sort_unstable();
+    let shifted = away.chunk_by(|a, b| a == b).map(<[i64]>::len).max().unwrap_or(0);
     let (mut taken, mut revised) = (HashSet::new(), Vec::new());
     for (answer, (_, place)) in answers.iter().zip(&all) {
         let Ok(k) = *place else { continue };
@@ -160,7 +171,7 @@ pub fn settle(
             pairs.push(Pairing { exposure, picture, confidence: answer.confidence });
         }
     }
-    Settled { pairs, revised, posed, doubtful, confidence }
+    Settled { pairs, revised, posed, doubtful, shifted, confidence }
 }
 
 /// As [`align`], with the shutter's announcements alone where each picture is announced twice.

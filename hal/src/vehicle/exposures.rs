@@ -169,8 +169,8 @@ where
         }
         // The whole flight once more, with both ends; then by votes what is still alone.
         let landing = self.exposures.align(self.matcher.settings());
-        for doubt in landing.doubts() {
-            self.status_text(MavSeverity::MAV_SEVERITY_WARNING, &doubt);
+        for (severity, doubt) in landing.doubts() {
+            self.status_text(severity, &doubt);
         }
         self.take_pairs(landing.pairs);
         let pairs = self.exposures.reconcile(0.0);

@@ -6,6 +6,7 @@ use super::{PENDING, PendingPicture};
 use crate::camera::Picture;
 use crate::matcher::reconcile::{Pairing, reconcile};
 use crate::matcher::{Matcher, MatcherSettings, Outcome, Reason, landing};
+use crate::mavlink::dialect::MavSeverity;
 use crate::pose::{BodyPose, PoseError};
 use crate::traits::PictureClues;
 use crate::trigger::Trigger;
@@ -59,11 +60,13 @@ pub(super) struct Landing {
     posed: usize,
     doubtful: usize,
     is_ambiguous: bool,
+    /// All of them fit one exposure earlier or later if something lacks at both ends.
+    may_be_shifted: bool,
 }
 
 impl Landing {
-    /// What the pilot is told where poses are in doubt; the log says more.
-    pub(super) fn doubts(&self) -> impl Iterator<Item = String> + use<> {
+    /// What the pilot is told where poses are in doubt, and how urgently; the log says more.
+    pub(super) fn doubts(&self) -> impl Iterator<Item = (MavSeverity, String)> + use<> {
         let Self { revised, posed, doubtful, .. } = *self;
         if revised > 0 {
             tracing::warn!("the whole flight says another exposure of {revised} pictures that were posed in flight");
@@ -77,8 +80,15 @@ impl Landing {
         } else if doubtful > 0 {
             tracing::warn!("ambiguous: {many}; geotags.csv holds their confidence");
         }
-        let ambiguous = self.is_ambiguous.then(|| format!("dgtr: ambiguous flight, {doubtful} of {posed} unsure"));
-        let other = (revised > 0).then(|| format!("dgtr: {revised} pictures may have another exposure's pose"));
+        let ambiguous = format!("dgtr: ambiguous flight, {doubtful} of {posed} unsure");
+        let ambiguous = match (self.is_ambiguous, self.may_be_shifted) {
+            (true, _) => Some((MavSeverity::MAV_SEVERITY_WARNING, ambiguous)),
+            // A whole flight of an even rhythm looks like that as well.
+            (false, true) => Some((MavSeverity::MAV_SEVERITY_NOTICE, ambiguous)),
+            (false, false) => None,
+        };
+        let other = || format!("dgtr: {revised} pictures may have another exposure's pose");
+        let other = (revised > 0).then(|| (MavSeverity::MAV_SEVERITY_WARNING, other()));
         ambiguous.into_iter().chain(other)
     }
 }
@@ -229,8 +239,9 @@ impl Exposures {
         let mut settled = landing::settle(&triggers, &clues, &known, settings);
         settled.pairs.retain(|pair| pair.picture < self.aside.len());
         let (revised, posed, doubtful) = (settled.revised.len(), settled.posed, settled.doubtful);
-        let is_ambiguous = settled.is_ambiguous();
-        Landing { pairs: self.take(&triggers, settled.pairs), revised, posed, doubtful, is_ambiguous }
+        let (is_ambiguous, may_be_shifted) = (settled.is_ambiguous(), settled.may_be_shifted());
+        let pairs = self.take(&triggers, settled.pairs);
+        Landing { pairs, revised, posed, doubtful, is_ambiguous, may_be_shifted }
     }
 
     fn take(&mut self, triggers: &[Trigger], mut pairs: Vec<Pairing>) -> Vec<(Trigger, PutAside, f32)> {
