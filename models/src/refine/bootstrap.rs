@@ -11,17 +11,19 @@ use glam::{DQuat, DVec3};
 use super::adjust::{Limits, adjust};
 use super::linking::{LINKED_SIGMA, Pair, median};
 use super::overlap::Ground;
-use super::problem::{Loss, SHARED};
+use super::problem::{Loss, SHARED, Shared};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
 use super::twoview::RelativePose;
-use super::{RefineError, Refiner, joining};
+use super::{RefineError, Refiner, agreement, joining};
 use crate::camera::{Pinhole, Pose, PoseSigma};
 
 /// The lens is not adjusted, however many pictures are placed.
 const NO_LENS: usize = usize::MAX;
 /// Pairs tried as a start; a flat scene has two explanations of any pair, of which one does not go on.
 const SEEDS: usize = 6;
+/// Starts that follow the best one in vain before no more are tried, where all that it placed agree.
+const NO_BETTER: usize = 2;
 /// Rays of a start that meet at more than this gain nothing more, degrees.
 const WIDE_DEG: f64 = 12.0;
 /// Points that a picture is placed from at least, and that must agree with its place.
@@ -36,6 +38,8 @@ pub(super) const RETRY: f64 = 1.5;
 pub(super) const COARSE_PX: f64 = 8.0;
 /// Errors of a place that stands on the ground as if it were flat, pixels: relief of a fifth of the height at half a baseline.
 const ROUGH_PX: f64 = 60.0;
+/// Tracks of an adjustment for each picture where that is more than `[refine] max_tracks`: while places are new, many tracks are wrong.
+const PER_PICTURE: usize = 250;
 /// How far the poses may be wrong once all are placed: a chain of pictures bends.
 pub(super) const SIGMA: PoseSigma = PoseSigma { position_m: [15.0; 3], rotation_rad: [0.15; 3] };
 
@@ -108,28 +112,38 @@ pub(super) fn grow_from_seeds(
     grow: &dyn Fn(&mut Refiner),
 ) {
     let largest = refiner.groups().iter().map(Vec::len).max().unwrap_or(0);
-    let mut best: Option<(Vec<Option<Pose>>, Pair)> = None;
+    // A wrong start goes on, too: what counts are pictures that agree with each other, then all that were placed.
+    let mut best: ((usize, usize), Option<(Vec<Option<Pose>>, Shared, Pair)>) = ((0, 2), None);
+    let (lens, mut since_best) = (refiner.shared, 0);
     for seed in seeds(refiner, tracks, web) {
+        refiner.take_lens(lens);
         start(refiner, &seed);
         grow(refiner);
-        let poses: Vec<_> = refiner.frames.iter().map(|f| (!f.unplaced).then_some(f.pose)).collect();
-        let placed = poses.iter().flatten().count();
+        let placed: Vec<bool> = refiner.frames.iter().map(|f| !f.unplaced).collect();
+        let count = |of: &[bool]| of.iter().filter(|x| **x).count();
+        let worth = (count(&agreement::largest_part(refiner, tracks, &placed)), count(&placed));
         tracing::debug!(
-            "from {} and {}: {placed} of {} placed",
+            "from {} and {}: {} of {} placed, {} agree",
             refiner.frames[seed.a as usize].name,
             refiner.frames[seed.b as usize].name,
-            refiner.frames.len()
+            worth.1,
+            refiner.frames.len(),
+            worth.0
         );
-        if placed > best.as_ref().map_or(2, |(poses, _)| poses.iter().flatten().count()) {
-            report.placed = placed;
-            best = Some((poses, seed));
+        since_best += 1;
+        if worth > best.0 {
+            let poses = refiner.frames.iter().map(|f| (!f.unplaced).then_some(f.pose)).collect();
+            (best, since_best) = ((worth, Some((poses, refiner.shared, seed))), 0);
         }
-        if placed * 10 >= largest * 9 {
+        let (agree, placed) = best.0;
+        if agree * 10 >= largest * 9 || (agree == placed && since_best >= NO_BETTER) {
             break;
         }
     }
     refiner.frames.iter_mut().for_each(|f| f.unplaced = true);
-    if let Some((poses, seed)) = best {
+    if let ((_, placed), Some((poses, lens, seed))) = best {
+        report.placed = placed;
+        refiner.take_lens(lens);
         for (frame, pose) in refiner.frames.iter_mut().zip(poses) {
             frame.unplaced = pose.is_none();
             frame.pose = pose.unwrap_or(frame.pose);
@@ -359,7 +373,9 @@ pub(super) fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64,
         frame.sigma = PoseSigma { position_m: [extent; 3], rotation_rad: [0.5; 3] };
     }
     let known = |t: &u32| refiner.sightings(tracks, *t).len() >= 2;
-    let chosen: Vec<u32> = (0..tracks.len() as u32).filter(known).take(refiner.settings.max_tracks).collect();
+    let most = refiner.settings.max_tracks.max(PER_PICTURE * placed.len());
+    let known: Vec<u32> = (0..tracks.len() as u32).filter(known).collect();
+    let chosen = tracks.select_of(known, refiner.frames.len(), most);
     let deadline = Instant::now() + Duration::from_secs_f64(refiner.settings.solve_seconds);
     for (loss, max_steps) in [(Loss::Huber(3.0), 10), (Loss::Cauchy(2.0), 6)] {
         let mut problem = refiner.problem(tracks, &chosen, max_px);
@@ -370,5 +386,60 @@ pub(super) fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64,
         }
         adjust(&mut problem, Limits { loss, max_steps, deadline });
         refiner.take(&problem);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::super::agreement::tests::{chance, flown};
+    use super::super::twoview::SplitMix;
+    use super::*;
+
+    #[test]
+    fn a_start_whose_pictures_agree_is_kept_though_another_one_placed_more() {
+        let (mut refiner, tracks) = flown(8, 0.0);
+        let right: Vec<Pose> = refiner.frames.iter().map(|f| f.pose).collect();
+        for a in 0..7 {
+            let pose = RelativePose { rotation: DQuat::IDENTITY, translation: -DVec3::X };
+            refiner.pairs.push(Pair { a, b: a + 1, pose, rotation_only: false });
+        }
+        let (tried, mut report) = (Cell::new(0), BootstrapReport::default());
+        let grow = |this: &mut Refiner| {
+            let (mut random, places) = (SplitMix::default(), if tried.get() == 0 { 8 } else { 6 });
+            let is_wrong = tried.get() == 0;
+            for (frame, pose) in this.frames.iter_mut().zip(&right).take(places) {
+                let off = if is_wrong { 9.0 * DVec3::splat(chance(&mut random)) } else { DVec3::ZERO };
+                (frame.unplaced, frame.pose) = (false, Pose { center: pose.center + off, ..*pose });
+            }
+            // What a start makes of the lens is no part of the next one.
+            assert_eq!(this.shared.lens.log_focal, 0.0);
+            this.shared.lens.log_focal = if is_wrong { 0.3 } else { 0.0 };
+            tried.set(tried.get() + 1);
+        };
+        let web = Web::new(&tracks, 8);
+        grow_from_seeds(&mut refiner, &tracks, &web, &mut report, &grow);
+        let placed: Vec<bool> = refiner.frames.iter().map(|f| !f.unplaced).collect();
+        assert_eq!(placed, [true, true, true, true, true, true, false, false]);
+        assert_eq!((report.placed, refiner.shared.lens.log_focal), (6, 0.0));
+        // The best one, and two after it in vain.
+        assert_eq!(tried.get(), 4);
+    }
+
+    #[test]
+    fn every_picture_has_tracks_in_an_adjustment_of_few_of_them() {
+        let (mut refiner, _) = flown(6, 0.0);
+        // Long tracks of the first pictures, short ones of the last.
+        let long = |t: u32| (0..4).map(|frame| Sighting { frame, feature: t }).collect();
+        let short = |t: u32| (4..6).map(|frame| Sighting { frame, feature: t }).collect();
+        let tracks = Tracks::of((0..60).map(long).chain((60..80).map(short)).collect());
+        refiner.frames[5].unplaced = true;
+        let among: Vec<u32> = (0..80).filter(|t| refiner.sightings(&tracks, *t).len() >= 2).collect();
+        assert_eq!(among.len(), 60, "of the last two pictures one is not placed");
+        refiner.frames[5].unplaced = false;
+        let chosen = tracks.select_of((0..80).collect(), 6, 30);
+        let of_last = chosen.iter().filter(|t| tracks.get(**t as usize).iter().any(|s| s.frame == 5)).count();
+        assert!(chosen.len() == 30 && of_last >= 5, "{of_last} of {}", chosen.len());
     }
 }

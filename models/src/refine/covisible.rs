@@ -126,7 +126,8 @@ fn propose_again(refiner: &Refiner, a: u32, b: u32, before: Option<&Pair>) -> (u
         match_frames(fa, fb, &Guide { predicted: &anywhere, radius: f64::INFINITY, lines: None }, limits)
     } else {
         let lines = epipolar_lines(&relative, &ca, &cb, fb.keypoints());
-        decoys::match_along(fa, fb, &lines, 3.0 * refiner.settings.epipolar_px, limits)
+        let share = if settled { decoys::FEW_WRONG } else { decoys::SOME_WRONG };
+        decoys::match_along((fa, fb), (&lines, 3.0 * refiner.settings.epipolar_px), limits, share)
     };
     let limits = TwoViewLimits {
         threshold: refiner.settings.epipolar_px / ca.f.min_element().min(cb.f.min_element()),

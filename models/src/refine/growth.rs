@@ -71,8 +71,7 @@ fn grow(refiner: &mut Refiner, tracks: &Tracks) {
                 continue;
             }
             refiner.frames.iter_mut().zip(before).for_each(|(f, pose)| f.pose = pose);
-            refiner.shared = lens;
-            refiner.frames.iter_mut().for_each(|f| f.straighten(&lens.lens));
+            refiner.take_lens(lens);
         }
     }
     for max_px in [COARSE_PX, refiner.settings.outlier_px] {

@@ -384,7 +384,7 @@ fn look_closely(refiner: &Refiner, look: &Look, threshold_px: f64) -> (Vec<Match
         match_frames(fa, fb, &Guide { predicted: &anywhere, radius: f64::INFINITY, lines: None }, limits)
     } else {
         let lines = epipolar_lines(&coarse.pose, &ca, &cb, fb.keypoints());
-        decoys::match_along(fa, fb, &lines, 2.0 * threshold_px, limits)
+        decoys::match_along((fa, fb), (&lines, 2.0 * threshold_px), limits, decoys::FEW_WRONG)
     };
     let limits = TwoViewLimits {
         threshold: threshold_px / focal(refiner, look.a, look.b),

@@ -7,7 +7,9 @@ use super::linking::{ADJUSTED_SIGMA, median};
 use super::motion::velocities;
 use super::part::Part;
 use super::placing::Placed;
-use super::problem::{ASPECT, FOCAL, INDEPENDENT, Loss, Observation, PRINCIPAL, PosePrior, Problem, RADIAL, SHARED};
+use super::problem::{
+    ASPECT, FOCAL, INDEPENDENT, Loss, Observation, PRINCIPAL, PosePrior, Problem, RADIAL, SHARED, Shared,
+};
 use super::resect::resect;
 use super::tracks::{Sighting, Tracks};
 use super::triangulate::Triangulated;
@@ -164,10 +166,13 @@ impl Refiner {
                 frame.pose = *pose;
             }
         }
-        self.shared = problem.shared;
-        for frame in &mut self.frames {
-            frame.straighten(&problem.shared.lens);
-        }
+        self.take_lens(problem.shared);
+    }
+
+    /// What all frames share, and their key points as that lens sees them.
+    pub(super) fn take_lens(&mut self, shared: Shared) {
+        self.shared = shared;
+        self.frames.iter_mut().for_each(|f| f.straighten(&shared.lens));
     }
 
     /// Writes back the poses that moved.

@@ -175,26 +175,30 @@ impl Tracks {
     /// At most `max` tracks such that every frame gets its share of long ones: first those that help a frame
     /// which still has fewer than the quota, then the longest.
     pub fn select(&self, frames: usize, max: usize) -> Vec<u32> {
-        if self.len() <= max {
-            return (0..self.len() as u32).collect();
+        self.select_of((0..self.len() as u32).collect(), frames, max)
+    }
+
+    /// At most `max` of the tracks `among`, chosen as [`Tracks::select`] does.
+    pub fn select_of(&self, among: Vec<u32>, frames: usize, max: usize) -> Vec<u32> {
+        if among.len() <= max {
+            return among;
         }
         // Each track has at least two sightings, so this quota can be met within half the cap.
         let quota = (max / frames.max(1)).max(1) as u32;
         let mut held = vec![0u32; frames];
-        let mut taken = vec![false; self.len()];
         let mut out = Vec::with_capacity(max);
-        for (i, taken) in taken.iter_mut().enumerate() {
-            if out.len() < max && self.get(i).iter().any(|s| held[s.frame as usize] < quota) {
-                self.get(i).iter().for_each(|s| held[s.frame as usize] += 1);
-                *taken = true;
-                out.push(i as u32);
+        let mut rest = Vec::new();
+        for i in among {
+            let sightings = self.get(i as usize);
+            if out.len() < max && sightings.iter().any(|s| held[s.frame as usize] < quota) {
+                sightings.iter().for_each(|s| held[s.frame as usize] += 1);
+                out.push(i);
+            } else {
+                rest.push(i);
             }
         }
-        for (i, taken) in taken.iter().enumerate() {
-            if out.len() < max && !taken {
-                out.push(i as u32);
-            }
-        }
+        rest.truncate(max - out.len());
+        out.extend(rest);
         out
     }
 }
