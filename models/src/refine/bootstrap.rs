@@ -54,6 +54,15 @@ pub struct BootstrapReport {
     pub joined_by_appearance: usize,
 }
 
+/// What followed from one start.
+struct Grown {
+    /// Pictures that agree with each other, and all that were placed.
+    worth: (usize, usize),
+    poses: Vec<Option<Pose>>,
+    shared: Shared,
+    seed: Pair,
+}
+
 /// Which tracks a picture sees, and how many each two have in common.
 pub(super) struct Web {
     seen_by: Vec<Vec<u32>>,
@@ -113,7 +122,7 @@ pub(super) fn grow_from_seeds(
 ) {
     let largest = refiner.groups().iter().map(Vec::len).max().unwrap_or(0);
     // A wrong start goes on, too: what counts are pictures that agree with each other, then all that were placed.
-    let mut best: ((usize, usize), Option<(Vec<Option<Pose>>, Shared, Pair)>) = ((0, 2), None);
+    let mut best: Option<Grown> = None;
     let (lens, mut since_best) = (refiner.shared, 0);
     for seed in seeds(refiner, tracks, web) {
         refiner.take_lens(lens);
@@ -131,19 +140,19 @@ pub(super) fn grow_from_seeds(
             worth.0
         );
         since_best += 1;
-        if worth > best.0 {
+        if worth > best.as_ref().map_or((0, 2), |b| b.worth) {
             let poses = refiner.frames.iter().map(|f| (!f.unplaced).then_some(f.pose)).collect();
-            (best, since_best) = ((worth, Some((poses, refiner.shared, seed))), 0);
+            (best, since_best) = (Some(Grown { worth, poses, shared: refiner.shared, seed }), 0);
         }
-        let (agree, placed) = best.0;
+        let (agree, placed) = best.as_ref().map_or((0, 2), |b| b.worth);
         if agree * 10 >= largest * 9 || (agree == placed && since_best >= NO_BETTER) {
             break;
         }
     }
     refiner.frames.iter_mut().for_each(|f| f.unplaced = true);
-    if let ((_, placed), Some((poses, lens, seed))) = best {
-        report.placed = placed;
-        refiner.take_lens(lens);
+    if let Some(Grown { worth, poses, shared, seed }) = best {
+        report.placed = worth.1;
+        refiner.take_lens(shared);
         for (frame, pose) in refiner.frames.iter_mut().zip(poses) {
             frame.unplaced = pose.is_none();
             frame.pose = pose.unwrap_or(frame.pose);

@@ -13,8 +13,8 @@ use models::refine::{RefineReport, Refiner};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+/// A picture in which key points are found, and about how many there are in it, at the size at which they are found in flight.
 const SIZE: (u32, u32) = (640, 480);
-/// Key points of a picture, about.
 const SEEN: f64 = 650.0;
 /// Noise of a key point along each axis, pixels.
 const NOISE: f64 = 0.7;
@@ -57,6 +57,8 @@ pub struct SimulatedCard {
     /// True over stated focal length.
     pub focal_off: f64,
     overlap: f64,
+    /// How many times as large as [`SIZE`] its pictures are when key points are found, with as many times as many of them.
+    times: u32,
     lens: Intrinsics,
     told: Vec<(Pose, PoseSigma)>,
     features: Vec<Features>,
@@ -101,20 +103,23 @@ fn looking(center: DVec3, at: DVec3) -> Pose {
 }
 
 impl SimulatedCard {
-    pub fn new(seed: u64) -> Self {
+    /// Its key points are found in pictures `times` as large as in flight: twice where pictures have 12 megapixels and nobody waits.
+    pub fn new(seed: u64, times: u32) -> Self {
         let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xCA2D);
         let kind = [Kind::Nadir, Kind::Oblique, Kind::Orbit, Kind::Street][(seed % 4) as usize];
         let gps = [Gps::None, Gps::Noisy, Gps::Half, Gps::Wrong][rng.random_range(0..4)];
         let (k1, focal_off) = (rng.random_range(-0.3..0.1), rng.random_range(0.8..1.2));
-        let focal = 640.0 * rng.random_range(0.65..1.1);
+        let (width, height) = (times * SIZE.0, times * SIZE.1);
+        let focal = f64::from(width) * rng.random_range(0.65..1.1);
         let stated = (focal / focal_off) as f32;
-        let lens = Intrinsics { width: SIZE.0, height: SIZE.1, fx: stated, fy: stated, cx: 320.0, cy: 240.0 };
+        let (cx, cy) = (width as f32 / 2.0, height as f32 / 2.0);
+        let lens = Intrinsics { width, height, fx: stated, fy: stated, cx, cy };
         let count = rng.random_range(12..=60usize);
         let overlap = rng.random_range(0.3..0.85);
         let (mut truth, points) = match kind {
-            Kind::Nadir | Kind::Oblique => survey(&mut rng, kind, count, overlap, focal),
-            Kind::Orbit => orbit(&mut rng, count),
-            Kind::Street => street(&mut rng, count),
+            Kind::Nadir | Kind::Oblique => survey(&mut rng, kind, count, overlap, (focal, times)),
+            Kind::Orbit => orbit(&mut rng, count, times),
+            Kind::Street => street(&mut rng, count, times),
         };
         for pose in &mut truth {
             pose.rotation = (pose.rotation * DQuat::from_scaled_axis(vector(&mut rng, 0.03))).normalize();
@@ -127,6 +132,7 @@ impl SimulatedCard {
             k1,
             focal_off,
             overlap,
+            times,
             lens,
             told,
             features: Vec::new(),
@@ -142,6 +148,7 @@ impl SimulatedCard {
     /// Key points of picture `i`.
     fn take(&mut self, rng: &mut Pcg64Mcg, i: usize, points: &[Point], focal: f64) {
         let pose = self.truth[i];
+        let size = DVec2::new(self.lens.width.into(), self.lens.height.into());
         let mut seen = Vec::new();
         for (k, p) in points.iter().enumerate() {
             let away = p.place - pose.center;
@@ -156,13 +163,13 @@ impl SimulatedCard {
             if q.z < 0.5 || 1.0 + 3.0 * self.k1 * r2 < 0.2 {
                 continue;
             }
-            let at = n * bent * focal + DVec2::new(320.0, 240.0);
-            if at.x > 2.0 && at.y > 2.0 && at.x < 638.0 && at.y < 478.0 {
+            let at = n * bent * focal + size / 2.0;
+            if at.min_element() > 2.0 && (size - at).min_element() > 2.0 {
                 seen.push((k, at, away.normalize(), q.z));
             }
         }
         // Near things first, as they are larger; then chance.
-        let share = (SEEN / seen.len().max(1) as f64).min(0.7);
+        let share = (f64::from(self.times) * SEEN / seen.len().max(1) as f64).min(0.7);
         let (mut features, mut of, mut directions) = (Features::default(), Vec::new(), HashMap::new());
         for (k, at, direction, _) in seen {
             // The same points are found again in most pictures.
@@ -232,6 +239,8 @@ impl SimulatedCard {
     pub fn settle(&self) -> (Refiner, RefineReport, bool) {
         let settings = RefineSettings {
             solve_seconds: 600.0,
+            feature_side: self.times * RefineSettings::default().feature_side,
+            max_features: self.times as usize * RefineSettings::default().max_features,
             mount_sigma_deg: 0.0,
             delay_sigma_s: 0.0,
             focal_sigma: 0.1,
@@ -286,8 +295,14 @@ fn point(rng: &mut Pcg64Mcg, place: DVec3, normal_: DVec3) -> Point {
 }
 
 /// Lines flown back and forth, 50 m above ground with relief.
-fn survey(rng: &mut Pcg64Mcg, kind: Kind, count: usize, overlap: f64, focal: f64) -> (Vec<Pose>, Vec<Point>) {
-    let (wide, long) = (640.0 / focal * 50.0, 480.0 / focal * 50.0);
+fn survey(
+    rng: &mut Pcg64Mcg,
+    kind: Kind,
+    count: usize,
+    overlap: f64,
+    (focal, times): (f64, u32),
+) -> (Vec<Pose>, Vec<Point>) {
+    let [wide, long] = [SIZE.0, SIZE.1].map(|side| f64::from(times * side) / focal * 50.0);
     // Three pictures must see a point somewhere.
     let (along, across) = (long * (1.0 - overlap.max(0.6)), wide * (1.0 - overlap));
     let lines = ((count as f64).sqrt() * 0.8).ceil() as usize;
@@ -304,8 +319,8 @@ fn survey(rng: &mut Pcg64Mcg, kind: Kind, count: usize, overlap: f64, focal: f64
     let reach = if kind == Kind::Oblique { 140.0 } else { 0.0 };
     let (width, length) = (lines as f64 * across + 2.0 * wide, each as f64 * along + 2.0 * long + reach);
     // Detection keeps about a third of what is there.
-    let dense = 3.0 * SEEN / (wide * long);
-    let total = ((width * length * dense) as usize).min(60_000);
+    let dense = 3.0 * f64::from(times) * SEEN / (wide * long);
+    let total = ((width * length * dense) as usize).min(60_000 * times as usize);
     let phase = rng.random_range(0.0..6.0);
     let points = (0..total)
         .map(|_| {
@@ -319,7 +334,7 @@ fn survey(rng: &mut Pcg64Mcg, kind: Kind, count: usize, overlap: f64, focal: f64
 }
 
 /// Around a building, 25 m away.
-fn orbit(rng: &mut Pcg64Mcg, count: usize) -> (Vec<Pose>, Vec<Point>) {
+fn orbit(rng: &mut Pcg64Mcg, count: usize, times: u32) -> (Vec<Pose>, Vec<Point>) {
     let pose = |i: usize, rng: &mut Pcg64Mcg| {
         let angle = std::f64::consts::TAU * i as f64 / count as f64;
         let center = DVec3::new(angle.cos() * 25.0, angle.sin() * 25.0, 12.0) + vector(rng, 0.6);
@@ -327,14 +342,14 @@ fn orbit(rng: &mut Pcg64Mcg, count: usize) -> (Vec<Pose>, Vec<Point>) {
     };
     let poses = (0..count).map(|i| pose(i, rng)).collect();
     let mut points = Vec::new();
-    for _ in 0..5000 {
+    for _ in 0..5000 * times {
         let (u, v) = (rng.random_range(-7.0..7.0), rng.random_range(0.0..9.0));
         let side = rng.random_range(0..4);
         let turn = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2 * f64::from(side));
         let depth = 7.0 + rng.random_range(-0.5..0.5);
         points.push(point(rng, turn * DVec3::new(depth, u, v), turn * DVec3::X));
     }
-    for _ in 0..3500 {
+    for _ in 0..3500 * times {
         let place =
             DVec3::new(rng.random_range(-25.0..25.0), rng.random_range(-25.0..25.0), rng.random_range(-0.3..0.3));
         points.push(point(rng, place, DVec3::Z));
@@ -343,7 +358,7 @@ fn orbit(rng: &mut Pcg64Mcg, count: usize) -> (Vec<Pose>, Vec<Point>) {
 }
 
 /// Along a street of houses, looking askew at one side.
-fn street(rng: &mut Pcg64Mcg, count: usize) -> (Vec<Pose>, Vec<Point>) {
+fn street(rng: &mut Pcg64Mcg, count: usize, times: u32) -> (Vec<Pose>, Vec<Point>) {
     let step = rng.random_range(1.0..2.2);
     let pose = |i: usize, rng: &mut Pcg64Mcg| {
         let center = DVec3::new(i as f64 * step, 0.0, 1.7) + vector(rng, 0.15);
@@ -352,13 +367,13 @@ fn street(rng: &mut Pcg64Mcg, count: usize) -> (Vec<Pose>, Vec<Point>) {
     let poses: Vec<Pose> = (0..count).map(|i| pose(i, rng)).collect();
     let length = count as f64 * step + 40.0;
     let mut points = Vec::new();
-    for _ in 0..(length * 120.0) as usize {
+    for _ in 0..(f64::from(times) * length * 120.0) as usize {
         let x = rng.random_range(-5.0..length);
         let setback = 8.0 + 1.5 * (x * 0.3).sin() + rng.random_range(-0.4..0.4);
         let place = DVec3::new(x, setback, rng.random_range(0.0..9.0));
         points.push(point(rng, place, -DVec3::Y));
     }
-    for _ in 0..(length * 25.0) as usize {
+    for _ in 0..(f64::from(times) * length * 25.0) as usize {
         let place = DVec3::new(rng.random_range(-5.0..length), rng.random_range(1.0..8.0), 0.0);
         points.push(point(rng, place, DVec3::Z));
     }
