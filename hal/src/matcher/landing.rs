@@ -114,7 +114,7 @@ pub struct Settled {
     pub posed: usize,
     /// How many of these fit another one nearly as well.
     pub doubtful: usize,
-    /// How many of them fit the exposure next that is as many exposures away, in the same direction, as that of most others.
+    /// Pictures whose second exposure is as many exposures earlier or later as that of most others.
     pub shifted: usize,
     /// The median of their confidences: by how much this assignment of the flight is likelier than the second.
     pub confidence: f32,
@@ -126,7 +126,7 @@ impl Settled {
         self.posed > 0 && self.confidence <= NEARLY_AS_LIKELY
     }
 
-    /// One exposure earlier or later, all pictures fit as well if both ends of the flight lack something.
+    /// No picture is sure, and one shift leads to the second exposure of nearly all: as where both ends of an even flight lack something.
     pub fn may_be_shifted(&self) -> bool {
         self.posed > 0 && self.doubtful == self.posed && self.shifted * 10 >= self.posed * 9
     }

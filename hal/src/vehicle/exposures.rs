@@ -8,7 +8,6 @@ use super::{CameraPose, Event, PosedPicture, Unmatched, UnmatchedReason, Vehicle
 use crate::camera::{Picture, exif_pose};
 use crate::error::{Error, ErrorKind, HalError};
 use crate::matcher::{Outcome, Reason};
-use crate::mavlink::dialect::MavSeverity;
 use crate::pose::PoseError;
 use crate::traits::{Camera, Clock, Link, PictureClues, PoseSource};
 use crate::trigger::{Source, Trigger, TriggerKind};

@@ -1,7 +1,8 @@
 //! Which pictures agree on one scene. Two rays nearly always meet somewhere, and an adjustment bends to what it is given: that a picture
 //! is held by many points says little where nothing but itself fixes them. So the scene is grown once more at its final poses, from its
 //! best pair: a picture belongs to it when enough of the points that two others of it fix are seen where it says, and most of a group
-//! that one weak match joined is not.
+//! that one weak match joined is not. With two pictures side by side, a third one elsewhere on their line may agree at other depths: in the
+//! end each is asked about the points that all the others fix.
 
 use rayon::prelude::*;
 
@@ -16,8 +17,10 @@ const LEAST_SHARE: f64 = 0.25;
 /// Share, of the points that all the others of its part fix, that a picture sees where it says. Along a street, seven tenths and more of them
 /// agree where all stand right, a quarter to a half where some of them went astray.
 const MEMBER_SHARE: f64 = 0.5;
-/// What a lens model and a rolling shutter leave at the edges of phone pictures, in picture widths: a key point's own noise is as many pixels
-/// at any size, this is not.
+/// Of the pictures that disagree, the worst one in so many is dropped before all are asked again.
+const DROPPED_AT_ONCE: usize = 4;
+/// By how much a rolling shutter stretches a picture (5 m/s for 30 ms at 60 m), in picture widths: it grows with the size in pixels, a key
+/// point's own noise does not.
 const MISFIT: f64 = 0.0025;
 
 /// Of the points that others fix, those that a picture has matches with, and those of them that it sees where it says.
@@ -68,12 +71,39 @@ pub(super) fn largest_part(refiner: &Refiner, tracks: &Tracks, all: &[bool]) -> 
             best.clone_from(&part);
         }
         waiting.iter_mut().zip(&part).for_each(|(w, p)| *w &= !p);
+        // Those that the part began with may have been dropped from it.
+        (waiting[a], waiting[b]) = (false, false);
     }
     best
 }
 
-/// The pictures `among` all that agree with the two of `start`, and with each other once all of them fix the points.
+/// The pictures `among` all that agree with the two of `start`, and each with what all the others of them fix.
 fn part(refiner: &Refiner, tracks: &Tracks, cameras: &[Pinhole], among: &[bool], start: [usize; 2]) -> Vec<bool> {
+    let (mut among, mut start) = (among.to_vec(), start);
+    loop {
+        let mut part = grown(refiner, tracks, cameras, &among, start);
+        let words = words(refiner, tracks, cameras, &part, Whose::Members);
+        let is_against = |i: &usize| part[*i] && words[*i].asked >= TIED && words[*i].share() < MEMBER_SHARE;
+        let mut against: Vec<usize> = (0..part.len()).filter(is_against).collect();
+        if against.is_empty() {
+            return part;
+        }
+        // The worst of them may be why others disagree; and what was reached by them alone has to be reached without them.
+        against.sort_by(|a, b| words[*a].share().total_cmp(&words[*b].share()));
+        against.truncate(against.len().div_ceil(DROPPED_AT_ONCE));
+        for i in against {
+            tracing::debug!("{}: {:?}, against the others", refiner.frames[i].name, words[i]);
+            (among[i], part[i]) = (false, false);
+        }
+        if !start.iter().all(|i| part[*i]) {
+            let Some((a, b)) = best_pair(refiner, tracks, cameras, &part) else { return vec![false; part.len()] };
+            start = [a, b];
+        }
+    }
+}
+
+/// The pictures `among` all that agree with what those before them fix, from the two of `start` on.
+fn grown(refiner: &Refiner, tracks: &Tracks, cameras: &[Pinhole], among: &[bool], start: [usize; 2]) -> Vec<bool> {
     let n = refiner.frames.len();
     let mut part = vec![false; n];
     start.iter().for_each(|i| part[*i] = true);
@@ -84,17 +114,9 @@ fn part(refiner: &Refiner, tracks: &Tracks, cameras: &[Pinhole], among: &[bool],
         if new.is_empty() {
             let of = &refiner.frames[start[0]].name;
             outside().for_each(|i| tracing::debug!("{}: {:?}, no part of {of}'s", refiner.frames[i].name, words[i]));
-            break;
+            return part;
         }
         new.into_iter().for_each(|i| part[i] = true);
-    }
-    // With two pictures side by side, a third one elsewhere on their line may agree at other depths.
-    loop {
-        let words = words(refiner, tracks, cameras, &part, Whose::Members);
-        let against = (0..n).filter(|i| part[*i] && words[*i].asked >= TIED && words[*i].share() < MEMBER_SHARE);
-        let Some(worst) = against.min_by(|a, b| words[*a].share().total_cmp(&words[*b].share())) else { return part };
-        tracing::debug!("{}: {:?}, against the others", refiner.frames[worst].name, words[worst]);
-        part[worst] = false;
     }
 }
 
@@ -229,5 +251,19 @@ pub(super) mod tests {
             let apart: Vec<bool> = refiner.frames.iter().map(|f| f.known.apart).collect();
             assert_eq!(apart, [false, false, false, false, true, false], "{off} pixels");
         }
+    }
+
+    #[test]
+    fn pictures_that_only_dropped_ones_reach_are_no_part_either() {
+        let (mut refiner, _) = flown(9, 0.0);
+        // The first four and the last three have no point in common; the two between see most of the first ones' where they are not.
+        for (i, t) in (4..6).flat_map(|i| (18..60).map(move |t| (i, t))) {
+            refiner.frames[i].seen[t][1] += if (i + t) % 2 == 0 { 40.0 } else { -40.0 };
+        }
+        let track = |t: u32| (if t < 60 { 0..6 } else { 4..9 }).map(|frame| Sighting { frame, feature: t }).collect();
+        let tracks = Tracks::of((0..80).map(track).collect());
+        agree(&mut refiner, &tracks);
+        let apart: Vec<bool> = refiner.frames.iter().map(|f| f.known.apart).collect();
+        assert_eq!(apart, [false, false, false, false, true, true, true, true, true]);
     }
 }

@@ -371,6 +371,14 @@ fn place(
     (best.0 >= PLACED_FROM).then_some(best.1)
 }
 
+/// Tracks that two placed pictures see, some of every picture.
+fn chosen_of_placed(refiner: &Refiner, tracks: &Tracks) -> Vec<u32> {
+    let placed = refiner.frames.iter().filter(|f| !f.unplaced).count();
+    let known = |t: &u32| refiner.sightings(tracks, *t).len() >= 2;
+    let known: Vec<u32> = (0..tracks.len() as u32).filter(known).collect();
+    tracks.select_of(known, refiner.frames.len(), refiner.settings.max_tracks.max(PER_PICTURE * placed))
+}
+
 /// Bundle adjustment of what is placed; its own poses hold it together weakly, for nothing else says where it is.
 /// From `lens_from` placed pictures on the lens is adjusted with them, as far as they tell it.
 pub(super) fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64, lens_from: usize) {
@@ -381,10 +389,7 @@ pub(super) fn adjust_placed(refiner: &mut Refiner, tracks: &Tracks, max_px: f64,
         frame.prior = frame.pose;
         frame.sigma = PoseSigma { position_m: [extent; 3], rotation_rad: [0.5; 3] };
     }
-    let known = |t: &u32| refiner.sightings(tracks, *t).len() >= 2;
-    let most = refiner.settings.max_tracks.max(PER_PICTURE * placed.len());
-    let known: Vec<u32> = (0..tracks.len() as u32).filter(known).collect();
-    let chosen = tracks.select_of(known, refiner.frames.len(), most);
+    let chosen = chosen_of_placed(refiner, tracks);
     let deadline = Instant::now() + Duration::from_secs_f64(refiner.settings.solve_seconds);
     for (loss, max_steps) in [(Loss::Huber(3.0), 10), (Loss::Cauchy(2.0), 6)] {
         let mut problem = refiner.problem(tracks, &chosen, max_px);
@@ -437,18 +442,21 @@ mod tests {
     }
 
     #[test]
-    fn every_picture_has_tracks_in_an_adjustment_of_few_of_them() {
+    fn every_placed_picture_has_tracks_in_an_adjustment_of_few_of_them() {
         let (mut refiner, _) = flown(6, 0.0);
-        // Long tracks of the first pictures, short ones of the last.
-        let long = |t: u32| (0..4).map(|frame| Sighting { frame, feature: t }).collect();
-        let short = |t: u32| (4..6).map(|frame| Sighting { frame, feature: t }).collect();
-        let tracks = Tracks::of((0..60).map(long).chain((60..80).map(short)).collect());
+        refiner.settings.max_tracks = 100;
+        // Many long tracks of the first pictures, few short ones of the last.
+        let seen_by = |frames: std::ops::Range<u32>, t: u32| {
+            frames.map(|frame| Sighting { frame, feature: t % 80 }).collect::<Vec<_>>()
+        };
+        let tracks = Tracks::of((0..2000).map(|t| seen_by(0..4, t)).chain((0..80).map(|t| seen_by(4..6, t))).collect());
+        let of_last =
+            |chosen: &[u32]| chosen.iter().filter(|t| tracks.get(**t as usize).iter().any(|s| s.frame == 5)).count();
+        let chosen = chosen_of_placed(&refiner, &tracks);
+        assert_eq!((chosen.len(), of_last(&chosen)), (6 * PER_PICTURE, 80));
+        // Of a picture without a place nothing is known.
         refiner.frames[5].unplaced = true;
-        let among: Vec<u32> = (0..80).filter(|t| refiner.sightings(&tracks, *t).len() >= 2).collect();
-        assert_eq!(among.len(), 60, "of the last two pictures one is not placed");
-        refiner.frames[5].unplaced = false;
-        let chosen = tracks.select_of((0..80).collect(), 6, 30);
-        let of_last = chosen.iter().filter(|t| tracks.get(**t as usize).iter().any(|s| s.frame == 5)).count();
-        assert!(chosen.len() == 30 && of_last >= 5, "{of_last} of {}", chosen.len());
+        let chosen = chosen_of_placed(&refiner, &tracks);
+        assert_eq!((chosen.len(), of_last(&chosen)), (5 * PER_PICTURE, 0));
     }
 }

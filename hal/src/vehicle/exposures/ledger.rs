@@ -60,7 +60,7 @@ pub(super) struct Landing {
     posed: usize,
     doubtful: usize,
     is_ambiguous: bool,
-    /// All of them fit one exposure earlier or later if something lacks at both ends.
+    /// All of them may belong to exposures one earlier or later.
     may_be_shifted: bool,
 }
 
