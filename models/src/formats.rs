@@ -2,7 +2,7 @@
 //! for it, and every error is one line: which file, what is wrong with it, how to mend it.
 
 use std::cmp::Ordering;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use config::error::{Error, ErrorKind};
@@ -120,24 +120,14 @@ impl FormatError {
     }
 }
 
-/// The whole of a file of at most `limit` bytes. The bound holds also for files that grow while being read and
-/// for pipes, whose length is not known beforehand.
+/// The whole of a file of at most `limit` bytes.
 ///
 /// # Errors
 /// [`FormatError::TooLarge`], else the operating system's.
 pub fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     let file = disk::regular::open(path).map_err(|e| FormatError::io(path, "opening", e))?;
-    let size = file.metadata().map_err(|e| FormatError::io(path, "reading", e))?.len();
-    let too_large = |size| FormatError::TooLarge { path: path.to_owned(), what: "its size in bytes", size, limit };
-    if size > limit {
-        return Err(too_large(size));
-    }
-    let mut bytes = Vec::with_capacity(size as usize);
-    file.take(limit + 1).read_to_end(&mut bytes).map_err(|e| FormatError::io(path, "reading", e))?;
-    if bytes.len() as u64 > limit {
-        return Err(too_large(bytes.len() as u64));
-    }
-    Ok(bytes)
+    let read = disk::regular::read_at_most(file, limit).map_err(|e| FormatError::io(path, "reading", e))?;
+    read.map_err(|size| FormatError::TooLarge { path: path.to_owned(), what: "its size in bytes", size, limit })
 }
 
 /// Names in the order in which people count: `_9` before `_20`, capitals beside small letters.

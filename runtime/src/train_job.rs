@@ -200,7 +200,7 @@ impl TrainJob {
         stop: &Interrupt,
         chosen: Option<Choice>,
     ) -> Result<Outcome, JobError> {
-        let go_on = || !stop.requested();
+        let cancelled = || stop.requested();
         let from =
             self.from.as_deref().map(|path| first::open(path, &self.output.folder, self.output.fresh)).transpose()?;
         from.as_ref().map_or(Ok(()), |model| first::check(model, &set))?;
@@ -218,7 +218,7 @@ impl TrainJob {
         let picture_scale = self.picture_scale(&set, is_card)?;
         let settings = self.poses.refine.then_some(&self.recipe.refine);
         let opened = began.elapsed();
-        let Some(card) = card::settle(&mut set, &self.output.folder, self.output.fresh, settings, &go_on)? else {
+        let Some(card) = card::settle(&mut set, &self.output.folder, self.output.fresh, settings, &cancelled)? else {
             return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train"), few: None });
         };
         let settled = began.elapsed() - opened;
@@ -297,9 +297,9 @@ impl TrainJob {
         if is_new && replaces {
             identity.write(&self.output.folder)?;
         }
-        let built = self.take(&mut engine, &mut source, &go_on)?
-            && engine.build(&go_on).map_err(|e| cause::of(e, &set, &frames))?;
-        let ready = built && engine.look_closer(&mut source, &go_on)?;
+        let built = self.take(&mut engine, &mut source, &cancelled)?
+            && engine.build(&cancelled).map_err(|e| cause::of(e, &set, &frames))?;
+        let ready = built && engine.look_closer(&mut source, &cancelled)?;
         let finished = ready && self.optimise(&mut engine, frames.len(), stop)?;
         if finished && self.evaluate {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
@@ -379,7 +379,7 @@ impl TrainJob {
         &self,
         engine: &mut Reconstruction,
         source: &mut Folder<'_>,
-        go_on: &dyn Fn() -> bool,
+        cancelled: &dyn Fn() -> bool,
     ) -> Result<bool, JobError> {
         let total = source.waiting();
         let mut progress = Progress::new("pictures", total as u64);
@@ -389,7 +389,7 @@ impl TrainJob {
             engine.report.stage("decode", decoding);
             progress.set((total - source.waiting()) as u64, || picture.name.clone());
             engine.add(picture, source.waiting() > 0)?;
-            if !go_on() {
+            if cancelled() {
                 return Ok(false);
             }
         }

@@ -39,7 +39,7 @@ fn merged(aircraft_of_field: usize) -> (Outcome, usize) {
     let settings = GroundSettings { epochs: 0, register: false, ..Default::default() };
     let (outcome, peak) = peak_of(|| {
         let members = (0..aircraft_of_field).map(|i| aircraft(dir.path(), i)).collect();
-        aggregate::run(members, &settings, None, dir.path(), &|| true).expect("merged")
+        aggregate::run(members, &settings, None, dir.path(), &|| false).expect("merged")
     });
     (outcome, peak)
 }

@@ -353,7 +353,7 @@ fn merged(ground: &Path, mission: &Mission) -> (Vec<View>, f64, f64) {
     let members = mission.aircraft.iter().map(member).collect();
     // Nothing was rendered that could be distilled.
     let settings = GroundSettings { epochs: 0, register: false, ..mission.ground.clone() };
-    let outcome = aggregate::run(members, &settings, Some(mission.origin), ground, &|| true).expect("merged");
+    let outcome = aggregate::run(members, &settings, Some(mission.origin), ground, &|| false).expect("merged");
     let (header, cloud) = model::read(&outcome.path).expect("a model");
     let mut count: HashMap<(i32, i32), usize> = HashMap::new();
     for [x, y, _] in &cloud.means {

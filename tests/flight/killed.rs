@@ -62,7 +62,7 @@ fn fly(out: &Path, promised: impl FnMut(Promise) + Send + 'static) {
         if ledger.steps_total() >= until && i + 1 < FRAMES {
             continue;
         }
-        ledger.build(&|| true).expect("built");
+        ledger.build(&|| false).expect("built");
         while ledger.steps_total() < until {
             let budget = RunBudget { steps: None, seconds: None };
             ledger.train(&budget, &mut |_| ControlFlow::Break(())).expect("trained");

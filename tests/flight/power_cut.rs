@@ -61,7 +61,7 @@ fn record(careless: bool) -> Recording {
 }
 
 /// Starts in what the power cut left and flies the rest; what went wrong.
-fn go_on(state: &State, promised: &[Promise], r: &Recording) -> Result<(), String> {
+fn continues_from(state: &State, promised: &[Promise], r: &Recording) -> Result<(), String> {
     let folder =
         tempfile::tempdir_in(if Path::new("/dev/shm").is_dir() { Path::new("/dev/shm") } else { r.folder.path() });
     let folder = folder.map_err(|e| e.to_string())?;
@@ -128,7 +128,7 @@ fn cut_everywhere(r: &Recording) -> (usize, usize, Vec<String>) {
     let (mut waiting, mut said) = (Vec::new(), Vec::new());
     let check = |waiting: &mut Vec<(State, Vec<Promise>)>| -> Vec<String> {
         let all = std::mem::take(waiting);
-        all.par_iter().filter_map(|(state, promised)| go_on(state, promised, r).err()).collect()
+        all.par_iter().filter_map(|(state, promised)| continues_from(state, promised, r).err()).collect()
     };
     let states = each(&r.done, |state, promised| {
         waiting.push((state, promised.to_vec()));

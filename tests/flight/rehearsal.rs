@@ -139,7 +139,7 @@ impl Reconstruct for Ledger {
         self.built > 0
     }
 
-    fn build(&mut self, _go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
+    fn build(&mut self, _cancelled: &dyn Fn() -> bool) -> Result<bool, EngineError> {
         (self.built, self.steps) = (self.views.len(), 0);
         Ok(true)
     }

@@ -110,11 +110,11 @@ public_key = "{east}"
         o
     }
 
-    fn receive(&self, go_on: impl FnMut(&Progress) -> bool) -> Reception {
-        let (stop, mut go_on) = (AtomicBool::new(false), go_on);
+    fn receive(&self, keep: impl FnMut(&Progress) -> bool) -> Reception {
+        let (stop, mut keep) = (AtomicBool::new(false), keep);
         let limit = Some(Duration::from_secs(60));
         let tell = &mut |p: &Progress| {
-            if !go_on(p) {
+            if !keep(p) {
                 stop.store(true, std::sync::atomic::Ordering::Relaxed);
             }
         };

@@ -60,21 +60,21 @@ impl Flight {
     fn fly(&self, checkpoints: u8, every: Duration) -> (Receiver, Offerer) {
         let mut r = self.receiver();
         let o = Offerer::start(&self.aircraft, Source::unsigned("m", "a1")).expect("offerer");
-        let go_on = AtomicBool::new(false);
+        let stop = AtomicBool::new(false);
         for n in 0..checkpoints {
             o.offer(&self.save(n));
             let until = Instant::now() + every;
             while Instant::now() < until {
-                r.round(&go_on).expect("round");
+                r.round(&stop).expect("round");
             }
         }
         o.offer_final(&self.save(checkpoints));
         let until = Instant::now() + LIMIT;
         while !(r.all_finished() && r.all_told()) && Instant::now() < until {
-            r.round(&go_on).expect("round");
+            r.round(&stop).expect("round");
         }
         assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(MODEL, checkpoints));
-        assert!(o.wait_delivered(LIMIT, || true));
+        assert!(o.wait_delivered(LIMIT, || false));
         (r, o)
     }
 }

@@ -3,7 +3,7 @@
 //! choose the file.
 
 use std::fs::{File, OpenOptions};
-use std::io;
+use std::io::{self, Read};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
@@ -24,6 +24,22 @@ pub fn open(path: &Path) -> io::Result<File> {
 /// As [`open`]; `InvalidInput` for a link, too.
 pub fn open_not_linked(path: &Path) -> io::Result<File> {
     not_linked(path, OpenOptions::new().read(true))
+}
+
+/// The whole of an open file of at most `limit` bytes, else how many bytes it has at least. The bound holds also for a file that grows
+/// while it is read.
+///
+/// # Errors
+/// The system's.
+pub fn read_at_most(file: File, limit: u64) -> io::Result<Result<Vec<u8>, u64>> {
+    let size = file.metadata()?.len();
+    if size > limit {
+        return Ok(Err(size));
+    }
+    let mut bytes = Vec::with_capacity(size as usize);
+    file.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
+    let read = bytes.len() as u64;
+    Ok(if read > limit { Err(read) } else { Ok(bytes) })
 }
 
 /// Opens the file at `path` to write it anew, made where there is none, for what is of use while it is written: a log, a trace.
@@ -112,6 +128,18 @@ mod tests {
         create(&at("mine")).expect("opened");
         create(&at("new")).expect("opened");
         assert_eq!(std::fs::read(at("mine")).expect("read"), b"");
+    }
+
+    #[test]
+    fn a_file_longer_than_its_limit_is_not_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("file");
+        std::fs::write(&path, [7; 5]).expect("written");
+        let read = |path: &Path, limit| read_at_most(open(path).expect("opened"), limit).expect("read");
+        assert_eq!((read(&path, 5), read(&path, 4), read(&path, u64::MAX)), (Ok(vec![7; 5]), Err(5), Ok(vec![7; 5])));
+        // Its size says nothing of what it will hold.
+        let without_size = Path::new("/proc/self/status");
+        assert!(read(without_size, 1 << 20).is_ok_and(|bytes| !bytes.is_empty()) && read(without_size, 4) == Err(5));
     }
 
     #[test]

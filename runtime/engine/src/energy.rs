@@ -134,7 +134,7 @@ mod tests {
         (settings.training.energy_wh, settings.training.watts) = (Some(25.0 / 3600.0), Some(10.0));
         let mut engine = Reconstruction::open(settings, Default::default(), "train").expect("opens");
         (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
-        assert!(engine.build(&|| true).expect("built"));
+        assert!(engine.build(&|| false).expect("built"));
         let budget = RunBudget { steps: None, seconds: None };
         let mut progress = 0.0;
         let mut each = |step: &StepReport| {

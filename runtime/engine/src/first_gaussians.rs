@@ -200,14 +200,14 @@ impl FirstGaussians {
     }
 
     /// Gaussians of all key frames, at most `capacity` of them for the ground that they show, and their depths, which training takes;
-    /// `None` when `go_on` said no. Where a model is `continued`, its Gaussians are the first.
+    /// `None` when `cancelled` said so. Where a model is `continued`, its Gaussians are the first.
     pub fn make(
         &mut self,
         poses: &Poses,
         training: &mut Training,
         capacity: &dyn Fn(f64) -> usize,
         continued: bool,
-        go_on: &dyn Fn() -> bool,
+        cancelled: &dyn Fn() -> bool,
     ) -> Result<Option<Fresh>, EngineError> {
         let Some(initialiser) = &mut self.initialiser else {
             return Ok(Some(self.without_network(poses, capacity(0.0), continued)?.into()));
@@ -220,7 +220,7 @@ impl FirstGaussians {
                 failed = training.set_prior(i, Some(&depth));
             }
         };
-        let made = feed_forward(initialiser, poses.len(), capacity, at_once, &mut prior, go_on)?;
+        let made = feed_forward(initialiser, poses.len(), capacity, at_once, &mut prior, cancelled)?;
         failed?;
         // Another start wants of them the depths alone: neither the Gaussians nor the light.
         Ok(match made {
@@ -267,7 +267,7 @@ impl FirstGaussians {
     }
 }
 
-/// All pictures of `initialiser` into at most `capacity` Gaussians; `None` when `go_on` said no. With `at_once` no picture
+/// All pictures of `initialiser` into at most `capacity` Gaussians; `None` when `cancelled` said so. With `at_once` no picture
 /// is still to come, and every depth is made once, from its best partners, on all threads. `prior` takes the depths one by one.
 fn feed_forward(
     initialiser: &mut Initialiser,
@@ -275,7 +275,7 @@ fn feed_forward(
     capacity: usize,
     at_once: bool,
     prior: &mut dyn FnMut(&str, DepthPrior),
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Option<Fresh>, EngineError> {
     let mut progress = Progress::new("initialising", pictures as u64);
     let (mut done, mut more) = (0, usize::from(at_once));
@@ -283,7 +283,7 @@ fn feed_forward(
         more = initialiser.advance(DEPTHS_BETWEEN_STOPS)?;
         done += more;
         progress.set(done as u64, || "depth".to_owned());
-        if more > 0 && !go_on() {
+        if more > 0 && cancelled() {
             return Ok(None);
         }
     }

@@ -61,17 +61,21 @@ pub trait Reconstruct {
     fn land(&mut self) {}
     /// Whether there is a model to train.
     fn has_model(&self) -> bool;
-    /// (Re)builds the model from all key frames and starts its schedule; false when `go_on` said no before it was.
+    /// (Re)builds the model from all key frames and starts its schedule; false when `cancelled` said so before it was.
     ///
     /// # Errors
     /// The network or the device fails; the pictures give no depth.
-    fn build(&mut self, go_on: &dyn Fn() -> bool) -> Result<bool, EngineError>;
-    /// Has what training pictures are too small to show cut out of the key frames, once no more of them come; false when `go_on` said
-    /// no before it was.
+    fn build(&mut self, cancelled: &dyn Fn() -> bool) -> Result<bool, EngineError>;
+    /// Has what training pictures are too small to show cut out of the key frames, once no more of them come; false when `cancelled` said
+    /// so before it was.
     ///
     /// # Errors
     /// A picture that was there cannot be read any more; the file of the views cannot be written.
-    fn look_closer(&mut self, _source: &mut dyn PictureSource, _go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
+    fn look_closer(
+        &mut self,
+        _source: &mut dyn PictureSource,
+        _cancelled: &dyn Fn() -> bool,
+    ) -> Result<bool, EngineError> {
         Ok(true)
     }
     /// Changes how long training may take; the share of the schedule that is over changes with it.
@@ -378,7 +382,7 @@ impl Reconstruct for Reconstruction {
         self.training.has_model()
     }
 
-    fn build(&mut self, go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
+    fn build(&mut self, cancelled: &dyn Fn() -> bool) -> Result<bool, EngineError> {
         let clock = Instant::now();
         // 1. Poses and lenses of all key frames.
         let placed = self.poses.solve(&mut self.report)?;
@@ -393,7 +397,7 @@ impl Reconstruct for Reconstruction {
         let share = self.can_grow().then(|| self.share());
         let capacity = |ground_m2: f64| share.map_or(most, |share| share.of(ground_m2));
         let continued = self.training.is_continued(&self.resumed, &self.poses);
-        let made = self.first.make(&self.poses, &mut self.training, &capacity, continued, go_on)?;
+        let made = self.first.make(&self.poses, &mut self.training, &capacity, continued, cancelled)?;
         let Some(mut fresh) = made else { return Ok(false) };
         self.report.stage("init", from);
         // 3. All pictures in one light.
@@ -430,8 +434,12 @@ impl Reconstruct for Reconstruction {
         Ok(true)
     }
 
-    fn look_closer(&mut self, source: &mut dyn PictureSource, go_on: &dyn Fn() -> bool) -> Result<bool, EngineError> {
-        crops::cut(&mut self.training, self.poses.views(), source, go_on, &mut self.report)
+    fn look_closer(
+        &mut self,
+        source: &mut dyn PictureSource,
+        cancelled: &dyn Fn() -> bool,
+    ) -> Result<bool, EngineError> {
+        crops::cut(&mut self.training, self.poses.views(), source, cancelled, &mut self.report)
     }
 
     fn set_seconds(&mut self, seconds: Option<f64>) {

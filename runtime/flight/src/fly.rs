@@ -263,14 +263,14 @@ fn outcome(
 ) -> FlyOutcome {
     let JobEnd { mut reconstruction, offerer, supervisor, model, gaussians, finished } = end;
     supervisor.status(&format!("{gaussians} Gaussians of {} key frames; delivering", reconstruction.keyframes()));
-    let go_on = || {
+    let cancelled = || {
         supervisor.alive();
-        !interrupt.requested()
+        interrupt.requested()
     };
     if finished {
         watch.craft(0, |craft| (craft.state, craft.schedule.left_s) = ("delivering the model", None));
     }
-    let delivered = finished && offerer.wait_delivered(DELIVERY, go_on);
+    let delivered = finished && offerer.wait_delivered(DELIVERY, cancelled);
     watch.craft(0, |craft| {
         craft.state = match (finished, delivered) {
             (true, true) => "done, the ground has the model",

@@ -160,7 +160,7 @@ pub fn distil(
     block: &Block<'_>,
     merged: &mut Merged,
     device: Option<&str>,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Option<(Learnt, Effort)>, AggregateError> {
     let (inputs, recipe) = (block.inputs, &block.inputs.recipe);
     let models = inputs.models.len();
@@ -224,9 +224,9 @@ pub fn distil(
     trainer.hold(|row| of_row[row].is_none());
     let steps = recipe.epochs.saturating_mul(taught.len() as u32);
     let budget = RunBudget { steps: Some(steps), seconds: recipe.seconds };
-    let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
+    let mut each = |_: &_| if cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
     report.steps = trainer.run(&mut pictures, &budget, &mut each)?.steps;
-    if !go_on() {
+    if cancelled() {
         return Ok(None);
     }
     let mut trained = GaussianCloud::default();

@@ -35,11 +35,11 @@ pub mod plan;
 pub mod region;
 pub mod register;
 pub mod seam;
-pub mod sight;
 pub mod squares;
 pub mod store;
 #[cfg(test)]
 mod testing;
+pub mod visibility;
 
 /// One aircraft's model as it arrived.
 #[derive(Clone, Debug)]

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use uplink::polygon;
 
 use super::member::{Bounds, Member};
-use super::sight::Sight;
+use super::visibility::Visibility;
 
 /// Distances closer than this count as equal, metres: corners that two polygons share differ by rounding.
 const TIE_M: f64 = 1e-6;
@@ -37,26 +37,26 @@ pub struct Region {
     /// Given by the mission, not derived from the views.
     pub declared: bool,
     /// Its pictures; the nearer camera decides between derived regions that overlap.
-    sight: Sight,
+    visibility: Visibility,
 }
 
 impl Region {
     /// A region of the mission.
     pub fn declared(corners: Vec<DVec2>) -> Self {
-        Self { corners, declared: true, sight: Sight::default() }
+        Self { corners, declared: true, visibility: Visibility::default() }
     }
 
     /// The declared region of a model, or the hull of what its cameras look at on ground of this height. None when there is
     /// neither.
     pub fn of(header: &ModelHeader, ground: f64) -> Option<Self> {
-        let sight = Sight::new(header.views.iter().map(|(_, v)| *v), ground);
+        let visibility = Visibility::new(header.views.iter().map(|(_, v)| *v), ground);
         if header.region.len() >= 3 {
             let corners = header.region.iter().map(|c| DVec2::from(*c)).collect();
-            return Some(Self { corners, declared: true, sight });
+            return Some(Self { corners, declared: true, visibility });
         }
         let looked_at = header.views.iter().map(|(_, v)| look_at(v.pose.center, v.pose.forward(), ground));
         let corners = hull(looked_at.collect());
-        (!corners.is_empty()).then_some(Self { corners, declared: false, sight })
+        (!corners.is_empty()).then_some(Self { corners, declared: false, visibility })
     }
 
     /// Whether a plan may have it.
@@ -119,7 +119,9 @@ impl Partition {
                 // On a common border, or where regions overlap: what the mission says before what we derived, then
                 // the nearer camera, then the earlier model.
                 Some((_, _, other)) if region.declared != other.declared => region.declared,
-                Some((_, _, other)) => !region.declared && region.sight.to_camera(p) < other.sight.to_camera(p),
+                Some((_, _, other)) => {
+                    !region.declared && region.visibility.to_camera(p) < other.visibility.to_camera(p)
+                }
             };
             if wins {
                 best = Some((i, distance, region));
@@ -161,7 +163,7 @@ impl Owners<'_> {
         let (reach, side) = (own.distance(p) + partition.border_m, partition.border_m / STRIP_SQUARES);
         let mut seen = |model: usize, of: &Region| {
             let middle = ((p / side).floor() + 0.5) * side;
-            *seen.entry((square_of(p, side), model)).or_insert_with(|| of.sight.pixels_per_m2(middle))
+            *seen.entry((square_of(p, side), model)).or_insert_with(|| of.visibility.pixels_per_m2(middle))
         };
         let (mut best, mut most) = (owner, None);
         for rival in few.iter().copied().filter(|i| *i != owner) {
@@ -209,12 +211,16 @@ mod tests {
     use crate::testing::nadir;
 
     fn region(corners: &[[f64; 2]], declared: bool) -> Region {
-        Region { corners: corners.iter().map(|c| DVec2::from(*c)).collect(), declared, sight: Sight::default() }
+        Region {
+            corners: corners.iter().map(|c| DVec2::from(*c)).collect(),
+            declared,
+            visibility: Visibility::default(),
+        }
     }
 
     /// Pictures taken straight down from these places, 20 m above the ground.
-    fn over(places: Vec<[f64; 2]>) -> Sight {
-        Sight::new(places.into_iter().map(|[x, y]| nadir(x, y, 20.0)), 0.0)
+    fn over(places: Vec<[f64; 2]>) -> Visibility {
+        Visibility::new(places.into_iter().map(|[x, y]| nadir(x, y, 20.0)), 0.0)
     }
 
     fn owner(partition: &Partition, p: DVec2) -> usize {
@@ -232,7 +238,7 @@ mod tests {
         for i in 0..60 {
             let (x, y, w, h) = (next(2000.0), next(2000.0), 20.0 + next(200.0), 20.0 + next(200.0));
             let mut region = region(&[[x, y], [x + w, y], [x + 0.5 * w, y + 0.3 * h], [x, y + h]], i % 3 > 0);
-            region.sight = over((0..4).map(|_| [x + next(w), y + next(h)]).collect());
+            region.visibility = over((0..4).map(|_| [x + next(w), y + next(h)]).collect());
             regions.push((i % 10 > 0).then_some(region));
         }
         let partition = Partition::of(regions, 0.0);
@@ -295,7 +301,7 @@ mod tests {
     fn overlapping_derived_regions_are_split_by_the_nearer_camera() {
         let mut a = region(&[[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [0.0, 1.0]], false);
         let mut b = region(&[[1.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0]], false);
-        (a.sight, b.sight) = (over(vec![[1.0, 0.5]]), over(vec![[3.0, 0.5]]));
+        (a.visibility, b.visibility) = (over(vec![[1.0, 0.5]]), over(vec![[3.0, 0.5]]));
         let p = Partition::of(vec![Some(a), Some(b)], 0.0);
         assert_eq!(owner(&p, DVec2::new(1.9, 0.5)), 0);
         assert_eq!(owner(&p, DVec2::new(2.1, 0.5)), 1);
@@ -306,7 +312,7 @@ mod tests {
         let mut west = region(&[[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]], true);
         let mut east = region(&[[40.0, 0.0], [80.0, 0.0], [80.0, 40.0], [40.0, 40.0]], true);
         // West's last line lies on the border and east's first one 16 m beyond it: from there a picture reaches 12.8 m.
-        (west.sight, east.sight) = (
+        (west.visibility, east.visibility) = (
             over(vec![[38.0, 16.0], [38.0, 20.0], [38.0, 24.0]]),
             over(vec![[56.0, 16.0], [56.0, 20.0], [56.0, 24.0]]),
         );

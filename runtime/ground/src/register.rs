@@ -89,18 +89,18 @@ impl<F: Fitter> Registrar<F> {
         Self { edges, fitter }
     }
 
-    /// Fits the pairs that are not known yet and keeps them; returns how many there were. `go_on` is asked before each.
+    /// Fits the pairs that are not known yet and keeps them; returns how many there were. `cancelled` is asked before each.
     ///
     /// # Errors
     /// The fitter's, or the folder of what is known cannot be written to; what was fitted by then is kept.
-    pub fn fit(&mut self, members: &[Member], go_on: &dyn Fn() -> bool) -> Result<usize, String> {
-        self.pairs(members, go_on).map(|(_, _, fitted)| fitted)
+    pub fn fit(&mut self, members: &[Member], cancelled: &dyn Fn() -> bool) -> Result<usize, String> {
+        self.pairs(members, cancelled).map(|(_, _, fitted)| fitted)
     }
 
     fn pairs(
         &mut self,
         members: &[Member],
-        go_on: &dyn Fn() -> bool,
+        cancelled: &dyn Fn() -> bool,
     ) -> Result<(Vec<Pair>, HashSet<Key>, usize), String> {
         let grounds: Vec<_> = members.iter().map(Member::bounds).collect();
         let ordered = |(a, b): (usize, usize)| match members[a].content() <= members[b].content() {
@@ -116,7 +116,7 @@ impl<F: Fitter> Registrar<F> {
             used.insert(key);
             let found = match self.edges.get(&key) {
                 Some(known) => known,
-                None if !go_on() => None,
+                None if cancelled() => None,
                 None => {
                     let found = self.fitter.fit(&members[first], &members[second])?;
                     if let Some(Fitted { points: [agree, all], rms_m: [before, after], .. }) = &found {
@@ -144,9 +144,9 @@ impl<F: Fitter> Registrar<F> {
         &mut self,
         members: &mut [Member],
         held: &Held<'_>,
-        go_on: &dyn Fn() -> bool,
+        cancelled: &dyn Fn() -> bool,
     ) -> Result<Registered, String> {
-        let (pairs, used, fitted) = self.pairs(members, go_on)?;
+        let (pairs, used, fitted) = self.pairs(members, cancelled)?;
         let mut report = Registered { pairs: pairs.len(), fitted, ..Default::default() };
         let node = |m: &Member| Node {
             middle: m.middle(),

@@ -32,7 +32,7 @@ pub fn written(dir: &Path, local: &LocalModel) -> Member {
 /// The plan of a merge in `store`, which has the models.
 pub fn planned(members: &mut [Member], settings: &GroundSettings, store: &Store) -> Plan {
     let fits = store.path().expect("a folder").join("fits");
-    let plan = plan(members, settings, None, store, fits, &|| true).expect("a plan").plan;
+    let plan = plan(members, settings, None, store, fits, &|| false).expect("a plan").plan;
     lay_out(members, &plan, store, &|_| true).expect("laid out");
     publish(&plan, store).expect("published");
     plan

@@ -147,7 +147,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
     let stop = Interrupt::install()?;
     within_bounds(&stop).map_err(CliError::failed)?;
     let members = args.models.iter().map(|p| LocalModel::read(p).map(Member::of)).collect::<Result<Vec<_>, _>>()?;
-    let outcome = aggregate::run(members, &settings, None, &args.out, &|| !stop.requested())?;
+    let outcome = aggregate::run(members, &settings, None, &args.out, &|| stop.requested())?;
     let mut run = summary::run_report("aggregate", &outcome, settings.seed);
     let mut data = summary::report(&outcome);
     let names = outcome.models.iter().map(|m| m.0.clone());

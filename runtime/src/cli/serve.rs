@@ -124,12 +124,12 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     supervisor.status(&format!("merging {} models", reception.received.len()));
     board.say("merging and distilling");
-    let at_work = || {
+    let joined = joining.finish(&|| supervisor.alive());
+    let cancelled = || {
         supervisor.alive();
-        true
+        false
     };
-    let joined = joining.finish(&at_work);
-    let merged = serve::merge(&mission, &reception, &args.out, &at_work);
+    let merged = serve::merge(&mission, &reception, &args.out, &cancelled);
     let (outcome, left_out) = match merged {
         Err(e @ ServeError::Nothing(_)) => return nothing(&args.out, &mission, &reception, e),
         merged => merged?,

@@ -65,7 +65,7 @@ pub(super) fn settle(
     out: &Path,
     fresh: bool,
     refine: Option<&RefineSettings>,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Option<Card>, JobError> {
     let mut card = Card::default();
     let Some(notes) = set.card.clone() else { return Ok(Some(card)) };
@@ -85,7 +85,7 @@ pub(super) fn settle(
             let stated = |f: &DatasetFrame| Settled { view: f.view, distortion: f.distortion };
             set.frames.iter().map(|f| (f.name.clone(), stated(f))).collect()
         }
-        Some(settings) => match refined(set, &notes, settings, out, go_on, &mut card.remarks)? {
+        Some(settings) => match refined(set, &notes, settings, out, cancelled, &mut card.remarks)? {
             Some((settled, place, known)) => {
                 std::fs::create_dir_all(out).map_err(JobError::io(out))?;
                 known.write(set, &settled, out)?;
@@ -245,7 +245,7 @@ fn refined(
     notes: &CardNotes,
     settings: &RefineSettings,
     out: &Path,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
     remarks: &mut Remarks,
 ) -> Result<Option<Agreed>, JobError> {
     let all = set.frames.len();
@@ -270,7 +270,7 @@ fn refined(
             open: &mut open,
             control: &|scale| surveyed::marked(set, &notes.control, scale),
             taken: &mut |done, name| progress.set(done as u64, || name.to_owned()),
-            cancelled: &|| !go_on(),
+            cancelled,
             fits: &|settings| {
                 let bytes = settling_bytes(settings, all as u64, false, (settings.threads as u64 + 1, pixels));
                 writable_bytes().is_some_and(|left| bytes <= left / 2)

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use disk::Disk;
 
-use super::folder::{read_bounded, write_whole};
+use super::folder::{read_not_linked, write_whole};
 
 /// The number of the present flight.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ impl FlightNumber {
     /// The number after the one in the file, which it replaces. A missing or unreadable file counts as 0: the ground's next
     /// receipt says where to go on.
     pub fn begin(path: Option<&Path>) -> Self {
-        let text = path.and_then(|p| read_bounded(p, 64).ok()).and_then(|bytes| String::from_utf8(bytes).ok());
+        let text = path.and_then(|p| read_not_linked(p, 64).ok()).and_then(|bytes| String::from_utf8(bytes).ok());
         if let Some(folder) = path.and_then(Path::parent) {
             // Aircraft of one machine share the folder of the keys.
             Disk::default().sweep_abandoned(folder);
@@ -49,8 +49,8 @@ impl FlightNumber {
 }
 
 /// Takes over the number that an earlier release kept in `before`.
-pub(crate) fn go_on(before: &Path, now: &Path) {
-    if let Ok(number) = read_bounded(before, 64)
+pub(crate) fn go_on_from(before: &Path, now: &Path) {
+    if let Ok(number) = read_not_linked(before, 64)
         && let Err(e) = write_whole(now, &number)
     {
         tracing::warn!("upload: {}: {}", now.display(), disk::told(&e));

@@ -4,7 +4,6 @@
 //! network. The ground's `<folder>/<mission>/ground.session` says what offers are to be bound to. Every file is written aside, synced and
 //! renamed; chunks come before the offer that names them, so a reader never sees an offer whose chunks were not yet complete.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -30,15 +29,11 @@ pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     Ok(Disk::default().replace(path, |out| out.write_all(bytes))?)
 }
 
-/// Reads a file of at most `limit` bytes.
-pub(super) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>, TransportError> {
+/// Reads a file of at most `limit` bytes that is no link.
+pub(super) fn read_not_linked(path: &Path, limit: u64) -> Result<Vec<u8>, TransportError> {
     let file = disk::regular::open_not_linked(path).map_err(TransportError::io(path))?;
-    let mut bytes = Vec::new();
-    file.take(limit + 1).read_to_end(&mut bytes).map_err(TransportError::io(path))?;
-    if bytes.len() as u64 > limit {
-        return Err(TransportError::TooLong { what: path.display().to_string(), bytes: bytes.len() as u64, limit });
-    }
-    Ok(bytes)
+    let read = disk::regular::read_at_most(file, limit).map_err(TransportError::io(path))?;
+    read.map_err(|bytes| TransportError::TooLong { what: path.display().to_string(), bytes, limit })
 }
 
 /// Whether a name is that of a chunk: 64 hexadecimal digits.
@@ -88,7 +83,7 @@ impl FolderOutlet {
     /// The session that the ground has written down here.
     fn session(&self) -> Option<Hash> {
         let path = self.dir.with_file_name(SESSION);
-        let bytes = read_bounded(&path, binding::MAX_SEALED).ok()?;
+        let bytes = read_not_linked(&path, binding::MAX_SEALED).ok()?;
         let Source { identity, mission, .. } = &self.source;
         let session = binding::open(&bytes, mission, Domain::Session, identity);
         if session.is_none() {
@@ -110,7 +105,7 @@ impl FolderOutlet {
     fn has(&self, path: &Path, hash: &Hash, bytes: u64) -> bool {
         match self.current {
             Some(_) => std::fs::symlink_metadata(path).is_ok_and(|m| m.is_file() && m.len() == bytes),
-            None => read_bounded(path, bytes).is_ok_and(|found| blake3::hash(&found) == *hash),
+            None => read_not_linked(path, bytes).is_ok_and(|found| blake3::hash(&found) == *hash),
         }
     }
 
@@ -164,7 +159,7 @@ impl Outlet for FolderOutlet {
 
     /// On the stick is delivered, unless the ground has said otherwise there.
     fn delivery(&mut self, offer: &Offer) -> Delivery {
-        let bytes = read_bounded(&self.dir.join("receipt"), MAX_ENCODED).unwrap_or_default();
+        let bytes = read_not_linked(&self.dir.join("receipt"), MAX_ENCODED).unwrap_or_default();
         let Source { identity, mission, aircraft, .. } = &self.source;
         let told = Receipt::open(&bytes, identity, mission, aircraft).and_then(|r| r.bearing(offer));
         let here = self.current.as_ref().is_some_and(|c| c.0 == offer.model);
@@ -205,7 +200,7 @@ impl FolderInlet {
     /// Writes the session where aircraft read it. A medium that cannot be written to, or is not there, brings models all the same.
     fn say_session(&self) -> Result<(), TransportError> {
         let path = self.dir.join(SESSION);
-        if read_bounded(&path, binding::MAX_SEALED).is_ok_and(|bytes| bytes == self.session) {
+        if read_not_linked(&path, binding::MAX_SEALED).is_ok_and(|bytes| bytes == self.session) {
             return Ok(());
         }
         let parent = self.root.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -236,7 +231,7 @@ impl Inlet for FolderInlet {
         for entry in entries.flatten().take(MAX_ENTRIES) {
             let is_folder = entry.file_type().is_ok_and(|t| t.is_dir());
             if is_folder && entry.file_name().to_str().is_some_and(is_safe_name) {
-                match read_bounded(&entry.path().join("offer"), self.max_offer) {
+                match read_not_linked(&entry.path().join("offer"), self.max_offer) {
                     Ok(bytes) => see(&bytes),
                     Err(TransportError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
                     // One bad offer must not hide the others; an empty one is counted as damaged.
@@ -260,7 +255,7 @@ impl Inlet for FolderInlet {
         let hash = offer.chunks[index];
         let path = self.dir.join(&offer.aircraft).join("chunk").join(hex(&hash));
         without_links(&self.root, &path).map_err(TransportError::io(&path))?;
-        match read_bounded(&path, offer.chunk_len(index)) {
+        match read_not_linked(&path, offer.chunk_len(index)) {
             Ok(bytes) if accept(&bytes) => Ok(bytes),
             Ok(_) => Err(TransportError::Corrupt(hash)),
             Err(TransportError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
@@ -289,7 +284,7 @@ impl Inlet for FolderInlet {
     fn end_session(&self) {
         let path = self.dir.join(SESSION);
         if without_links(&self.root, &path).is_ok()
-            && read_bounded(&path, binding::MAX_SEALED).is_ok_and(|bytes| bytes == self.session)
+            && read_not_linked(&path, binding::MAX_SEALED).is_ok_and(|bytes| bytes == self.session)
             && let Err(e) = std::fs::remove_file(&path)
         {
             tracing::debug!("serve: {}: {e}", path.display());

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::binding;
 use crate::disk_error::{DiskError, io};
-use crate::folder::read_bounded;
+use crate::folder::read_not_linked;
 use crate::keys::random;
 use crate::offer::{Hash, Offer, Order, hex};
 
@@ -72,7 +72,7 @@ impl Memory {
     ) -> Result<Self, DiskError> {
         let path = state.join(format!("{mission}.received.json"));
         let read = |p: &Path| {
-            let bytes = read_bounded(p, LIMIT).map_err(|e| e.to_string())?;
+            let bytes = read_not_linked(p, LIMIT).map_err(|e| e.to_string())?;
             serde_json::from_slice::<BTreeMap<String, Last>>(&bytes).map_err(|e| format!("{}: {e}", p.display()))
         };
         let newest = Disk::default().newest(&path, read).map_err(io(&path))?;
@@ -151,7 +151,7 @@ impl Memory {
 /// The name of the session that has `received`: made with it, and the same after a restart.
 fn session_of(received: &Path) -> Result<String, DiskError> {
     let path = received.join("session");
-    let there = read_bounded(&path, NAME).ok().and_then(|bytes| String::from_utf8(bytes).ok());
+    let there = read_not_linked(&path, NAME).ok().and_then(|bytes| String::from_utf8(bytes).ok());
     if let Some(name) = there.filter(|name| name.len() as u64 == NAME) {
         return Ok(name);
     }

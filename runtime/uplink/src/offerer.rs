@@ -103,14 +103,14 @@ impl Offerer {
         locked(&self.shared.0).status.clone()
     }
 
-    /// Waits until the newest model has arrived, at most `timeout`, and no longer than `go_on` holds (asked ten
+    /// Waits until the newest model has arrived, at most `timeout`, and no longer than until `cancelled` (asked ten
     /// times a second). Returns whether it arrived; at once when there is nowhere it could, or the ground refused it.
-    pub fn wait_delivered(&self, timeout: Duration, mut go_on: impl FnMut() -> bool) -> bool {
+    pub fn wait_delivered(&self, timeout: Duration, mut cancelled: impl FnMut() -> bool) -> bool {
         if !self.configured {
             return false;
         }
         let until = Instant::now() + timeout;
-        while go_on() && Instant::now() < until {
+        while !cancelled() && Instant::now() < until {
             let OffererStatus { delivered, refused, .. } = self.status();
             if delivered || !refused.is_empty() {
                 return delivered;

@@ -24,12 +24,12 @@ use super::heartbeat::Condition;
 use super::offer::{Offer, OfferError, Order};
 use super::transport::Inlet;
 use lookout::{Lookout, QUIET};
-use sight::Sight;
+use offered::Offered;
 use slot::{Advance, Link, Slot};
 
 mod behind;
 mod lookout;
-mod sight;
+mod offered;
 mod slot;
 
 /// Longest wait for everything that is not a chunk: two ways over a link of some seconds.
@@ -175,7 +175,7 @@ pub struct Receiver {
     dir: PathBuf,
     seats: Vec<Seat>,
     /// What is shown.
-    sight: Sight,
+    offered: Offered,
     lookout: Lookout,
     /// Whose turn it is when not all can be at work at once.
     turn: usize,
@@ -229,7 +229,7 @@ impl Receiver {
             link: Arc::new(link),
             dir: dir.into(),
             seats,
-            sight: Sight::default(),
+            offered: Offered::default(),
             lookout: Lookout::default(),
             turn: 0,
             wake,
@@ -293,7 +293,7 @@ impl Receiver {
     /// Notes who has given a sign of life since the last time.
     fn note_who_was_heard(&mut self) {
         for seat in &mut self.seats {
-            let newest = self.sight.of(&seat.id).iter().map(|shown| shown.0.order).max();
+            let newest = self.offered.of(&seat.id).iter().map(|shown| shown.0.order).max();
             let trace = (newest, seat.progress, seat.received.as_ref().map(|r| (r.size, r.finished)));
             // What lay here before the session is no sign.
             let is_first = seat.heard.is_none() && newest.is_none();
@@ -425,18 +425,18 @@ impl Receiver {
 
     /// Takes in what is shown, and lets each aircraft that is not at work choose anew where that has changed.
     fn take_in(&mut self) {
-        let Self { link, lookout, sight, seats, counters, refusals, .. } = self;
-        for news in lookout.news(link, sight, counters, refusals) {
-            let shown: HashSet<&str> = news.sight.aircraft().collect();
+        let Self { link, lookout, offered, seats, counters, refusals, .. } = self;
+        for news in lookout.news(link, offered, counters, refusals) {
+            let shown: HashSet<&str> = news.offered.aircraft().collect();
             seats.iter_mut().for_each(|s| s.is_to_choose |= news.is_over || shown.contains(s.id.as_str()));
             match news.is_over {
-                true => *sight = news.sight,
-                false => sight.update(news.sight),
+                true => *offered = news.offered,
+                false => offered.update(news.offered),
             }
         }
         for seat in seats.iter_mut().filter(|s| s.is_to_choose) {
             if let Place::Here(slot) = &mut seat.place {
-                slot.choose(sight.of(&seat.id), &link.admission, counters, refusals);
+                slot.choose(offered.of(&seat.id), &link.admission, counters, refusals);
                 seat.stale = slot.stale();
                 seat.progress = slot.progress();
                 (seat.is_over, seat.is_told) = (slot.is_over(), slot.is_told());

@@ -16,7 +16,7 @@ use disk::Disk;
 
 use super::admission::{Admission, ModelRefusal};
 use super::disk_error::{DiskError, io};
-use super::folder::{is_hash, read_bounded};
+use super::folder::{is_hash, read_not_linked};
 use super::offer::{Hash, Offer, hex};
 
 /// The offer of the model that lies complete.
@@ -91,7 +91,7 @@ impl Store {
             disk.sweep(folder);
         }
         let note = |name: &str| {
-            let bytes = read_bounded(&dir.join(name), Offer::max_encoded(settings)).ok()?;
+            let bytes = read_not_linked(&dir.join(name), Offer::max_encoded(settings)).ok()?;
             admission.offer(&bytes, settings).ok()
         };
         if let Some(model) = store.hash_of_model() {
@@ -158,7 +158,7 @@ impl Store {
             disk::regular::open(&self.model_path()).ok()?.read_exact_at(&mut bytes, *start).ok()?;
             Some(bytes)
         });
-        held.filter(right).or_else(|| read_bounded(&self.chunk_path(hash), length).ok().filter(right))
+        held.filter(right).or_else(|| read_not_linked(&self.chunk_path(hash), length).ok().filter(right))
     }
 
     /// Keeps one chunk, whose hash has been checked.

@@ -103,7 +103,7 @@ fn offer(field: &Field, mission: &Mission, which: std::ops::Range<usize>, out: &
         let source = Source::of(mission, &id(i), &out.join("aircraft")).map_err(|e| failed(&e))?;
         let offerer = Offerer::start(&mission.upload, source).map_err(|e| failed(&e))?;
         offerer.offer_final(&path);
-        if !offerer.wait_delivered(OFFERED, || true) {
+        if !offerer.wait_delivered(OFFERED, || false) {
             return Err(failed(&format!("{} does not come to lie in {}", id(i), out.display())));
         }
         offerer.shutdown();

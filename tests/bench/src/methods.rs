@@ -160,13 +160,13 @@ struct Field<'a> {
 /// not done again.
 pub fn measure(
     request: &Request,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
     each: &mut dyn FnMut(&MethodResult),
 ) -> Result<Comparison, JobError> {
     let field = Field::open(request)?;
     let mut methods = Vec::with_capacity(request.methods.len());
     for method in &request.methods {
-        let result = field.measure(method, go_on)?;
+        let result = field.measure(method, cancelled)?;
         each(&result);
         methods.push(result);
     }
@@ -217,7 +217,7 @@ impl<'a> Field<'a> {
     }
 
     /// Figures of a method, from before where all that decides them is the same.
-    fn measure(&self, method: &Method, go_on: &dyn Fn() -> bool) -> Result<MethodResult, JobError> {
+    fn measure(&self, method: &Method, cancelled: &dyn Fn() -> bool) -> Result<MethodResult, JobError> {
         let request = self.request;
         let (trainings, folder) = (self.trainings(method), request.out.join(method.name));
         let kept = folder.join("result.json");
@@ -240,7 +240,7 @@ impl<'a> Field<'a> {
         let from = Instant::now();
         let path = folder.join("global.dgtr");
         let global = match (&method.merge, &ground) {
-            (Merge::ByRegion(_), Some(ground)) => by_region(method, &trained, ground, &folder, go_on)?,
+            (Merge::ByRegion(_), Some(ground)) => by_region(method, &trained, ground, &folder, cancelled)?,
             (Merge::Opacities, Some(ground)) => {
                 let clients: Vec<PathBuf> = trained.iter().map(|t| t.model.clone()).collect();
                 let ground = federated::Ground {
@@ -248,7 +248,7 @@ impl<'a> Field<'a> {
                     device_mib: ground.device_mib,
                     seed: ground.seed,
                 };
-                federated::merge(&clients, &ground, &path, go_on)?.ok_or_else(stopped)?;
+                federated::merge(&clients, &ground, &path, cancelled)?.ok_or_else(stopped)?;
                 path
             }
             _ => trained.first().map(|t| t.model.clone()).unwrap_or(path),
@@ -344,12 +344,12 @@ fn by_region(
     trained: &[Trained],
     ground: &GroundSettings,
     folder: &Path,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<PathBuf, JobError> {
     let failed = |e: AggregateError| JobError::Child { kind: e.kind(), line: format!("{}: {e}", method.name) };
     let read = |t: &Trained| LocalModel::read(&t.model).map(Member::of);
     let members = trained.iter().map(read).collect::<Result<Vec<_>, _>>().map_err(failed)?;
-    let outcome = aggregate::run(members, ground, None, folder, go_on).map_err(failed)?;
+    let outcome = aggregate::run(members, ground, None, folder, cancelled).map_err(failed)?;
     match outcome.not_distilled {
         Some(e) => Err(failed(e)),
         None if outcome.interrupted => Err(stopped()),

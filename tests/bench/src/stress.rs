@@ -71,16 +71,3 @@ pub fn elsewhere() -> Table {
         rows: ELSEWHERE.iter().map(|(input, file, name)| [*input, *file, *name].map(String::from).to_vec()).collect(),
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn without_a_device_the_reference_keeps_every_promise() {
-        let all = run(None, 0, &mut |_| {});
-        assert!(all.len() > 10 && all.iter().all(|t| t.path == "reference"));
-        let broken: Vec<_> = all.iter().filter(|t| !t.held).collect();
-        assert!(broken.is_empty(), "{broken:?}");
-    }
-}

@@ -202,8 +202,12 @@ fn every_skip_is_a_row_with_a_verdict() {
 
 #[test]
 fn the_reference_keeps_every_promise_without_a_device() {
-    let text = held(&bench(&["stress", "--reference-only"]));
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("stress.json");
+    let text = held(&bench(&["stress", "--reference-only", "--json", &file.to_string_lossy()]));
     assert!(text.contains("held") && !text.contains("BROKEN"), "{text}");
+    let all = json(&file).as_array().unwrap().clone();
+    assert!(all.len() > 10 && all.iter().all(|t| t["path"] == "reference" && t["held"] == true), "{all:?}");
 }
 
 #[test]

@@ -31,7 +31,7 @@ fn built_as(delivers: Option<Rounding>, incremental: bool) -> Option<Reconstruct
         Reconstruction::open(settings_for(delivers, incremental), ModelHeader::default(), "train").expect("opens");
     engine.land();
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
-    assert!(engine.build(&|| true).expect("built"));
+    assert!(engine.build(&|| false).expect("built"));
     Some(engine)
 }
 
@@ -124,7 +124,7 @@ fn a_model_that_is_continued_after_it_had_been_thinned_is_not_thinned_again() {
         assert!(again.resume(dir.path()).expect("read").is_some());
         again.land();
         (0..3).for_each(|i| again.add(picture(i), i < 2).expect("taken"));
-        assert!(again.build(&|| true).expect("built"));
+        assert!(again.build(&|| false).expect("built"));
         train(&mut again, u32::MAX);
         assert_eq!((again.delivery.thinned, again.gaussians()), (true, left), "incremental: {incremental}");
     }
@@ -137,8 +137,8 @@ fn a_schedule_that_the_clock_ends_is_thinned_and_rounded_too() {
     let whole = engine.gaussians();
     // Long enough for a few dozen steps on a machine that does other work as well.
     let budget = RunBudget { steps: None, seconds: Some(5.0) };
-    let mut go_on = |_: &StepReport| ControlFlow::Continue(());
-    assert_eq!(engine.train(&budget, &mut go_on).expect("trains"), StopReason::Schedule);
+    let mut each = |_: &StepReport| ControlFlow::Continue(());
+    assert_eq!(engine.train(&budget, &mut each).expect("trains"), StopReason::Schedule);
     assert!(engine.delivery.is_rounded() && engine.delivery.thinned && engine.gaussians() < whole);
 }
 

@@ -20,7 +20,7 @@ fn take(engine: &mut Reconstruction) {
     for i in 0..3 {
         engine.add(picture(i), i < 2).expect("taken");
     }
-    assert!(engine.build(&|| true).expect("built"));
+    assert!(engine.build(&|| false).expect("built"));
 }
 
 /// Looks at so many pictures, in parts.

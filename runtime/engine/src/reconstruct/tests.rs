@@ -17,7 +17,7 @@ fn giving_up_gaussians_does_not_start_the_schedule_anew() {
     settings.training.density.strategy = Strategy::Relocate;
     let mut engine = Reconstruction::open(settings, ModelHeader::default(), "train").expect("opens");
     (0..3).for_each(|i| engine.add(picture(i), i < 2).expect("taken"));
-    assert!(engine.build(&|| true).expect("built"));
+    assert!(engine.build(&|| false).expect("built"));
     // As after a landing.
     engine.training.trainer.schedule_mut().begin_at(0.25);
     let budget = RunBudget { steps: Some(20), seconds: None };

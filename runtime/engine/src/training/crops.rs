@@ -17,7 +17,7 @@ use crate::source::PictureSource;
 const SCALES: [f64; 4] = [1.0, 0.5, 0.25, 0.125];
 
 /// Cuts crops out of all key frames, which `source` decodes once more, as many as were planned: all of the largest size whose crops
-/// find room, or of each picture those with the most detail. False when `go_on` said no.
+/// find room, or of each picture those with the most detail. False when `cancelled` said so.
 ///
 /// # Errors
 /// A picture that was there cannot be read any more; the file of the views cannot be written.
@@ -25,7 +25,7 @@ pub(crate) fn cut(
     training: &mut Training,
     views: &[(String, View)],
     source: &mut dyn PictureSource,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
     report: &mut RunReport,
 ) -> Result<bool, EngineError> {
     let most = training.trainer.plan().crops;
@@ -45,7 +45,7 @@ pub(crate) fn cut(
             add(training, (i, view), &whole, mask.as_ref(), share)?;
         }
         progress.set(i as u64 + 1, || name.clone());
-        if !go_on() {
+        if cancelled() {
             return Ok(false);
         }
     }

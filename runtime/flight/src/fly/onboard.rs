@@ -218,11 +218,11 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
     fn build(&mut self, capture: &mut Handover) -> Result<(), FlightError> {
         self.act_as(capture, Activity::Building);
         let supervisor = &self.supervisor;
-        let at_work = || {
+        let cancelled = || {
             supervisor.alive();
-            true
+            false
         };
-        match self.reconstruction.build(&at_work) {
+        match self.reconstruction.build(&cancelled) {
             Ok(_) => {
                 capture.note_in_model();
                 capture.refined(|name| self.reconstruction.pose(name))?;

@@ -64,15 +64,15 @@ pub fn run(
     settings: &GroundSettings,
     origin: Option<Geodetic>,
     out: &Path,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Outcome, AggregateError> {
     let store = Store::folder(&out.join(GROUND));
     let path = out.join("global.dgtr");
-    let planned = planning::plan(&mut members, settings, origin, &store, out.join(REGISTRATION), go_on)?;
+    let planned = planning::plan(&mut members, settings, origin, &store, out.join(REGISTRATION), cancelled)?;
     planning::publish(&planned.plan, &store)?;
     let header = join::header(&planned.plan, &|index| Ok(members[index].header.clone()))?;
     let (store, plan, device) = (&store, &planned.plan, settings.device.as_deref());
-    let work = Work { store, plan, members: &members, device, header, path: &path, go_on };
+    let work = Work { store, plan, members: &members, device, header, path: &path, cancelled };
     // A cell that lay there and turns out to be damaged when all are put together is removed and made once more.
     let done = match work.round() {
         Err(AggregateError::MissingCells { .. }) => work.round(),
@@ -106,7 +106,7 @@ struct Work<'a> {
     device: Option<&'a str>,
     header: ModelHeader,
     path: &'a Path,
-    go_on: &'a dyn Fn() -> bool,
+    cancelled: &'a dyn Fn() -> bool,
 }
 
 /// What they came to.
@@ -135,7 +135,7 @@ impl Work<'_> {
             let merged = plan.inputs(&plan.cells[i]).merged_only();
             names[i] = merged.hash()?;
             if join::sound(store, plan, &names[i])?.is_none() {
-                make::make(&merged, store, None, &|| true)?;
+                make::make(&merged, store, None, &|| false)?;
             }
         }
         wanted.retain(|i| names[*i] != plan.cells[*i].input);
@@ -144,7 +144,7 @@ impl Work<'_> {
         };
         let joined = join(&names, wanted.is_empty())?;
         let (effort, seconds) = (Distilled::default(), vec![("merge", start.elapsed().as_secs_f64())]);
-        let (not_distilled, interrupted) = (None, !(self.go_on)());
+        let (not_distilled, interrupted) = (None, (self.cancelled)());
         let mut done = Done { joined, names, effort, made, not_distilled, interrupted, seconds };
         if wanted.is_empty() {
             return Ok(done);
@@ -152,7 +152,7 @@ impl Work<'_> {
         let start = Instant::now();
         for i in wanted {
             let inputs = plan.inputs(&plan.cells[i]);
-            match make::make(&inputs, store, self.device, self.go_on) {
+            match make::make(&inputs, store, self.device, self.cancelled) {
                 Ok(Some(made)) => {
                     done.names[i] = plan.cells[i].input;
                     done.effort.took(made.effort, &|model| inputs.models[model].index);
@@ -166,7 +166,7 @@ impl Work<'_> {
         }
         done.seconds.push(("distil", start.elapsed().as_secs_f64()));
         let start = Instant::now();
-        done.interrupted = !(self.go_on)();
+        done.interrupted = (self.cancelled)();
         let is_whole = done.names.iter().zip(&plan.cells).all(|(name, cell)| *name == cell.input);
         done.joined = join(&done.names, is_whole && !done.interrupted)?;
         done.seconds.push(("write", start.elapsed().as_secs_f64()));

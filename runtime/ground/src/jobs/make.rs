@@ -26,12 +26,12 @@ pub fn make(
     inputs: &Inputs,
     store: &Store,
     device: Option<&str>,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Option<Made>, AggregateError> {
     let block = Block::new(inputs, store);
     let mut merged = merge(&block)?;
     let kept = std::mem::take(&mut merged.kept);
-    let Some((learnt, effort)) = distil(&block, &mut merged, device, go_on)? else { return Ok(None) };
+    let Some((learnt, effort)) = distil(&block, &mut merged, device, cancelled)? else { return Ok(None) };
     let inside = std::mem::take(&mut merged.inside);
     // What was trained may have moved over the border: where it was when it was merged counts.
     merged.cloud.retain(|i| inside[i]);

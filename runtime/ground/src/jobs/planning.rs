@@ -63,7 +63,7 @@ pub fn plan(
     origin: Option<Geodetic>,
     store: &Store,
     fits: PathBuf,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Planned, AggregateError> {
     if members.is_empty() {
         return Err(AggregateError::NoModels);
@@ -82,7 +82,7 @@ pub fn plan(
     laps.end("unify");
     let (mut registered, mut not_registered) = (Registered::default(), None);
     if settings.register {
-        match registrar(settings, &fits).register(members, &held, go_on) {
+        match registrar(settings, &fits).register(members, &held, cancelled) {
             Ok(done) => registered = done,
             Err(e) => not_registered = Some(e),
         }

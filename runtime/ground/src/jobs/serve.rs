@@ -205,7 +205,7 @@ pub fn merge(
     mission: &Mission,
     reception: &Reception,
     out: &Path,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<(Outcome, Vec<(PathBuf, ModelRefusal)>), ServeError> {
     let (mut members, mut left_out) = (Vec::new(), Vec::new());
     for r in &reception.received {
@@ -218,7 +218,7 @@ pub fn merge(
     if members.is_empty() {
         return Err(ServeError::Nothing(mission.name.clone()));
     }
-    let outcome = aggregate::run(members, &mission.ground, Some(mission.origin), out, go_on)?;
+    let outcome = aggregate::run(members, &mission.ground, Some(mission.origin), out, cancelled)?;
     Ok((outcome, left_out))
 }
 

@@ -75,7 +75,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
         let is_new = was_there.is_none();
         let head = match was_there {
             Some(head) => head,
-            None => match make::make(&inputs, &store, args.device.as_deref(), &|| !stop.requested())? {
+            None => match make::make(&inputs, &store, args.device.as_deref(), &|| stop.requested())? {
                 Some(made) => made.head,
                 None => return Err(CliError::interrupted("stopped on request; run the same command again")),
             },

@@ -56,7 +56,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
     // What is known of pairs stays with a folder; for a bucket it is found anew.
     let scratch = tempfile::tempdir().map_err(CliError::failed)?;
     let fits = store.path().unwrap_or(scratch.path()).join(REGISTRATION);
-    let planned = plan(&mut members, &settings, origin, &store, fits, &|| !stop.requested())?;
+    let planned = plan(&mut members, &settings, origin, &store, fits, &|| stop.requested())?;
     if stop.requested() {
         return Err(CliError::interrupted("stopped on request; run the same command again"));
     }

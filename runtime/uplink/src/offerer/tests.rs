@@ -72,7 +72,7 @@ fn where_no_rounded_model_can_be_written_the_exact_one_is_offered() {
     std::fs::create_dir(dir.path().join("model.delivery.dgtr")).expect("in the way");
     let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(&path);
-    assert!(o.wait_delivered(LIMIT, || true));
+    assert!(o.wait_delivered(LIMIT, || false));
     assert_eq!(o.status().bytes, std::fs::metadata(&path).expect("metadata").len());
 }
 
@@ -84,7 +84,7 @@ fn a_model_is_rounded_for_delivery_as_finely_as_is_set_and_the_ground_reads_it()
         let settings = UploadSettings { encoding, ..settings };
         let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
         o.offer_final(&path);
-        assert!(o.wait_delivered(LIMIT, || true));
+        assert!(o.wait_delivered(LIMIT, || false));
         let sent = o.status().bytes;
         assert!(10 * sent < std::fs::metadata(&path).expect("metadata").len(), "{sent} bytes");
         let left = o.status().sent;
@@ -110,9 +110,9 @@ fn no_checkpoint_is_offered_that_the_last_model_replaces_before_another_could_fo
         let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
         o.expect_last(last_in);
         o.offer(&path);
-        assert_eq!(o.wait_delivered(Duration::from_secs(2), || true), offers == 2);
+        assert_eq!(o.wait_delivered(Duration::from_secs(2), || false), offers == 2);
         o.offer_final(&path);
-        assert!(o.wait_delivered(LIMIT, || true));
+        assert!(o.wait_delivered(LIMIT, || false));
         assert_eq!(o.status().offers, offers);
     }
 }
@@ -126,7 +126,7 @@ fn a_checkpoint_does_not_wait_for_a_last_model_that_is_overdue() {
     // It was to be here by now, and training rests.
     o.expect_last(Duration::ZERO);
     o.offer(&path);
-    assert!(o.wait_delivered(LIMIT, || true));
+    assert!(o.wait_delivered(LIMIT, || false));
     assert_eq!(o.status().offers, 1);
 }
 
@@ -146,10 +146,10 @@ fn a_model_travels_through_a_folder_that_is_plugged_in_late() {
     write_model(&path, &noise(50_000, 1));
     let o = Offerer::start(&settings, Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(&path);
-    assert!(!o.wait_delivered(Duration::from_millis(300), || true));
+    assert!(!o.wait_delivered(Duration::from_millis(300), || false));
     assert!(o.status().failures > 0 && !o.status().last_error.is_empty());
     std::fs::create_dir(&stick).expect("plug in");
-    assert!(o.wait_delivered(LIMIT, || true));
+    assert!(o.wait_delivered(LIMIT, || false));
     o.shutdown();
     let mut r = Receiver::open(&settings, anything(&["a1"]), &dir.path().join("g")).expect("receiver");
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
@@ -160,7 +160,7 @@ fn a_model_travels_through_a_folder_that_is_plugged_in_late() {
 fn without_a_way_to_the_ground_nothing_is_waited_for() {
     let o = Offerer::start(&UploadSettings::default(), Source::unsigned("m", "a1")).expect("offerer");
     o.offer_final(Path::new("/nonexistent"));
-    assert!(!o.wait_delivered(LIMIT, || true));
+    assert!(!o.wait_delivered(LIMIT, || false));
     o.shutdown();
 }
 
@@ -195,7 +195,7 @@ fn two_aircraft_deliver_over_loopback_tcp_whoever_starts_first() {
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()), "{:?} {:?}", r.counters, a1.status());
     let got: Vec<Vec<u8>> = r.received().iter().map(|m| std::fs::read(&m.path).expect("read")).collect();
     assert!(got[0] == noise(3_000_000, 2) && got[1] == noise(1_000_000, 3));
-    assert!(a1.wait_delivered(LIMIT, || true) && a2.wait_delivered(LIMIT, || true));
+    assert!(a1.wait_delivered(LIMIT, || false) && a2.wait_delivered(LIMIT, || false));
     assert_eq!(r.counters.corrupt, 0);
     a1.shutdown();
     a2.shutdown();
@@ -229,7 +229,7 @@ fn a_ground_station_that_restarts_mid_transfer_resumes_over_the_network() {
     assert!(receive(&mut r, LIMIT, |r| r.all_finished()));
     assert_eq!(r.counters.chunks_reused, first);
     assert_eq!(r.counters.chunks + first, 489);
-    assert!(o.wait_delivered(LIMIT, || true));
+    assert!(o.wait_delivered(LIMIT, || false));
     assert!(std::fs::read(&r.received()[0].path).expect("read") == noise(8_000_000, 4));
 }
 
@@ -268,7 +268,7 @@ fn over_tls_only_aircraft_of_the_same_authority_deliver() {
     let friend = friend.expect("offerer");
     friend.offer_final(&path);
     assert!(receive(&mut r, LIMIT, |r| !r.received().is_empty()), "{:?}", friend.status());
-    assert!(friend.wait_delivered(LIMIT, || true));
+    assert!(friend.wait_delivered(LIMIT, || false));
     assert!(!receive(&mut r, Duration::from_secs(2), |r| r.received().len() > 1));
     assert!(r.received()[0].aircraft == "friend" && !stranger.status().delivered);
 }
@@ -292,7 +292,7 @@ fn yesterdays_final_model_on_the_stick_is_named_and_not_taken_for_todays() {
             Source { identity: ids[0].clone(), flight_number: Some(numbers.clone()), ..Source::unsigned("m", "a1") };
         let o = Offerer::start(&settings, source).expect("offerer");
         o.offer_final(&path);
-        assert!(o.wait_delivered(LIMIT, || true));
+        assert!(o.wait_delivered(LIMIT, || false));
     };
     let session = |name: &str, again: bool| {
         let received = dir.path().join(name);
@@ -365,7 +365,7 @@ fn a_model_made_for_another_session_is_refused_by_a_ground_that_remembers_nothin
         let source = Source { identity: ids[0].clone(), flight_number: numbers, ..Source::unsigned("m", "a1") };
         let o = Offerer::start(&settings, source).expect("offerer");
         o.offer_final(&path);
-        assert!(o.wait_delivered(LIMIT, || true));
+        assert!(o.wait_delivered(LIMIT, || false));
     };
     let session = |computer: &str| {
         let (state, received) = (dir.path().join(format!("state of {computer}")), dir.path().join(computer));

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::super::admission::Refusals;
 use super::super::transport::Patience;
-use super::sight::Sight;
+use super::offered::Offered;
 use super::slot::Link;
 use super::{ANSWER, ReceiveCounters, STACK_BYTES};
 
@@ -32,7 +32,7 @@ struct Look {
     number: u64,
     answers: Receiver<Answer>,
     worker: JoinHandle<()>,
-    sight: Sight,
+    offered: Offered,
     /// When the last answer came.
     heard: Instant,
     /// Something came since it was acted upon.
@@ -42,7 +42,7 @@ struct Look {
 /// What a pass over the looks brought.
 pub(super) struct News {
     /// What is shown, of the aircraft in it.
-    pub(super) sight: Sight,
+    pub(super) offered: Offered,
     /// The look is over: whoever is not in it shows nothing.
     pub(super) is_over: bool,
 }
@@ -87,7 +87,7 @@ impl Lookout {
         let heard = Instant::now();
         self.numbers += 1;
         let number = self.numbers;
-        self.looks.push(Look { number, answers, worker, sight: Sight::default(), heard, is_fresh: false });
+        self.looks.push(Look { number, answers, worker, offered: Offered::default(), heard, is_fresh: false });
         self.begun = Some(heard);
         Ok(())
     }
@@ -96,7 +96,7 @@ impl Lookout {
     pub(super) fn news(
         &mut self,
         link: &Link,
-        before: &Sight,
+        before: &Offered,
         counters: &mut ReceiveCounters,
         refusals: &mut Refusals,
     ) -> Vec<News> {
@@ -109,13 +109,13 @@ impl Lookout {
                 let _ = look.worker.join();
                 if look.number >= self.newest {
                     self.newest = look.number;
-                    news.push(News { sight: look.sight, is_over });
+                    news.push(News { offered: look.offered, is_over });
                 }
                 continue;
             }
             if look.is_fresh && look.heard.elapsed() >= QUIET && look.number >= self.newest {
                 (look.is_fresh, self.newest) = (false, look.number);
-                news.push(News { sight: look.sight.clone(), is_over });
+                news.push(News { offered: look.offered.clone(), is_over });
             }
             under_way.push(look);
         }
@@ -137,7 +137,7 @@ impl Look {
     fn take_in(
         &mut self,
         link: &Link,
-        before: &Sight,
+        before: &Offered,
         counters: &mut ReceiveCounters,
         refusals: &mut Refusals,
     ) -> bool {
@@ -145,7 +145,7 @@ impl Look {
             match self.answers.try_recv() {
                 Ok(Answer::Shown(inlet, bytes)) => {
                     let let_in = |bytes: &[u8]| link.admission.offer(bytes, &link.settings);
-                    match self.sight.see(before, &bytes, inlet, let_in) {
+                    match self.offered.see(before, &bytes, inlet, let_in) {
                         Ok(()) => (self.heard, self.is_fresh) = (Instant::now(), true),
                         Err(e) => {
                             counters.count_refusal(&e);

@@ -8,7 +8,7 @@ use config::upload::UploadSettings;
 use disk::Disk;
 
 use super::behind::Behind;
-use super::sight::Shown;
+use super::offered::Shown;
 use super::{ANSWER, ReceiveCounters, Received};
 use crate::admission::{Admission, ModelRefusal, Refusals};
 use crate::keys::{Domain, SignatureBytes};

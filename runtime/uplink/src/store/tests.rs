@@ -42,7 +42,7 @@ fn receive(store: &mut Store, model: &OfferedModel) -> Result<(), StoreError> {
 }
 
 /// Opens what the power cut left and receives the rest; what went wrong.
-fn go_on(state: &State, promised: &[u64], recorded: &Path, models: &[OfferedModel]) -> Result<(), String> {
+fn continues_from(state: &State, promised: &[u64], recorded: &Path, models: &[OfferedModel]) -> Result<(), String> {
     let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
     state.lay_out(recorded, folder.path()).map_err(|e| e.to_string())?;
     let mut store = Store::open(&Disk::default(), folder.path(), &settings(), &admission());
@@ -84,7 +84,7 @@ fn a_power_cut_after_any_operation_of_a_reception_loses_no_model_that_was_comple
     store.note(&models[1].offer).expect("noted");
     let done: Vec<Done<u64>> = recorder.take();
     let mut wrong = Vec::new();
-    let states = each(&done, |state, promised| wrong.extend(go_on(&state, promised, &dir, &models).err()));
+    let states = each(&done, |state, promised| wrong.extend(continues_from(&state, promised, &dir, &models).err()));
     println!("{} operations, {states} states after a power cut, {} wrong", done.len(), wrong.len());
     assert!(wrong.is_empty(), "{} of {states}: {:#?}", wrong.len(), &wrong[..wrong.len().min(5)]);
     assert!(states >= 100, "{states} states");

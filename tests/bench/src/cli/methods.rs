@@ -104,7 +104,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         networks: args.networks,
         again: args.again,
     };
-    let comparison = measure(&request, &|| !stop.requested(), &mut |m| {
+    let comparison = measure(&request, &|| stop.requested(), &mut |m| {
         if let Some(all) = &m.quality.all {
             tracing::info!("{}: {:.2} dB, {:.2} with colours fitted", m.method, all.psnr, all.psnr_colors_fitted);
         }

@@ -67,7 +67,7 @@ fn recipe(seed: u64, sh_degree: u8) -> TrainSettings {
     t
 }
 
-/// Merges the clients' models into `path`; its number of Gaussians, or `None` when `go_on` said no.
+/// Merges the clients' models into `path`; its number of Gaussians, or `None` when `cancelled` said so.
 ///
 /// # Errors
 /// A model cannot be read or the result not be written; the device fails.
@@ -75,7 +75,7 @@ pub fn merge(
     clients: &[PathBuf],
     ground: &Ground,
     path: &Path,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Option<usize>, JobError> {
     let clients: Vec<(ModelHeader, GaussianCloud)> =
         clients.iter().map(|p| model::read(p)).collect::<Result<_, _>>()?;
@@ -121,7 +121,7 @@ pub fn merge(
     for lesson in &lessons {
         pictures.add(trainer.device_mut(), lesson, None)?;
     }
-    let mut each = |_: &_| if go_on() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) };
+    let mut each = |_: &_| if cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
     let pass = lessons.len() as u32;
     for (until, entropy) in [(pass, 0.0), (EPOCHS * pass, ENTROPY)] {
         trainer.set_loss(&LossSettings { entropy, ..recipe.loss })?;
@@ -215,9 +215,9 @@ mod tests {
         }
         let ground = Ground { device: None, device_mib: 64, seed: 1 };
         let path = dir.path().join("global.dgtr");
-        assert_eq!(merge(&clients, &ground, &path, &|| false).expect("merges"), None, "stopped");
+        assert_eq!(merge(&clients, &ground, &path, &|| true).expect("merges"), None, "stopped");
         assert!(!path.is_file());
-        let kept = merge(&clients, &ground, &path, &|| true).expect("merges").expect("to its end");
+        let kept = merge(&clients, &ground, &path, &|| false).expect("merges").expect("to its end");
         let (header, global) = model::read(&path).expect("read");
         assert_eq!((global.len(), header.views.len(), header.steps), (kept, 6, 30));
         let all: Vec<GaussianCloud> = clients.iter().map(|c| model::read(c).expect("read").1).collect();

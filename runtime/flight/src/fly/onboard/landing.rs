@@ -88,11 +88,11 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
         }
         if !interrupt.requested() && !self.failsafe.state().forbids_training() {
             let supervisor = &self.supervisor;
-            let go_on = || {
+            let cancelled = || {
                 supervisor.alive();
-                !interrupt.requested()
+                interrupt.requested()
             };
-            self.reconstruction.look_closer(capture, &go_on)?;
+            self.reconstruction.look_closer(capture, &cancelled)?;
         }
         // What the autopilot said last of its battery holds; the rest of what the HAL saw ended with the flight, and there
         // is no flight's time any more that training could be behind.
@@ -121,8 +121,8 @@ impl<R: Reconstruct, K: Clock> Job<R, K> {
                 offerer.expect_last(left(Duration::from_nanos(now_ns.saturating_sub(began)), [first, r.progress]));
                 let alarmed = failsafe.glance(now_ns, seen, &at_leisure, views);
                 // Only where saving leaves no trace, as in any training.
-                let go_on = !interrupt.requested() && !alarmed && (now_ns < due_ns || !r.settled);
-                if go_on { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+                let pause = interrupt.requested() || alarmed || (now_ns >= due_ns && r.settled);
+                if pause { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             })?;
             self.act(capture)?;
             if reason != StopReason::Caller || interrupt.requested() {

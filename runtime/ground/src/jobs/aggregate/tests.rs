@@ -34,11 +34,11 @@ fn run(
     settings: &GroundSettings,
     origin: Option<Geodetic>,
     out: &Path,
-    go_on: &dyn Fn() -> bool,
+    cancelled: &dyn Fn() -> bool,
 ) -> Result<Outcome, AggregateError> {
     let dir = tempfile::tempdir().expect("temp dir");
     let members = models.iter().map(|m| written(dir.path(), m)).collect();
-    super::run(members, settings, origin, out, go_on)
+    super::run(members, settings, origin, out, cancelled)
 }
 
 fn settings() -> GroundSettings {
@@ -66,7 +66,7 @@ fn skipped(outcome: &Outcome) -> bool {
 #[test]
 fn distillation_brings_the_seam_closer_to_both_teachers_and_leaves_the_rest_alone() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let outcome = run(pair(), &settings(), None, dir.path(), &|| true).expect("aggregate");
+    let outcome = run(pair(), &settings(), None, dir.path(), &|| false).expect("aggregate");
     if skipped(&outcome) {
         return;
     }
@@ -81,7 +81,7 @@ fn distillation_brings_the_seam_closer_to_both_teachers_and_leaves_the_rest_alon
     assert_eq!((cloud.len(), header.finished, header.views.len()), (outcome.gaussians, true, 6));
     // Beyond six cells of 2 m on both sides of the border everything was drawn and nothing moved.
     let merge_only = GroundSettings { epochs: 0, ..settings() };
-    let merged = run(pair(), &merge_only, None, &dir.path().join("merged"), &|| true).expect("aggregate");
+    let merged = run(pair(), &merge_only, None, &dir.path().join("merged"), &|| false).expect("aggregate");
     let beside = |c: &GaussianCloud| {
         let rows: Vec<u32> = (0..c.len() as u32).filter(|i| c.means[*i as usize][0].abs() > 14.0).collect();
         c.rows(&rows)
@@ -98,7 +98,7 @@ fn distillation_brings_the_seam_closer_to_both_teachers_and_leaves_the_rest_alon
 fn views_between_training_views_take_part_when_asked() {
     let dir = tempfile::tempdir().expect("temp dir");
     let both = GroundSettings { between_views: true, epochs: 1, ..settings() };
-    let outcome = run(pair(), &both, None, dir.path(), &|| true).expect("aggregate");
+    let outcome = run(pair(), &both, None, dir.path(), &|| false).expect("aggregate");
     if skipped(&outcome) {
         return;
     }
@@ -112,7 +112,7 @@ fn the_same_models_give_the_same_bytes() {
     let dir = tempfile::tempdir().expect("temp dir");
     let bytes = ["a", "b"].map(|name| {
         let out = dir.path().join(name);
-        let outcome = run(pair(), &settings(), None, &out, &|| true).expect("aggregate");
+        let outcome = run(pair(), &settings(), None, &out, &|| false).expect("aggregate");
         let (_, cloud) = model::read(&outcome.path).expect("global model");
         cloud
     });
@@ -123,7 +123,7 @@ fn the_same_models_give_the_same_bytes() {
 fn a_missing_device_still_leaves_the_merged_model() {
     let dir = tempfile::tempdir().expect("temp dir");
     let none = GroundSettings { device: Some("no such device".into()), ..settings() };
-    let outcome = run(pair(), &none, None, dir.path(), &|| true).expect("merged");
+    let outcome = run(pair(), &none, None, dir.path(), &|| false).expect("merged");
     assert!(outcome.not_distilled.as_ref().is_some_and(|e| e.kind() == ErrorKind::Device));
     let (header, cloud) = model::read(&outcome.path).expect("global model");
     assert!(!header.finished && cloud.len() == outcome.gaussians && cloud.len() > 3000);
@@ -135,7 +135,7 @@ fn a_single_model_becomes_the_global_one_unchanged() {
     let dir = tempfile::tempdir().expect("temp dir");
     let one = vec![pair().remove(0)];
     let cloud = one[0].cloud.clone();
-    let outcome = run(one, &settings(), None, dir.path(), &|| true).expect("aggregate");
+    let outcome = run(one, &settings(), None, dir.path(), &|| false).expect("aggregate");
     assert_eq!(outcome.distilled.as_ref().map(|d| d.learnt.used), Some(0));
     assert_eq!(model::read(&outcome.path).expect("global model").1, cloud);
 }
@@ -153,8 +153,8 @@ fn models_around_different_origins_meet_in_one_frame() {
     away_from_home.header(&mut models[1].header);
     models[1].header.origin = Some(away);
     let merge_only = GroundSettings { epochs: 0, ..settings() };
-    let outcome = run(models, &merge_only, None, &dir.path().join("a"), &|| true).expect("aggregate");
-    let straight = run(pair(), &merge_only, None, &dir.path().join("b"), &|| true).expect("aggregate");
+    let outcome = run(models, &merge_only, None, &dir.path().join("a"), &|| false).expect("aggregate");
+    let straight = run(pair(), &merge_only, None, &dir.path().join("b"), &|| false).expect("aggregate");
     assert_eq!(outcome.kept, straight.kept);
     let read = |o: &Outcome| model::read(&o.path).expect("global model").1.means;
     let apart = read(&outcome).into_iter().zip(read(&straight)).map(|(a, b)| glam::Vec3::from(a).distance(b.into()));
@@ -165,7 +165,7 @@ fn models_around_different_origins_meet_in_one_frame() {
 #[test]
 fn models_that_do_not_belong_together_are_refused_by_name() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let refused = |models| run(models, &settings(), None, dir.path(), &|| true).expect_err("refused").to_string();
+    let refused = |models| run(models, &settings(), None, dir.path(), &|| false).expect_err("refused").to_string();
     assert!(refused(vec![]).contains("no models"));
     let mut models = pair();
     models[0].header.origin = Some(Geodetic { lat_deg: 47.0, lon_deg: 8.0, alt_m: 0.0 });

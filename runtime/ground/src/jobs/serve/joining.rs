@@ -71,7 +71,7 @@ impl Joining {
     }
 
     /// Waits until everything that arrived is fitted; `alive` is called meanwhile.
-    pub fn finish(mut self, alive: &dyn Fn() -> bool) -> Joined {
+    pub fn finish(mut self, alive: &dyn Fn()) -> Joined {
         self.queue = None;
         let Some(worker) = self.worker.take() else { return Joined::default() };
         while !worker.is_finished() {
@@ -97,7 +97,7 @@ fn work(mission: &Mission, out: &Path, queue: &Receiver<Arrival>) -> Joined {
         }
         members.retain(|m| m.name() != aircraft);
         members.extend(member);
-        match registrar.fit(&members, &|| true) {
+        match registrar.fit(&members, &|| false) {
             Ok(fitted) => joined.fits.push(fitted),
             // The merge meets it again and says so.
             Err(e) => {

@@ -47,7 +47,7 @@ fn fly(mission: &Mission, dir: &Path, id: &str) {
     models::formats::model::write(&path, &local.header, &local.cloud).expect("write");
     let offerer = Offerer::start(&mission.upload, unsigned(&mission.name, id)).expect("offerer");
     offerer.offer_final(&path);
-    assert!(offerer.wait_delivered(Duration::from_secs(30), || true));
+    assert!(offerer.wait_delivered(Duration::from_secs(30), || false));
     offerer.shutdown();
 }
 
@@ -72,7 +72,7 @@ fn all_aircraft_arrive_and_each_keeps_its_own_region() {
         assert!(craft.bytes > Some(0) && craft.chunks.is_none(), "{craft:?}");
     }
     assert_eq!(page.subtitle, "2 of 2 final models are here");
-    let (outcome, unreadable) = merge(&mission, &reception, &out, &|| true).expect("merged");
+    let (outcome, unreadable) = merge(&mission, &reception, &out, &|| false).expect("merged");
     assert!(unreadable.is_empty() && outcome.path == out.join("global.dgtr"));
     // The models themselves name no region: the mission's were used.
     assert_eq!((outcome.gaussians, outcome.kept[0].own, outcome.kept[1].own), (3200, 1600, 1600));
@@ -85,12 +85,12 @@ fn after_a_timeout_what_has_arrived_is_merged_and_the_rest_is_named() {
     let (mission, out) = (mission(dir.path()), dir.path().join("out"));
     let stop = AtomicBool::new(false);
     let none = receive(&mission, &out, Some(Duration::ZERO), &stop, &mut |_| {}).expect("received");
-    assert!(matches!(merge(&mission, &none, &out, &|| true), Err(ServeError::Nothing(_))));
+    assert!(matches!(merge(&mission, &none, &out, &|| false), Err(ServeError::Nothing(_))));
     fly(&mission, dir.path(), "east");
     let one = receive(&mission, &out, Some(Duration::from_secs(1)), &stop, &mut |_| {}).expect("received");
     assert_eq!(one.missing, ["west"]);
     // East saw the western half too, and nobody else did.
-    assert_eq!(merge(&mission, &one, &out, &|| true).expect("merged").0.gaussians, 3200);
+    assert_eq!(merge(&mission, &one, &out, &|| false).expect("merged").0.gaussians, 3200);
     // Started again, it continues where it was.
     fly(&mission, dir.path(), "west");
     let both = receive(&mission, &out, None, &stop, &mut |_| {}).expect("received");
@@ -106,16 +106,16 @@ fn a_received_file_that_is_no_model_does_not_cost_the_others() {
     std::fs::write(&path, b"not a model").expect("write");
     let offerer = Offerer::start(&mission.upload, unsigned(&mission.name, "east")).expect("offerer");
     offerer.offer_final(&path);
-    assert!(offerer.wait_delivered(Duration::from_secs(30), || true));
+    assert!(offerer.wait_delivered(Duration::from_secs(30), || false));
     let reception = receive(&mission, &out, None, &AtomicBool::new(false), &mut |_| {}).expect("received");
     assert_eq!((reception.missing.as_slice(), reception.counters.models_damaged), (&["east".to_owned()][..], 1));
     assert!(reception.refusals.iter().any(|(why, n)| why.contains("east's model") && n == 1));
-    let (outcome, left_out) = merge(&mission, &reception, &out, &|| true).expect("merged");
+    let (outcome, left_out) = merge(&mission, &reception, &out, &|| false).expect("merged");
     assert_eq!((outcome.models.len(), left_out.len()), (1, 0));
     // Damaged on the ground afterwards: left out, and the other one is merged all the same.
     fly(&mission, dir.path(), "east");
     let reception = receive(&mission, &out, None, &AtomicBool::new(false), &mut |_| {}).expect("received");
     std::fs::write(&reception.received[1].path, b"not a model").expect("write");
-    let (outcome, left_out) = merge(&mission, &reception, &out, &|| true).expect("merged");
+    let (outcome, left_out) = merge(&mission, &reception, &out, &|| false).expect("merged");
     assert_eq!((outcome.models.len(), left_out.len()), (1, 1));
 }

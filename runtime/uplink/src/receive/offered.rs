@@ -17,13 +17,13 @@ const MOST: usize = 4 * PER_AIRCRAFT * MAX_AIRCRAFT;
 
 /// What is shown now.
 #[derive(Clone, Default)]
-pub(super) struct Sight {
+pub(super) struct Offered {
     /// By the hash of their bytes.
     offers: HashMap<blake3::Hash, Arc<Offer>>,
     by_aircraft: HashMap<String, Vec<Shown>>,
 }
 
-impl Sight {
+impl Offered {
     /// Of one aircraft, in the order they were seen.
     pub fn of(&self, aircraft: &str) -> &[Shown] {
         self.by_aircraft.get(aircraft).map_or(&[], Vec::as_slice)
@@ -89,9 +89,9 @@ mod tests {
     #[test]
     fn the_same_bytes_are_let_in_once_however_often_and_by_however_many_inlets_they_are_shown() {
         let (west, mut asked) = (offer("m", "west", 1), 0);
-        let (bytes, mut before) = (west.encode(), Sight::default());
+        let (bytes, mut before) = (west.encode(), Offered::default());
         for _ in 0..3 {
-            let mut now = Sight::default();
+            let mut now = Offered::default();
             for inlet in [0, 1, 0] {
                 let let_in = |_: &[u8]| {
                     asked += 1;
@@ -108,9 +108,9 @@ mod tests {
 
     #[test]
     fn what_is_refused_is_refused_again_and_not_remembered() {
-        let (west, mut now) = (offer("m", "west", 1), Sight::default());
+        let (west, mut now) = (offer("m", "west", 1), Offered::default());
         for _ in 0..2 {
-            let refused = now.see(&Sight::default(), &west.encode(), 0, |_| Err(OfferError::Version(9)));
+            let refused = now.see(&Offered::default(), &west.encode(), 0, |_| Err(OfferError::Version(9)));
             assert_eq!(refused, Err(OfferError::Version(9)));
         }
         assert!(now.of("west").is_empty() && now.offers.is_empty());
@@ -118,10 +118,10 @@ mod tests {
 
     #[test]
     fn of_a_flood_of_different_offers_the_newest_remain() {
-        let mut now = Sight::default();
+        let mut now = Offered::default();
         for counter in [3, 9, 1, 7, 2, 8, 4, 6, 5] {
             let flood = offer("m", "west", counter);
-            now.see(&Sight::default(), &flood.encode(), 0, |_| Ok(flood.clone())).expect("let in");
+            now.see(&Offered::default(), &flood.encode(), 0, |_| Ok(flood.clone())).expect("let in");
         }
         let mut kept: Vec<u64> = now.of("west").iter().map(|(o, _)| o.order.counter).collect();
         kept.sort_unstable();

@@ -9,13 +9,13 @@ const FEWEST: usize = 2;
 
 /// Where an aircraft's pictures were taken.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Sight {
+pub struct Visibility {
     views: Vec<View>,
     /// Height of its ground, metres.
     ground: f64,
 }
 
-impl Sight {
+impl Visibility {
     /// Of these pictures, over ground of this height.
     pub fn new(views: impl Iterator<Item = View>, ground: f64) -> Self {
         Self { views: views.collect(), ground }
@@ -51,12 +51,12 @@ mod tests {
     #[test]
     fn ground_below_counts_as_much_as_its_pixels_and_ground_that_one_picture_saw_not_at_all() {
         let views = [nadir(0.0, 0.0, 20.0), nadir(4.0, 0.0, 20.0)];
-        let sight = Sight::new(views.into_iter(), 0.0);
+        let visibility = Visibility::new(views.into_iter(), 0.0);
         // 50 pixels of focal length at 20 m: 6.25 to the square metre and picture.
-        assert!((sight.pixels_per_m2(DVec2::new(2.0, 1.0)) - 12.5).abs() < 1e-9);
-        assert_eq!(sight.pixels_per_m2(DVec2::new(-10.0, 0.0)), 0.0, "only the first saw it");
-        assert_eq!(sight.pixels_per_m2(DVec2::new(500.0, 0.0)), 0.0);
-        assert_eq!(sight.to_camera(DVec2::new(7.0, 4.0)), 5.0);
+        assert!((visibility.pixels_per_m2(DVec2::new(2.0, 1.0)) - 12.5).abs() < 1e-9);
+        assert_eq!(visibility.pixels_per_m2(DVec2::new(-10.0, 0.0)), 0.0, "only the first saw it");
+        assert_eq!(visibility.pixels_per_m2(DVec2::new(500.0, 0.0)), 0.0);
+        assert_eq!(visibility.to_camera(DVec2::new(7.0, 4.0)), 5.0);
     }
 
     #[test]
@@ -70,7 +70,7 @@ mod tests {
         let (at, small) = (DVec3::new(1.0, 2.0, 0.0), 1e-4);
         let (u, v) = (project(at + DVec3::X * small) - project(at), project(at + DVec3::Y * small) - project(at));
         let drawn = u.perp_dot(v).abs() / (small * small);
-        let got = Sight::new([view, view].into_iter(), 0.0).pixels_per_m2(at.truncate()) / 2.0;
+        let got = Visibility::new([view, view].into_iter(), 0.0).pixels_per_m2(at.truncate()) / 2.0;
         assert!((got - drawn).abs() < 1e-3 * drawn, "{got} {drawn}");
     }
 
@@ -78,7 +78,8 @@ mod tests {
     fn a_camera_below_the_ground_or_broken_sees_nothing() {
         let mut broken = nadir(0.0, 0.0, 20.0);
         broken.pose.center.x = f64::NAN;
-        let sight = Sight::new([nadir(0.0, 0.0, -20.0), nadir(0.0, 0.0, -20.0), broken, broken].into_iter(), 0.0);
-        assert_eq!(sight.pixels_per_m2(DVec2::ZERO), 0.0);
+        let visibility =
+            Visibility::new([nadir(0.0, 0.0, -20.0), nadir(0.0, 0.0, -20.0), broken, broken].into_iter(), 0.0);
+        assert_eq!(visibility.pixels_per_m2(DVec2::ZERO), 0.0);
     }
 }
