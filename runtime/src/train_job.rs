@@ -217,6 +217,8 @@ impl TrainJob {
         let poses = if is_card { PoseSource::Dataset } else { self.poses.source };
         let picture_scale = self.picture_scale(&set, is_card)?;
         let settings = self.poses.refine.then_some(&self.recipe.refine);
+        let notes = set.card.clone();
+        surveyed::forget(&self.output.folder)?;
         let opened = began.elapsed();
         let Some(card) = card::settle(&mut set, &self.output.folder, self.output.fresh, settings, &cancelled)? else {
             return Ok(Outcome { finished: false, steps: 0, report: RunReport::new("train"), few: None });
@@ -304,8 +306,9 @@ impl TrainJob {
         if finished && self.evaluate {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
-        if finished {
-            surveyed::measure(&mut engine, &set, picture_scale)?;
+        if finished && let Some(notes) = &notes {
+            let field = surveyed::Field { set: &set, notes, is_refined: self.poses.refine, scale: picture_scale };
+            surveyed::measure(&mut engine, &field, &self.output.folder, &cancelled)?;
         }
         let steps = engine.header().steps;
         let covered = match finished {

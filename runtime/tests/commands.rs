@@ -18,6 +18,9 @@ use models::formats::transforms::pose_to_opengl;
 mod again;
 #[path = "commands/begun.rs"]
 mod begun;
+#[path = "commands/checked.rs"]
+#[cfg(feature = "lab")]
+mod checked;
 #[path = "commands/crowded.rs"]
 mod crowded;
 #[path = "commands/earlier.rs"]

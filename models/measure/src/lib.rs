@@ -1,8 +1,10 @@
 //! What is measured on maps of heights, each number with its standard deviation.
 //!
-//! [`heights`] is a part of a map in memory, [`noise`] what its heights are worth, [`areas`] the polygons that people draw, [`base`] the
-//! ground below a heap, [`volume`] how much lies between the two, [`contours`] lines of equal height, [`change`] what differs between two maps.
+//! [`accuracy`] is what check points say of a map, [`heights`] a part of a map in memory, [`noise`] what its heights are worth, [`areas`]
+//! the polygons that people draw, [`base`] the ground below a heap, [`volume`] how much lies between the two, [`contours`] lines of equal
+//! height, [`change`] what differs between two maps.
 
+pub mod accuracy;
 pub mod areas;
 pub mod base;
 pub mod change;

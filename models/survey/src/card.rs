@@ -11,7 +11,7 @@
 //! | Skydio `drone-skydio:` | `Latitude`, `Longitude` | `AbsoluteAltitude`, `RelativeAltitude` | `CameraOrientationNEDYaw/Pitch/Roll`, −90° = nadir | `CalibratedFocalLength` |
 //! | Pix4D `Camera:` (senseFly, Sequoia, MicaSense, Autel, Yuneec, Sentera) | ±`GPSXYAccuracy` | ±`GPSZAccuracy` | `Yaw/Pitch/Roll`, 0° = nadir with the heading at the top of the picture; a pitch below −45° (Autel) is taken as −90° = nadir; senseFly's roll has the other sign | `PerspectiveFocalLength` (mm), `PerspectiveDistortion` r1 r2 r3 t1 t2, `PrincipalPoint` (mm) |
 //! | `geo.txt` (OpenDroneMap), Pix4D's list, tables with named columns | as stated, with its accuracies | as stated | yaw, pitch, roll: 0° = nadir in `geo.txt` | – |
-//! | `gcp_list.txt` | surveyed points marked in pictures: they hold the poses, and give a card without GPS its place, north and scale | as stated | – | – |
+//! | `gcp_list.txt` | surveyed points marked in pictures: they hold the poses, and give a card without GPS its place, north and scale; those named `CHK` measure the model instead | as stated | – | – |
 //! | flight log | at the exposure, 1.5 m | as logged | the airframe's (10°), the gimbal's where logged (3°) | – |
 
 use std::path::{Path, PathBuf};
@@ -82,6 +82,61 @@ pub struct CardOptions {
     pub band: Option<String>,
 }
 
+/// A card's surveyed points: those that hold the poses, and those that measure what comes out.
+struct Lists {
+    control: Vec<control::SurveyedPoint>,
+    check: Vec<control::SurveyedPoint>,
+}
+
+/// Reads the lists that were asked for and those that lie among the pictures; a point counts once, and never both ways.
+fn surveyed(
+    options: &CardOptions,
+    marked: &[PathBuf],
+    records: &[record::Record],
+    lines: &mut Vec<String>,
+    read: &mut Vec<String>,
+) -> Result<Lists, CardError> {
+    let mut of_file = |file: &Path, lines: &mut Vec<String>| -> Result<Vec<control::SurveyedPoint>, CardError> {
+        let mut points = control::read(file)?;
+        let (line, is_whole) = control::summary(file, &points, records);
+        if is_whole { &mut *read } else { &mut *lines }.push(line);
+        sources::judge_points(file, &mut points, records, lines)?;
+        Ok(points)
+    };
+    let real = |file: &PathBuf| file.canonicalize().unwrap_or_else(|_| file.clone());
+    let asked: Vec<PathBuf> = options.control.iter().chain(&options.check).map(real).collect();
+    let found = marked.iter().filter(|file| !asked.contains(&real(file)));
+    let (mut all, mut twice) = (Vec::new(), 0);
+    for file in options.control.iter().chain(found) {
+        twice += control::join(&mut all, of_file(file, lines)?);
+    }
+    let (mut check, mut control): (Vec<_>, Vec<_>) = all.into_iter().partition(control::SurveyedPoint::is_check);
+    let named = check.len();
+    if let Some(file) = &options.check {
+        let points = of_file(file, lines)?;
+        let held = control.extract_if(.., |held| points.iter().any(|p| p.is_at(held))).count();
+        if held > 0 {
+            lines.push(format!(
+                "{}: {held} of its points are ground control, too; they hold nothing now",
+                file.display()
+            ));
+        }
+        twice += control::join(&mut check, points);
+    }
+    if twice > 0 {
+        lines.push(format!("{twice} surveyed points are in more than one list; each counts once"));
+    }
+    match (named, control.len()) {
+        (0, _) => {}
+        (n, 0) => {
+            lines.push(format!("all {n} surveyed points are named CHK: they measure the model, and none holds it"))
+        }
+        (n, _) => read.push(format!("{n} surveyed points are named CHK: they measure the model and do not hold it")),
+    }
+    lines.extend(control::doubtful_names(&control));
+    Ok(Lists { control, check })
+}
+
 impl Card {
     /// True when there is a file with the extension of a picture or a film below `folder`, or what kept such files from being found.
     pub fn has_pictures(folder: &Path) -> bool {
@@ -125,21 +180,7 @@ impl Card {
         }
         record::in_order(&mut records);
         sources::standing_still(&mut records, &mut lines, &mut notes);
-        let mut control = Vec::new();
-        for file in options.control.iter().chain(&marked) {
-            let mut points = control::read(file)?;
-            let (line, is_whole) = control::summary(file, &points, &records);
-            if is_whole { &mut read } else { &mut lines }.push(line);
-            sources::judge_points(file, &mut points, &records, &mut lines)?;
-            control.extend(points);
-        }
-        let mut check = Vec::new();
-        if let Some(file) = &options.check {
-            check = control::read(file)?;
-            let (line, is_whole) = control::summary(file, &check, &records);
-            if is_whole { &mut read } else { &mut lines }.push(line);
-            sources::judge_points(file, &mut check, &records, &mut lines)?;
-        }
+        let Lists { control, check } = surveyed(options, &marked, &records, &mut lines, &mut read)?;
         if !records.iter().any(|r| r.fix.is_some()) {
             lines.push(format!(
                 "none of {} pictures says where it was taken (no GPS in EXIF or XMP, no geotags): the scene has no place, no north and no scale (neighbours are 1 apart); --geotags or --log would give them",

@@ -71,8 +71,9 @@ pub(super) fn settle(
     let Some(notes) = set.card.clone() else { return Ok(Some(card)) };
     announce(set, &notes);
     let (file, of) = (out.join(FILE), set.frames.len());
-    if !fresh && let Some(settled) = known(set, &file)? {
+    if !fresh && let Some((settled, origin)) = known(set, &file)? {
         card.used = Some((settled.len(), of));
+        set.origin = origin;
         set.settle(&settled);
         return Ok(Some(card));
     }
@@ -106,8 +107,11 @@ pub(super) fn settle(
     Ok(Some(card))
 }
 
+/// Poses by picture, and where on Earth their frame is.
+type Earlier = (HashMap<String, Settled>, Option<Geodetic>);
+
 /// What an earlier start settled on, when it was about the same pictures.
-fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, Settled>>, JobError> {
+fn known(set: &Dataset, file: &Path) -> Result<Option<Earlier>, JobError> {
     if !file.is_file() {
         return Ok(None);
     }
@@ -121,7 +125,7 @@ fn known(set: &Dataset, file: &Path) -> Result<Option<HashMap<String, Settled>>,
         settled.insert(frame.name.clone(), of_shot(frame, before));
     }
     // Pictures that came since want poses, too.
-    Ok((settled.len() == earlier.shots.len()).then_some(settled))
+    Ok((settled.len() == earlier.shots.len()).then_some((settled, earlier.origin)))
 }
 
 /// Gives a card the poses that the training of `model` settled on, its held-out pictures' too; says so where there are none.
@@ -268,7 +272,11 @@ fn refined(
         settings,
         &mut Needs {
             open: &mut open,
-            control: &|scale| surveyed::marked(set, &notes.control, scale),
+            control: &|scale| {
+                // Where nothing else says where the scene is, the first of them is its origin.
+                let origin = set.origin.or(notes.control.first().map(|p| p.position));
+                origin.map_or_else(Vec::new, |origin| surveyed::marked(set, &notes.control, origin, scale))
+            },
             taken: &mut |done, name| progress.set(done as u64, || name.to_owned()),
             cancelled,
             fits: &|settings| {

@@ -25,7 +25,7 @@ pub(super) const GPS_SIGMA_M: f64 = 3.0;
 const RTK_FIXED_M: [f64; 2] = [0.03, 0.06];
 const RTK_FLOAT_M: [f64; 2] = [0.5, 1.0];
 /// A height that is not stated, one standard deviation, metres.
-pub(super) const UNKNOWN_HEIGHT_SIGMA_M: f64 = 100.0;
+pub const UNKNOWN_HEIGHT_SIGMA_M: f64 = 100.0;
 /// Heights that an aircraft can have, metres.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = -1000.0..=20_000.0;
 /// What a height of thousandths of a metre below zero becomes in 32 bits without a sign, metres.

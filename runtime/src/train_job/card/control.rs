@@ -68,6 +68,7 @@ mod tests {
             name: name.to_owned(),
             position: Geodetic { lat_deg: 46.0, lon_deg: 7.0, alt_m: 400.0 },
             sigma_m: [0.03, vertical],
+            is_sigma_stated: [true; 2],
             marks: Vec::new(),
         };
         let residual =
