@@ -307,8 +307,8 @@ impl TrainJob {
             self.score(&mut engine, &set, &frames, picture_scale, metric.as_mut())?;
         }
         if finished && let Some(notes) = &notes {
-            let field = surveyed::Field { set: &set, notes, is_refined: self.poses.refine, scale: picture_scale };
-            surveyed::measure(&mut engine, &field, &self.output.folder, &cancelled)?;
+            let inputs = surveyed::Inputs { set: &set, notes, is_refined: self.poses.refine, scale: picture_scale };
+            surveyed::measure(&mut engine, &inputs, &self.output.folder, &cancelled)?;
         }
         let steps = engine.header().steps;
         let covered = match finished {

@@ -200,7 +200,7 @@ impl FileServer {
     pub(super) fn next(&mut self, file: &[u8], may_burst: bool) -> Option<FILE_TRANSFER_PROTOCOL_DATA> {
         let (client, packet) = match self.answers.pop_front() {
             Some(answer) => answer,
-            None if may_burst => self.sessions.iter_mut().flatten().find_map(|session| session.next_of(file))?,
+            None if may_burst => self.sessions.iter_mut().flatten().find_map(|session| session.next_packet(file))?,
             None => return None,
         };
         let (target_system, target_component) = client;
@@ -216,7 +216,7 @@ impl FileServer {
 
 impl Session {
     /// The next packet of the burst.
-    fn next_of(&mut self, file: &[u8]) -> Option<(Client, Packet)> {
+    fn next_packet(&mut self, file: &[u8]) -> Option<(Client, Packet)> {
         let mut request = self.burst.take()?;
         let piece = piece(file, &request);
         let end = request.offset.saturating_add(piece.len() as u32);

@@ -18,7 +18,7 @@ const LEAST_SHARE: f64 = 0.25;
 /// agree where all stand right, a quarter to a half where some of them went astray.
 const MEMBER_SHARE: f64 = 0.5;
 /// Of the pictures that disagree, the worst one in so many is dropped before all are asked again.
-const DROPPED_AT_ONCE: usize = 4;
+const WORST_ONE_IN: usize = 4;
 /// By how much a rolling shutter stretches a picture (5 m/s for 30 ms at 60 m), in picture widths: it grows with the size in pixels, a key
 /// point's own noise does not.
 const MISFIT: f64 = 0.0025;
@@ -90,7 +90,7 @@ fn part(refiner: &Refiner, tracks: &Tracks, cameras: &[Pinhole], among: &[bool],
         }
         // The worst of them may be why others disagree; and what was reached by them alone has to be reached without them.
         against.sort_by(|a, b| words[*a].share().total_cmp(&words[*b].share()));
-        against.truncate(against.len().div_ceil(DROPPED_AT_ONCE));
+        against.truncate(against.len().div_ceil(WORST_ONE_IN));
         for i in against {
             tracing::debug!("{}: {:?}, against the others", refiner.frames[i].name, words[i]);
             (among[i], part[i]) = (false, false);

@@ -88,7 +88,7 @@ struct Lists {
     check: Vec<control::SurveyedPoint>,
 }
 
-/// Reads the lists that were asked for and those that lie among the pictures; a point counts once, and never both ways.
+/// Reads the lists that were given and those that lie among the pictures; a point counts once, and never both ways.
 fn surveyed(
     options: &CardOptions,
     marked: &[PathBuf],
@@ -111,7 +111,7 @@ fn surveyed(
         twice += control::join(&mut all, of_file(file, lines)?);
     }
     let (mut check, mut control): (Vec<_>, Vec<_>) = all.into_iter().partition(control::SurveyedPoint::is_check);
-    let named = check.len();
+    let named = (check.len(), control.len());
     if let Some(file) = &options.check {
         let points = of_file(file, lines)?;
         let held = control.extract_if(.., |held| points.iter().any(|p| p.is_at(held))).count();
@@ -126,7 +126,7 @@ fn surveyed(
     if twice > 0 {
         lines.push(format!("{twice} surveyed points are in more than one list; each counts once"));
     }
-    match (named, control.len()) {
+    match named {
         (0, _) => {}
         (n, 0) => {
             lines.push(format!("all {n} surveyed points are named CHK: they measure the model, and none holds it"))

@@ -177,7 +177,7 @@ struct CardArgs {
     /// Number of the camera whose exposures in --log are meant [default: the one that the pictures fit].
     #[arg(long, value_name = "N", requires = "log")]
     camera: Option<u8>,
-    /// Surveyed points marked in a card's pictures, those named CHK-… for measuring alone [default: its gcp_list.txt].
+    /// Surveyed points marked in a card's pictures, beside those of its gcp_list.txt; those named CHK-… measure the finished model alone.
     #[arg(long, value_name = "FILE")]
     gcp: Option<PathBuf>,
     /// Of a card with several bands or lenses the one of this name [default: natural colours].

@@ -47,8 +47,8 @@ struct Row<'a> {
     found: PointOff,
 }
 
-/// What a job knows that measures a card's points.
-pub(super) struct Field<'a> {
+/// What is compared with a card's surveyed points.
+pub(super) struct Inputs<'a> {
     pub set: &'a Dataset,
     pub notes: &'a CardNotes,
     /// The poses are those that the pictures agreed on, not those that they state.
@@ -74,7 +74,7 @@ pub(super) fn forget(out: &Path) -> Result<(), JobError> {
 /// The renderer's; the files cannot be written.
 pub(super) fn measure(
     engine: &mut Reconstruction,
-    &Field { set, notes, is_refined, scale }: &Field,
+    &Inputs { set, notes, is_refined, scale }: &Inputs,
     out: &Path,
     cancelled: &dyn Fn() -> bool,
 ) -> Result<(), JobError> {
@@ -101,7 +101,7 @@ pub(super) fn measure(
             crops.take(what, &points[mark.point].name, mark);
         })?;
         let Some(scores) = scores else {
-            tracing::warn!("{what}: not compared, the job was asked to stop");
+            tracing::warn!("{what}: not compared: the job was cancelled");
             return Ok(());
         };
         scores.announce(what);
@@ -120,8 +120,8 @@ pub(super) fn measure(
     doubts.iter().for_each(|d| tracing::warn!("surveyed points: {d}"));
     let (to, text) = (out.join(POINTS), table(&rows));
     Disk::default().replace(&to, |file| file.write_all(text.as_bytes())).map_err(|e| JobError::io(&to)(e.into()))?;
-    let comparisons = crops.beside_photographs(set, scale);
-    let page = ReportData { comparisons, warnings: doubts, ..page(&rows, accuracy.as_ref()) };
+    let mut page = page(&rows, accuracy.as_ref(), crops.points());
+    (page.comparisons, page.warnings) = (crops.beside_photographs(set, scale), doubts);
     page.write(&out.join(PAGE))?;
     engine.report.stage("surveyed", clock);
     Ok(())
@@ -210,8 +210,8 @@ fn texts(of: &[&str]) -> Vec<String> {
     of.iter().map(|s| (*s).to_owned()).collect()
 }
 
-/// All of it but the pictures and what to doubt.
-fn page(rows: &[Row], accuracy: Option<&Accuracy>) -> ReportData {
+/// All of it but what to doubt and the pictures, which show the marks of some points.
+fn page(rows: &[Row], accuracy: Option<&Accuracy>, pictured: usize) -> ReportData {
     let count = |of: Use, what: &str| {
         let n = rows.iter().filter(|r| r.of == of).count();
         format!("{n} {what}{}", if n == 1 { "" } else { "s" })
@@ -259,8 +259,10 @@ fn page(rows: &[Row], accuracy: Option<&Accuracy>) -> ReportData {
     };
     data.tables.push(Table {
         title: "Every point".into(),
-        note: "The mean error of its marks, and the survey's own standard deviation along an axis and in height."
-            .into(),
+        note: format!(
+            "The mean error of its marks, and the survey's own standard deviation along an axis and in height. Pictures show the marks of {pictured} of {} points.",
+            rows.len()
+        ),
         head: texts(&["point", "use", "marks", "east", "north", "up", "sigma in the plane", "sigma up"]),
         rows: rows.iter().map(each).collect(),
     });
@@ -344,7 +346,8 @@ mod tests {
         assert!(accuracy.rms_m.east < 0.031, "ground control does not count");
         let warnings = doubts(&rows, Some(&accuracy), true);
         assert!(warnings.iter().any(|w| w.contains("0.400 m too high")), "{warnings:?}");
-        let page = page(&rows, Some(&accuracy));
+        let page = page(&rows, Some(&accuracy), 4);
+        assert!(page.tables[2].note.contains("the marks of 4 of 6 points"));
         assert!(page.tables[1].note.contains("asks for 30") && !page.tables[1].note.contains("Tested to meet"));
         assert_eq!(page.tables[2].rows.len(), 6);
         let figures = page.tables.iter().flat_map(|t| &t.rows).flat_map(|r| r.iter().skip(1));

@@ -49,7 +49,7 @@ impl FlightNumber {
 }
 
 /// Takes over the number that an earlier release kept in `before`.
-pub(crate) fn go_on_from(before: &Path, now: &Path) {
+pub(crate) fn take_over(before: &Path, now: &Path) {
     if let Ok(number) = read_not_linked(before, 64)
         && let Err(e) = write_whole(now, &number)
     {

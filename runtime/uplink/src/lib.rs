@@ -83,7 +83,7 @@ impl Source {
         let folder = if identity.is_signed() { config::state::folder(keys) } else { out.into() };
         let flight_number = Some(folder.join(&name));
         if let Some(now) = flight_number.as_deref().filter(|now| identity.is_signed() && !now.exists()) {
-            flight_number::go_on_from(&keys.join(&name), now);
+            flight_number::take_over(&keys.join(&name), now);
         }
         Ok(Self {
             mission: mission.name.clone(),

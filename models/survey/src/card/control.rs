@@ -46,11 +46,10 @@ impl SurveyedPoint {
         is_check(&self.name)
     }
 
-    /// Whether both lie within a millimetre of each other.
+    /// Whether both lie within a millimetre of each other in the plane: their heights may be from two datums.
     pub(super) fn is_at(&self, other: &Self) -> bool {
         let (a, b) = (self.position, other.position);
-        let near = |a: f64, b: f64, most: f64| (a - b).abs() < most;
-        near(a.lat_deg, b.lat_deg, SAME[1]) && near(a.lon_deg, b.lon_deg, SAME[1]) && near(a.alt_m, b.alt_m, SAME[0])
+        (a.lat_deg - b.lat_deg).abs() < SAME[1] && (a.lon_deg - b.lon_deg).abs() < SAME[1]
     }
 
     /// Takes what a row says of its standard deviations.
@@ -87,7 +86,8 @@ fn unchecked(name: &str) -> Option<&str> {
     (!is_word).then_some(rest)
 }
 
-/// Takes the points of another list among those `known`: one that two lists hold is one point with the marks of both. How many those are.
+/// Takes the points of another list among those `known`, and returns how many of them were known. Such a point has the marks of both lists,
+/// and measures the model where either says so.
 pub(super) fn join(known: &mut Vec<SurveyedPoint>, points: Vec<SurveyedPoint>) -> usize {
     let mut twice = 0;
     for point in points {
@@ -96,6 +96,9 @@ pub(super) fn join(known: &mut Vec<SurveyedPoint>, points: Vec<SurveyedPoint>) -
             continue;
         };
         twice += 1;
+        if point.is_check() && !there.is_check() {
+            there.name.clone_from(&point.name);
+        }
         for mark in point.marks {
             if !there.marks.contains(&mark) {
                 there.marks.push(mark);
@@ -107,7 +110,8 @@ pub(super) fn join(known: &mut Vec<SurveyedPoint>, points: Vec<SurveyedPoint>) -
 
 /// One line on points that may have been meant to check and hold the model: their names are words that begin with `CHK`.
 pub(super) fn doubtful_names(control: &[SurveyedPoint]) -> Option<String> {
-    let names: Vec<&str> = control.iter().map(|p| p.name.as_str()).filter(|n| after(n, "CHK").is_some()).collect();
+    let names: Vec<&str> =
+        control.iter().map(|p| p.name.as_str()).filter(|n| after(n, "CHK").is_some() && !is_check(n)).collect();
     let first = names.first()?;
     Some(format!(
         "{} surveyed points hold the model although their names begin with CHK ({first}{}); CHK-1 would measure it",
@@ -257,6 +261,9 @@ mod tests {
         assert_eq!(join(&mut known, other), 1);
         let marks: Vec<usize> = known.iter().map(|p| p.marks.len()).collect();
         assert_eq!((known[0].name.as_str(), marks), ("p", vec![3, 1, 1]));
+        // Of another height, and a check point there.
+        let other = read_text("EPSG:4326\n7.1 46 447 1 2 a.jpg CHK-q\n").unwrap();
+        assert_eq!((join(&mut known, other), known.len(), known[1].is_check()), (1, 3, true));
         let error = read_text("EPSG:4326\n7 46 400 1 2 a.jpg p\n7 46 400 3 4 b.jpg CHK-1\n").unwrap_err().to_string();
         assert!(error.contains("line 3") && error.contains("a check point or not?"), "{error}");
         assert!(doubtful_names(&known).is_none());

@@ -8,7 +8,7 @@ use models::metrics::to_rgb8;
 use pages::report::Comparison;
 use survey::dataset::{Dataset, picture_names};
 
-/// Points that are shown, and pictures of each: some 30 KB a picture.
+/// Points that are shown, and pictures of each.
 const POINTS: usize = 40;
 const PICTURES: usize = 2;
 /// What is shown around a mark, pixels to each side, and how many times it is enlarged.
@@ -53,6 +53,11 @@ impl Crops {
         let rendered = cut(&image, mark.pixel, &crosses);
         *self.of_point.entry((list, mark.point)).or_default() += 1;
         self.all.push(Crop { point: name.to_owned(), picture: mark.picture.to_owned(), crosses, rendered });
+    }
+
+    /// Points of which something is shown.
+    pub fn points(&self) -> usize {
+        self.of_point.len()
     }
 
     /// Each beside its photograph, which is decoded anew at `scale`; one that cannot be any more is left out.
