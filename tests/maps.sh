@@ -36,7 +36,7 @@ import json, sys, rasterio
 from rio_cogeo.cogeo import cog_validate
 folder = sys.argv[1]
 georef = json.load(open(folder + "/map.georef.json"))
-for name, bands, dtype in (("ortho.tif", 4, "uint8"), ("dsm.tif", 1, "float32")):
+for name, bands, dtype in (("ortho.tif", 4, "uint8"), ("dsm.tif", 1, "float32"), ("dsm_sigma.tif", 1, "float32"), ("ortho_sigma.tif", 1, "float32")):
     with rasterio.open(f"{folder}/{name}") as d:
         crs = None if d.crs is None else f"EPSG:{d.crs.to_epsg()}"
         print(name, crs, tuple(d.bounds), d.width, "x", d.height, "overviews", d.overviews(1), "nodata", d.nodata)

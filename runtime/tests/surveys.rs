@@ -33,7 +33,7 @@ use sim::world::WorldSettings;
 use sim::{SessionSettings, SimSettings};
 use survey::coverage::{CoverageMap, CoverageRegion, State};
 use survey::ortho::crs::Crs;
-use survey::ortho::files::MapFiles;
+use survey::ortho::files::{MapFiles, NO_HEIGHT, Pixels};
 use survey::ortho::grid::Grid;
 
 const PLACE: Geodetic = Geodetic { lat_deg: 47.4, lon_deg: 8.5, alt_m: 430.0 };
@@ -515,7 +515,9 @@ fn hillside(folder: &Path) -> PathBuf {
             |(x, y): (u32, u32)| grid.place(DVec2::new(f64::from(block.x + x) + 0.5, f64::from(block.y + y) + 0.5)).y;
         let heights: Vec<f32> = pixels().map(|p| (500.0 + 0.1 * (north(p) - zero)) as f32).collect();
         let mut rgba: Vec<u8> = pixels().flat_map(|_| [120, 130, 140, 255]).collect();
-        files.write(block, &mut rgba, &heights).expect("written");
+        let unknown = vec![NO_HEIGHT; heights.len()];
+        let pixels = Pixels { rgba: &mut rgba, heights: &heights, height_sigmas: &unknown, plane_sigmas: &unknown };
+        files.write(block, pixels).expect("written");
     }
     files.finish(&Disk::default(), None).expect("a map");
     folder.join("dsm.tif")

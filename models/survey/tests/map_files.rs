@@ -8,7 +8,7 @@ use disk::Disk;
 use geometry::geodesy::Geodetic;
 use glam::{DVec2, DVec3};
 use survey::ortho::crs::Crs;
-use survey::ortho::files::{MapFiles, NO_HEIGHT};
+use survey::ortho::files::{MapFiles, NO_HEIGHT, Pixels};
 use survey::ortho::grid::{BLOCK, Block, Grid};
 use survey::ortho::height_raster;
 use tiff::decoder::{Decoder, DecodingResult, Limits};
@@ -39,9 +39,16 @@ fn write(grid: &Grid, folder: &Path) -> u64 {
         let mut rgba: Vec<u8> =
             pixels.clone().flat_map(|(x, y)| if bare(x, y) { [0; 4] } else { color(x, y) }).collect();
         let heights: Vec<f32> = pixels.map(|(x, y)| if bare(x, y) { NO_HEIGHT } else { height(x, y) }).collect();
-        files.write(block, &mut rgba, &heights).unwrap();
+        let part = |of: f32| heights.iter().map(|z| if *z == NO_HEIGHT { *z } else { of * z }).collect::<Vec<f32>>();
+        let (height_sigmas, plane_sigmas) = (part(0.01), part(0.02));
+        let pixels =
+            Pixels { rgba: &mut rgba, heights: &heights, height_sigmas: &height_sigmas, plane_sigmas: &plane_sigmas };
+        files.write(block, pixels).unwrap();
     }
-    files.finish(&Disk::default(), Some(ORIGIN)).unwrap().covered
+    let written = files.finish(&Disk::default(), Some(ORIGIN)).unwrap();
+    let [height, plane] = written.sigma_m.map(|median| median.unwrap());
+    assert!((0.5..0.7).contains(&height) && (plane / height - 2.0).abs() < 0.1, "{height} {plane}");
+    written.covered
 }
 
 #[test]
@@ -51,7 +58,7 @@ fn another_program_reads_the_pixels_the_place_and_the_overviews() {
     let [columns, rows] = grid.size();
     let covered = write(&grid, folder.path());
     assert_eq!(covered, u64::from(columns) * u64::from(rows) - 100 - u64::from(BLOCK * BLOCK));
-    for name in ["ortho.tif", "dsm.tif"] {
+    for (name, of) in [("ortho.tif", 0.0), ("dsm.tif", 1.0), ("dsm_sigma.tif", 0.01), ("ortho_sigma.tif", 0.02)] {
         let file = File::open(folder.path().join(name)).unwrap();
         let mut tif = Decoder::new(file).unwrap().with_limits(Limits::unlimited());
         assert_eq!(tif.dimensions().unwrap(), (columns, rows));
@@ -77,7 +84,7 @@ fn another_program_reads_the_pixels_the_place_and_the_overviews() {
                 assert_eq!(tif.get_tag_ascii_string(Tag::GdalNodata).unwrap(), "-9999");
                 let at = |x: u32, y: u32| heights[(y * columns + x) as usize];
                 for (x, y) in [(10, 0), (511, 511), (5, 512), (columns - 1, rows - 1)] {
-                    assert_eq!(at(x, y), height(x, y), "{x} {y}");
+                    assert_eq!(at(x, y), of * height(x, y), "{x} {y}");
                 }
                 assert_eq!((at(0, 0), at(600, 100)), (NO_HEIGHT, NO_HEIGHT));
             }
@@ -110,7 +117,7 @@ fn another_program_reads_the_pixels_the_place_and_the_overviews() {
         assert!(small.width() <= 640 && small.height() <= 640 && small.width() > 300);
     }
     let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
-    assert_eq!(left.len(), 7, "nothing else stays: {left:?}");
+    assert_eq!(left.len(), 11, "nothing else stays: {left:?}");
 }
 
 #[test]

@@ -11,7 +11,7 @@ use std::sync::atomic::Ordering;
 use glam::DVec2;
 use heap::{MOST, NOW};
 use survey::ortho::crs::Crs;
-use survey::ortho::files::MapFiles;
+use survey::ortho::files::{MapFiles, Pixels};
 use survey::ortho::grid::{BLOCK, Grid};
 
 /// 72 million pixels hold no more than 5 million: blocks go to the disk.
@@ -26,7 +26,10 @@ fn memory_does_not_grow_with_the_map() {
         // A diagonal of blocks: the others are not there, as around most flights.
         for block in files.blocks().to_vec().into_iter().filter(|b| b.x / BLOCK == b.y / BLOCK) {
             let n = (block.width * block.height) as usize;
-            files.write(block, &mut vec![200; 4 * n], &vec![1.5; n]).unwrap();
+            let metres = vec![1.5; n];
+            let pixels =
+                Pixels { rgba: &mut vec![200; 4 * n], heights: &metres, height_sigmas: &metres, plane_sigmas: &metres };
+            files.write(block, pixels).unwrap();
         }
         files.finish(&Default::default(), None).unwrap();
         MOST.load(Ordering::Relaxed) - before

@@ -14,7 +14,7 @@ use models::formats::FormatError;
 use models::formats::model::{self, Chunks, ModelHeader};
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
-use survey::ortho::grid::BLOCK;
+use survey::ortho::grid::DRAWN;
 use vulkan::trainer::{PictureStore, TrainError, Trainer};
 
 use super::pieces;
@@ -178,7 +178,7 @@ pub fn file_renderer(
 /// # Errors
 /// Errors of [`renderer`]; the model cannot be read any more.
 pub fn map_renderer(device: Option<&str>, model: &Chunks) -> Result<Trainer, EngineError> {
-    renderer_of_pieces(device, model, (BLOCK, BLOCK), INSTANCES_PER_MAP_PIXEL)
+    renderer_of_pieces(device, model, (DRAWN, DRAWN), INSTANCES_PER_MAP_PIXEL)
 }
 
 fn renderer_of_pieces(

@@ -154,6 +154,14 @@ fn compare_heights(args: &Args, reference: &Path) -> Result<(), CliError> {
         scores.median_abs_m,
         scores.le90_m
     );
+    if let Some(sigmas) = &scores.sigmas {
+        outln!(
+            "the map's standard deviations: median {:.3} m, {:.1} % of the errors within one, {:.1} % within two",
+            sigmas.median_m,
+            100.0 * sigmas.within_one,
+            100.0 * sigmas.within_two
+        );
+    }
     Ok(())
 }
 

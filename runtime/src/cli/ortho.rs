@@ -11,7 +11,6 @@ use job::console;
 use job::interrupt;
 use measure::contours;
 use measure::heights::{HeightMap, MOST_PIXELS};
-use measure::noise::Noise;
 use models::formats::model::Chunks;
 use survey::coordinates::Reference;
 use survey::ortho::files::Written;
@@ -23,8 +22,10 @@ use crate::error::JobError;
 /// Arguments of `dgtr ortho`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes ortho.tif (colour and alpha), dsm.tif (heights, metres), world files, small pictures of both, and \
-                        map.georef.json. The reference system is the UTM zone of the model's origin."
+    after_help = "Writes ortho.tif (colour and alpha), dsm.tif (heights, metres), dsm_sigma.tif and ortho_sigma.tif (standard deviations \
+                        of heights and of places, metres), world files, small pictures, and map.georef.json. The reference system is \
+                        the UTM zone of the model's origin. Standard deviations are those within the map: what the poses put it off by \
+                        as a whole is not in them."
 )]
 pub struct Args {
     /// The .dgtr model.
@@ -47,6 +48,9 @@ pub struct Args {
     /// Leave out ground that fewer training pictures saw.
     #[arg(long, value_name = "N", default_value_t = MapRequest::default().min_views)]
     pub min_views: usize,
+    /// Leave out ground whose height has a larger standard deviation, or none, centimetres.
+    #[arg(long, value_name = "CM", value_parser = above_zero)]
+    pub max_sigma: Option<f64>,
     /// Also draw lines of equal height every M metres: contours.geojson and contours.dxf.
     #[arg(long, value_name = "M", value_parser = above_zero)]
     pub contours: Option<f64>,
@@ -57,7 +61,7 @@ pub struct Args {
 
 fn above_zero(text: &str) -> Result<f64, String> {
     let metres = text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0);
-    metres.ok_or_else(|| "a height above zero is needed, metres".to_owned())
+    metres.ok_or_else(|| "a length above zero is needed".to_owned())
 }
 
 fn ups() -> impl TypedValueParser<Value = Up> {
@@ -82,6 +86,7 @@ pub fn run(args: Args) -> Result<(), CliError> {
         epsg: args.epsg,
         bounds: args.bounds,
         min_views: args.min_views,
+        max_sigma_m: args.max_sigma.map(|cm| cm / 100.0),
         up: args.up,
         ..MapRequest::default()
     };
@@ -93,11 +98,17 @@ pub fn run(args: Args) -> Result<(), CliError> {
         tracing::info!("{}: the map's metres are not those of the pictures' poses ({local})", args.out.display());
     }
     if let Some(interval) = args.contours {
-        draw_contours(&args.out, interval)?;
+        draw_contours(&args.out, interval, map.surface().side())?;
     }
     let crs = map.grid().crs().epsg().map_or("the model's own metres".to_owned(), |code| format!("EPSG:{code}"));
+    let worth = match written.sigma_m {
+        [Some(height), Some(plane)] => {
+            format!("heights within ± {height:.3} m and places within ± {plane:.3} m of each other (medians)")
+        }
+        _ => "nothing vouches for its heights: fewer than two pictures show them".to_owned(),
+    };
     progress.finish(&format!(
-        "{}: {columns} × {rows} pixels of {:.3} m in {crs}, {:.1} % covered",
+        "{}: {columns} × {rows} pixels of {:.3} m in {crs}, {:.1} % covered, {worth}",
         args.out.display(),
         map.grid().gsd(),
         100.0 * written.covered as f64 / (f64::from(columns) * f64::from(rows)),
@@ -151,14 +162,13 @@ fn is_model(path: &Path) -> bool {
     read.is_ok() && &head == b"dgtr"
 }
 
-/// Draws lines of equal height of the map in `folder`, smoothed over what errors reach.
-fn draw_contours(folder: &Path, interval: f64) -> Result<(), CliError> {
+/// Draws lines of equal height of the map in `folder`, of the means of squares of `side` pixels: nearer heights share their rays.
+fn draw_contours(folder: &Path, interval: f64, side: usize) -> Result<(), CliError> {
     let mut map = HeightMap::open(&folder.join("dsm.tif"))?;
     let reference = map.epsg().and_then(|code| Reference::named(&format!("EPSG:{code}"))).transpose();
     let reference = reference.map_err(CliError::input)?;
     let Some(heights) = map.part(map.bounds(), MOST_PIXELS)? else { return Ok(()) };
-    let reach = Noise::of(&heights).map_or(1.0, |noise| noise.reach_m / heights.gsd());
-    let contours = contours::draw(&heights.coarser(reach.round() as usize), interval)?;
+    let contours = contours::draw(&heights.coarser(side), interval)?;
     let disk = Disk::default();
     let [geojson, dxf] = ["contours.geojson", "contours.dxf"].map(|name| folder.join(name));
     disk.replace(&geojson, |file| contours::write_geojson(file, &contours, reference.as_ref()))

@@ -9,7 +9,7 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use serde_json::Value;
 use survey::ortho::crs::Crs;
-use survey::ortho::files::MapFiles;
+use survey::ortho::files::{MapFiles, NO_HEIGHT, Pixels};
 use survey::ortho::grid::Grid;
 
 use super::{dgtr, error_line, has_device};
@@ -26,7 +26,9 @@ fn map(folder: &Path, height: impl Fn(DVec2) -> f64) -> PathBuf {
         let rough = |p: DVec2| 0.03 * ((p.x * 91.7).sin() + (p.y * 73.3).cos() + (p.x * p.y * 17.9).sin());
         let heights: Vec<f32> = pixels().map(place).map(|p| (height(p) + rough(p)) as f32).collect();
         let mut rgba: Vec<u8> = pixels().flat_map(|_| [120, 130, 140, 255]).collect();
-        files.write(block, &mut rgba, &heights).unwrap();
+        let unknown = vec![NO_HEIGHT; heights.len()];
+        let pixels = Pixels { rgba: &mut rgba, heights: &heights, height_sigmas: &unknown, plane_sigmas: &unknown };
+        files.write(block, pixels).unwrap();
     }
     files.finish(&Disk::default(), None).unwrap();
     folder.to_owned()

@@ -2,23 +2,27 @@
 //! shows from straight above, and with heights taken directly from the first Gaussians, the fused depth maps.
 
 mod picture;
+pub mod survey;
 
-use sim::world::{FromAbove, MapKind, World};
+use models::camera::{Pinhole, Pose, View};
+use sim::world::{FromAbove, MapKind, PinholeView, World};
 use std::path::Path;
 
+use ::survey::ortho::files::NO_HEIGHT;
+use ::survey::ortho::grid::{Block, Grid};
 use engine::device::map_renderer;
-use engine::evaluate::heights::HeightScores;
+use engine::evaluate::heights::{Compared as Height, HeightScores};
 use engine::ortho::{DrawnBlock, Map, MapRequest};
 use glam::{DMat4, DVec2, DVec3, DVec4};
 use models::cloud::GaussianCloud;
 use models::formats::model::{self, Chunks, ModelHeader};
 use serde::Serialize;
-use survey::ortho::files::NO_HEIGHT;
-use survey::ortho::grid::{Block, Grid};
 
 use super::child;
-use runtime::device_report::survey as world;
+use runtime::device_report::survey as usual;
 use runtime::error::JobError;
+
+use survey::Survey;
 
 /// Roofs and ground within so many pixels of a step in height are left out of the figures: there, half a pixel aside is
 /// metres up or down.
@@ -27,6 +31,8 @@ const EDGE_PIXELS: i64 = 2;
 const STEP_M: f64 = 0.5;
 /// Squares whose shift against the exact orthophoto is measured, pixels a side.
 const PATCH: u32 = 64;
+/// What lies behind what a picture shows by more than this share of its depth is hidden in it.
+const BEHIND: f64 = 0.01;
 /// Share of a square that must hold ground.
 const PATCH_COVER: f64 = 0.9;
 /// Rounds of Gauss–Newton on a square's shift.
@@ -39,7 +45,7 @@ pub struct MapScores {
     pub gsd_m: f64,
     /// Pixels compared.
     pub pixels: usize,
-    /// Of the ground that two pictures saw, the share that the map shows.
+    /// Of the ground that enough pictures saw, the share that the map shows.
     pub covered: f64,
     /// Orthophoto against the exact one, dB.
     pub psnr: f64,
@@ -51,6 +57,10 @@ pub struct MapScores {
     pub heights: HeightScores,
     /// Heights from the fused depth maps alone.
     pub fused_depth: HeightScores,
+    /// Heights of all that has one, steps included and plants not.
+    pub all_heights: HeightScores,
+    /// Of the squares' shifts along both axes, the shares within one and two standard deviations of places.
+    pub shift_within: [f64; 2],
 }
 
 /// A map and the truth, pixel by pixel.
@@ -60,19 +70,31 @@ struct Compared {
     /// Red, green, blue, 0 to 1; `None` where the map has nothing.
     drawn: Vec<Option<[f32; 3]>>,
     heights: Vec<f32>,
+    height_sigmas: Vec<f32>,
+    plane_sigmas: Vec<f32>,
     truth: Vec<FromAbove>,
     /// Where in the model, metres.
     places: Vec<DVec2>,
 }
 
-/// Writes the simulated survey to `out`, trains it with `training` (flags of `dgtr train`) and measures its map, without the
-/// ground that fewer than `min_views` pictures saw.
+/// Writes a simulated survey (none: the one that `doctor` flies) to `out`, trains it with `training` (flags of `dgtr train`) and measures
+/// its map, without the ground that fewer than `min_views` pictures saw.
 ///
 /// # Errors
 /// The training fails, or the folder cannot be written to.
-pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> Result<MapScores, JobError> {
-    let (data, world) = (out.join("data"), world::world(seed));
-    world::write_data_set(&data, seed, 1.0)?;
+pub fn measure(
+    out: &Path,
+    survey: Option<&Survey>,
+    seed: u64,
+    min_views: usize,
+    training: &[String],
+) -> Result<MapScores, JobError> {
+    let data = out.join("data");
+    let world = survey.map_or_else(|| usual::world(seed), |survey| survey.world(seed));
+    match survey {
+        None => usual::write_data_set(&data, seed, 1.0)?,
+        Some(survey) => survey.write(&data, &world)?,
+    }
     let train = |name: &str, more: &[String]| {
         let mut arguments = ["train", &data.display().to_string(), "--fresh", "--seed"].map(str::to_owned).to_vec();
         arguments.push(seed.to_string());
@@ -89,35 +111,70 @@ pub fn measure(out: &Path, seed: u64, min_views: usize, training: &[String]) -> 
     let origin = model.header.origin.map_or(0.0, |o| o.alt_m);
     let level: Vec<bool> = (0..compared.truth.len()).map(|i| compared.is_level(i)).collect();
     let fused = fused_heights(&first, &compared, map.grid().gsd());
-    let errors_of = |height: &dyn Fn(usize) -> Option<f64>| {
-        let compare = |i: usize| compared.drawn[i].and_then(|_| height(i)).map(|h| h - compared.truth[i].height);
-        let all: Vec<Option<f64>> = (0..level.len()).filter(|i| level[*i]).map(compare).collect();
+    let errors_of = |counts: &dyn Fn(usize) -> bool, height: &dyn Fn(usize) -> Option<(f64, Option<f64>)>| {
+        let compare = |i: usize| {
+            let (z, sigma) = compared.drawn[i].and_then(|_| height(i))?;
+            Some(Height { error: z - compared.truth[i].height, sigma })
+        };
+        let all: Vec<Option<Height>> = (0..level.len()).filter(|i| counts(*i)).map(compare).collect();
         let missing = all.iter().filter(|e| e.is_none()).count();
-        HeightScores::of(&all.into_iter().flatten().collect::<Vec<f64>>(), missing)
+        HeightScores::of(&all.into_iter().flatten().collect::<Vec<Height>>(), missing)
+    };
+    let is_level = |i: usize| level[i];
+    let drawn_height = |i: usize| {
+        let sigma = Some(f64::from(compared.height_sigmas[i])).filter(|sigma| *sigma >= 0.0);
+        Some((f64::from(compared.heights[i]) - origin, sigma))
     };
     picture::write(&out.join("errors.png"), &compared, &level, origin)?;
-    let (shift_px, squares) = compared.shift();
+    let (shift_px, squares, shift_within) = compared.shift(map.grid().gsd());
     let drawn = compared.drawn.iter().flatten().count();
     Ok(MapScores {
         gsd_m: map.grid().gsd(),
         pixels: drawn,
-        covered: drawn as f64 / seen_pixels(&map, &model.header, &compared) as f64,
+        covered: covered(&map, &model.header, &compared, &world),
         psnr: compared.psnr(),
         shift_px,
         squares,
-        heights: errors_of(&|i| Some(f64::from(compared.heights[i]) - origin)),
-        fused_depth: errors_of(&|i| fused[i]),
+        heights: errors_of(&is_level, &drawn_height),
+        fused_depth: errors_of(&is_level, &|i| fused[i].map(|z| (z, None))),
+        all_heights: errors_of(&|i| compared.truth[i].kind != MapKind::Plant, &drawn_height),
+        shift_within,
     })
 }
 
-/// Pixels whose true surface at least two pictures saw.
-fn seen_pixels(map: &Map, header: &ModelHeader, compared: &Compared) -> usize {
-    let views: Vec<_> = header.views.iter().map(|(_, v)| (models::camera::Pinhole::from(v), v.intrinsics)).collect();
-    let seen = |i: &usize| {
+/// Of the pixels whose true surface enough pictures saw, the share that the map shows.
+fn covered(map: &Map, header: &ModelHeader, compared: &Compared, world: &World) -> f64 {
+    let views: Vec<_> = header.views.iter().map(|(_, view)| (Pinhole::from(view), photographed(world, view))).collect();
+    let is_seen = |i: &usize| {
         let point = compared.places[*i].extend(compared.truth[*i].height);
-        views.iter().filter(|(c, k)| c.project(point).is_some_and(|p| k.contains(p))).count() >= map.min_views()
+        views.iter().filter(|(camera, depths)| shows(camera, depths, point)).count() >= map.min_views()
     };
-    (0..compared.truth.len()).filter(seen).count().max(1)
+    let seen: Vec<usize> = (0..compared.truth.len()).filter(is_seen).collect();
+    let drawn = seen.iter().filter(|i| compared.drawn[**i].is_some()).count();
+    drawn as f64 / seen.len().max(1) as f64
+}
+
+/// The true depths of a view, metres.
+struct Depths {
+    width: usize,
+    of: Vec<f32>,
+}
+
+fn photographed(world: &World, view: &View) -> Depths {
+    let k = &view.intrinsics;
+    let [fx, fy, cx, cy] = [k.fx, k.fy, k.cx, k.cy].map(f64::from);
+    let Pose { rotation, center: position } = view.pose;
+    let camera = PinholeView { width: k.width, height: k.height, fx, fy, cx, cy, position, rotation };
+    Depths { width: k.width as usize, of: world.render(&camera).1 }
+}
+
+/// Whether a picture shows a point, and nothing before it.
+fn shows(camera: &Pinhole, depths: &Depths, point: DVec3) -> bool {
+    let depth = camera.local(point).z;
+    camera.project(point).filter(|p| p.cmpge(DVec2::ZERO).all() && p.x < depths.width as f64).is_some_and(|p| {
+        let at = depths.of.get(p.y as usize * depths.width + p.x as usize);
+        at.is_some_and(|seen| depth - f64::from(*seen) < BEHIND * depth)
+    })
 }
 
 fn draw(map: &Map, model: &Chunks, world: &World) -> Result<Compared, JobError> {
@@ -131,6 +188,8 @@ fn draw(map: &Map, model: &Chunks, world: &World) -> Result<Compared, JobError> 
         rows,
         drawn: vec![None; n],
         heights: vec![NO_HEIGHT; n],
+        height_sigmas: vec![NO_HEIGHT; n],
+        plane_sigmas: vec![NO_HEIGHT; n],
         truth: vec![nothing; n],
         places: vec![DVec2::ZERO; n],
     };
@@ -147,6 +206,8 @@ fn draw(map: &Map, model: &Chunks, world: &World) -> Result<Compared, JobError> 
                 if is_drawn && drawn.rgba[4 * from + 3] > 0 {
                     let color = [0, 1, 2].map(|c| f32::from(drawn.rgba[4 * from + c]) / 255.0);
                     (all.drawn[to], all.heights[to]) = (Some(color), drawn.heights[from]);
+                    (all.height_sigmas[to], all.plane_sigmas[to]) =
+                        (drawn.height_sigmas[from], drawn.plane_sigmas[from]);
                 }
             }
         }
@@ -236,18 +297,31 @@ impl Compared {
         -10.0 * (sum / n.max(1) as f64).log10()
     }
 
-    /// Root mean square over squares of how far each is shifted against the truth, and their number.
-    fn shift(&self) -> (f64, usize) {
-        let (mut sum, mut n) = (0.0, 0usize);
+    /// Root mean square over squares of how far each is shifted against the truth, their number, and the shares of the shifts along both
+    /// axes that are within one and two standard deviations of the square's places.
+    fn shift(&self, gsd: f64) -> (f64, usize, [f64; 2]) {
+        let (mut sum, mut n, mut within) = (0.0, 0usize, [0usize; 2]);
         for y in (1..self.rows.saturating_sub(PATCH as usize + 1)).step_by(PATCH as usize) {
             for x in (1..self.columns.saturating_sub(PATCH as usize + 1)).step_by(PATCH as usize) {
                 if let Some(shift) = self.shift_of([x, y]) {
                     sum += shift.length_squared();
                     n += 1;
+                    let sigma = self.plane_sigma([x, y]) / gsd;
+                    let inside = |times: f64| shift.to_array().iter().filter(|s| s.abs() <= times * sigma).count();
+                    within = [within[0] + inside(1.0), within[1] + inside(2.0)];
                 }
             }
         }
-        ((sum / n.max(1) as f64).sqrt(), n)
+        let n_or_one = n.max(1) as f64;
+        ((sum / n_or_one).sqrt(), n, within.map(|k| k as f64 / (2.0 * n_or_one)))
+    }
+
+    /// Median of the standard deviations of a square's places, metres.
+    fn plane_sigma(&self, [x0, y0]: [usize; 2]) -> f64 {
+        let side = PATCH as usize;
+        let all = (y0..y0 + side).flat_map(|y| self.plane_sigmas[y * self.columns + x0..][..side].iter());
+        let mut known: Vec<f64> = all.filter(|sigma| **sigma >= 0.0).map(|sigma| f64::from(*sigma)).collect();
+        geometry::median(&mut known).unwrap_or(0.0)
     }
 
     /// Least squares over the square's pixels: drawn(p) = gain · truth(p + shift) + offset (Lucas & Kanade 1981). `None` where

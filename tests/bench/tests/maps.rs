@@ -50,13 +50,29 @@ fn the_map_of_a_simulated_survey_is_true_and_better_than_its_depth_maps() {
         "{scores}"
     );
 
+    // Two of three errors are within what the map says of them, and nearly all within twice that.
+    let sigmas = &scores["all_heights"]["sigmas"];
+    let share = |name: &str| sigmas[name].as_f64().expect(name);
+    assert!((0.60..=0.82).contains(&share("within_one")) && share("within_two") > 0.9, "{scores}");
+    assert!(share("median_m") < 2.5 * height("all_heights", "median_abs_m"), "{scores}");
+
     // The same model by `dgtr ortho`, and by `dgtr eval` against points that lie on the plane z = 0 but for one.
     let model = "survey/trained/model.dgtr";
     let output = run(dir.path(), &["ortho", model, "--out", "map", "--gsd", "25", "--min-views", "4"]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let georef = json(&dir.path().join("map/map.georef.json"));
     assert_eq!((georef["crs"].as_str(), georef["gsd_m"].as_f64()), (Some("EPSG:32632"), Some(0.25)));
-    assert!(georef["covered_pixels"].as_u64() > Some(10_000), "{georef}");
+    let covered = georef["covered_pixels"].as_u64().expect("a count");
+    assert!(covered > 10_000, "{georef}");
+    let sigma = georef["height_sigma_m"].as_f64().expect("a median");
+    assert!((0.01..0.3).contains(&sigma) && georef["plane_sigma_m"].as_f64() < Some(sigma), "{georef}");
+    // What is worth less than the median is about half of it.
+    let most = (100.0 * sigma).to_string();
+    let cut = ["ortho", model, "--out", "cut", "--gsd", "25", "--min-views", "4", "--max-sigma", &most];
+    let output = run(dir.path(), &cut);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let left = json(&dir.path().join("cut/map.georef.json"))["covered_pixels"].as_u64().expect("a count");
+    assert!(left.abs_diff(covered / 2) < covered / 10, "{left} of {covered}");
     std::fs::write(dir.path().join("points.csv"), "x,y,z\n0,0,0\n5,5,0\n5,5,0\n9000,0,0\n").expect("written");
     let output = run(dir.path(), &["eval", model, "--heights", "points.csv", "--json"]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -1,4 +1,4 @@
-//! What ground a map of a model covers, how high that ground is, from how high it may be looked at, and who saw it.
+//! What ground a map of a model covers, how high that ground is, from how high it may be looked at, and the views around it.
 
 use geometry::median;
 use glam::{DVec2, DVec3, Vec3};
@@ -109,33 +109,37 @@ impl Extent {
         !self.views.is_empty()
     }
 
-    /// The views whose ground overlaps a square of half side `reach` around a place: those to ask with [`ViewsAround::count`].
+    /// The views whose ground overlaps a square of half side `reach` around a place.
     pub fn views_around(&self, place: DVec2, reach: f64) -> ViewsAround<'_> {
         let (low, high) = (place - reach, place + reach);
-        let overlaps = |v: &&Footprint| v.low.cmple(high).all() && v.high.cmpge(low).all();
-        ViewsAround(self.views.iter().filter(overlaps).collect())
+        let overlaps = |(_, v): &(usize, &Footprint)| v.low.cmple(high).all() && v.high.cmpge(low).all();
+        ViewsAround(self.views.iter().enumerate().filter(overlaps).collect())
     }
 }
 
-/// Views around a place.
-pub struct ViewsAround<'a>(Vec<&'a Footprint>);
+/// Views around a place, each with its number among those of the extent.
+pub struct ViewsAround<'a>(Vec<(usize, &'a Footprint)>);
 
 impl ViewsAround<'_> {
-    /// How many views there are to ask.
+    /// How many views there are.
     pub fn views(&self) -> usize {
         self.0.len()
     }
 
-    /// How many pictures have a world point in them.
-    pub fn count(&self, point: DVec3) -> usize {
+    /// Each of them.
+    pub fn each(&self) -> impl Iterator<Item = (usize, &View)> {
+        self.0.iter().map(|(i, footprint)| (*i, &footprint.view))
+    }
+
+    /// Those that have a world point in their frusta: the pixel where, and the depth.
+    pub fn showing(&self, point: DVec3) -> impl Iterator<Item = (usize, &View, [f32; 3])> {
         let p = point.as_vec3();
-        let sees = |v: &&&Footprint| {
-            let k = &v.view.intrinsics;
-            v.projector
-                .project(p)
-                .is_some_and(|(x, y, _)| (0.0..k.width as f32).contains(&x) && (0.0..k.height as f32).contains(&y))
-        };
-        self.0.iter().filter(sees).count()
+        self.0.iter().filter_map(move |(i, footprint)| {
+            let k = &footprint.view.intrinsics;
+            let (x, y, depth) = footprint.projector.project(p)?;
+            let is_inside = (0.0..k.width as f32).contains(&x) && (0.0..k.height as f32).contains(&y);
+            is_inside.then_some((*i, &footprint.view, [x, y, depth]))
+        })
     }
 }
 
@@ -254,10 +258,10 @@ mod tests {
     }
 
     #[test]
-    fn who_saw_a_point_is_counted() {
+    fn who_has_a_point_in_its_frustum_is_told() {
         let views = [nadir(DVec3::new(0.0, 0.0, 58.0)), nadir(DVec3::new(20.0, 0.0, 58.0))];
         let extent = Extent::of(&cloud(), &views, &[]).unwrap();
-        let count = |x: f64| extent.views_around(DVec2::new(x, 0.0), 5.0).count(DVec3::new(x, 0.0, 10.0));
+        let count = |x: f64| extent.views_around(DVec2::new(x, 0.0), 5.0).showing(DVec3::new(x, 0.0, 10.0)).count();
         assert_eq!([count(-30.0), count(5.0), count(50.0), count(80.0)], [1, 2, 1, 0]);
     }
 

@@ -10,6 +10,10 @@ use models::camera::{OrthographicView, Pose};
 
 /// Side of the blocks that a map is drawn and stored in, pixels.
 pub const BLOCK: u32 = 512;
+/// Pixels around a block that are drawn with it, so that what depends on its surroundings has no seams.
+pub const MARGIN: u32 = 16;
+/// Side of what is drawn of a block, pixels.
+pub const DRAWN: u32 = BLOCK + 2 * MARGIN;
 /// Longest side of a map, pixels.
 pub const MAX_SIDE: u32 = 1 << 18;
 
@@ -39,7 +43,7 @@ pub struct Block {
     pub height: u32,
 }
 
-/// A block as it is drawn: `BLOCK` × `BLOCK` pixels, those outside of the map included.
+/// A block as it is drawn: `DRAWN` × `DRAWN` pixels, of which the block's begin at `MARGIN`; those outside of the map are included.
 #[derive(Clone, Copy, Debug)]
 pub struct BlockView {
     /// The camera.
@@ -154,8 +158,8 @@ impl Grid {
         let y = (south - south.dot(x) * x).normalize();
         let rotation = DQuat::from_mat3(&DMat3::from_cols(x, y, x.cross(y)));
         let view = OrthographicView {
-            width: BLOCK,
-            height: BLOCK,
+            width: DRAWN,
+            height: DRAWN,
             pixels_per_metre: [1.0 / east.length(), 1.0 / south.length()],
             pose: Pose { rotation, center },
         };
@@ -202,7 +206,8 @@ mod tests {
                 let pixel = DVec2::new(f64::from(block.x) + u, f64::from(block.y) + v);
                 let world = grid.crs().to_enu(grid.place(pixel).extend(60.0 + z)).unwrap();
                 let c = view.pose.rotation.conjugate() * (world - view.pose.center);
-                let drawn = [0, 1].map(|k| c[k] * view.pixels_per_metre[k] + f64::from(BLOCK) / 2.0);
+                let drawn =
+                    [0, 1].map(|k| c[k] * view.pixels_per_metre[k] + f64::from(DRAWN) / 2.0 - f64::from(MARGIN));
                 worst = worst.max((drawn[0] - u).abs()).max((drawn[1] - v).abs());
                 assert!((top_m - c.z - (60.0 + z)).abs() < 1e-3, "height {} of {}", top_m - c.z, 60.0 + z);
             }

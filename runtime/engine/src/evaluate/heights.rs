@@ -36,6 +36,30 @@ pub struct HeightScores {
     pub median_abs_m: f64,
     /// 90 % are no farther off.
     pub le90_m: f64,
+    /// How the map's standard deviations hold; none where no height has one.
+    pub sigmas: Option<SigmaScores>,
+}
+
+/// How standard deviations hold against errors.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct SigmaScores {
+    /// Heights that have one.
+    pub points: usize,
+    /// Their median, metres.
+    pub median_m: f64,
+    /// Share of the errors within one of them: 0.683 where errors are normal.
+    pub within_one: f64,
+    /// Within two: 0.954.
+    pub within_two: f64,
+}
+
+/// A height that was compared, metres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Compared {
+    /// The map's less the reference.
+    pub error: f64,
+    /// What the map says of its standard deviation.
+    pub sigma: Option<f64>,
 }
 
 /// The points of a reference in the model's frame: a file of surveyed points, a raster of heights where `map` has ground, or a data
@@ -95,9 +119,12 @@ pub fn compare(map: &Map, trainer: &mut Trainer, points: &[DVec3]) -> Result<Hei
         }
         for (pixel, height) in points {
             let at = (pixel.y as u32 - y) * block.width + (pixel.x as u32 - x);
-            match drawn.heights[at as usize] {
-                NO_HEIGHT => missing += 1,
-                drawn => errors.push(f64::from(drawn) - height),
+            let of = |values: &[f32]| Some(values[at as usize]).filter(|v| *v != NO_HEIGHT).map(f64::from);
+            match of(&drawn.heights) {
+                None => missing += 1,
+                Some(drawn_height) => {
+                    errors.push(Compared { error: drawn_height - height, sigma: of(&drawn.height_sigmas) });
+                }
             }
         }
     }
@@ -105,38 +132,68 @@ pub fn compare(map: &Map, trainer: &mut Trainer, points: &[DVec3]) -> Result<Hei
 }
 
 impl HeightScores {
-    /// Of errors in metres, and the number of points without one.
-    pub fn of(errors: &[f64], missing: usize) -> Self {
-        if errors.is_empty() {
+    /// Of what was compared, and the number of points that could not be.
+    pub fn of(compared: &[Compared], missing: usize) -> Self {
+        if compared.is_empty() {
             return Self { missing, ..Self::default() };
         }
-        let n = errors.len() as f64;
-        let mut sizes: Vec<f64> = errors.iter().map(|e| e.abs()).collect();
-        sizes.sort_by(f64::total_cmp);
-        let quantile = |share: f64| sizes[((sizes.len() - 1) as f64 * share).round() as usize];
+        let n = compared.len() as f64;
+        let errors = || compared.iter().map(|c| c.error);
+        let sizes = sorted(errors().map(f64::abs));
         Self {
-            points: errors.len(),
+            points: compared.len(),
             missing,
-            bias_m: errors.iter().sum::<f64>() / n,
-            rmse_m: (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt(),
-            median_abs_m: quantile(0.5),
-            le90_m: quantile(0.9),
+            bias_m: errors().sum::<f64>() / n,
+            rmse_m: (errors().map(|e| e * e).sum::<f64>() / n).sqrt(),
+            median_abs_m: quantile(&sizes, 0.5),
+            le90_m: quantile(&sizes, 0.9),
+            sigmas: SigmaScores::of(compared),
         }
     }
 }
 
+impl SigmaScores {
+    fn of(compared: &[Compared]) -> Option<Self> {
+        let known = || compared.iter().filter_map(|c| c.sigma.map(|sigma| (c.error.abs(), sigma)));
+        let sigmas = sorted(known().map(|(_, sigma)| sigma));
+        let within =
+            |times: f64| known().filter(|(size, sigma)| *size <= times * sigma).count() as f64 / sigmas.len() as f64;
+        (!sigmas.is_empty()).then(|| Self {
+            points: sigmas.len(),
+            median_m: quantile(&sigmas, 0.5),
+            within_one: within(1.0),
+            within_two: within(2.0),
+        })
+    }
+}
+
+fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut all: Vec<f64> = values.collect();
+    all.sort_by(f64::total_cmp);
+    all
+}
+
+fn quantile(sorted: &[f64], share: f64) -> f64 {
+    sorted[((sorted.len() - 1) as f64 * share).round() as usize]
+}
+
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 mod tests {
     use super::*;
 
     #[test]
     fn the_figures_are_those_of_the_errors() {
-        let errors: Vec<f64> = (0..=100).map(|i| f64::from(i) / 100.0 - 0.25).collect();
-        let s = HeightScores::of(&errors, 7);
+        let of = |i: u32| Compared { error: f64::from(i) / 100.0 - 0.25, sigma: (i >= 25).then_some(0.25) };
+        let compared: Vec<Compared> = (0..=100).map(of).collect();
+        let s = HeightScores::of(&compared, 7);
         assert_eq!((s.points, s.missing), (101, 7));
         assert!((s.bias_m - 0.25).abs() < 1e-12, "{s:?}");
         assert!((s.rmse_m - (0.0625f64 + 0.085).sqrt()).abs() < 1e-9, "{s:?}");
         assert!((s.median_abs_m - 0.26).abs() < 0.02 && (s.le90_m - 0.65).abs() < 0.011, "{s:?}");
+        let sigmas = s.sigmas.unwrap();
+        assert_eq!((sigmas.points, sigmas.median_m), (76, 0.25));
+        assert!((sigmas.within_one - 26.0 / 76.0).abs() < 1e-12 && (sigmas.within_two - 51.0 / 76.0).abs() < 1e-12);
         assert_eq!(HeightScores::of(&[], 3), HeightScores { missing: 3, ..Default::default() });
     }
 }
