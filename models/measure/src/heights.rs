@@ -62,6 +62,28 @@ impl HeightMap {
         Ok(map)
     }
 
+    /// The standard deviations of its heights: `NAME_sigma.tif` beside `NAME.tif`, as a map of ours has them. `None` where there is none.
+    ///
+    /// # Errors
+    /// It cannot be read, or its pixels are not those of the heights.
+    pub fn sigmas(&self) -> Result<Option<Self>, MeasureError> {
+        let Some(name) = self.path.file_stem() else { return Ok(None) };
+        let beside = self.path.with_file_name(format!("{}_sigma.tif", name.to_string_lossy()));
+        if !beside.is_file() {
+            return Ok(None);
+        }
+        let sigmas = Self::open(&beside)?;
+        let pixels = |map: &Self| (map.raster.place(), map.raster.size(), map.epsg());
+        match pixels(&sigmas) == pixels(self) {
+            true => Ok(Some(sigmas)),
+            false => Err(FormatError::invalid(
+                &beside,
+                format!("its pixels are not those of {}; draw the map again, or move it away", self.path.display()),
+            )
+            .into()),
+        }
+    }
+
     /// EPSG code of its reference system; `None`: metres of its own.
     pub fn epsg(&self) -> Option<u16> {
         self.raster.epsg()

@@ -3,7 +3,7 @@
 #![allow(clippy::expect_used, clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use glam::{DVec2, DVec3};
-use measure::change::{Change, find};
+use measure::change::{Change, Dated, find};
 use measure::heights::Heights;
 
 const GSD: f64 = 0.1;
@@ -46,14 +46,22 @@ fn heap(p: DVec2, at: [f64; 2], m3: f64) -> f64 {
     (radius / 3.0 * (1.0 - p.distance(at.into()) / radius)).max(0.0)
 }
 
-fn map(seed: u64, blur: usize, sigma: f64, shift: DVec3, of: impl Fn(DVec2) -> f64) -> Heights {
+fn map(seed: u64, blur: usize, sigma: f64, shift: DVec3, of: impl Fn(DVec2) -> f64) -> Dated {
     let errors = noise(seed, blur, sigma);
     let corner = DVec2::new(0.0, SIDE as f64 * GSD);
     let value = |i: usize| {
         let p = corner + DVec2::new((i % SIDE) as f64 + 0.5, -((i / SIDE) as f64) - 0.5) * GSD;
         (of(p - shift.truncate()) + shift.z + errors[i]) as f32
     };
-    Heights::new(corner, GSD, [SIDE, SIDE], (0..SIDE * SIDE).map(value).collect()).unwrap()
+    let heights = Heights::new(corner, GSD, [SIDE, SIDE], (0..SIDE * SIDE).map(value).collect()).unwrap();
+    Dated { heights, sigmas: None }
+}
+
+/// The standard deviations of a map, by place.
+fn sigmas(of: impl Fn(DVec2) -> f64) -> Option<Heights> {
+    let corner = DVec2::new(0.0, SIDE as f64 * GSD);
+    let place = |i: usize| corner + DVec2::new((i % SIDE) as f64 + 0.5, -((i / SIDE) as f64) - 0.5) * GSD;
+    Heights::new(corner, GSD, [SIDE, SIDE], (0..SIDE * SIDE).map(|i| of(place(i)) as f32).collect())
 }
 
 fn at(change: &Change, place: [f64; 2]) -> Option<&measure::change::spots::Spot> {
@@ -130,6 +138,27 @@ fn what_one_of_the_two_did_not_see_is_not_said_to_have_changed() {
     assert!(at(&change, [50.0, 55.0]).is_some());
     let unseen = change.difference.metres.iter().filter(|m| m.is_nan()).count();
     assert!((198..=200).contains(&(unseen / SIDE)), "{unseen}");
+}
+
+#[test]
+fn what_a_map_itself_doubts_or_does_not_vouch_for_is_no_change() {
+    let [doubted, unknown, sure] = [[50.0, 55.0], [10.0, 40.0], [45.0, 28.0]];
+    let heaps = |p: DVec2| [doubted, unknown, sure].map(|at| heap(p, at, 40.0)).iter().sum::<f64>();
+    let near = |p: DVec2, at: [f64; 2]| p.distance(at.into()) < 6.0;
+    let worth = |p: DVec2| if near(p, doubted) { 1.5 } else { 0.04 };
+    let old = map(1, 2, 0.04, DVec3::ZERO, ground);
+    let mut new = map(2, 2, 0.04, DVec3::ZERO, |p| ground(p) + heaps(p));
+    assert_eq!(find(&old, &new).unwrap().spots.len(), 3);
+    new.sigmas = sigmas(|p| if near(p, unknown) { f64::NAN } else { worth(p) });
+    for old_says in [None, sigmas(|_| 0.04)] {
+        let change = find(&Dated { heights: old.heights.clone(), sigmas: old_says }, &new).unwrap();
+        let all: Vec<_> = change.spots.iter().map(|s| (s.middle, s.volume_m3)).collect();
+        assert!(all.len() == 1 && at(&change, sure).is_some(), "{all:?}");
+        let unseen = change.difference.metres.iter().filter(|m| m.is_nan()).count() as f64 * GSD * GSD;
+        assert!((unseen / (36.0 * std::f64::consts::PI) - 1.0).abs() < 0.02, "{unseen} m²");
+    }
+    new.sigmas = sigmas(|_| f64::NAN);
+    assert!(find(&old, &new).err().unwrap().to_string().contains("nothing vouches"));
 }
 
 #[test]

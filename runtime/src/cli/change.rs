@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use disk::Disk;
-use measure::change::{Change, MOST_COMPARED, find, write};
+use measure::change::{Change, Dated, MOST_COMPARED, find, write};
 use measure::heights::HeightMap;
 use serde::Serialize;
 use survey::coordinates::Reference;
@@ -20,8 +20,8 @@ const PRINTED: usize = 20;
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Writes change.geojson, change.kml (where the map is on Earth), change.csv, change.tif (metres and standard \
-                  deviations) and change.json. Ground that one of the two did not see is no change. What a map has wrong, holes \
-                  and floaters of a model, is one."
+                  deviations) and change.json. Ground that one of the two did not see, or for whose height nothing vouches \
+                  (no value in the dsm_sigma.tif beside it), is no change. What a map has wrong by more than it says is one."
 )]
 pub struct Args {
     /// The older date: a GeoTIFF of heights, the folder of a map, or a .dgtr model.
@@ -65,11 +65,16 @@ pub fn run(args: Args) -> Result<(), CliError> {
     }
     let apart = || CliError::input(format!("{} and {} have no ground in common", old.display(), new.display()));
     let common = before.common(&after).ok_or_else(apart)?;
-    let heights = before.part(common, MOST_COMPARED)?.zip(after.part(common, MOST_COMPARED)?).ok_or_else(apart)?;
-    let change = find(&heights.0, &heights.1)?;
+    let dated = |map: &mut HeightMap| -> Result<Dated, CliError> {
+        let heights = map.part(common, MOST_COMPARED)?.ok_or_else(apart)?;
+        let sigmas = map.sigmas()?.map(|mut map| map.part(common, MOST_COMPARED)).transpose()?.flatten();
+        Ok(Dated { heights, sigmas })
+    };
+    let (earlier, later) = (dated(&mut before)?, dated(&mut after)?);
+    let change = find(&earlier, &later)?;
     let reference = after.epsg().and_then(|code| Reference::named(&format!("EPSG:{code}"))).transpose();
     let reference = reference.map_err(CliError::input)?;
-    let pixel_m2 = heights.1.pixel_m2();
+    let pixel_m2 = later.heights.pixel_m2();
     let unseen = change.difference.metres.iter().filter(|m| m.is_nan()).count();
     let answer = Answer {
         old: &old,

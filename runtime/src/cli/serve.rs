@@ -151,7 +151,11 @@ pub fn run(args: Args) -> Result<(), CliError> {
         let from = Instant::now();
         board.say("drawing the map");
         match draw_file(&outcome.path, mission.ground.device.as_deref(), &args.out.join("map")) {
-            Ok(map) => data.files.extend(["orthophoto", "heights"].map(str::to_owned).into_iter().zip(map.files)),
+            Ok(map) => {
+                let names =
+                    ["orthophoto", "heights", "standard deviations of heights", "standard deviations of places"];
+                data.files.extend(names.map(str::to_owned).into_iter().zip(map.files));
+            }
             Err(e) => data.warnings.push(format!("There is no new map: {e}.")),
         }
         run.stage("map", from);

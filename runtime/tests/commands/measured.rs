@@ -9,14 +9,19 @@ use models::cloud::GaussianCloud;
 use models::formats::model::{self, ModelHeader};
 use serde_json::Value;
 use survey::ortho::crs::Crs;
-use survey::ortho::files::{MapFiles, NO_HEIGHT, Pixels};
+use survey::ortho::files::{MapFiles, Pixels};
 use survey::ortho::grid::Grid;
 
 use super::{dgtr, error_line, has_device};
 
 /// A map of 60 m by 60 m at 0.2 m in its own metres.
 fn map(folder: &Path, height: impl Fn(DVec2) -> f64) -> PathBuf {
-    let grid = Grid::new(Crs::local(), [DVec2::splat(-30.0), DVec2::splat(30.0)], 0.2).unwrap();
+    map_of(folder, 30.0, height)
+}
+
+/// One of another half side, metres.
+fn map_of(folder: &Path, half: f64, height: impl Fn(DVec2) -> f64) -> PathBuf {
+    let grid = Grid::new(Crs::local(), [DVec2::splat(-half), DVec2::splat(half)], 0.2).unwrap();
     let mut files = MapFiles::begin(folder, &grid).unwrap();
     for block in files.blocks().to_vec() {
         let pixels = || (0..block.height).flat_map(|y| (0..block.width).map(move |x| (x, y)));
@@ -26,8 +31,8 @@ fn map(folder: &Path, height: impl Fn(DVec2) -> f64) -> PathBuf {
         let rough = |p: DVec2| 0.03 * ((p.x * 91.7).sin() + (p.y * 73.3).cos() + (p.x * p.y * 17.9).sin());
         let heights: Vec<f32> = pixels().map(place).map(|p| (height(p) + rough(p)) as f32).collect();
         let mut rgba: Vec<u8> = pixels().flat_map(|_| [120, 130, 140, 255]).collect();
-        let unknown = vec![NO_HEIGHT; heights.len()];
-        let pixels = Pixels { rgba: &mut rgba, heights: &heights, height_sigmas: &unknown, plane_sigmas: &unknown };
+        let sigmas = vec![0.03; heights.len()];
+        let pixels = Pixels { rgba: &mut rgba, heights: &heights, height_sigmas: &sigmas, plane_sigmas: &sigmas };
         files.write(block, pixels).unwrap();
     }
     files.finish(&Disk::default(), None).unwrap();
@@ -97,7 +102,13 @@ fn what_cannot_be_measured_is_refused_in_one_line() {
     refused(&["volume", heights, path], "of its rim");
     std::fs::write(&areas, SQUARE.replace("Polygon", "LineString")).unwrap();
     refused(&["volume", heights, path], "no polygon");
-    refused(&["change", path, heights, "--out", folder.path().join("c").to_str().unwrap()], "areas.geojson");
+    let out = folder.path().join("c");
+    refused(&["change", path, heights, "--out", out.to_str().unwrap()], "areas.geojson");
+    // The standard deviations of another map.
+    let small = folder.path().join("small");
+    map_of(&small, 20.0, hills);
+    std::fs::copy(small.join("dsm_sigma.tif"), new.join("dsm_sigma.tif")).unwrap();
+    refused(&["change", heights, heights, "--out", out.to_str().unwrap()], "dsm_sigma.tif: its pixels are not those");
 }
 
 #[test]

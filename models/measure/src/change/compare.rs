@@ -2,6 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
+use super::Dated;
 use super::register::{Registration, sloped};
 use crate::heights::Heights;
 use crate::noise::Noise;
@@ -30,8 +31,9 @@ pub struct Difference {
 }
 
 /// Compares.
-pub fn compare(old: &Heights, new: &Heights, registration: &Registration) -> Difference {
-    let [w, h] = new.size();
+pub fn compare(old: &Dated, new: &Dated, registration: &Registration) -> Difference {
+    let (told, [w, h]) = ([old, new].map(|dated| dated.sigmas.as_ref()), new.heights.size());
+    let (old, new) = (&old.heights, &new.heights);
     let shift = DVec3::from(registration.shift_m);
     // The older map on the newer one's pixels.
     let moved: Vec<f32> = (0..w * h)
@@ -48,11 +50,16 @@ pub fn compare(old: &Heights, new: &Heights, registration: &Registration) -> Dif
     for i in 0..w * h {
         let (x, y) = (i % w, i / w);
         let Some((a, b)) = before.at(x, y).zip(new.at(x, y)) else { continue };
-        metres[i] = (b - a) as f32;
         let place = new.place(DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
+        // What the maps say of this place, and never less than what they differ by where nothing changed.
+        let said = [told[0].map(|map| map.height(place - shift.truncate())), told[1].map(|map| map.at(x, y))];
+        let Some(said) = said.into_iter().flatten().map(|sigma| sigma.map(|s| s * s)).sum::<Option<f64>>() else {
+            continue;
+        };
+        metres[i] = (b - a) as f32;
         let slope = sloped(&before, place).map_or(DVec2::ZERO, |(_, slope)| slope);
         let way = DVec3::new(-slope.x, -slope.y, 1.0);
-        let variance = registration.noise_m.powi(2) + way.dot(registration.covariance * way).max(0.0);
+        let variance = registration.noise_m.powi(2).max(said) + way.dot(registration.covariance * way).max(0.0);
         sigma[i] = variance.sqrt() as f32;
     }
     let unexplained = [outside(new, &before, within), outside(&before, new, within)];

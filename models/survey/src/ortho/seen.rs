@@ -10,12 +10,12 @@ use models::camera::View;
 
 use super::extent::ViewsAround;
 
-/// Longest side of a depth map, samples.
-const LONGEST: u32 = 160;
+/// Longest side of a depth map, samples; less where a block has many views.
+const LONGEST: f64 = 160.0;
 /// A picture shows what lies within this share of the depth that it sees, in front or behind.
 const NEAR: f32 = 0.02;
-/// Samples kept; those of the views that were needed longest ago give way. A block's own views always stay.
-const KEPT: usize = 1 << 22;
+/// Samples of a block's views, at most, and of those that earlier blocks needed: these give way, the oldest first.
+const KEPT: usize = 1 << 20;
 
 /// Depth maps of views, those that were needed last.
 #[derive(Clone, Debug, Default)]
@@ -49,26 +49,30 @@ impl DepthMaps {
     /// The views around a place whose depth maps are to be rendered first, as small as is enough.
     pub fn lacking(&mut self, around: &ViewsAround<'_>) -> Vec<(usize, View)> {
         self.now += 1;
-        let mut lacking = Vec::new();
+        let most = KEPT as f64 / around.views().max(1) as f64;
+        let (mut lacking, mut coming) = (Vec::new(), 0);
         for (i, view) in around.each() {
-            match self.maps.get_mut(&i) {
-                Some(map) => map.used = self.now,
-                None => {
-                    let k = view.intrinsics;
-                    let share = f64::from(LONGEST) / f64::from(k.width.max(k.height));
-                    let [width, height] =
-                        [k.width, k.height].map(|side| (f64::from(side) * share.min(1.0)).ceil() as u32);
-                    lacking.push((i, View { intrinsics: k.resized(width, height), ..*view }));
-                }
+            if let Some(map) = self.maps.get_mut(&i) {
+                map.used = self.now;
+                continue;
             }
+            let k = view.intrinsics;
+            let [width, height] = [k.width, k.height].map(f64::from);
+            let share = (LONGEST / width.max(height)).min((most / (width * height)).sqrt()).min(1.0);
+            let small = k.resized(((width * share) as u32).max(1), ((height * share) as u32).max(1));
+            coming += small.pixels();
+            lacking.push((i, View { intrinsics: small, ..*view }));
         }
-        let kept = |maps: &BTreeMap<usize, DepthMap>| maps.values().map(|map| map.depths.len()).sum::<usize>();
-        while kept(&self.maps) > KEPT {
+        while self.samples() + coming > KEPT {
             let oldest = self.maps.iter().filter(|(_, map)| map.used < self.now).min_by_key(|(_, map)| map.used);
             let Some(oldest) = oldest.map(|(i, _)| *i) else { break };
             self.maps.remove(&oldest);
         }
         lacking
+    }
+
+    fn samples(&self) -> usize {
+        self.maps.values().map(|map| map.depths.len()).sum()
     }
 
     /// Takes a view's depth map: columns and rows, and depths along the optical axis row by row, NaN where there is no surface.
@@ -215,13 +219,27 @@ mod tests {
         let extent = level_ground(&views);
         let mut depths = DepthMaps::default();
         for i in 0..400 {
-            let around = extent.views_around(DVec2::new(50.0 * f64::from(i), 0.0), 5.0);
-            for (view, small) in depths.lacking(&around) {
-                let k = small.intrinsics;
-                depths.insert(view, [k.width, k.height], vec![1.0; k.pixels()]);
-            }
-            assert!(depths.maps.values().map(|m| m.depths.len()).sum::<usize>() <= KEPT + 4 * 160 * 120);
+            fill(&mut depths, &extent.views_around(DVec2::new(50.0 * f64::from(i), 0.0), 5.0));
+            assert!(depths.samples() <= KEPT, "{}", depths.samples());
         }
-        assert!(depths.maps.len() < 300 && depths.maps.contains_key(&399));
+        assert!(depths.maps.len() < 60 && depths.maps.contains_key(&399));
+    }
+
+    #[test]
+    fn thousands_of_views_of_one_block_have_small_depth_maps() {
+        let views: Vec<View> = (0..4096).map(|i| nadir(0.01 * f64::from(i))).collect();
+        let extent = level_ground(&views);
+        let around = extent.views_around(DVec2::ZERO, 500.0);
+        let mut depths = DepthMaps::default();
+        fill(&mut depths, &around);
+        assert_eq!(depths.maps.len(), 4096);
+        assert!((KEPT / 2..=KEPT).contains(&depths.samples()), "{}", depths.samples());
+    }
+
+    fn fill(depths: &mut DepthMaps, around: &ViewsAround<'_>) {
+        for (view, small) in depths.lacking(around) {
+            let k = small.intrinsics;
+            depths.insert(view, [k.width, k.height], vec![1.0; k.pixels()]);
+        }
     }
 }
